@@ -108,7 +108,7 @@ class LaggedFunction(ABC):
 
     kind: ClassVar[str]
     ellipsoid: ClassVar[bool] = False  # whether the ellipsoid alone says where it was trained
-    folded: int = 0  # 1 or 2 where the sign of the output is not measured, see `lagged_kernels.run`
+    folded: bool = False  # whether the sign of the output is not measured, see `lagged_kernels.run`
 
     @property
     @abstractmethod
@@ -297,7 +297,7 @@ class LaggedFunction(ABC):
         out, x = np.empty((z.shape[0], p)), self.regressors
         if self.folded:
             z[: self.lag, :p] *= self.first_sign(theta, z)
-        shape = np.array([self.lag, p, p + x.n_inputs, int(free), self.folded], dtype=np.int64)
+        shape = np.array([self.lag, p, p + x.n_inputs, int(free), int(self.folded)], dtype=np.int64)
         run(z, x.column, x.back, shape, out, *numbers.values())
         return out
 
@@ -327,18 +327,12 @@ class LaggedFunction(ABC):
         propagate(out, np.ascontiguousarray(by_x if free else -by_x), *self._recurrence(at), first)
         return out[first:]
 
-    def fold(self, J: Array, rows: Rows, *, free: bool, before: Array | None = None) -> Array:
+    def fold(self, J: Array, rows: Rows) -> Array:
         """Return slopes of what is measured from those of the outputs; they differ where that is a magnitude."""
         if not self.folded:
             return J
-        sign = np.copysign(1.0, rows.z[rows.first - 1 : rows.first + J.shape[0], : self.n_outputs])[:, :, None]
-        if self.folded == 1:
-            return np.asarray(sign[1:] * J)
-        out = 0.5 * sign[1:] * J
-        if free:
-            earlier = np.zeros_like(J[:1]) if before is None else before[-1:]
-            out += 0.5 * sign[:-1] * np.concatenate([earlier, J[:-1]])
-        return np.asarray(out)
+        sign = np.copysign(1.0, rows.z[rows.first : rows.first + J.shape[0], : self.n_outputs])
+        return np.asarray(sign[:, :, None] * J)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -388,7 +382,7 @@ class LaggedModel(ScaledModel):
         if ys.shape[0] > self.lag:
             of, theta = self.function, self.scaled_theta
             _, rows = of.predict(theta, of.rows(ys, us))
-            out[self.lag :] = of.fold(of.slopes(theta, rows, free=False), rows, free=False)
+            out[self.lag :] = of.fold(of.slopes(theta, rows, free=False), rows)
         return out * (self.y_scale[:, None] / self.unit)
 
     def simulate(self, u: Array, y: Array) -> Array:

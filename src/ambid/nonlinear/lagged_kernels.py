@@ -47,7 +47,7 @@ def run(
     length zero. A row of `terms` names regressors, -1 behind the last; `place` its output, and 1 for a denominator.
     Predicts from measured outputs and writes innovations into z, or with `free` its own outputs. `out` (n, n_outputs)
     is NaN where nothing is computed, and from a divergence on. With `folded` the sign of the output is not measured: it
-    gets that of the prediction, and `out` is its magnitude (2: the mean of those now and one sample ago).
+    gets that of the prediction, and `out` is its magnitude.
     """
     lag, p, n_e, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
@@ -104,8 +104,6 @@ def run(
             out[t, o] = f[o]
             if folded == 1:
                 out[t, o] = abs(f[o])
-            elif folded == 2:
-                out[t, o] = 0.5 * (abs(f[o]) + abs(z[t - 1, o]))
             if free == 1:
                 z[t, o] = f[o]
             else:

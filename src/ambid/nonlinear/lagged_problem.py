@@ -98,7 +98,7 @@ class LaggedProblem:
         """Yield record number and weighted slopes and errors of some of its rows, (n, n_outputs, n_live + 1)."""
         of, theta = self.function, self.whole(v)
         at = of.regressors.own if self.free else of.regressors.noisy
-        reach = int(of.regressors.back[at].max(initial=int(of.folded == 2)))
+        reach = int(of.regressors.back[at].max(initial=0))
         for k, (y, u) in enumerate(self.parts):
             if self.free:
                 run, z = of.free_run(theta, y, u)
@@ -109,11 +109,11 @@ class LaggedProblem:
             before: Array | None = None
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
-                some, past = rows.part(part), before
-                J = of.slopes(theta, some, free=self.free, live=self.live, before=past)
+                some = rows.part(part)
+                J = of.slopes(theta, some, free=self.free, live=self.live, before=before)
                 if reach:
-                    before = J[-reach:].copy() if past is None else np.concatenate([past, J])[-reach:]
-                J = of.fold(J, some, free=self.free, before=past)
+                    before = J[-reach:].copy() if before is None else np.concatenate([before, J])[-reach:]
+                J = of.fold(J, some)
                 yield k, np.matmul(self.weight, np.concatenate([J, left[part, :, None]], axis=2))
 
     def sample_rows(self, v: Array) -> list[Array]:

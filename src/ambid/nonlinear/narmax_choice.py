@@ -83,9 +83,7 @@ class NarmaxSettings:
         "prediction or simulation: which errors the coefficients make small at last; prediction",
         *("prediction", "simulation"),
     )
-    output: str = choice(
-        "magnitude, or mean magnitude (over a sample), where the sensor sees no sign; signed", *OUTPUTS
-    )
+    output: str = choice("magnitude, where the sensor sees no sign; signed", *OUTPUTS)
     symmetry: str = choice(
         "odd where the plant is the same the other way round: terms of odd degree alone; none", "none", "odd"
     )
@@ -494,7 +492,7 @@ def _start_of_magnitude(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> C
     """The best linear model of the magnitude, fitted to the free run."""
     order, delays = min(s.ny, 3), range(max(s.nk, 1), s.nk + s.nu)
     terms = tuple((f,) for f in lagged(1, 1, ny=order, nu=len(delays), nk=delays.start))
-    function = PolynomialFunction(numerators=(terms,), denominators=((),), m=1, folded=OUTPUTS.index(s.output))
+    function = PolynomialFunction(numerators=(terms,), denominators=((),), m=1, folded=True)
     best, least = None, np.inf
     starts = _starts(order, delays, parts)
     for k, start in enumerate(starts):

@@ -19,7 +19,7 @@ from ambid.nonlinear.blocks import Block, Mask, Terms
 from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names
 
 MOST_CANDIDATES = 20_000
-OUTPUTS = ("signed", "magnitude", "mean magnitude")
+OUTPUTS = ("signed", "magnitude")
 
 
 @dataclass(frozen=True, slots=True, order=True)
@@ -135,7 +135,7 @@ class PolynomialFunction(LaggedFunction):
     numerators: tuple[tuple[Term, ...], ...]  # by output
     denominators: tuple[tuple[Term, ...], ...]
     m: int  # inputs
-    folded: int = 0  # number in `OUTPUTS`
+    folded: bool = False
 
     @cached_property
     def owned(self) -> tuple[tuple[int, int, Term], ...]:
@@ -222,4 +222,4 @@ class PolynomialFunction(LaggedFunction):
         num, den = (terms_from_json(found[k], p, m) for k in ("numerators", "denominators"))
         if found["output"] not in OUTPUTS:
             raise ValueError(f"output is none of {', '.join(OUTPUTS)}")
-        return cls(numerators=num, denominators=den, m=m, folded=OUTPUTS.index(found["output"]))
+        return cls(numerators=num, denominators=den, m=m, folded=found["output"] == "magnitude")
