@@ -25,7 +25,6 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from scipy.signal import lfilter
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
@@ -38,7 +37,7 @@ from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term
 from ambid.nonlinear.records import Parts
 from ambid.nonlinear.selection import Candidates, MatrixCandidates, Selection, candidates, select_terms
 from ambid.nonlinear.settings import choice, read_settings, whole
-from ambid.nonlinear.state_start import pole_grid
+from ambid.nonlinear.state_start import rank_grid
 
 _ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations
 _NEARLY_ALL = 0.99  # of the output's energy
@@ -494,32 +493,13 @@ def _start_of_magnitude(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> C
     terms = tuple((f,) for f in lagged(1, 1, ny=order, nu=len(delays), nk=delays.start))
     function = PolynomialFunction(numerators=(terms,), denominators=((),), m=1, folded=True)
     best, least = None, np.inf
-    starts = _starts(order, delays, parts)
-    for k, start in enumerate(starts):
+    for k, (A, _, d, gain) in enumerate(rank_grid(parts, order, delays)[:_REFINED]):
         if tick is not None:
-            tick("sign of the output", k / len(starts))
-        trial = Choice(function=function, theta=start)
+            tick("sign of the output", k / _REFINED)
+        theta = np.concatenate([-A[1:], gain * (np.array(delays) == d)])
+        trial = Choice(function=function, theta=theta)
         found = trial.search(parts, free=True, most=30)
         if best is None or found.cost < least:
             best, least = trial.with_theta(found.theta), found.cost
     assert best is not None
     return best
-
-
-def _starts(order: int, delays: range, parts: Parts) -> list[Array]:
-    """The best of the grid, coefficients in the order of the terms."""
-    scored: list[tuple[float, int, Array]] = []
-    y = np.concatenate([p[0][:, 0] for p in parts])
-    for A in pole_grid(order):
-        runs = [lfilter([1.0], A, p[1][:, 0]) for p in parts]
-        for d in delays:
-            x = np.abs(np.concatenate([np.concatenate([np.zeros(d), r[: r.size - d]]) for r in runs]))
-            size = float(x @ x)
-            if not (np.isfinite(size) and size > 0):
-                continue
-            gain = float(x @ y) / size
-            b = np.zeros(len(delays))
-            b[d - delays.start] = gain
-            scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), np.concatenate([-A[1:], b])))
-    scored.sort(key=lambda found: found[:2])
-    return [theta for _, _, theta in scored[:_REFINED]]

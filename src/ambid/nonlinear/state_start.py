@@ -9,6 +9,7 @@ Golub and Pereyra 1973). Nothing runs away over a short shot, so that unstable p
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any
@@ -167,27 +168,32 @@ def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[
 # --- a grid of poles, where the sensor sees no sign -------------------------------------------------------------------
 
 
-def grid_starts(parts: Parts, n: int, most: int, dt: float) -> list[tuple[Layout, Array]]:
-    """Return the `most` best linear models of `n` poles on a grid behind a sensor without sign, the best first.
+def rank_grid(parts: Parts, n: int, delays: Sequence[int] = (1,)) -> list[tuple[Array, int, int, float]]:
+    """Return linear models gain q^-d / A(q^-1) of `n` poles behind a sensor without sign, the best first.
 
-    The sign is not in the data, and a search from a wrong one ends in a wrong minimum. Each model has the gain that
-    fits the magnitude best.
+    The sign is not in the data, and a search from a wrong one ends in a wrong minimum. By model A, the input, its delay
+    d and the gain that fits the magnitude best.
     """
     from scipy.signal import lfilter
 
-    m = parts[0][1].shape[1]
-    layout = Layout.free(dt, (n,), (_STEP,) * (n - 1) + (0.0,), (1.0,) * (n + m), sensor=True)
     y = np.concatenate([p[0][:, 0] for p in parts])
-    scored: list[tuple[float, int, Array, int, float]] = []
+    scored: list[tuple[float, int, tuple[Array, int, int, float]]] = []
     for A in pole_grid(n):
-        for j in range(m):
-            x = np.concatenate([np.abs(lfilter([0.0, 1.0], A, p[1][:, j])) for p in parts])
-            size = float(x @ x)
-            if np.isfinite(size) and size > 0:
-                gain = float(x @ y) / size
-                scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), A, j, gain))
-    scored.sort(key=lambda found: found[:2])
-    return [(layout, _grid_weights(layout, A, j, gain)) for _, _, A, j, gain in scored[:most]]
+        for j in range(parts[0][1].shape[1]):
+            runs = [np.abs(lfilter([1.0], A, u[:, j])) for _, u in parts]
+            for d in delays:
+                x = np.concatenate([np.concatenate([np.zeros(d), r[: r.size - d]]) for r in runs])
+                size = float(x @ x)
+                if np.isfinite(size) and size > 0:
+                    gain = float(x @ y) / size
+                    scored.append((float(np.sum((gain * x - y) ** 2)), len(scored), (A, j, d, gain)))
+    return [model for _, _, model in sorted(scored, key=lambda found: found[:2])]
+
+
+def grid_starts(parts: Parts, n: int, most: int, dt: float) -> list[tuple[Layout, Array]]:
+    """Return the `most` best linear networks of `n` poles on the grid."""
+    layout = Layout.free(dt, (n,), (_STEP,) * (n - 1) + (0.0,), (1.0,) * (n + parts[0][1].shape[1]), sensor=True)
+    return [(layout, _grid_weights(layout, A, j, gain)) for A, j, _, gain in rank_grid(parts, n)[:most]]
 
 
 def _grid_weights(layout: Layout, A: Array, channel: int, gain: float) -> Array:
