@@ -19,18 +19,8 @@ from ambid.blackbox.model import (
     pole_covariance,
 )
 from ambid.errors import ModelError
-from ambid.estimation.estimate import (
-    by_output,
-    check_schema,
-    fields_json,
-    json_text,
-    only_outputs,
-    plain_json,
-    read_as,
-    read_whole,
-)
+from ambid.estimation.estimate import fit_document, json_text, only_outputs, read_as, read_fit
 
-SCHEMA = "ambid.fit/1"
 _LARGEST = 1e100  # what a number in a file may be: beyond, its square is not finite any more
 NO_INNOVATIONS = (
     "none: a frequency response has no innovations, and its noise stands in the covariance of the coefficients"
@@ -58,7 +48,6 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
         "sd": None if fit.sd is None else _model_json(fit.model, fit.sd, fit.outputs)[1],
         "noise_variance": noise if noise is None or len(fit.outputs) > 1 else noise[0, 0],
         "noise_covariance": noise,
-        "rate_hz": 1.0 / fit.dt,
         "poles": _poles_json(fit),
         "offsets": {
             "inputs": dict(zip(fit.inputs, fit.offsets.u, strict=True)),
@@ -69,8 +58,7 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
         "continuous_time": fit.model.dt is None,
         "delay_s": fit.model.delay if isinstance(fit.model, TransferModel) else None,
     }
-    document = fields_json(fit, without=("model", "offsets", "dt", "covariance", "noise_covariance"))
-    return by_output({"schema": SCHEMA, **document, **plain_json(more)})
+    return fit_document(fit, more, without=("offsets", "noise_covariance"))
 
 
 def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) -> tuple[str, Any]:
@@ -121,8 +109,7 @@ def _poles_json(fit: BlackBoxFit) -> list[dict[str, Any]]:
 
 def fit_from_json(document: Mapping[str, Any], where: str) -> BlackBoxFit:
     """Read a fit back; `where` is the name of its file, for messages."""
-    check_schema(document, SCHEMA, where, "a fit", "fit")
-    return read_whole(lambda: _from_json(document), where, "fit", "fit")
+    return read_fit(_from_json, document, where)
 
 
 def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
@@ -144,24 +131,11 @@ def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
             "dt": 1.0 / _rate(d),
         },
     )
-    _check_consistent(fit)
-    return fit
-
-
-def _check_consistent(fit: BlackBoxFit) -> None:
-    """Raise ValueError where the parts do not belong together."""
-    noise, size = fit.noise_covariance, fit.model.theta.size
-    if (fit.model.n_inputs, fit.model.n_outputs) != (len(fit.inputs), len(fit.outputs)) or noise.shape != (
-        len(fit.outputs),
-        len(fit.outputs),
-    ):
-        raise ValueError("inputs, outputs, noise and model are not of the same size")
-    if fit.covariance is not None and fit.covariance.shape != (size, size):
-        raise ValueError("the covariance is not of the model's coefficients")
-    if np.any(np.diag(_finite(noise, "noise_covariance")) < 0):
+    if np.any(np.diag(_finite(fit.noise_covariance, "noise_covariance")) < 0):
         raise ValueError("a noise variance is negative")
     if fit.covariance is not None:
         _finite(fit.covariance, "covariance")
+    return fit
 
 
 def _finite(value: Any, what: str) -> Array:

@@ -221,6 +221,7 @@ class FittedModel(Judged):
 
 
 T = TypeVar("T")
+FIT_SCHEMA = "ambid.fit/1"
 
 COVARIANCE = types.MappingProxyType(
     {"names": "covariance_names", "matrix": "covariance", "method": "covariance_method"}
@@ -293,6 +294,30 @@ def only_outputs(document: Mapping[str, Any], outputs: tuple[str, ...]) -> dict[
         "fit": {o: document["fit"][o] for o in outputs if o in document["fit"]},
         "validation": None if judged is None else {o: judged[o] for o in outputs},
     }
+
+
+def fit_document(fit: FittedModel, more: Mapping[str, Any], without: tuple[str, ...]) -> dict[str, Any]:
+    """Return a fit in the form of schema ``ambid.fit/1``: its fields but some, and `more`."""
+    document = fields_json(fit, without=("model", "dt", "covariance", *without))
+    return by_output({"schema": FIT_SCHEMA, **document, **plain_json({"rate_hz": 1.0 / fit.dt, **more})})
+
+
+def read_fit(read: Callable[[Mapping[str, Any]], T], document: Mapping[str, Any], where: str) -> T:
+    """Read a fit back; `where` is the name of its file, for messages."""
+    check_schema(document, FIT_SCHEMA, where, "a fit", "fit")
+
+    def whole() -> Any:
+        fit: Any = read(document)
+        model, p = fit.model, len(fit.outputs)
+        if fit.noise_covariance.shape != (p, p):
+            raise ValueError("the noise covariance is not of the outputs")
+        if model is not None and (model.n_inputs, model.n_outputs) != (len(fit.inputs), p):
+            raise ValueError("inputs, outputs and model are not of the same size")
+        if model is not None and fit.covariance is not None and fit.covariance.shape != (model.theta.size,) * 2:
+            raise ValueError("the covariance is not of the model's numbers")
+        return fit
+
+    return cast("T", read_whole(whole, where, "fit", "fit"))
 
 
 def json_text(document: Mapping[str, Any]) -> str:

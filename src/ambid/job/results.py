@@ -8,10 +8,10 @@ from typing import Any, Unpack
 
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_json
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.fit_file import SCHEMA, fit_from_json
+from ambid.blackbox.fit_file import fit_from_json
 from ambid.errors import AmbidError, EstimationError
+from ambid.estimation.estimate import FIT_SCHEMA, Estimate, estimate_from_json
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
-from ambid.estimation.estimate import Estimate, estimate_from_json
 from ambid.job.data import Channels, Reading, Source, check_same_bench, load, signals_of
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
@@ -58,7 +58,7 @@ def read_estimate(path: str | Path) -> AnyEstimate | AnyFit:
             "Give what 'ambid identify --json' wrote"
         ) from None
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema == SCHEMA:
+    if schema == FIT_SCHEMA:
         if str(document.get("structure")) in NONLINEAR_STRUCTURES:
             return nonlinear_fit_from_json(document, f"fit {path}")
         return fit_from_json(document, f"fit {path}")

@@ -9,20 +9,9 @@ from types import MappingProxyType
 from typing import Any
 
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.estimate import (
-    by_output,
-    check_schema,
-    fields_json,
-    json_text,
-    only_outputs,
-    plain_json,
-    read_as,
-    read_whole,
-)
+from ambid.estimation.estimate import fit_document, json_text, only_outputs, read_as, read_fit
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
-
-SCHEMA = "ambid.fit/1"
 
 
 def nonlinear_fit_text(fit: NonlinearFit) -> str:
@@ -44,17 +33,14 @@ def nonlinear_fit_to_json(fit: NonlinearFit) -> dict[str, Any]:
         "sd": fit.sd,
         "covariance": None if fit.covariance is None else {"from": fit.covariance_from, "matrix": fit.covariance},
         "noise_variance": noise[0, 0] if len(fit.outputs) == 1 else noise,
-        "rate_hz": 1.0 / fit.dt,
         "dt_s": fit.dt,
     }
-    document = fields_json(fit, without=("model", "covariance", "covariance_from", "dt"))
-    return by_output({"schema": SCHEMA, **document, **plain_json(more)})
+    return fit_document(fit, more, without=("covariance_from",))
 
 
 def nonlinear_fit_from_json(document: Mapping[str, Any], where: str) -> NonlinearFit:
     """Read a nonlinear fit back; `where` is the name of its file, for messages."""
-    check_schema(document, SCHEMA, where, "a fit", "fit")
-    return read_whole(lambda: _from_json(document), where, "fit", "fit")
+    return read_fit(_from_json, document, where)
 
 
 def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
@@ -74,13 +60,6 @@ def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
     )
     if (fit.model is None) != (fit.status == "failed"):
         raise ValueError("a failed fit has no model, every other has one")
-    if fit.noise_covariance.shape != (len(fit.outputs),) * 2:
-        raise ValueError("the noise covariance is not of the outputs")
-    if fit.model is not None:
-        if (fit.model.n_inputs, fit.model.n_outputs) != (len(fit.inputs), len(fit.outputs)):
-            raise ValueError("inputs, outputs and model are not of the same size")
-        if fit.covariance is not None and fit.covariance.size != fit.model.theta.size**2:
-            raise ValueError("the covariance is not of the model's parameters")
     return fit
 
 
