@@ -11,8 +11,9 @@ import numpy as np
 from ambid.physics.loop import Noise
 from ambid.physics.models import model
 from ambid.physics.presets import preset
-from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
+from ambid.recursive.fusion import FusedSensor, SensorFusion
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf
+from ambid.recursive.kalman import constant_velocity
 from ambid.track.evidence import Samples
 from ambid.track.rpem import PhysicalRpem
 from ambid.track.window import MovingWindow
@@ -164,11 +165,11 @@ def _fusion() -> Job:
     x = 2e-5 * np.sin(2 * np.pi * 11.0 * t)
     sd = np.array([1e-6, 1.5e-6, 2e-6])
     y = x[:, None] + sd * rng.standard_normal((n, 3))
-    motion = free_motion(RATE, q=1e-2)
+    state, start_sd = constant_velocity(RATE, q=1e-2, r=1.0), np.array([1e-3, 1.0])
     sensors = [FusedSensor(name=f"s{j}", gain=1.0, noise_sd=float(s), resolution=0.0) for j, s in enumerate(sd)]
 
     def make() -> SensorFusion:
-        return SensorFusion(RATE, sensors, motion=motion)
+        return SensorFusion(RATE, sensors, q=1e-2)
 
     def feed() -> Callable[[int, int], object]:
         made = make()
@@ -178,10 +179,9 @@ def _fusion() -> Job:
         made = make()
         return lambda k: made.update(y[k])
 
-    state = motion.state
     orders = {
         "A": state.A.tolist(), "C": np.tile(state.C, (3, 1)).tolist(), "Q": state.Q.tolist(),
-        "R": np.diag(sd**2).tolist(), "P0": np.diag(motion.start_sd**2).tolist(), "truth": x[:n_peer].tolist(),
+        "R": np.diag(sd**2).tolist(), "P0": np.diag(start_sd**2).tolist(), "truth": x[:n_peer].tolist(),
     }  # fmt: skip
 
     def compare(found: dict[str, Array]) -> Same:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
+from ambid.recursive.fusion import FusedSensor, SensorFusion
 
 RATE_HZ, SECONDS = 20_000.0, 2.0
 GAIN, NOISE = 4000.0, 2e-3  # V/m and V: 0.5 um
@@ -36,7 +36,7 @@ def three(seed: int) -> tuple[SensorFusion, dict[str, float]]:
     values = GAIN * x[:, None] + NOISE * rng.standard_normal((n, 3))
     values[int(SLIP_S * RATE_HZ) :, 1] += GAIN * SLIP
     sensors = [FusedSensor(name=s, gain=GAIN, noise_sd=NOISE, resolution=0.0, drift_rate=2e-3) for s in "abc"]
-    fusion = SensorFusion(RATE_HZ, sensors, motion=free_motion(RATE_HZ, q=1e-2))
+    fusion = SensorFusion(RATE_HZ, sensors, q=1e-2)
     position, sd = fusion.update(values).T
     for event in fusion.events:
         print(f"{event.t:8.4f} s  {event.kind} {event.parameter}: {event.why}")
@@ -62,7 +62,7 @@ def pair(seed: int) -> dict[str, float]:
         for s, g in (("upper", GAIN), ("lower", -GAIN))
     ]
     values = np.column_stack([GAIN * (x + warming), GAIN * (warming - x)]) + NOISE * rng.standard_normal((n, 2))
-    fusion = SensorFusion(RATE_HZ, sensors, motion=free_motion(RATE_HZ, q=1e-2), temperature_rate=20.0)
+    fusion = SensorFusion(RATE_HZ, sensors, q=1e-2, temperature_rate=20.0)
     position, sd = fusion.update(values).T
     found = {
         "upper alone, at the end": float(np.mean(values[-2000:, 0] / GAIN - x[-2000:])),

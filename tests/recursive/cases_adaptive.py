@@ -64,7 +64,6 @@ CASES = [
         signals=regression,
     ),
     Case(name="rls-reset", make=lambda: RecursiveLeastSquares(4, memory=500, reset_every=90), signals=regression),
-    Case(name="rls-walk", make=lambda: RecursiveLeastSquares(4, walk=[1e-4, 1e-3, 0, 1e-4]), signals=regression),
     Case(name="iv", make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4), signals=instruments),
     Case(
         name="iv-forgetting",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
+from ambid.recursive.fusion import FusedSensor, SensorFusion
 
 RATE = 20_000.0
 GAIN = 4000.0  # V/m
@@ -19,7 +19,7 @@ def sensors(n=3, **settings):
 
 
 def fusion(n=3, *, q=Q, settings=None, **more):
-    return SensorFusion(RATE, sensors(n, **(settings or {})), motion=free_motion(RATE, q=q), **more)
+    return SensorFusion(RATE, sensors(n, **(settings or {})), q=q, **more)
 
 
 def vibration(n, amplitude=15e-6, hz=50.0):

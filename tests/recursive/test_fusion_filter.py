@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.fusion import Motion, SensorFusion, free_motion, still_samples
-from ambid.recursive.kalman import KalmanFilter, linear_state
+from ambid.recursive.fusion import SensorFusion, still_samples
+from ambid.recursive.kalman import KalmanFilter, constant_velocity, linear_state
 from tests.recursive.fusion_benches import GAIN, NOISE, RATE, SIGMA, Q, fusion, readings, sensors, vibration
 
 DRIFT = 0.2  # V/√s: fast, so that offsets walk in single samples
@@ -27,7 +27,7 @@ def test_without_faults_it_is_the_kalman_filter_of_the_whole_state():
     y = readings(vibration(400), seed=3)
     y[100:103, 1] = np.nan
     fused = fusion(settings={"drift_rate": DRIFT, "offset_sd": 4e-3})
-    state = fused.motion.state
+    state = constant_velocity(RATE, q=Q, r=1.0)
     A, Qs = np.eye(5), np.diag([0, 0, *[(DRIFT / GAIN) ** 2 / RATE] * 3])
     A[:2, :2], Qs[:2, :2] = state.A, state.Q
     model = linear_state(A, np.hstack([np.ones((3, 1)), np.zeros((3, 1)), np.eye(3)]), Qs, SIGMA**2 * np.eye(3))
@@ -49,7 +49,7 @@ def test_errors_are_as_large_as_stated_and_smaller_than_of_the_best_sensor(give)
     noise = np.array([2e-3, 3e-3, 4e-3])
     y = GAIN * x[:, :, None] + zeros + noise * rng.standard_normal((runs, n, 3))
     used = [replace(s, noise_sd=sd, drift_rate=0.02, offset_sd=3e-3) for s, sd in zip(sensors(), noise, strict=True)]
-    fresh = SensorFusion(RATE, used, motion=free_motion(RATE, q=Q, start_sd=(5e-6, 1e-3)), give=give)
+    fresh = SensorFusion(RATE, used, q=Q, start_sd=(5e-6, 1e-3), give=give)
     normalised, errors = np.empty(runs), np.empty(runs)
     for k in range(runs):
         out = fresh.copy().update(y[k])
@@ -133,16 +133,14 @@ def test_how_long_a_value_may_stand_still_follows_from_resolution_and_noise():
     ("make", "words"),
     [
         (lambda: fusion(1), "two or more"),
-        (lambda: SensorFusion(RATE, sensors() + sensors(1), motion=free_motion(RATE, q=Q)), "distinct names"),
+        (lambda: SensorFusion(RATE, sensors() + sensors(1), q=Q), "distinct names"),
         (lambda: fusion(give="smoothed"), "'filtered' or 'instant'"),
         (lambda: fusion(restore_s=0.0), "must be positive"),
         (lambda: sensors(1, gain=0.0), "finite and not 0"),
         (lambda: sensors(1, noise_sd=-1.0), "positive"),
         (lambda: sensors(1, limits=(1.0, 0.0)), "low < high"),
         (lambda: fusion().update(np.zeros((5, 2))), "for 3 channels"),
-        (lambda: fusion().restore("z"), "sensors are a, b, c"),
-        (lambda: free_motion(RATE, q=Q, start_sd=(0.0, 1.0)), "start_sd must be positive"),
-        (lambda: Motion(state=linear_state(*[np.eye(2)] * 4), start=0, start_sd=1), "wants one"),
+        (lambda: fusion(start_sd=(0.0, 1.0)), "two positive numbers"),
     ],
 )  # fmt: skip
 def test_refusals_name_the_rule(make, words):

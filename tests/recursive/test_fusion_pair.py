@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.recursive.fusion import FusedSensor, SensorFusion, free_motion
+from ambid.recursive.fusion import FusedSensor, SensorFusion
 from tests.recursive.fusion_benches import GAIN, NOISE, RATE, Q, vibration
 
 PER_KELVIN = 1e-6 * GAIN  # V/K
@@ -15,7 +15,7 @@ N = 40_000
 def pair(**settings):
     gains = (("upper", GAIN), ("lower", -GAIN))
     sensors = [FusedSensor(name=s, gain=g, noise_sd=NOISE, resolution=0.0, **settings) for s, g in gains]
-    return SensorFusion(RATE, sensors, motion=free_motion(RATE, q=Q), temperature_rate=20.0)
+    return SensorFusion(RATE, sensors, q=Q, temperature_rate=20.0)
 
 
 def test_twenty_micrometres_of_drift_leave_less_than_a_tenth_of_one():

@@ -49,21 +49,6 @@ def test_with_forgetting_the_error_is_smaller_than_the_matrix_by_one_plus_factor
     np.testing.assert_allclose(np.diag(rls.P) / np.diag(rls.covariance), 1.999, rtol=0.05)
 
 
-def test_a_walk_makes_it_the_kalman_filter() -> None:
-    phi, y = data(3)
-    walk = np.array([1e-2, 0.0, 3e-4])
-    rls = RecursiveLeastSquares(3, prior=4.0, walk=walk, noise_sd=0.2)
-    rls.update(phi, y)
-    theta, P = np.zeros(3), 4 * np.eye(3)
-    for row, out in zip(phi, y, strict=True):
-        P = P + np.diag(walk)
-        K = P @ row / (1 + row @ P @ row)
-        theta = theta + K * (out - row @ theta)
-        P = P - np.outer(K, row @ P)
-    np.testing.assert_allclose(rls.estimate, theta, rtol=1e-9)
-    np.testing.assert_allclose(rls.covariance, 0.04 * P, rtol=1e-8, atol=1e-12)
-
-
 def test_directional_forgetting_is_that_of_cao_and_schwartz_and_its_covariance_that_of_the_error() -> None:
     phi, y = data(4, 80)
     rls = RecursiveLeastSquares(4, prior=2.0, forgetting="directional", factor=0.9, noise_sd=0.2, limit=1e9)
@@ -108,7 +93,7 @@ def test_wind_up_ends_at_the_limit_and_the_estimate_stays() -> None:
 
 
 @pytest.mark.parametrize(
-    "settings", [{"memory": 1000.0}, {"factor": 0.3}, {"forgetting": "directional", "factor": 0.9}, {"walk": 1e-12}]
+    "settings", [{"memory": 1000.0}, {"factor": 0.3}, {"forgetting": "directional", "factor": 0.9}]
 )
 def test_ten_million_poor_updates_keep_the_covariance_sound(settings: dict[str, object]) -> None:
     """Regressors of 1e-9 to 1e6, bursts, collinear stretches and silence."""
@@ -166,7 +151,6 @@ def test_a_reset_forgets_the_covariance_and_keeps_the_estimate(settings: dict[st
     np.testing.assert_allclose(rls.P, 5 * np.eye(4), rtol=1e-12)
     np.testing.assert_allclose(rls.covariance, 0.2 * np.eye(4), rtol=1e-12)
     fresh = RecursiveLeastSquares(4, start=at, prior=5.0, noise_sd=0.2, **settings)  # type: ignore[arg-type]
-    rls.reset(prior=7.0)
     rls.reset()
     rls.update(phi[:8], y[:8])
     fresh.update(phi[:8], y[:8])
@@ -197,8 +181,6 @@ def test_noise_is_found_from_few_samples_and_kept_in_silence() -> None:
         {"forgetting": "exponential"},
         {"forgetting": "none", "memory": 10.0},
         {"forgetting": "sudden", "memory": 10.0},
-        {"memory": 10.0, "walk": 1.0},
-        {"walk": -1.0},
         {"prior": -1.0},
         {"prior": np.ones((4, 4))},
         {"prior": [1.0, 2.0]},
@@ -257,9 +239,3 @@ def test_a_stuck_signal_makes_no_coefficient_surer(forgetting: Forgetting, n: in
     rls.update(phi[10_000:], y[10_000:])
     assert rls.noise_variance > 0.1 * noise
     assert (np.abs(rls.estimate - truth) < 5 * sd).all()
-
-
-def test_the_limit_is_one_of_forgetting_and_a_walk_goes_on_unseen() -> None:
-    rls = RecursiveLeastSquares(2, prior=1.0, walk=[0.01, 0.0], limit=2.0, noise_sd=1.0)
-    rls.update(np.zeros((10_000, 2)), np.zeros(10_000))
-    np.testing.assert_allclose(np.diag(rls.covariance), [101.0, 1.0], rtol=1e-9)

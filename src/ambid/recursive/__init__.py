@@ -12,9 +12,7 @@ if TYPE_CHECKING:
     from ambid.recursive.blocks import OnlineThreeBlocks as OnlineThreeBlocks
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
     from ambid.recursive.fusion import FusedSensor as FusedSensor
-    from ambid.recursive.fusion import Motion as Motion
     from ambid.recursive.fusion import SensorFusion as SensorFusion
-    from ambid.recursive.fusion import free_motion as free_motion
     from ambid.recursive.joint import JointEkf as JointEkf
     from ambid.recursive.joint import JointStart as JointStart
     from ambid.recursive.joint import JointUkf as JointUkf

@@ -21,9 +21,9 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import as_block, check_channels, kernels
-from ambid.recursive.kalman import LinearState, constant_velocity
+from ambid.recursive.kalman import constant_velocity
 from ambid.recursive.lines import Event, EventKind
-from ambid.recursive.square_root import covariance_of, factors_of, root_of
+from ambid.recursive.square_root import covariance_of, root_of
 
 _CONTINUOUS = 3.0  # equal values in succession that a signal without steps does not give
 _SECONDS = 2.0  # the longest run of equal values worth waiting for
@@ -109,70 +109,6 @@ def still_samples(sensor: FusedSensor, rate_hz: float, quiet_samples: float) -> 
     return float(n) if n <= _SECONDS * rate_hz else 0.0
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """A sampled linear motion with one position, and what is known of it when fusion begins.
-
-    Attributes
-    ----------
-    state : LinearState
-        Its one output is the position in m; R is not used, and it has no inputs.
-    start : ndarray, shape (n_states,)
-    start_sd : ndarray, shape (n_states,)
-        All positive.
-    """
-
-    state: LinearState
-    start: Array
-    start_sd: Array
-
-    def __post_init__(self) -> None:
-        """Refuse what fusion cannot start from."""
-        n = self.state.A.shape[0]
-        start, sd = np.array(self.start, dtype=np.float64), np.array(self.start_sd, dtype=np.float64)
-        outputs, inputs = self.state.C.shape[0], self.state.B.shape[1]
-        if outputs != 1 or inputs:
-            raise EstimationError(
-                f"motion: {outputs} outputs and {inputs} inputs; fusion wants one output, the position, and no input"
-            )
-        if start.shape != (n,) or sd.shape != (n,) or not (np.isfinite(start).all() and np.isfinite(sd).all()):
-            raise EstimationError(
-                f"motion: start and start_sd must be {n} finite numbers each. Give one for each state"
-            )
-        if not (sd > 0.0).all():
-            raise EstimationError("motion: start_sd must be positive. Give what is not known of each state")
-        object.__setattr__(self, "start", start)
-        object.__setattr__(self, "start_sd", sd)
-
-
-def free_motion(
-    rate_hz: float, *, q: float, start_sd: ArrayLike = (1e-3, 1.0), start: ArrayLike = (0.0, 0.0)
-) -> Motion:
-    """Return position and velocity under white acceleration.
-
-    Parameters
-    ----------
-    rate_hz : float
-        Sampling rate in Hz.
-    q : float
-        Intensity of the acceleration, (m/s²)²s. A motion of amplitude a and angular frequency ω needs about a² ω³.
-    start_sd : array_like, shape (2,)
-        In m and m/s.
-    start : array_like, shape (2,)
-
-    Returns
-    -------
-    Motion
-
-    Raises
-    ------
-    EstimationError
-        If a number is not positive.
-    """
-    state = constant_velocity(rate_hz, q=q, r=1.0)
-    return Motion(state=state, start=np.asarray(start), start_sd=np.asarray(start_sd))
-
-
 class SensorFusion:
     """Kalman filter of several position sensors with detection and exclusion of faulty ones.
 
@@ -198,8 +134,11 @@ class SensorFusion:
         Sampling rate in Hz.
     sensors : sequence of FusedSensor
         Two or more, with distinct names.
-    motion : Motion
-        See `free_motion`.
+    q : float
+        Of the motion: intensity of a white acceleration, (m/s²)²s. A motion of amplitude a and angular frequency ω
+        needs about a² ω³.
+    start_sd : tuple of float
+        What is not known of position and velocity, both about 0, when fusion begins: m and m/s.
     temperature_rate : float
         The shared temperature walks: K/√s; used where a sensor has `warmth`.
     false_alarms_per_hour : float
@@ -231,7 +170,8 @@ class SensorFusion:
         rate_hz: float,
         sensors: Sequence[FusedSensor],
         *,
-        motion: Motion,
+        q: float,
+        start_sd: tuple[float, float] = (1e-3, 1.0),
         temperature_rate: float = 0.0,
         false_alarms_per_hour: float = 0.1,
         restore_s: float = 0.25,
@@ -239,10 +179,11 @@ class SensorFusion:
         start_s: float = 0.0,
     ) -> None:
         check_channels("sensor fusion", rate_hz, len(sensors))
-        self.rate_hz, self.start_s, self.sensors, self.motion = rate_hz, start_s, tuple(sensors), motion
+        self.rate_hz, self.start_s, self.sensors = rate_hz, start_s, tuple(sensors)
+        motion = constant_velocity(rate_hz, q=q, r=1.0)
         self.names = tuple(s.name for s in self.sensors)
-        _check(self.names, false_alarms_per_hour, restore_s, temperature_rate, give)
-        at, m, n = self._at, len(self.sensors), motion.state.A.shape[0]
+        _check(self.names, start_sd, false_alarms_per_hour, restore_s, temperature_rate, give)
+        at, m, n = self._at, len(self.sensors), motion.A.shape[0]
         warm = any(s.warmth for s in self.sensors) and temperature_rate > 0.0
         self._n, self._m, self._first = n, m, n + warm  # first: row of the first offset
         size = n + warm + m
@@ -257,16 +198,15 @@ class SensorFusion:
         walks = np.append(np.full(int(warm), temperature_rate**2), (drift / gain) ** 2) / rate_hz
         # the walking offsets go in steps of several samples where they are far below the noise
         stride = _STRIDE if (walks[-m:] * _STRIDE <= 0.01 * variance).all() else 1.0
-        self._walk = walks * stride
+        self._walk = np.append(np.zeros(n), walks * stride)
         self._settings = np.array([log(quiet * _TESTS), give == "instant", max(1.0, restore_s * rate_hz), stride])
-        self._A, self._G = np.ascontiguousarray(motion.state.A), np.ascontiguousarray(root_of(motion.state.Q))
+        self._A, self._G = motion.A, root_of(motion.Q)
         offsets = np.maximum(np.abs(offset / gain), 1e-6 * noise / np.abs(gain)) ** 2
         begin = np.full(int(warm), max(temperature_rate**2 / rate_hz, 1e-12))
         self._memory = np.zeros((size + 1, size))
-        self._memory[size, :n] = motion.start
-        np.fill_diagonal(self._memory, [*motion.start_sd**2, *begin, *offsets])
+        np.fill_diagonal(self._memory, [*np.square(start_sd), *begin, *offsets])
         self._H = np.zeros((m + 2, size))
-        self._H[: m + 1, :n] = motion.state.C[0]
+        self._H[: m + 1, 0] = 1.0
         self._H[:m, n:] = np.hstack([(warmth / gain)[:, None], np.eye(m)]) if warm else np.eye(m)
         self._watch, self._clock = np.zeros((m, at.COLUMNS)), np.zeros(10)
         self._watch[:, at.LAST] = np.nan  # no value before the first
@@ -513,13 +453,6 @@ class SensorFusion:
         return covariance_of(self._memory[:-1])
 
     @property
-    def offsets(self) -> Array:
-        """How far each sensor's zero has walked and how sure that is, in its unit, shape (n_sensors, 2)."""
-        gains = np.array([s.gain for s in self.sensors])
-        sd = np.sqrt(np.diag(self.covariance)[self._first :]) * np.abs(gains)
-        return np.column_stack([self._memory[-1, self._first :] * gains, sd])
-
-    @property
     def temperature(self) -> tuple[float, float]:
         """Shared temperature since the start and its standard deviation, K; NaN where it is not modelled."""
         if self._first == self._n:
@@ -530,39 +463,13 @@ class SensorFusion:
     def relative_sd(self) -> float:
         """Standard deviation of the next predicted position against the mean of the working sensors' zeros, m."""
         h = np.zeros(self._memory.shape[1])
-        h[: self._n] = self.motion.state.C[0]
+        h[0] = 1.0
         at_work = self._watch[:, self._at.OUT] == 0.0
         if at_work.any():
             h[self._first :] = at_work / at_work.sum()
             if self._first > self._n:
                 h[self._n] = float(self._H[: self._m, self._n][at_work].mean())
         return float(np.sqrt(h @ self.covariance @ h))
-
-    def restore(self, name: str, *, offset_sd: float | None = None) -> None:
-        """Use a sensor again at once, as an operator may who has mended it.
-
-        Parameters
-        ----------
-        name : str
-        offset_sd : float, optional
-            What is not known of its zero now, in its unit, where it was moved; added to what was not known before.
-
-        Raises
-        ------
-        EstimationError
-            If there is no such sensor, or `offset_sd` is negative.
-        """
-        if name not in self.names or not (offset_sd is None or 0.0 <= offset_sd < np.inf):
-            raise EstimationError(
-                f"sensor fusion: restore({name!r}, offset_sd={offset_sd}); sensors are {', '.join(self.names)}, and "
-                "offset_sd is at least 0. Mend the call"
-            )
-        i = self.names.index(name)
-        P = self.covariance
-        P[self._first + i, self._first + i] += ((offset_sd or 0.0) / self.sensors[i].gain) ** 2
-        self._memory[:-1] = factors_of(P)
-        self._restore(i, self.n_samples)
-        self._tell("restored", self.n_samples, "ordered by the operator", "", name)
 
     def copy(self) -> Self:
         """Return an independent fusion in the same state.
@@ -574,7 +481,14 @@ class SensorFusion:
         return deepcopy(self)
 
 
-def _check(names: tuple[str, ...], alarms: float, restore_s: float, temperature_rate: float, give: str) -> None:
+def _check(
+    names: tuple[str, ...],
+    start_sd: tuple[float, float],
+    alarms: float,
+    restore_s: float,
+    temperature_rate: float,
+    give: str,
+) -> None:
     if len(names) < 2 or len(set(names)) < len(names):
         raise EstimationError(
             f"sensor fusion: sensors {names}; it wants two or more with distinct names. Mend the list"
@@ -584,5 +498,7 @@ def _check(names: tuple[str, ...], alarms: float, restore_s: float, temperature_
             f"sensor fusion: false_alarms_per_hour {alarms}, restore_s {restore_s}, temperature_rate "
             f"{temperature_rate}; the first two must be positive, the last at least 0. Mend them"
         )
+    if len(start_sd) != 2 or not all(0.0 < sd < np.inf for sd in start_sd):
+        raise EstimationError(f"sensor fusion: start_sd {start_sd}; give two positive numbers, in m and m/s")
     if give not in ("filtered", "instant"):
         raise EstimationError(f"sensor fusion: give {give!r}; it is 'filtered' or 'instant'. Choose one of them")

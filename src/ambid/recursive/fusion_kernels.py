@@ -14,7 +14,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.square_root_kernels import project, propagate, shrink, size, widen
+from ambid.recursive.square_root_kernels import project, propagate, shrink, size, walk
 
 # columns of `sensors`
 PER_GAIN, OFFSET, NOISE, LOW, HIGH, STUCK = range(6)
@@ -68,10 +68,10 @@ def absorb(z: Array, sensors: Array, memory: Array, H: Array, f: Array, b: Array
 
 
 @compiled(fastmath={"contract"})
-def advance(memory: Array, A: Array, G: Array, walk: Array, stride: int, now: int, W: Array, w: Array) -> None:
+def advance(memory: Array, A: Array, G: Array, walks: Array, stride: int, now: int, W: Array, w: Array) -> None:
     """Move mean and covariance one sample on.
 
-    `walk` (n_states - n,) is what temperature and offsets walk in `stride` samples, and they do so in such steps.
+    `walks` (n_states,) is what temperature and offsets walk in `stride` samples, and they do so in such steps.
     """
     last, n = memory.shape[1], A.shape[0]
     for i in range(n):
@@ -83,12 +83,7 @@ def advance(memory: Array, A: Array, G: Array, walk: Array, stride: int, now: in
         memory[last, i] = w[i]
     propagate(memory[:last], A, np.empty((n, 0)), G, W, w)
     if now % stride == 0:
-        for i in range(n, last):
-            if walk[i - n] > 0.0:
-                for j in range(i):
-                    w[j] = 0.0
-                w[i] = 1.0
-                widen(memory, w[: i + 1], walk[i - n])
+        walk(memory, walks, w)
 
 
 @compiled(fastmath={"contract"})
@@ -291,7 +286,7 @@ def _instant(memory: Array, H: Array, sensors: Array, now: Array, W: Array, f: A
 
 @compiled(fastmath={"contract"})
 def fuse_scan(
-    k: int, y: Array, out: Array, A: Array, G: Array, H: Array, walk: Array, sensors: Array, settings: Array,
+    k: int, y: Array, out: Array, A: Array, G: Array, H: Array, walks: Array, sensors: Array, settings: Array,
     memory: Array, watch: Array, clock: Array, ring: Array, kept: Array, now: Array,
 ) -> int:  # fmt: skip
     """Run over a block from sample k; return where it stopped, `clock[STAGE]` saying what is to be done there.
@@ -375,7 +370,7 @@ def fuse_scan(
             out[k, 0], out[k, 1] = x, sqrt(noise)
         else:
             out[k, 0], out[k, 1] = filtered, sqrt(variance)
-        advance(memory, A, G, walk, stride, int(t), M, b)
+        advance(memory, A, G, walks, stride, int(t), M, b)
         clock[NOW], clock[STAGE] = t + 1.0, RETURN if stop else READ
         k += 1
         if stop:

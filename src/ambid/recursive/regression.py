@@ -126,7 +126,7 @@ class _Factored(Recursion):
     def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None) -> None:
         found = coefficient_names(names)
         p = len(found)
-        super().__init__(found, p, 7 * p + 4 * p * p, start, noise_sd)
+        super().__init__(found, p, 6 * p + 4 * p * p, start, noise_sd)
 
     def _factors(self, which: int) -> Array:
         """Return a view of the factors (p, p) of P (0), of its companion (1), or of both at the start (2, 3)."""
@@ -135,9 +135,9 @@ class _Factored(Recursion):
         return self._s[first : first + p * p].reshape(p, p)
 
     def _rest(self) -> Array:
-        """Return a view of the rows walk, prior and scratch, shape (6, p)."""
+        """Return a view of the rows prior and scratch, shape (5, p)."""
         p = len(self._names)
-        return self._s[self._at.HEAD + p + 4 * p * p :].reshape(6, p)
+        return self._s[self._at.HEAD + p + 4 * p * p :].reshape(5, p)
 
 
 class RecursiveLeastSquares(_Factored):
@@ -145,8 +145,7 @@ class RecursiveLeastSquares(_Factored):
 
     What is forgotten:
 
-    - ``"none"``: nothing. The estimate is that of batch least squares with the same prior. With `walk`, it is the
-      Kalman filter of coefficients that walk at random.
+    - ``"none"``: nothing. The estimate is that of batch least squares with the same prior.
     - ``"exponential"``: a sample k samples ago weighs factor**k. Where the regressor lacks a direction, P grows there
       (wind-up) until the mean of P_ii over its prior is `limit`; forgetting is then slowed for all directions so far
       that it stays there: coefficients that are still excited are tracked more slowly meanwhile.
@@ -155,8 +154,7 @@ class RecursiveLeastSquares(_Factored):
 
     The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
     regressors: σ²C with the error's own recursion C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ. With forgetting it is less than
-    σ²P, by 1 + factor in the stationary state. The lag behind moving coefficients is not in it, except with `walk`,
-    where C = P.
+    σ²P, by 1 + factor in the stationary state. The lag behind moving coefficients is not in it.
 
     Where something is forgotten, every sample counts with the σ² of its own time, once σ² is known (after a memory): a
     calm makes no coefficient surer.
@@ -167,7 +165,6 @@ class RecursiveLeastSquares(_Factored):
 
     Numbers: factors U and D > 0 are updated without subtraction of D, so that P stays positive definite whatever is
     rounded; forgetting divides D and damps old rounding errors; the limit bounds P from above, the data from below.
-    With `walk` nothing bounds P from above: unseen coefficients walk on, by n `walk` in n samples, and P says so.
 
     Parameters
     ----------
@@ -186,11 +183,9 @@ class RecursiveLeastSquares(_Factored):
         The same as a time constant in samples, 1 / (1 - factor).
     limit : float
         Of forgetting: largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
-        Without effect where nothing is forgotten, so also with `walk`.
+        Without effect where nothing is forgotten.
     reset_every : int, optional
         P and C are set back to the prior after so many samples, the estimate kept.
-    walk : array_like, shape () or (p,), optional
-        Variance of one sample's step of each coefficient over the variance of e.
     noise_sd : float, optional
         Standard deviation of e, where known; else it is tracked.
 
@@ -218,7 +213,6 @@ class RecursiveLeastSquares(_Factored):
         memory: float | None = None,
         limit: float = 100.0,
         reset_every: int | None = None,
-        walk: ArrayLike | None = None,
         noise_sd: float | None = None,
     ) -> None:
         forgets = factor is not None or memory is not None
@@ -228,25 +222,24 @@ class RecursiveLeastSquares(_Factored):
             raise EstimationError("forgetting is none; leave factor and memory out")
         if not forgets and forgetting in ("exponential", "directional"):
             raise EstimationError(f"forgetting is {forgetting}; say how fast, by factor or memory")
-        if forgets and walk is not None:
-            raise EstimationError("walk and forgetting are two models of one thing. Give one of them")
         super().__init__(names, start, noise_sd)
         s, p, at = self._s, len(self._names), self._at
-        s[at.KIND] = at.LEAST_SQUARES if walk is None else at.WALK
-        if forgetting == "directional":
-            s[at.KIND] = at.DIRECTIONAL
+        s[at.KIND] = at.DIRECTIONAL if forgetting == "directional" else at.LEAST_SQUARES
         self._forget(factor, memory, limit)
         s[at.VAGUE] = float(prior is None)
         s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
         s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
         settle = _SETTLES * _NOISE_MEMORIES * s[at.MEMORY]
         s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], settle)
-        steps = numbers("walk", 0.0 if walk is None else walk, p)
-        if (steps < 0).any():
-            raise EstimationError(f"walk is {walk!r}; variances are not negative")
-        self._rest()[0] = steps
-        self._set_prior(prior_of("prior", VAGUE if prior is None else prior, p))
-        self._begin()
+        prior = prior_of("prior", VAGUE if prior is None else prior, p)
+        scale = np.sqrt(np.diag(prior))
+        inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
+        # the companion begins as the covariance of the error, or as the information of squared weights
+        directional = s[at.KIND] == at.DIRECTIONAL
+        self._factors(2)[:] = factors_of(prior)
+        self._factors(3)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
+        self._rest()[0] = np.diag(prior)
+        self.reset()
 
     @property
     def P(self) -> Array:
@@ -265,38 +258,8 @@ class RecursiveLeastSquares(_Factored):
         half = root_of_factors(self._factors(1)).T @ self.P
         return np.asarray(unit * (half.T @ half))
 
-    def reset(self, prior: ArrayLike | None = None) -> None:
-        """Say that the coefficients may have moved: P and C become the prior, the estimate stays.
-
-        Parameters
-        ----------
-        prior : array_like, shape (), (p,) or (p, p), optional
-            Over the variance of e; the one given at the start if none.
-
-        Raises
-        ------
-        EstimationError
-            If it is not positive definite.
-        """
-        if prior is None:
-            self._begin()
-            return
-        kept = self._factors(2).copy(), self._factors(3).copy()
-        self._set_prior(prior_of("prior", prior, len(self._names)))
-        self._begin()
-        self._factors(2)[:], self._factors(3)[:] = kept
-
-    def _set_prior(self, prior: Array) -> None:
-        """Keep P₀ and what its companion begins with: C, or the information of squared weights."""
-        scale = np.sqrt(np.diag(prior))
-        inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
-        directional = self._s[self._at.KIND] == self._at.DIRECTIONAL
-        self._factors(2)[:] = factors_of(prior)
-        self._factors(3)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
-        if not self._s[self._at.USED]:
-            self._rest()[1] = np.diag(prior)
-
-    def _begin(self) -> None:
+    def reset(self) -> None:
+        """Say that the coefficients may have moved: P and C become the prior, the estimate stays."""
         s, at = self._s, self._at
         self._factors(0)[:], self._factors(1)[:] = self._factors(2), self._factors(3)
         if s[at.UNIT]:

@@ -1,7 +1,7 @@
 """Compiled recursions of linear regressions: least squares and LMS, instrumental variables, delay lines.
 
 A recursion is one array, since a call from Python costs by the number of arrays. Over the square-root core: head |
-estimate p | factors of P p p | factors of its companion p p | both at the start | walk p | prior variance p | scratch
+estimate p | factors of P p p | factors of its companion p p | both at the start | prior variance p | scratch
 4 p. The companion is the information of squared weights for least squares, else the covariance of the error. Least
 squares of four coefficients stay in registers.
 
@@ -52,7 +52,7 @@ Table = NDArray[np.int64]
 ) = range(26)
 HEAD = 26
 
-LEAST_SQUARES, DIRECTIONAL, WALK, LMS, NLMS = range(5)
+LEAST_SQUARES, DIRECTIONAL, LMS, NLMS = range(4)
 
 # A sample that leads there is rejected; variance over the best one, in place of a prior; least noise over the unit.
 _HUGE, _WORSE, _SILENT = 1e200, 1e9, 1e-12
@@ -148,20 +148,12 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
 
 
 @compiled(error_model="numpy")
-def _widen(s: Array, F: Array, walk: Array, x: Array, a: Array) -> None:
-    """Widen P before a sample: by a random walk, or so that the information that x meets is forgotten (Cao-Schwartz).
+def _forget(s: Array, F: Array, x: Array, a: Array) -> None:
+    """Widen P before a sample so that the information that x meets is forgotten (Cao and Schwartz 2000).
 
-    The latter is P + (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
+    P becomes P + (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
     """
     p = x.size
-    if s[KIND] == WALK:
-        for i in range(p):
-            if walk[i] > 0.0:
-                for j in range(i):
-                    a[j] = 0.0
-                a[i] = 1.0
-                widen(F, a[: i + 1], walk[i])
-        return
     for j in range(p):
         a[j] = x[j]
     met = 0.0
@@ -180,8 +172,8 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
     """Take in samples t, ... until so many have been used; return the first that was not taken."""
     first, q = HEAD + p, p * p
     theta, F, G = s[HEAD:first], s[first : first + q].reshape(p, p), s[first + q : first + 2 * q].reshape(p, p)
-    rest = s[first + 4 * q :].reshape(6, p)
-    walk, f, k, a, x = rest[0], rest[2], rest[3], rest[4], rest[5]  # views here: in the loop they would be counted
+    rest = s[first + 4 * q :].reshape(5, p)
+    f, k, a, x = rest[1], rest[2], rest[3], rest[4]  # views here: in the loop they would be counted
     kind, gradient, now = s[KIND], s[KIND] >= LMS, s[NOW]
     grow, drop, one = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0
     seen = G if gradient else F
@@ -217,18 +209,17 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
                     F[j, j] *= grow
                     G[j, j] *= drop
             else:
-                _widen(s, F, walk, x, a)
+                _forget(s, F, x, a)
                 project(F, x, f)
             alpha = shrink(F, f, one, k)
             leverage = spread = alpha - 1.0
             for j in range(p):
                 theta[j] += k[j] * (e / alpha)
                 a[j] = k[j] / alpha
-            if kind != WALK:  # not more than P says, but where the noise has just fallen
-                if kind == DIRECTIONAL:
-                    now = noise_of_now(s)
-                project(G, k if kind == LEAST_SQUARES else x, f)
-                spread = min(size(G, f) / now, spread)
+            if kind == DIRECTIONAL:
+                now = noise_of_now(s)
+            project(G, k if kind == LEAST_SQUARES else x, f)
+            spread = min(size(G, f) / now, spread)  # not more than P says, but where the noise has just fallen
         if leverage > 0.0:  # σ² = E e² / (1 + φᵀCφ): a sample that says little of the estimate says little of its noise
             w, share = 1.0 / (1.0 + spread), leverage / (leverage + s[TYPICAL])
             keep = 1.0 - s[NOISE_RATE] * share
@@ -238,7 +229,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
                 s[TYPICAL] += s[NOISE_RATE] * share * (0.1 * leverage - s[TYPICAL])
         if kind == LEAST_SQUARES:
             widen(G, x, now)
-        elif kind != WALK:
+        else:
             # C becomes (I - Kφᵀ) C (I - Kφᵀ)ᵀ + r K Kᵀ: the best gain's, and a square of what K differs from it
             alpha = shrink(G, f, one if gradient else noise_of_now(s), k)
             root = np.sqrt(alpha)
@@ -276,7 +267,7 @@ def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
         if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
             s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
         s[NOW] = noise_of_now(s)
-        F, prior, total = s[a : a + q].reshape(p, p), s[a + 4 * q + p :], 0.0
+        F, prior, total = s[a : a + q].reshape(p, p), s[a + 4 * q :], 0.0
         for i in range(p):
             now = variance(F, i)
             if s[VAGUE] > 0:

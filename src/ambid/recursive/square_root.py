@@ -50,4 +50,4 @@ def _unit_triangle(n: int) -> tuple[NDArray[np.bool_], Array]:
 def root_of(P: Array, floor: float = 0.0) -> Array:
     """Return a square root of a semidefinite matrix; eigenvalues under `floor` times the largest are raised to it."""
     values, vectors = np.linalg.eigh(P)
-    return np.asarray(vectors * np.sqrt(np.maximum(values, floor * max(values[-1], 0.0))))
+    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, floor * max(values[-1], 0.0))))
