@@ -52,12 +52,6 @@ def test_final_estimate_is_the_offline_one(name: str, seed: int) -> None:
         np.testing.assert_allclose(r.sd, fit.sd[fit.sd > 0], rtol=0.05)
         np.testing.assert_allclose(r.noise_variance, fit.noise_covariance[0, 0], rtol=0.03)
         np.testing.assert_allclose(r.model.dt, 1e-3)
-        if not data.n_inputs:
-            continue
-        at = r.offsets, fit.offsets  # an offset of the input is one of the output as well
-        gain = [x.frequency_response(np.zeros(1))[0, 0, 0].real for x in (r.model, fit.model)]
-        levels = [o.y[0] - g * o.u[0] for o, g in zip(at, gain, strict=True)]
-        assert abs(levels[0] - levels[1]) < 0.05 * np.std(y)
 
 
 def test_without_the_last_samples_before_it_a_fit_goes_on_with_little_loss() -> None:
@@ -65,7 +59,7 @@ def test_without_the_last_samples_before_it_a_fit_goes_on_with_little_loss() -> 
     data = system.data(1, 20_000, offset=10.0)
     r = RecursivePolynomial.from_fit(system.fit(data.part(0, 10_000)))
     r.update(data.u[10_000:], data.y[10_000:, 0])
-    assert 0 < r.n_waited < 30
+    assert 0 < r.counts["waited"] < 30
     assert distance(r, system.fit(data)) < 0.2
 
 
@@ -139,7 +133,7 @@ def test_armax_is_consistent_on_an_unstable_plant_in_a_loop() -> None:
 def test_bias_under_feedback_is_told() -> None:
     assert any("biased" in w for w in RecursivePolynomial("oe", ORDERS["oe"]).warnings)
     assert not any("biased" in w for w in RecursivePolynomial("oe", ORDERS["oe"], open_loop=True).warnings)
-    assert any("biased" in w for w in RecursivePolynomial.from_fit(fit_of("oe")).fit().warnings)
+    assert any("biased" in w for w in RecursivePolynomial.from_fit(fit_of("oe")).warnings)
 
 
 def moving_armax(n: int, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -193,8 +187,7 @@ def test_coefficients_that_would_be_unstable_are_held_back_and_counted() -> None
         p = r.model.outputs[0]
         assert abs(p.C[1]) < 1
         assert abs(p.F[0][1]) < 1
-    assert r.n_projected > 0
-    assert r.fit().details["projected"] == r.n_projected
+    assert r.counts["projected"] > 0
     assert any("unstable C or F" in w for w in r.warnings)
     assert abs(r.estimate[0] - 1.0) < 0.3
     assert abs(r.estimate[2] + 0.97) < 0.03
@@ -222,7 +215,7 @@ def test_no_excitation_no_wind_up() -> None:
     b = slice(2, 4)
     assert np.all(np.abs(r.estimate[b] - before[b]) < 4 * np.maximum(sd, r.sd)[b])
     assert np.all(np.linalg.eigvalsh(r.covariance) > 0)
-    assert r.n_held > 100_000
+    assert r.counts["held"] > 100_000
     r.update(u, y)
     assert np.all(np.abs(r.estimate - [-1.5, 0.7, 1.0, 0.5, 0.5, 0.3]) < 5 * r.sd)
 
@@ -244,8 +237,6 @@ def test_a_stalled_start_says_so_in_its_deviations_until_a_later_search_converge
             r.update(data.u[k : k + 1000], data.y[k : k + 1000, 0])
             doubtful = any("did not converge" in w for w in r.warnings)
             if r.started:
-                assert r.fit().status == ("stalled" if doubtful else "converged")
-                np.testing.assert_allclose(r.fit().sd[r.fit().sd > 0], r.sd)
                 assert np.all(np.abs(r.estimate - truth) < 4.5 * r.sd)
             if r.started and doubtful:
                 assert np.all(r.sd > 0.5 * np.abs(truth))
@@ -269,7 +260,7 @@ def test_a_short_memory_winds_up_to_the_limit_and_not_beyond(forgetting: float) 
         variance = max(r.noise_variance, 0.09) * np.diag(covariance_of(state.F))
         largest = max(largest, float(np.max(variance / state.limit)))
     assert largest <= 1.0 + 1e-9
-    assert r.n_held > 0
+    assert r.counts["held"] > 0
 
 
 def test_a_memory_too_short_for_a_gradient_is_told() -> None:
@@ -298,32 +289,13 @@ def test_nothing_is_learnt_from_a_window_without_excitation() -> None:
     r = RecursivePolynomial("armax", system.orders, burn_in=500)
     r.update(np.zeros(9000), np.full(9000, 3.0))
     assert not r.started
-    assert r.n_failed_starts > 0
+    assert r.counts["failed_starts"] > 0
     assert np.isnan(r.noise_variance)
     assert "no estimate" in r.warnings[0]
-    with pytest.raises(EstimationError, match="first window"):
-        r.fit()
     errors = r.update(data.u, data.y[:, 0])
     assert r.started
     assert np.isfinite(errors[-1])
     assert r.n_used == 13_000
-
-
-def test_a_result_is_that_of_an_offline_fit() -> None:
-    system = SYSTEMS["armax"]
-    data = system.data(0, 3000)
-    off = system.fit(data)
-    r = RecursivePolynomial("armax", system.orders, dt=1e-3)
-    r.update(data.u, data.y[:, 0])
-    fit = r.fit()
-    assert fit.structure == "armax"
-    assert dict(fit.orders) == dict(off.orders)
-    assert fit.model.names == off.model.names
-    assert np.array_equal(fit.sd > 0, off.sd > 0)
-    np.testing.assert_allclose(fit.model.poles(), off.model.poles(), atol=0.01)
-    again = RecursivePolynomial.from_fit(fit, samples=3000)
-    np.testing.assert_allclose(again.estimate, r.estimate)
-    np.testing.assert_allclose(again.covariance, r.covariance, rtol=1e-6)
 
 
 @pytest.mark.parametrize(

@@ -39,5 +39,5 @@ def test_innovations_are_those_of_a_model_fitted_to_each_record(structure: str, 
         assert ratio < 1.05, RECORDS[k]
         assert np.mean(np.isnan(e)) < 0.02
         assert np.all(np.linalg.eigvalsh(r.covariance / np.outer(r.sd, r.sd)) > 0)
-    assert r.n_projected == 0
+    assert r.counts["projected"] == 0
     assert not r.warnings

@@ -9,7 +9,6 @@ counts once.
 from __future__ import annotations
 
 from copy import deepcopy
-from dataclasses import replace
 from typing import Any, Self
 
 import numpy as np
@@ -19,7 +18,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit import structure as structure_named
-from ambid.blackbox.model import Offsets, PolynomialModel
+from ambid.blackbox.model import PolynomialModel
 from ambid.blackbox.polynomial_predictor import compact_orders, read_orders
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import as_blocks, kernels
@@ -38,7 +37,6 @@ _REFITTED = 16  # first windows
 _MOST = 20  # evaluations of a fit that begins near its end
 _WORSE = 1.5  # growth, or fall to one over it, of the innovations' standard deviation that is told
 _FEW = 20  # samples of memory for each coefficient, below which gradients of C, D and F mislead
-_INTEGRATES = 1e-6  # A(1) over sum |A|, below which a constant cannot be an offset of the output
 _NUMBERS = (float, np.float64)
 
 
@@ -52,7 +50,7 @@ class RecursivePolynomial:
     wants A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
 
     A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
-    learnt until the unknown states of the filters have died away (`n_waited`).
+    learnt until the unknown states of the filters have died away (`counts`).
 
     Where no search of the largest first window converged, `fit` says "stalled" and standard deviations are as large as
     the coefficients, until one of a later window does.
@@ -219,24 +217,15 @@ class RecursivePolynomial:
         return self._rejected_before + self._count(_REJECTED)
 
     @property
-    def n_waited(self) -> int:
-        """Samples that were history alone, while the states of the filters were not known."""
-        return self._count(_WAITED)
+    def counts(self) -> dict[str, int]:
+        """How often something happened, in samples.
 
-    @property
-    def n_projected(self) -> int:
-        """Samples at which the filters stopped short of the estimate to keep C and F stable."""
-        return self._count(_PROJECTED)
-
-    @property
-    def n_held(self) -> int:
-        """Samples at which nothing was forgotten because a coefficient would have become as vague as it is large."""
-        return self._count(_HELD)
-
-    @property
-    def n_failed_starts(self) -> int:
-        """_Windows from which no first estimate could be had (no excitation, say)."""
-        return self._failed_starts
+        ``waited``: they were history alone, while the states of the filters were not known; ``projected``: the filters
+        stopped short of the estimate to keep C and F stable; ``held``: nothing was forgotten, because a coefficient
+        would have become as vague as it is large; ``failed_starts``: first windows without an estimate.
+        """
+        kept = {"waited": _WAITED, "projected": _PROJECTED, "held": _HELD}
+        return {**{name: self._count(k) for name, k in kept.items()}, "failed_starts": self._failed_starts}
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -356,62 +345,6 @@ class RecursivePolynomial:
         full = self._start.copy()
         full[self._who.layout.free] = self.estimate
         return PolynomialModel(outputs=(self._who.layout.polynomials(full),), dt=self._who.dt)
-
-    @property
-    def offsets(self) -> Offsets:
-        """Operating point for which the model holds, SI; NaN until the first window is full.
-
-        The constant of A y = (B/F) u + constant is the output's, unless A sums to zero: an integrating plant has any
-        level, and the constant stands for an offset of its inputs.
-        """
-        if self._state is None:
-            return Offsets(u=np.full(self._n_u, np.nan), y=np.full(1, np.nan))
-        centre, constant, p = self._state.levels.copy(), float(self._state.at[-1]), self.model.outputs[0]
-        level = float(p.A.sum())
-        gain = np.array([b.sum() / f.sum() if f.sum() else np.inf for b, f in zip(p.B, p.F, strict=True)])
-        if abs(level) > _INTEGRATES * float(np.abs(p.A).sum()):
-            centre[0] += constant / level
-        elif gain.size and np.all(np.isfinite(gain)) and np.any(gain):
-            centre[1:] -= constant * gain / float(gain @ gain)
-        return Offsets(u=centre[1:], y=centre[:1])
-
-    def fit(self) -> BlackBoxFit:
-        """Return the present estimate in the form of an off-line fit.
-
-        Returns
-        -------
-        BlackBoxFit
-            Its `fit`, `criteria` and `checks` are empty: they need data.
-
-        Raises
-        ------
-        EstimationError
-            If there is no estimate yet.
-        """
-        if self._state is None:
-            raise EstimationError(
-                f"{self._who.structure}: the first window is not full: no estimate. Feed more samples"
-            )
-        who, model, free = self._who, self.model, self._who.layout.free
-        covariance = np.zeros((model.theta.size,) * 2)
-        covariance[np.ix_(free, free)] = self.covariance
-        found = BlackBoxFit(
-            structure=who.structure,
-            orders=compact_orders(who.structure, who.layout),
-            model=model,
-            covariance=covariance,
-            n_estimated=free.size,
-            offsets=self.offsets,
-            noise_covariance=np.array([[self.noise_variance]]),
-            inputs=who.inputs,
-            outputs=who.outputs,
-            units=dict(who.units),
-            dt=who.dt,
-            record={"samples": self.n_used, "rate_hz": 1.0 / who.dt},
-            warnings=self.warnings,
-            details={"recursive": True, **self._state.counts()},
-        )
-        return replace(found, status="stalled") if self._doubtful else found
 
     def copy(self) -> Self:
         """Return an independent estimator in the same state.

@@ -152,16 +152,6 @@ class State:
         return self.coef[2:]
 
     @property
-    def levels(self) -> Array:
-        """What is taken off output and inputs, shape (1 + n_inputs,)."""
-        return self.real[4:]
-
-    def counts(self) -> dict[str, int]:
-        """Return how many samples were used, rejected, waited, projected and held."""
-        names = ("used", "rejected", "waited", "projected", "held")
-        return {name: int(self.count[k]) for name, k in zip(names, COUNTED, strict=True)}
-
-    @property
     def at_border(self) -> bool:
         """Whether the filters had to stop short of the estimate often, or do so now."""
         return bool(self.count[6] > _OFTEN * self.count[8] or not np.array_equal(self.theta, self.at))
