@@ -323,12 +323,17 @@ class EvidenceStream:
             self._begin(u, y)
         errors = np.empty_like(y)
         forcing = self._nothing_like(y.shape[0]) if samples.forcing is None else samples.forcing
-        used = advance(
-            u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
-            self._triangle, self._counts, errors, *self._scratch,
-        )  # fmt: skip
+        used, counts, full = 0, self._counts, True
+        while full and counts[2] < counts[4]:
+            used = advance(
+                used, u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
+                counts, errors, *self._scratch,
+            )  # fmt: skip
+            full = counts[1] + y.shape[1] > self._rows.shape[1]
+            if full or counts[2] == counts[4]:
+                self._fold()
         self.sample += used
-        return used, errors[:used], self._evidence() if self._counts[2] == self._counts[4] else None
+        return used, errors[:used], self._evidence() if counts[2] == counts[4] else None
 
     def close(self, block: int) -> Evidence | None:
         """Return the evidence of the samples since the last block, and go on with blocks of another length.
@@ -337,12 +342,15 @@ class EvidenceStream:
         """
         found = None
         if self._counts[2]:
-            n = int(self._counts[1])
-            fold(self._triangle, self._rows, n, n)
-            self._counts[1] = 0
+            self._fold()
             found = self._evidence()
         self._counts[4] = block
         return found
+
+    def _fold(self) -> None:
+        n = int(self._counts[1])
+        fold(self._triangle, self._rows, n, n)
+        self._counts[1] = 0
 
     def _nothing_like(self, n: int) -> Array:
         if self._nothing.shape[0] != n:

@@ -46,10 +46,12 @@ def _step(M: Array, D: Array, s: Array, w: Array, f: Array) -> None:
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def advance(
-    u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array, s: Array,
-    rows: Array, triangle: Array, counts: Integers, errors: Array, w: Array, f: Array,
+    first: int, u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array,
+    s: Array, rows: Array, counts: Integers, errors: Array, w: Array, f: Array,
 ) -> int:  # fmt: skip
-    """Run until a block is complete, samples are used up, or one is not finite; return how many were used.
+    """Run from sample `first` until a block is complete, `rows` are full, samples are used up, or one is not finite.
+
+    Returns the sample that comes next.
 
     `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `M` (n_x + n_y, n_l) gives the next
     state and the weighted innovations, `s` (n_x, p + 1) holds the sensitivities and in its last column the state.
@@ -59,7 +61,7 @@ def advance(
     """
     n_x, n_u, n_y, p = s.shape[0], u.shape[1], y.shape[1], s.shape[1] - 1
     depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
-    for k in range(y.shape[0]):
+    for k in range(first, y.shape[0]):
         now, column, total = counts[0], n_x, 0.0
         for j in range(n_u):
             history[now, j] = (u[k, j] - scale[0, j]) / scale[1, j]
@@ -97,10 +99,7 @@ def advance(
         else:
             counts[3] -= 1
         if counts[1] + n_y > room or counts[2] == counts[4]:
-            fold(triangle, rows, counts[1], counts[1])
-            counts[1] = 0
-            if counts[2] == counts[4]:
-                return k + 1
+            return k + 1
     return len(y)
 
 

@@ -144,7 +144,7 @@ def watch(
             freedom += note[1]
             if m == 2 and n_bases % 2 == 0 and level + 1 < levels:
                 up += counts[level + 1] % 4
-                _gather(acc, 1, bases[up], other)
+                _gather(acc, m // 2, bases[up], other)  # a plain 1 has a type of its own
                 notes[up, 0], notes[up, 1] = rest, freedom
                 notes[up, 2], notes[up, 3] = note[2], note[3]
             if level > 0 and m < 3:
