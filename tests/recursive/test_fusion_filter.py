@@ -39,8 +39,7 @@ def test_without_faults_it_is_the_kalman_filter_of_the_whole_state():
     assert fused.covariance == pytest.approx(other.covariance, rel=1e-6, abs=1e-9 * other.covariance[2, 2])
 
 
-@pytest.mark.parametrize("give", ["filtered", "instant"])
-def test_errors_are_as_large_as_stated_and_smaller_than_of_the_best_sensor(give):
+def test_errors_are_as_large_as_stated_and_smaller_than_of_the_best_sensor():
     rng = np.random.default_rng(5)
     runs, n = 400, 120
     x = walking_motion(rng, runs, n)
@@ -49,7 +48,7 @@ def test_errors_are_as_large_as_stated_and_smaller_than_of_the_best_sensor(give)
     noise = np.array([2e-3, 3e-3, 4e-3])
     y = GAIN * x[:, :, None] + zeros + noise * rng.standard_normal((runs, n, 3))
     used = [replace(s, noise_sd=sd, drift_rate=0.02, offset_sd=3e-3) for s, sd in zip(sensors(), noise, strict=True)]
-    fresh = SensorFusion(RATE, used, q=Q, start_sd=(5e-6, 1e-3), give=give)
+    fresh = SensorFusion(RATE, used, q=Q, start_sd=(5e-6, 1e-3))
     normalised, errors = np.empty(runs), np.empty(runs)
     for k in range(runs):
         out = fresh.copy().update(y[k])
@@ -134,7 +133,6 @@ def test_how_long_a_value_may_stand_still_follows_from_resolution_and_noise():
     [
         (lambda: fusion(1), "two or more"),
         (lambda: SensorFusion(RATE, sensors() + sensors(1), q=Q), "distinct names"),
-        (lambda: fusion(give="smoothed"), "'filtered' or 'instant'"),
         (lambda: fusion(restore_s=0.0), "must be positive"),
         (lambda: sensors(1, gain=0.0), "finite and not 0"),
         (lambda: sensors(1, noise_sd=-1.0), "positive"),

@@ -10,7 +10,7 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.job import identify
 from ambid.physics.presets import preset
-from ambid.recursive.joint import JointEkf, JointUkf, start_from
+from ambid.recursive.joint import JointEkf, JointUkf
 from ambid.signals import multisine
 from ambid.simulate import simulate_preset
 from tests.bearing.benches import run
@@ -49,7 +49,7 @@ def test_goes_on_from_an_off_line_estimate_to_that_of_the_whole_record(bearing, 
 
 
 def test_takes_over_what_the_estimate_knows(begun):
-    start = start_from(begun, RATE, rates={"R": 0.01}, offset_sd={"force": 2.0})
+    start = replace(JointEkf.from_estimate(begun, RATE, rates={"R": 0.01}).start, offset_sd={"force": 2.0})
     assert start.names == (*begun.covariance_names, "force_offset", "voltage_offset")
     assert start.delay == begun.delay["voltage"].samples + begun.delay["voltage"].fraction
     assert start.operating_point == {r: begun.operating_point[r] for r in ("voltage", "position", "current")}
@@ -62,14 +62,12 @@ def test_takes_over_what_the_estimate_knows(begun):
 
 def test_an_estimate_that_cannot_be_gone_on_from_is_refused(begun):
     with pytest.raises(EstimationError, match="failed"):
-        start_from(replace(begun, status="failed"), RATE)
+        JointEkf.from_estimate(replace(begun, status="failed"), RATE)
     with pytest.raises(EstimationError, match="10000 Hz"):
-        start_from(begun, 10_000.0)
+        JointEkf.from_estimate(begun, 10_000.0)
     gain = replace(begun, noise=replace(begun.noise, form="gain", disturbance_sd={}, sensor_sd={}))
     with pytest.raises(EstimationError, match="wants levels"):
-        start_from(gain, RATE)
-    levels = {"sensor_sd": begun.noise.sensor_sd, "disturbance_sd": begun.noise.disturbance_sd}
-    assert start_from(gain, RATE, **levels).sensor_sd == begun.noise.sensor_sd
+        JointEkf.from_estimate(gain, RATE)
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from copy import deepcopy
 from dataclasses import dataclass
 from math import erf, inf, isfinite, log, sqrt
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -145,10 +145,6 @@ class SensorFusion:
         Of all sensors together, at most.
     restore_s : float
         Time for which an excluded sensor has to agree; doubled each time it fails soon again, up to 64 fold.
-    give : {"filtered", "instant"}
-        The filtered position, or that of each instant's values alone, less the offsets: noisier, and without any
-        dynamics of the filter. NaN with infinite standard deviation where no value of that instant can be used.
-
     start_s : float
         Time of the first sample, for events.
 
@@ -175,14 +171,13 @@ class SensorFusion:
         temperature_rate: float = 0.0,
         false_alarms_per_hour: float = 0.1,
         restore_s: float = 0.25,
-        give: Literal["filtered", "instant"] = "filtered",
         start_s: float = 0.0,
     ) -> None:
         check_channels("sensor fusion", rate_hz, len(sensors))
         self.rate_hz, self.start_s, self.sensors = rate_hz, start_s, tuple(sensors)
         motion = constant_velocity(rate_hz, q=q, r=1.0)
         self.names = tuple(s.name for s in self.sensors)
-        _check(self.names, start_sd, false_alarms_per_hour, restore_s, temperature_rate, give)
+        _check(self.names, start_sd, false_alarms_per_hour, restore_s, temperature_rate)
         at, m, n = self._at, len(self.sensors), motion.A.shape[0]
         warm = any(s.warmth for s in self.sensors) and temperature_rate > 0.0
         self._n, self._m, self._first = n, m, n + warm  # first: row of the first offset
@@ -199,14 +194,14 @@ class SensorFusion:
         # the walking offsets go in steps of several samples where they are far below the noise
         stride = _STRIDE if (walks[-m:] * _STRIDE <= 0.01 * variance).all() else 1.0
         self._walk = np.append(np.zeros(n), walks * stride)
-        self._settings = np.array([log(quiet * _TESTS), give == "instant", max(1.0, restore_s * rate_hz), stride])
+        self._settings = np.array([log(quiet * _TESTS), max(1.0, restore_s * rate_hz), stride])
         self._A, self._G = motion.A, root_of(motion.Q)
         offsets = np.maximum(np.abs(offset / gain), 1e-6 * noise / np.abs(gain)) ** 2
         begin = np.full(int(warm), max(temperature_rate**2 / rate_hz, 1e-12))
         self._memory = np.zeros((size + 1, size))
         np.fill_diagonal(self._memory, [*np.square(start_sd), *begin, *offsets])
-        self._H = np.zeros((m + 2, size))
-        self._H[: m + 1, 0] = 1.0
+        self._H = np.zeros((m + 1, size))
+        self._H[:, 0] = 1.0
         self._H[:m, n:] = np.hstack([(warmth / gain)[:, None], np.eye(m)]) if warm else np.eye(m)
         self._watch, self._clock = np.zeros((m, at.COLUMNS)), np.zeros(10)
         self._watch[:, at.LAST] = np.nan  # no value before the first
@@ -487,7 +482,6 @@ def _check(
     alarms: float,
     restore_s: float,
     temperature_rate: float,
-    give: str,
 ) -> None:
     if len(names) < 2 or len(set(names)) < len(names):
         raise EstimationError(
@@ -500,5 +494,3 @@ def _check(
         )
     if len(start_sd) != 2 or not all(0.0 < sd < np.inf for sd in start_sd):
         raise EstimationError(f"sensor fusion: start_sd {start_sd}; give two positive numbers, in m and m/s")
-    if give not in ("filtered", "instant"):
-        raise EstimationError(f"sensor fusion: give {give!r}; it is 'filtered' or 'instant'. Choose one of them")

@@ -26,7 +26,7 @@ COUNT, R, RR, RX, X, XX, GATED, TESTED, SQUARES, DOUBT, WAS_OUT, ZERO, BETWEEN, 
 # standard deviation, and one over that; then come the rows of the innovations' covariance
 Z, USED, E, T, PER, S_0 = range(6)
 # entries of `settings` and of `clock`
-HEIGHT, INSTANT, RESTORE_N, STRIDE = range(4)
+HEIGHT, RESTORE_N, STRIDE = range(3)
 NOW, OLD, NEW, FRESH, COMMON, COMPARED, DISPUTED, STREAK, AGREED, STAGE = range(10)
 # what is to be done of the sample in work
 READ, TEST, TAKE, RETURN = range(4)
@@ -259,39 +259,13 @@ def _read(y: Array, sensors: Array, watch: Array, now: Array) -> bool:
 
 
 @compiled(fastmath={"contract"})
-def _instant(memory: Array, H: Array, sensors: Array, now: Array, W: Array, f: Array, n: int) -> tuple[float, float]:
-    """Return the mean of this instant's values, weighted by S⁻¹ 1, less the offsets as predicted; and its variance.
-
-    The motion has no part in it but for the weights. Row m + 1 of H becomes how it sees the state.
-    """
-    (m, last), used, total, noise, x = (H.shape[0] - 2, H.shape[1]), now[USED], 0.0, 0.0, 0.0
-    _compare(now, W, total > 0.0)
-    for j in range(last):
-        H[m + 1, j] = 0.0
-    for i in range(m):
-        for j in range(m):
-            total -= W[i, j] if used[i] > 0.0 and used[j] > 0.0 else 0.0
-    for i in range(m):
-        if used[i] > 0.0:
-            weight = 0.0
-            for j in range(m):
-                weight -= W[i, j] / total if used[j] > 0.0 else 0.0
-            x += weight * now[Z, i]
-            noise += weight * weight * sensors[i, NOISE]
-            for j in range(n, last):
-                H[m + 1, j] += weight * H[i, j]
-    x -= _see(memory, H, m + 1, f)
-    return x, noise + size(memory, f)
-
-
-@compiled(fastmath={"contract"})
 def fuse_scan(
     k: int, y: Array, out: Array, A: Array, G: Array, H: Array, walks: Array, sensors: Array, settings: Array,
     memory: Array, watch: Array, clock: Array, ring: Array, kept: Array, now: Array,
 ) -> int:  # fmt: skip
     """Run over a block from sample k; return where it stopped, `clock[STAGE]` saying what is to be done there.
 
-    `H` (m + 2, n_states): how each sensor sees the state, position, scratch. `out` (n_samples, 2): position and its
+    `H` (m + 1, n_states): how each sensor sees the state, and position. `out` (n_samples, 2): position and its
     standard deviation. `ring` (2 span, m): displacements that were used, else NaN. `kept`: the filter as it was before
     the two last whole spans.
     """
@@ -336,14 +310,11 @@ def fuse_scan(
                     alarm = alarm or (watch[i, OUT] == 0.0 and watch[i, j] > settings[HEIGHT])
             if alarm:
                 return k
-        quietest, seen, noise, x = inf, 0, inf, nan
+        quietest = inf
         for i in range(m):
             ring[at, i] = z[i] if used[i] > 0.0 else nan
             if used[i] > 0.0:
-                seen += 1
                 quietest = min(quietest, sensors[i, NOISE])
-        if settings[INSTANT] > 0.0 and seen > 0:
-            x, noise = _instant(memory, H, sensors, now, W, f[0], n)
         absorb(ring[at], sensors, memory, H, f[0], b)
         filtered = _see(memory, H, m, f[m])
         variance, stop = size(memory, f[m]), False
@@ -365,11 +336,7 @@ def fuse_scan(
             clock[AGREED] = clock[AGREED] + 1.0 if agreed else 0.0
             stop = stop or clock[AGREED] >= settings[RESTORE_N]
             variance += extra
-            noise += extra
-        if settings[INSTANT] > 0.0:
-            out[k, 0], out[k, 1] = x, sqrt(noise)
-        else:
-            out[k, 0], out[k, 1] = filtered, sqrt(variance)
+        out[k, 0], out[k, 1] = filtered, sqrt(variance)
         advance(memory, A, G, walks, stride, int(t), M, b)
         clock[NOW], clock[STAGE] = t + 1.0, RETURN if stop else READ
         k += 1

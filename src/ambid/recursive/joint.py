@@ -230,9 +230,36 @@ class JointFilter:
         self._counts[5] = 1
 
     @classmethod
-    def from_estimate(cls, estimate: Estimate, rate_hz: float, **settings: Mapping[str, float]) -> Self:
-        """Return a filter that starts from an off-line estimate of the same rate; `settings` as in `start_from`."""
-        return cls(start_from(estimate, rate_hz, **settings))
+    def from_estimate(cls, estimate: Estimate, rate_hz: float, *, rates: Mapping[str, float] | None = None) -> Self:
+        """Return a filter that starts from an off-line estimate of the same rate; `rates` as in `JointStart`."""
+        if estimate.status == "failed":
+            raise EstimationError("the estimate has failed; a filter cannot start from it. Identify again")
+        rate = estimate.record.get("rate_hz")
+        if isinstance(rate, int | float) and abs(rate / rate_hz - 1.0) > 1e-6:
+            raise EstimationError(
+                f"the estimate is of a record at {rate:g} Hz and the samples come at {rate_hz:g} Hz; noise and delay "
+                "are per sample. Identify at the rate of the samples"
+            )
+        of, noise = model_named(estimate.model), estimate.noise
+        if not noise.sensor_sd or not noise.disturbance_sd:
+            raise EstimationError(
+                f"the estimate describes its noise as a {noise.form}; a joint filter wants levels. Identify with noise "
+                "levels, or give a JointStart"
+            )
+        delay = estimate.delay[of.inputs[0]]
+        start = JointStart(
+            model=of,
+            rate_hz=rate_hz,
+            values=estimate.values,
+            free=estimate.covariance_names,
+            covariance=estimate.covariance,
+            sensor_sd=noise.sensor_sd,
+            disturbance_sd=noise.disturbance_sd,
+            delay=delay.samples + delay.fraction,
+            operating_point={r: estimate.operating_point.get(r, 0.0) for r in (*of.inputs, *of.outputs)},
+            rates=rates or {},
+        )
+        return cls(start)
 
     @property
     def estimate(self) -> Array:
@@ -323,51 +350,6 @@ class JointFilter:
     def copy(self) -> Self:
         """Return an independent filter in the same state."""
         return deepcopy(self)
-
-
-def start_from(
-    estimate: Estimate,
-    rate_hz: float,
-    *,
-    rates: Mapping[str, float] | None = None,
-    offset_sd: Mapping[str, float] | None = None,
-    sensor_sd: Mapping[str, float] | None = None,
-    disturbance_sd: Mapping[str, float] | None = None,
-) -> JointStart:
-    """Return the start that an off-line estimate makes.
-
-    `estimate`: parameters, covariance, delay, noise levels and operating point are taken from it; `rates`, `offset_sd`:
-    as in `JointStart`; `sensor_sd`, `disturbance_sd`: in place of the estimate's.
-    """
-    if estimate.status == "failed":
-        raise EstimationError("the estimate has failed; a filter cannot start from it. Identify again")
-    rate = estimate.record.get("rate_hz")
-    if isinstance(rate, int | float) and abs(rate / rate_hz - 1.0) > 1e-6:
-        raise EstimationError(
-            f"the estimate is of a record at {rate:g} Hz and the samples come at {rate_hz:g} Hz; noise and delay are "
-            "per sample. Identify at the rate of the samples"
-        )
-    of, noise = model_named(estimate.model), estimate.noise
-    sensor, disturbance = sensor_sd or noise.sensor_sd, disturbance_sd or noise.disturbance_sd
-    if not sensor or not disturbance:
-        raise EstimationError(
-            f"the estimate describes its noise as a {noise.form}; a joint filter wants levels. Give sensor_sd and "
-            "disturbance_sd, or identify with noise levels"
-        )
-    delay = estimate.delay[of.inputs[0]]
-    return JointStart(
-        model=of,
-        rate_hz=rate_hz,
-        values=estimate.values,
-        free=estimate.covariance_names,
-        covariance=estimate.covariance,
-        sensor_sd=sensor,
-        disturbance_sd=disturbance,
-        delay=delay.samples + delay.fraction,
-        operating_point={r: estimate.operating_point.get(r, 0.0) for r in (*of.inputs, *of.outputs)},
-        offset_sd=offset_sd or {},
-        rates=rates or {},
-    )
 
 
 class JointEkf(JointFilter):
