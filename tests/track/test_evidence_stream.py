@@ -67,10 +67,12 @@ def test_evidence_predicts_the_loss_at_other_numbers(numbers, moved):
     _, (here,) = run(numbers, moved, samples, ROWS - settle)
     direction = np.random.default_rng(2).normal(size=moved.size) / np.sqrt(np.sum(here.J**2, axis=0))
     slope = 2 * direction @ here.J.T @ here.r
+    W = np.linalg.inv(np.linalg.cholesky(numbers.innovation_covariance))
 
     def loss(q):
         stream = EvidenceStream(numbers, linearise(numbers, q), 1 << 40)
-        return np.sum(stream.feed(samples)[1][settle:] ** 2)  # weighted innovations
+        errors = stream.feed(samples)[1][settle:] / numbers.problem.scales.output
+        return np.sum((errors @ W.T) ** 2)
 
     assert loss(moved) == pytest.approx(here.loss(moved), rel=1e-9)
     for h in (1e-2, 1e-3):

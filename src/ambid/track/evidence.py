@@ -273,7 +273,7 @@ class EvidenceStream:
         self._counts[4] = block
         self._nothing = np.zeros((0, 2 if numbers.synchronous else 0))
         root = np.linalg.cholesky(numbers.innovation_covariance)
-        self._W, self.unit = np.linalg.inv(root), root.T * problem.scales.output
+        self._W, self._unit = np.linalg.inv(root), root * problem.scales.output[:, None]
         self._M, self._fresh = self._stacked(at), True
         self._scratch = np.zeros(self._M.shape[1]), np.zeros((n + n_y, p + 1))
         self.latest: Evidence | None = None
@@ -315,8 +315,7 @@ class EvidenceStream:
         """Take samples until a block is complete, they are used up, or one is not finite.
 
         Returns `used`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
-        (used, n_outputs), weighted innovations, which `unit` (n_outputs, n_outputs) brings to SI; `evidence`: of the
-        block that these samples complete.
+        (used, n_outputs), innovations, SI; `evidence`: of the block that these samples complete.
         """
         u, y = samples.u, samples.y
         if self._fresh and y.shape[0]:
@@ -327,7 +326,7 @@ class EvidenceStream:
         while full and counts[2] < counts[4]:
             used = advance(
                 used, u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
-                counts, errors, *self._scratch,
+                counts, self._unit, errors, *self._scratch,
             )  # fmt: skip
             full = counts[1] + y.shape[1] > self._rows.shape[1]
             if full or counts[2] == counts[4]:

@@ -361,7 +361,6 @@ class PhysicalRpem(PhysicalEstimator):
                 self.n_rejected += 1
                 k += 1
                 self.stream.restart(self.stream.sample + 1)
-        errors @= self.stream.unit
         return errors.reshape(np.shape(outputs))
 
     def _one(self, samples: Samples) -> Array:
@@ -374,7 +373,7 @@ class PhysicalRpem(PhysicalEstimator):
             self.n_rejected += 1
             self.stream.restart(self.stream.sample + 1)
             return np.full(samples.y.shape, np.nan)
-        return errors @ self.stream.unit
+        return errors
 
     def take(self, evidence: Evidence) -> None:
         """Take in the evidence of a block.

@@ -47,7 +47,7 @@ def _step(M: Array, D: Array, s: Array, w: Array, f: Array) -> None:
 @compiled(error_model="numpy", fastmath={"contract"})
 def advance(
     first: int, u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array,
-    s: Array, rows: Array, counts: Integers, errors: Array, w: Array, f: Array,
+    s: Array, rows: Array, counts: Integers, unit: Array, errors: Array, w: Array, f: Array,
 ) -> int:  # fmt: skip
     """Run from sample `first` until a block is complete, `rows` are full, samples are used up, or one is not finite.
 
@@ -55,9 +55,9 @@ def advance(
 
     `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `M` (n_x + n_y, n_l) gives the next
     state and the weighted innovations, `s` (n_x, p + 1) holds the sensitivities and in its last column the state.
-    `errors` (n_samples, n_y) gets the weighted innovations. `rows` (p + 1, room) holds rows that are not folded yet.
-    `counts`: place of the next input in `history`, rows and samples of the present block, samples still to settle,
-    samples of a block. `w` (n_l,) and `f` (n_x + n_y, p + 1) are scratch.
+    `errors` (n_samples, n_y) gets the innovations in SI, the triangle `unit` times weighted ones. `rows` (p + 1, room)
+    holds rows that are not folded yet. `counts`: place of the next input in `history`, rows and samples of the present
+    block, samples still to settle, samples of a block. `w` (n_l,) and `f` (n_x + n_y, p + 1) are scratch.
     """
     n_x, n_u, n_y, p = s.shape[0], u.shape[1], y.shape[1], s.shape[1] - 1
     depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
@@ -86,7 +86,10 @@ def advance(
         _step(M, D, s, w, f)
         r, settled = counts[1], counts[3] == 0
         for i in range(n_y):
-            errors[k, i] = f[n_x + i, p]
+            v = 0.0
+            for j in range(i + 1):
+                v += unit[i, j] * f[n_x + j, p]
+            errors[k, i] = v
             if settled:
                 for q in range(p + 1):
                     rows[q, r + i] = f[n_x + i, q]

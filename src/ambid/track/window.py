@@ -179,7 +179,6 @@ class MovingWindow(PhysicalEstimator):
                 k += 1
                 self._recent.clear()
                 self.stream.restart(self.stream.sample + 1)
-        errors @= self.stream.unit
         return errors.reshape(np.shape(outputs))
 
     def _solve(self) -> None:
