@@ -492,8 +492,7 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
 def _state_space_tangent(fit: BlackBoxFit, found: Errors, u: Array, y: Array) -> tuple[Array, ...]:
     """Move along every entry of A and B, of K where there is noise, and of D where there is any.
 
-    Entries that were not estimated, as those of a delay that was given, stand still: moving them would take a wrong
-    delay out of the residuals.
+    Entries that were not estimated stand still: moving them would take what they miss out of the residuals.
     """
     m = found.model
     x = run_states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
