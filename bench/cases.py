@@ -12,8 +12,8 @@ from ambid.bearing.multistart import Signals, starts
 from ambid.estimation.likelihood import search, weight_of
 from ambid.estimation.predictor import PredictorProblem
 from ambid.job import signals_of
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.rig import default_rig
 from ambid.signals import multisine

@@ -13,8 +13,8 @@ from ambid.bearing.linear import greybox
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
 from ambid.job import identify
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.rig import default_rig
 from ambid.simulate import simulate_preset

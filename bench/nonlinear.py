@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from ambid.blackbox.data import IOData
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from ambid.simulate import simulate_preset
 from table import Table

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.recursive.fusion import FusedSensor, SensorFusion
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf

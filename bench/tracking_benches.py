@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Noise, placed_loop
-from ambid.physics.models import model
 from ambid.physics.presets import Preset, preset
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Event

@@ -7,8 +7,7 @@ import pytest
 
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import identify, load, signals_of
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, model
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record, write_record
 from ambid.rig import default_rig

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from ambid.bearing.coil import coil_instrumental, coil_least_squares
 from ambid.job import identify
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.rig import default_rig
 from ambid.signals import multisine
 from ambid.simulate import LinearPlant, noise_at_snr, simulate

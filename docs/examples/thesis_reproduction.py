@@ -13,8 +13,8 @@ import numpy as np
 
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate import noise_at_snr, simulate_preset

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from ambid.errors import AmbidError as AmbidError
     from ambid.estimation.estimate import Estimate as Estimate
     from ambid.estimation.estimate import estimate_from_json as estimate_from_json
-    from ambid.physics.models import model as model
-    from ambid.physics.models import model_names as model_names
+    from ambid.physics.linear_model import model as model
+    from ambid.physics.linear_model import model_names as model_names
     from ambid.physics.presets import preset as preset
     from ambid.physics.presets import preset_names as preset_names
     from ambid.record import Channel as Channel

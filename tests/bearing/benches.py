@@ -10,10 +10,8 @@ import numpy as np
 
 from ambid.bearing.linear import Signals
 from ambid.estimation.predictor import PredictorProblem, Scales
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import Loop, Noise
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate import LinearPlant, simulate

@@ -5,9 +5,7 @@ import pytest
 from scipy.linalg import expm, expm_frechet
 from scipy.signal import cont2discrete
 
-from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import StateSpace
-from ambid.physics.models import model
+from ambid.physics.linear_model import StateSpace, discretise, model
 from tests.bearing.benches import BEARING, COIL, SPRUNG, THESIS
 from tests.estimation.reference import STEP
 

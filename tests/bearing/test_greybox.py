@@ -11,8 +11,7 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, model
 from tests.bearing.benches import parameters, problem_of, run
 
 N = 6000

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError, nearest
-from ambid.physics.models import model, model_names
+from ambid.physics.linear_model import model, model_names
 from tests.bearing.benches import BEARING, COIL, FALLING, SPRUNG, THESIS
 from tests.estimation.reference import STEP, continuous
 

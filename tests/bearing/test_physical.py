@@ -16,9 +16,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import EstimationError
-from ambid.physics.discretise import discretise
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, discretise, model
 from tests.bearing.benches import BEARING, COIL, SPRUNG, THESIS, parameters, run
 
 UNITS = {"voltage": "V", "current": "A", "position": "m"}

@@ -51,7 +51,7 @@ def test_every_room_stands_in_a_tier_and_on_the_map():
 
 
 FABRICATED = {
-    "upward": ("ambid.physics.models", "from ambid.simulate.bench import simulate", "upward"),
+    "upward": ("ambid.physics.linear_model", "from ambid.simulate.bench import simulate", "upward"),
     "upward, the room itself": ("ambid.record.record", "from ambid import rig", "upward"),
     "upward by two dots": ("ambid.record.csv_format", "from ..physics import models", "upward"),
     "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
@@ -68,7 +68,7 @@ FABRICATED = {
     "private module as a name": ("ambid.rig.schema", "from ambid.record import _files", "_files is private to record"),
     "private name": (
         "ambid.simulate.bench",
-        "from ambid.physics.models import _blocks",
+        "from ambid.physics.linear_model import _blocks",
         "_blocks is private to physics",
     ),
     "the package itself": ("ambid.job", "import ambid", "stands above it"),
@@ -88,7 +88,7 @@ def test_a_forbidden_import_is_found(module, source, complaint):
 ALLOWED = {
     "downward": (
         "ambid.bearing.linear",
-        "from ambid.physics.models import model\nfrom ambid.errors import ModelError",
+        "from ambid.physics.linear_model import model\nfrom ambid.errors import ModelError",
     ),
     "own private module": ("ambid.record.csv_format", "from ambid.record._files import file_bytes"),
     "own private module, relative": ("ambid.record.csv_format", "from ._files import file_bytes"),

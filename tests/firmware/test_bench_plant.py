@@ -8,7 +8,7 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from tests.firmware.conftest import BENCH
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.job.identification import identify_nonlinear
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.rig import RigMagnet, default_rig
 from ambid.simulate import simulate

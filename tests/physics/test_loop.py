@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise, placed_loop
-from ambid.physics.models import model
 
 BEARING = {"m": 4.0, "k_x": -1.29e5, "k_i": 55.7, "R": 1.6, "L": 0.026, "c": 20.0}
 POLES = (-1500.0, -250 + 250j, -250 - 250j, -20.0)

@@ -24,7 +24,7 @@ def test_rests_at_its_equilibrium(plant: NonlinearPlant, x: float) -> None:
 
 @pytest.mark.parametrize(("plant", "x"), [(PAIR, 0.0), (PAIR, 6e-5), (BALL, 0.009)])
 def test_linearisation_gives_the_state_matrix_of_the_linear_model(plant: NonlinearPlant, x: float) -> None:
-    from ambid.physics.models import model
+    from ambid.physics.linear_model import model
 
     point, h = plant.equilibrium(x), 1e-30
     a = model("one-axis").matrices(plant.linearise(x)).A

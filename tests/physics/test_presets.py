@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset, preset_names
 from ambid.simulate import closed_loop_poles
 

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
-from ambid.physics.discretise import zero_order_hold
-from ambid.physics.models import model, model_names
+from ambid.physics.linear_model import model, model_names, zero_order_hold
 from ambid.physics.sensor_gain import SensorGains
 
 THETA = {"m": 4.0, "k_x": -1.29e5, "k_i": 55.7, "R": 1.6, "L": 0.026, "c": 3.0}

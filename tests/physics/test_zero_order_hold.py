@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.physics.discretise import discretise, zero_order_hold
-from ambid.physics.linear_model import StateSpace
+from ambid.physics.linear_model import StateSpace, discretise, zero_order_hold
 
 
 def test_double_integrator_and_first_order_lag() -> None:

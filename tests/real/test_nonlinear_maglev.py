@@ -13,7 +13,7 @@ import pytest
 from ambid.cli import run
 from ambid.job.identification import identify_nonlinear
 from ambid.job.results import read_estimate
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.rig import load_rig
 from tests.measured import ABSENT, MAGLEV
 

@@ -127,7 +127,7 @@ def test_writer_refuses_what_the_reader_would_refuse(tmp_path):
 
 @pytest.mark.parametrize("long", [1 << 30, 0], ids=["by NumPy", "compiled"])
 def test_long_files_keep_their_order_and_name_a_late_fault(tmp_path, monkeypatch, long):
-    monkeypatch.setattr("ambid.record._csv_text._LONG", long)
+    monkeypatch.setattr("ambid.record.csv_format._LONG", long)
     values = np.random.default_rng(1).standard_normal((50_000, 3))
     rows = [",".join(map(repr, row)) for row in values.tolist()]
     header = "a [V],b [A],c [m]"

@@ -8,8 +8,7 @@ import numpy as np
 from scipy.linalg import solve_discrete_are
 
 from ambid.bearing.linear import Signals
-from ambid.physics.discretise import discretise
-from ambid.physics.models import model
+from ambid.physics.linear_model import discretise, model
 from ambid.signals import multisine
 from tests.bearing.benches import BEARING, Bench
 

@@ -8,9 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.physics.linear_model import StateSpace
-from ambid.physics.models import model, model_names
-from ambid.physics.one_axis import OneAxis
+from ambid.physics.linear_model import OneAxis, StateSpace, model, model_names
 from ambid.recursive.joint import powers_of
 
 

@@ -8,8 +8,7 @@ from ambid.bearing.coil import coil_instrumental, coil_least_squares
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, model
 
 GAIN, POLE = 550.0, 860.0
 TRUTH = {"R": POLE / GAIN, "L": 1 / GAIN}

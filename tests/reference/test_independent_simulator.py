@@ -118,8 +118,7 @@ def test_offsets_and_scale_of_the_record_change_nothing(outside, tmp_path):
 
 def test_the_discrete_plants_are_the_same(outside):
     # sign conventions of the two simulators, before any estimation
-    from ambid.physics.discretise import discretise
-    from ambid.physics.models import model
+    from ambid.physics.linear_model import discretise, model
 
     for bench in (outside.THESIS, outside.BEARING, outside.HOBBY):
         a, b, f = outside._discrete(bench)

@@ -5,8 +5,7 @@ import pytest
 
 from ambid.bearing.linear import greybox
 from ambid.bearing.uncertainty import uncertainty
-from ambid.physics.discretise import discretise
-from ambid.physics.models import model
+from ambid.physics.linear_model import discretise, model
 from ambid.physics.presets import preset
 from tests.bearing.benches import parameters, run
 

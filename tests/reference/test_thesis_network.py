@@ -8,7 +8,7 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.nn import nn
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from ambid.simulate import simulate_preset
 

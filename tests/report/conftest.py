@@ -3,7 +3,7 @@
 import pytest
 
 from ambid.job import identify, signals_of
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from ambid.report.figures import Evidence
 from ambid.rig import default_rig

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.estimation.estimate import Estimate
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.report.figures import poles, responses
 
 

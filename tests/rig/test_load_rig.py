@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError, RigError
+from ambid.physics.linear_model import Parameter, model, model_names
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model, model_names
-from ambid.physics.parameters import Parameter
 from ambid.rig import RecordSettings, default_rig, load_rig, write_rig
 
 MINIMAL = 'schema = "ambid.rig/1"\nmodel = "one-axis"\n'

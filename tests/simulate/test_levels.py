@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.simulate import LinearPlant, Simulation, largest_amplitude, simulate, simulate_preset
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import cont2discrete, dlsim
 
 from ambid.errors import ModelError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
 from ambid.physics.nonlinear import OperatingPoint
 from ambid.physics.presets import preset, preset_names
 from ambid.simulate import LinearPlant, closed_loop_matrix, closed_loop_poles, simulate, simulate_preset

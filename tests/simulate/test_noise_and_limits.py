@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import discretise, model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.simulate import LinearPlant, noise_at_snr, simulate, simulate_preset
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import PowerStage
 from ambid.physics.presets import Preset, preset

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import ModelError
-from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import discretise, model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset, preset_names
 from ambid.simulate import (
     LinearPlant,

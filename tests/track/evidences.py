@@ -9,9 +9,8 @@ import numpy as np
 from ambid.estimation.likelihood import weight_of
 from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.estimation.sensitivity import Workspace, innovations, residual_blocks
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.sensor_gain import SensorGains
 from ambid.signals import multisine
 from ambid.simulate import LinearPlant, simulate

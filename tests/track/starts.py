@@ -8,8 +8,7 @@ import numpy as np
 
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.models import model
+from ambid.physics.linear_model import LinearModel, model
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig

@@ -8,7 +8,7 @@ import pytest
 from ambid.bearing.uncertainty import uncertainty
 from ambid.estimation.likelihood import search, sparse_gain
 from ambid.estimation.sensitivity import innovations
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.validate.physical import (
     agreement,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.job import identify
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Loop, Noise
-from ambid.physics.models import model
 from ambid.rig import default_rig
 from ambid.simulate import LinearPlant, simulate
 

@@ -8,8 +8,8 @@ import pytest
 from ambid.bearing.linear import Signals
 from ambid.errors import EstimationError
 from ambid.job import identify, signals_of
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
-from ambid.physics.models import model
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulate import simulate_preset

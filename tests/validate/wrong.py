@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 
 _AXIS = model("one-axis")
 

@@ -21,7 +21,7 @@ from ambid.acquire.session import Course, RunReport, run
 from ambid.acquire.view import BenchView
 from ambid.arrays import Array
 from ambid.errors import DeviceError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.rig import Rig
 from ambid.track.blocks import Frame
 

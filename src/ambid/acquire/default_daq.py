@@ -15,8 +15,8 @@ from ambid.acquire.device import DeviceEvent
 from ambid.acquire.protocol.table import table
 from ambid.acquire.scales import ADC_TOP, PWM_TOP, nearest_rate, output_rates, who
 from ambid.errors import RigError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import UNLIMITED, Interval
-from ambid.physics.models import model
 from ambid.record.calibration import Calibration
 from ambid.rig.rig import DAQ_RATE_HZ, Daq, Rig, RigChannel
 

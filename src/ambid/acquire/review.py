@@ -10,7 +10,7 @@ import numpy as np
 from ambid.acquire.scales import output_rates, scale_of, who
 from ambid.acquire.settings import ControllerSettings, exact_gains, has_position, realised
 from ambid.errors import ModelError, RigError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.rig.rig import Rig
 
 _ROUNDED = 0.01  # of a gain: more is worth a line

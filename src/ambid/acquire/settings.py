@@ -35,8 +35,8 @@ from ambid.acquire.scales import (
 )
 from ambid.arrays import Array
 from ambid.errors import DeviceError, RigError
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Loop
-from ambid.physics.models import model
 from ambid.rig.rig import Daq, Rig
 
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
@@ -347,7 +347,7 @@ def _si_scale(rig: Rig, settings: ControllerSettings, role: str) -> Scale | None
 
 
 def _unit(rig: Rig, role: str) -> str:
-    from ambid.rig.load import role_units
+    from ambid.rig.rig import role_units
 
     third = _third_role(rig) if role == "extra" else None
     return role_units(model(rig.model)).get(third or role, "1")

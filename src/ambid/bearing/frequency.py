@@ -23,8 +23,7 @@ from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, Judged, Parametric
 from ambid.estimation.linear import directions, one_thread
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]

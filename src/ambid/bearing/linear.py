@@ -23,8 +23,7 @@ from ambid.estimation.likelihood import Fit, extend, promise_of, score_statistic
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, assemble, stable
 from ambid.estimation.sensitivity import Workspace
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 
 
 def greybox(

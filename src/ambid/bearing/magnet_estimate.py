@@ -33,8 +33,7 @@ from ambid.estimation.likelihood import Fit
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import noise_floor
 from ambid.physics.coenergy_law import MagnetLaw
-from ambid.physics.one_axis import OneAxis
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import OneAxis, Parameter
 
 _NEAR_WHOLE = 0.1  # distance of a delay from a whole number at which the whole number is tried
 _SHORT = 12  # iterations with which a whole delay is tried

@@ -21,9 +21,8 @@ from ambid.blackbox.fit_file import fit_to_json
 from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
 from ambid.estimation.estimate import covariance_together, fields_json, plain_json
-from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import StateSpace
-from ambid.physics.models import model as physical_model
+from ambid.physics.linear_model import StateSpace, discretise
+from ambid.physics.linear_model import model as physical_model
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]

@@ -25,8 +25,7 @@ from ambid.estimation.likelihood import evaluate, search, with_linear_part
 from ambid.estimation.linear import column_sizes, triangle_of
 from ambid.estimation.predictor import PredictorProblem, Scales, all_scales, assemble_all, noise_floor
 from ambid.estimation.sensitivity import Workspace
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 
 Spectrum = NDArray[np.complexfloating]
 Term = tuple[str, Spectrum, Spectrum]  # role whose noise it holds, what that noise passes through, moments

@@ -27,8 +27,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, Parametric
 from ambid.estimation.linear import one_thread
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 
 _MISFIT = 1e-3  # probability of the misfit below which a black box does not agree with this physics
 _GROSS = 25.0  # chi-square over degrees of freedom from which nothing of it is believed

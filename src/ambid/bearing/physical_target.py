@@ -17,8 +17,7 @@ from ambid.bearing.multistart import Moments
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, TransferModel, response_covariance
 from ambid.errors import EstimationError
-from ambid.physics.discretise import DiscreteSpace, discretise
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import DiscreteSpace, LinearModel, discretise
 
 Complex = NDArray[np.complex128]
 

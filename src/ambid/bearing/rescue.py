@@ -40,8 +40,7 @@ from ambid.estimation.likelihood import Fit, evaluate, search
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.sensitivity import Workspace, innovations
 from ambid.estimation.uncertainty import explained_by_past
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 
 EVALUATIONS = 1200  # of the likelihood, unless the caller says otherwise: 1 to 2 s, and as much for local searches
 FAR = 0.5  # part of the innovations' variance that a linear regression may explain before a fit counts as failed

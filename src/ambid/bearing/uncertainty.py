@@ -21,7 +21,7 @@ from ambid.estimation.linear import directions
 from ambid.estimation.predictor import Predictor, assemble, stable
 from ambid.estimation.sensitivity import Workspace, linearise, products
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 
 _SHORT = 25.0  # memories below which the likelihood of a noise level is itself too rough, and all is widened once more
 _LONG = 75.0  # memories of the predictor from which noise levels are known well enough not to ask

@@ -25,8 +25,7 @@ from ambid.blackbox.frequency import Lines, build_response_fit, check_lines, sea
 from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
-from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import StateSpace
+from ambid.physics.linear_model import StateSpace, discretise
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]

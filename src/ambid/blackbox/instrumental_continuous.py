@@ -48,7 +48,7 @@ from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.blackbox.prediction import Numbers, Responses, companion, filter_states, free_response, responses
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
-from ambid.physics.discretise import zero_order_hold
+from ambid.physics.linear_model import zero_order_hold
 
 _ROUGH, _FINE = 6, 60  # steps spent on a start, and on the best of them
 _HALVINGS = 6

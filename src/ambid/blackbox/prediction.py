@@ -24,7 +24,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.sensitivity import run
-from ambid.physics.discretise import zero_order_hold
+from ambid.physics.linear_model import zero_order_hold
 
 Numbers = Any  # arrays of real numbers, or of complex ones for complex steps
 
@@ -207,7 +207,7 @@ def responses(den: Array, num: Array, step: float, u: Array) -> Responses:
     `den`: (n + 1,); `num`: (n_inputs, n + 1), highest power first; `step`: sampling interval in units of 1/w0; `u`:
     (n_samples, n_inputs).
     """
-    from ambid.physics.discretise import zero_order_hold
+    from ambid.physics.linear_model import zero_order_hold
 
     n, n_u = den.size - 1, u.shape[1]
     size = n * (n_u + 1)

@@ -16,7 +16,7 @@ def info(record: opt.RecordFile, rig: opt.RigFile = None, rate: opt.Rate = None,
 
     With --rig: the channels by role, calibrated; the noise of the outputs is then told from what the input explains.
     """
-    from ambid.physics.models import model
+    from ambid.physics.linear_model import model
     from ambid.record import read_record
     from ambid.report.tables import record_text
     from ambid.rig import load_rig, read_bench
@@ -36,7 +36,7 @@ def models() -> None:
     from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
     from ambid.physics.bearing_numbers import BEARING_NUMBERS
-    from ambid.physics.models import model, model_names
+    from ambid.physics.linear_model import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
     from ambid.signals import EXCITATIONS

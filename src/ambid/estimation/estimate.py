@@ -23,8 +23,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, nearest
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, model
 
 
 class Tick(Protocol):

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.physics.discretise import DiscreteSpace, discretise
-from ambid.physics.linear_model import LinearModel, StateSpace
+from ambid.physics.linear_model import DiscreteSpace, LinearModel, StateSpace, discretise
 
 _BLOCK = 8192  # rows that are looked at at once: they stay in the cache
 NoiseForm = Literal["levels", "gain", "given"]

@@ -17,7 +17,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Tick
 from ambid.job.data import Reading, Source, known_rig, load, origin
 from ambid.physics.coenergy_law import MagnetLaw
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.rig import Rig, RigMagnet
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from ambid.errors import EstimationError, RecordError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Record, read_record
 from ambid.rig import Rig, bench_record, default_rig, load_rig, mat_variables, read_bench, rig_text
 from ambid.signals.conditioning import cut

@@ -17,7 +17,7 @@ from ambid.estimation.estimate import Tick, guessed, part_of, silent
 from ambid.estimation.linear import one_thread
 from ambid.job.data import Channels, Clock, Columns, Source, check_same_bench, known_rig
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Record
 from ambid.rig import Rig
 

@@ -16,7 +16,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, Tick, silent
 from ambid.estimation.linear import one_thread
 from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, rig_entry, signals_of
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Record
 from ambid.rig import Rig
 

@@ -19,7 +19,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Tick, silent
 from ambid.estimation.linear import one_thread
 from ambid.job.data import Channels, Clock, Columns, Source
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.rig import Rig
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold

@@ -16,8 +16,8 @@ from ambid.job.data import Channels, Reading, Source, check_same_bench, load, si
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
-from ambid.physics.models import model
-from ambid.record.files import file_bytes, utf8_text
+from ambid.physics.linear_model import model
+from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
 from ambid.validate.fits import objections
 from ambid.validate.fits import validation as fit_validation

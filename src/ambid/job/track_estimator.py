@@ -22,7 +22,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, Source
 from ambid.job.following import EstimatorWords, Following, Memory
 from ambid.job.track_start import rows_of, start_of
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Record, read_record
 from ambid.recursive import (
     JointEkf,

@@ -28,7 +28,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.following import Following, FollowingWords
 from ambid.job.track_start import BenchRows, start_of
 from ambid.job.tracking import follow
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.rig import Rig

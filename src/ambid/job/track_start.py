@@ -16,13 +16,10 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, Source, known_rig, load
 from ambid.job.identification import identify
 from ambid.job.results import read_linear_estimate
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, read_rows
 from ambid.rig import Rig, bench_record
-from ambid.rig.load import OPTIONAL_ROLES
-from ambid.rig.rig import RigChannel
+from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
 from ambid.track.guard import ABSURD
 from ambid.track.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
 from ambid.track.replay import Replay, blocks_of

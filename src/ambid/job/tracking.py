@@ -17,7 +17,7 @@ from ambid.estimation.linear import one_thread
 from ambid.job.data import Reading, Source, known_rig
 from ambid.job.following import EstimatorWords, Following, TrackWords, check_settings
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackLine
 from ambid.rig import Rig, load_rig
 from ambid.track.blocks import Block, Stretch

@@ -8,14 +8,14 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.physics.linear_model import LinearModel as LinearModel
+    from ambid.physics.linear_model import Parameter as Parameter
+    from ambid.physics.linear_model import model as model
+    from ambid.physics.linear_model import model_names as model_names
     from ambid.physics.loop import Limits as Limits
     from ambid.physics.loop import Noise as Noise
     from ambid.physics.loop import placed_loop as placed_loop
     from ambid.physics.magnet import DifferentialPair as DifferentialPair
-    from ambid.physics.models import model as model
-    from ambid.physics.models import model_names as model_names
     from ambid.physics.nonlinear import NonlinearPlant as NonlinearPlant
-    from ambid.physics.parameters import Parameter as Parameter
     from ambid.physics.presets import preset as preset
 
 __getattr__, __dir__, __all__ = exports(__name__)

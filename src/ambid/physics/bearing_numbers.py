@@ -5,7 +5,7 @@ Mass, resistance and damping are those of the linear model and stand with it (`o
 
 from __future__ import annotations
 
-from ambid.physics.parameters import ParameterSpec
+from ambid.physics.linear_model import ParameterSpec
 
 BEARING_NUMBERS: tuple[ParameterSpec, ...] = (
     ParameterSpec(

@@ -1,17 +1,68 @@
-"""What a linear model is: physics as a function of named parameters (theory.md sec. 1).
+"""Linear models: parameters, physics as a function of them (theory.md sec. 1), and its exact discretisation.
 
-A model turns parameters into continuous-time matrices and their exact derivatives. It knows nothing of data.
+A model turns parameters into continuous-time matrices and their exact derivatives. It knows nothing of data. Under a
+zero-order hold the input is held over a sample and may reach the plant a fraction of a sample late: over one period the
+plant sees first the previous value, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, nearest
-from ambid.physics.parameters import ParameterSpec
+
+Role = Literal["free", "fixed", "prior"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ParameterSpec:
+    """A number that a model has."""
+
+    name: str  # name in code, SI unit, and one line that says what it is (theory.md sec. 0).
+    unit: str
+    meaning: str
+    positive: bool = False  # physics allows positive values only (mass, resistance, inductance)
+    default: float | None = None  # value taken as fixed when nothing is said of it; None: it is free
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Parameter:
+    """What is known of one parameter, in SI units.
+
+    Attributes
+    ----------
+    name, unit : str
+        Name and SI unit.
+    role : {"free", "fixed", "prior"}
+        Estimated; held at `value`; estimated with a Gaussian prior (`value`, `sd`).
+    value : float or None
+        Start value (free, optional), value (fixed) or mean (prior).
+    sd : float or None
+        Standard deviation of the prior; None otherwise.
+    """
+
+    name: str
+    unit: str
+    role: Role = "free"
+    value: float | None = None
+    sd: float | None = None
+
+    def __post_init__(self) -> None:
+        if self.role in ("fixed", "prior") and self.value is None:
+            raise ModelError(f"parameter {self.name!r} is {self.role} but has no value. Give value = ...")
+        if self.role == "prior" and not (self.sd is not None and self.sd > 0):
+            raise ModelError(
+                f"parameter {self.name!r} has a prior without a positive sd (got {self.sd}). Give sd = ..."
+            )
+        if self.role != "prior" and self.sd is not None:
+            raise ModelError(f"parameter {self.name!r} is {self.role} but has an sd. Remove sd, or set role = 'prior'")
+
 
 UNITS = {  # of inputs, outputs, states and disturbances
     "voltage": "V",
@@ -95,3 +146,327 @@ def unknown_parameter(of: LinearModel, parameter: str) -> ModelError:
     return ModelError(
         f"model {of.name!r} has no parameter {parameter!r}; it has {', '.join(names)}.{nearest(parameter, names)}"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class OneAxis:
+    """Coil, magnet and mass on one axis (thesis eq. 4.4 and 4.8).
+
+    m x'' = k_i i - k_x x - c x' + f,  V = R i + L i' + k_i x'; both position and current are measured (the printed C =
+    [1 0 1]^T has to be two rows, theory.md sec. 1).
+    """
+
+    name: str = "one-axis"  # as in `LinearModel`
+    summary: str = "coil + magnet + mass on one axis: voltage in, position and current out"
+    parameters: tuple[ParameterSpec, ...] = (MASS, K_X, K_I, R, L, C)
+    inputs: tuple[str, ...] = ("voltage",)
+    outputs: tuple[str, ...] = ("position", "current")
+    states: tuple[str, ...] = ("position", "velocity", "current")
+    disturbances: tuple[str, ...] = ("force", "voltage")
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """SI units of inputs, outputs, states and disturbances."""
+        return UNITS
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return A, B, E, C of thesis eq. 4.8 with damping.
+
+        `theta`: m, k_x, k_i, R, L, c in SI units. Returns a (3, 3), B (3, 1), E (3, 2), C (2, 3).
+        """
+        m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
+        return StateSpace(
+            A=np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, k_i / m], [0.0, -k_i / ell, -r / ell]]),
+            B=np.array([[0.0], [0.0], [1.0 / ell]]),
+            E=np.array([[0.0, 0.0], [1.0 / m, 0.0], [0.0, 1.0 / ell]]),
+            C=np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]),
+        )
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
+
+        `theta`: m, k_x, k_i, R, L, c in SI units; `parameter`: name of the parameter. Returns derivatives of A (3, 3),
+        B (3, 1), E (3, 2), C (2, 3).
+        """
+        m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
+        d_a, d_b, d_e = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 2))
+        match parameter:
+            case "m":
+                d_a[1] = np.array([k_x, c, -k_i]) / m**2
+                d_e[1, 0] = -1.0 / m**2
+            case "k_x":
+                d_a[1, 0] = -1.0 / m
+            case "k_i":
+                d_a[1, 2], d_a[2, 1] = 1.0 / m, -1.0 / ell
+            case "R":
+                d_a[2, 2] = -1.0 / ell
+            case "L":
+                d_a[2] = np.array([0.0, k_i, r]) / ell**2
+                d_b[2, 0] = d_e[2, 1] = -1.0 / ell**2
+            case "c":
+                d_a[1, 1] = -1.0 / m
+            case _:
+                raise unknown_parameter(self, parameter)
+        return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((2, 3)))
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the scale against which a damping near zero is judged: that of critical damping.
+
+        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
+        frequency.
+        """
+        return {"c": float(np.sqrt(abs(theta["m"] * max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]))))}
+
+
+@dataclass(frozen=True, slots=True)
+class Coil:
+    """Coil with the rotor at rest (thesis eq. 2.3 and 4.1): V = R i + L i'."""
+
+    name: str = "coil"  # as in `LinearModel`
+    summary: str = "coil alone, rotor held at rest: voltage in, current out"
+    parameters: tuple[ParameterSpec, ...] = (R, L)
+    inputs: tuple[str, ...] = ("voltage",)
+    outputs: tuple[str, ...] = ("current",)
+    states: tuple[str, ...] = ("current",)
+    disturbances: tuple[str, ...] = ("voltage",)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """SI units of inputs, outputs, states and disturbances."""
+        return UNITS
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return A, B, E, C, each (1, 1), for R in ohm and L in H.
+
+        `theta`: R and L in SI units. Returns all of shape (1, 1).
+        """
+        r, ell = theta["R"], theta["L"]
+        return StateSpace(
+            A=np.array([[-r / ell]]), B=np.array([[1.0 / ell]]), E=np.array([[1.0 / ell]]), C=np.array([[1.0]])
+        )
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return dA, dB, dE, dC for one parameter, each (1, 1).
+
+        `theta`: R and L in SI units; `parameter`: ``"R"`` or ``"L"``. Returns all of shape (1, 1).
+        """
+        r, ell = theta["R"], theta["L"]
+        zero = np.zeros((1, 1))
+        match parameter:
+            case "R":
+                return StateSpace(A=np.array([[-1.0 / ell]]), B=zero, E=zero, C=zero)
+            case "L":
+                d_b = np.array([[-1.0 / ell**2]])
+                return StateSpace(A=np.array([[r / ell**2]]), B=d_b, E=d_b, C=zero)
+            case _:
+                raise unknown_parameter(self, parameter)
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return no scales: neither R nor L may be zero.
+
+        `theta`: R and L in SI units. Returns empty.
+        """
+        del theta
+        return {}
+
+
+@dataclass(frozen=True, slots=True)
+class Rotor:
+    """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f.
+
+    The current is the input, as with a transconductance amplifier; the data show only ratios to m (theory.md sec. 1),
+    so m wants a fixed value or a prior.
+    """
+
+    name: str = "rotor"  # as in `LinearModel`
+    summary: str = "magnet + mass, current-driven: current in, position out (shows ratios to m only)"
+    parameters: tuple[ParameterSpec, ...] = (MASS, K_X, K_I, C)
+    inputs: tuple[str, ...] = ("current",)
+    outputs: tuple[str, ...] = ("position",)
+    states: tuple[str, ...] = ("position", "velocity")
+    disturbances: tuple[str, ...] = ("force",)
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """SI units of inputs, outputs, states and disturbances."""
+        return UNITS
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return A (2, 2), B (2, 1), E (2, 1), C (1, 2).
+
+        `theta`: m, k_x, k_i, c in SI units. Returns the continuous-time matrices.
+        """
+        m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
+        return StateSpace(
+            A=np.array([[0.0, 1.0], [-k_x / m, -c / m]]),
+            B=np.array([[0.0], [k_i / m]]),
+            E=np.array([[0.0], [1.0 / m]]),
+            C=np.array([[1.0, 0.0]]),
+        )
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
+
+        `theta`: m, k_x, k_i, c in SI units; `parameter`: name of the parameter. Returns the derivatives.
+        """
+        m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
+        d_a, d_b, d_e = np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 1))
+        match parameter:
+            case "m":
+                d_a[1] = np.array([k_x, c]) / m**2
+                d_b[1, 0], d_e[1, 0] = -k_i / m**2, -1.0 / m**2
+            case "k_x":
+                d_a[1, 0] = -1.0 / m
+            case "k_i":
+                d_b[1, 0] = 1.0 / m
+            case "c":
+                d_a[1, 1] = -1.0 / m
+            case _:
+                raise unknown_parameter(self, parameter)
+        return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((1, 2)))
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the scale against which a damping near zero is judged: that of critical damping.
+
+        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
+        frequency.
+        """
+        return {"c": float(np.sqrt(abs(theta["m"] * theta["k_x"])))}
+
+
+_MODELS: dict[str, LinearModel] = {m.name: m for m in (OneAxis(), Coil(), Rotor())}
+
+
+def model_names() -> tuple[str, ...]:
+    """Return the names of all linear models.
+
+    Returns
+    -------
+    tuple of str
+        Names as they are written in a rig file.
+    """
+    return tuple(_MODELS)
+
+
+def model(name: str) -> LinearModel:
+    """Return the linear model called `name`.
+
+    Parameters
+    ----------
+    name : str
+        One of `model_names`.
+
+    Returns
+    -------
+    LinearModel
+        The model.
+
+    Raises
+    ------
+    ModelError
+        If there is none of that name; the message names the nearest.
+    """
+    if name not in _MODELS:
+        raise ModelError(
+            f"there is no model {name!r}; there are {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} "
+            "See 'ambid models'"
+        )
+    return _MODELS[name]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DiscreteSpace:
+    """Matrices of x[k+1] = A x[k] + B u[k-d] + B_late u[k-d-1] + E d[k], y[k] = C x[k]."""
+
+    A: Array  # (n_states, n_states)
+    B: Array  # (n_states, n_inputs), `B_late` is zero where the delay is a whole number of samples
+    B_late: Array
+    E: Array  # (n_states, n_disturbances), disturbances held over a sample
+    C: Array  # (n_outputs, n_states)
+
+
+def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
+    """Discretise x' = A x + B u exactly, u held over a sample.
+
+    exp([[A, B], [0, 0]] T) holds both (Van Loan 1978).
+
+    `A`: (n_states, n_states), complex for a complex step; `B`: (n_states, n_inputs); `period_s`: sampling period in s.
+    Returns `A_d`: (n_states, n_states); `B_d`: (n_states, n_inputs).
+    """
+    n, n_u = B.shape
+    block = np.zeros((n + n_u, n + n_u), dtype=np.result_type(A, B))
+    block[:n, :n], block[:n, n:] = A, B
+    full = _exponential(block * period_s, n)
+    return full[:n, :n], full[:n, n:]
+
+
+def discretise(
+    space: StateSpace, period_s: float, *, fraction: float | None = None, derivatives: Sequence[StateSpace] = ()
+) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
+    """Discretise exactly, together with the derivatives along given directions.
+
+    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the
+    upper right block of exp([[M, dM], [0, M]] T) (Mathias 1996).
+
+    `space`: continuous-time matrices; `period_s`: sampling period in s; `derivatives`: directions (dA, dB, dE); dC is
+    passed on. Without directions matrices may be stacked, (..., rows, columns). Returns `discrete`: the discrete
+    matrices; `directional`: their derivatives, one for each direction; where `fraction` is given, one more: along the
+    fraction itself.
+    """
+    n, nu = space.B.shape[-2:]
+    size = n + nu + space.E.shape[-1]
+    kind = np.result_type(space.A, space.B, space.E)
+    several, width = ((len(derivatives),), 2 * size) if derivatives else (space.A.shape[:-2], size)
+    stack = np.zeros((*several, width, width), dtype=kind)
+    edges = (slice(0, n), slice(n, n + nu), slice(n + nu, size))
+    for name, columns in zip("ABE", edges, strict=True):
+        stack[..., :n, columns] = getattr(space, name)
+        if derivatives:
+            stack[:, :n, columns.start + size : columns.stop + size] = [getattr(d, name) for d in derivatives]
+    if derivatives:
+        stack[:, size : size + n, size:] = stack[:, :n, :size]
+    stack *= period_s
+    full = _exponential(stack, n)
+    late = full if fraction is None else _exponential(stack * (1.0 - fraction), n)
+
+    def split(now: Array, partial: Array, c: Array) -> DiscreteSpace:
+        b = partial[..., :n, n : n + nu]
+        return DiscreteSpace(
+            A=now[..., :n, :n], B=b, B_late=now[..., :n, n : n + nu] - b, E=now[..., :n, n + nu : size], C=c
+        )
+
+    first, first_late = (full[0], late[0]) if derivatives else (full, late)
+    discrete = split(first, first_late, space.C)
+    directional = [split(full[j, :size, size:], late[j, :size, size:], d.C) for j, d in enumerate(derivatives)]
+    if fraction is not None:
+        slope = -period_s * first_late[..., :n, :n] @ space.B
+        zero = np.zeros_like
+        directional.append(
+            DiscreteSpace(A=zero(discrete.A), B=slope, B_late=-slope, E=zero(discrete.E), C=zero(space.C))
+        )
+    return discrete, tuple(directional)
+
+
+_PADE = (17297280.0, 8648640.0, 1995840.0, 277200.0, 25200.0, 1512.0, 56.0, 1.0)  # of order 7
+_REACH = 0.95  # norm up to which it is right to rounding (Higham 2005)
+
+
+def _exponential(a: NDArray[Any], n: int) -> NDArray[Any]:
+    """Exponential of one or several matrices by scaling and squaring (Higham 2005).
+
+    Scaled by their first `n` rows and columns, which the others only follow: large inputs cost no digits.
+    `a`: (..., size, size).
+    """
+    norms = np.sum(np.abs(a[..., :n, :n]), axis=-2)
+    norm = float(np.max(norms, initial=0.0, where=np.isfinite(norms)))
+    squarings = max(0, int(np.ceil(np.log2(norm / _REACH)))) if norm > 0.0 else 0
+    a = a / 2.0**squarings
+    square = a @ a
+    fourth = square @ square
+    even = (np.eye(a.shape[-1]), square, fourth, square @ fourth)
+    odd = a @ sum(c * power for c, power in zip(_PADE[1::2], even, strict=True))
+    rest = sum(c * power for c, power in zip(_PADE[::2], even, strict=True))
+    more = np.linalg.solve(rest - odd, 2.0 * odd)  # what is beyond the identity: digits of slow modes stand there
+    for _ in range(squarings):
+        more = 2.0 * more + more @ more
+    return np.asarray(more + np.eye(a.shape[-1]))

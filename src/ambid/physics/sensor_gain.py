@@ -11,8 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ambid.physics.linear_model import LinearModel, StateSpace
-from ambid.physics.parameters import ParameterSpec
+from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
 
 PREFIX = "gain_"
 

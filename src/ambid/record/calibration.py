@@ -13,9 +13,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, RecordError, UnitError
-from ambid.record._csv_text import data_rows, find_header, read_values
-from ambid.record.files import file_bytes, sha256_of, utf8_text
-from ambid.record.record import Channel, Step
+from ambid.record.csv_format import data_rows, find_header, read_values
+from ambid.record.record import Channel, Step, file_bytes, sha256_of, utf8_text
 from ambid.units import Unit, parse_unit
 
 _EDGE = 1e-9  # of the table's span: rounding in the last digit is not outside the table

@@ -7,6 +7,7 @@ history then says so. Numbers have a decimal point. Rows in messages are lines o
 from __future__ import annotations
 
 import gzip
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,9 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
-from ambid.record._csv_text import Header, data_rows, find_header, read_plain, read_values
-from ambid.record.files import file_bytes, gunzipped, sha256_of, utf8_text
-from ambid.record.record import Channel, Record, Step
+from ambid.record.record import Channel, Record, Step, file_bytes, gunzipped, sha256_of, utf8_text
 from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly, usual_rate
 from ambid.units import UNKNOWN, Unit, nearest_unit, parse_unit
 
@@ -180,3 +179,173 @@ def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
     units = [c.source_unit if c.unit == UNKNOWN else c.unit for c in record.channels]
     names = [c.name if u == UNKNOWN else f"{c.name} [{u}]" for c, u in zip(record.channels, units, strict=True)]
     return [*(f"# {line}" for text in comments for line in text.splitlines()), ",".join(["time [s]", *names])]
+
+
+_HEADER_CELL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
+_BLOCK = 20_000  # rows that are read at once
+_LONG = 1 << 23  # bytes from which compiled reading saves more than loading it takes
+_HEAD = 1 << 16  # bytes in which the header of a plain file ends
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Header:
+    """The header row: its line number, the delimiter it shows, and the columns it names."""
+
+    row: int
+    delimiter: str
+    names: tuple[str, ...]
+    unit_texts: tuple[str | None, ...]
+    comments: tuple[str, ...]
+
+
+def find_header(lines: Sequence[str], path: Path) -> Header:
+    """Find the header row and take it apart."""
+    row = next((k for k, text in enumerate(lines, start=1) if text.strip() and not text.startswith("#")), None)
+    if row is None:
+        raise RecordError(f"{path} has no header row. Write one row of 'name [unit]', then the numbers")
+    line = lines[row - 1]
+    comments = [text.lstrip("#").strip() for text in lines[: row - 1] if text.startswith("#")]
+    delimiter = _delimiter(line, row, path)
+    cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
+    if all(np.isfinite(_number(cell)) for cell in cells):
+        raise RecordError(
+            f"{path}, row {row}: numbers stand where the header row is wanted. Write one row of 'name [unit]' before"
+            " them, without '#'"
+        )
+    names, units = [], []
+    for j, cell in enumerate(cells, start=1):
+        match = _HEADER_CELL.fullmatch(cell)
+        name = match["name"].strip() if match else cell
+        if not name:
+            raise RecordError(
+                f"{path}, row {row}: column {j} has no name. Write 'name [unit]', or remove the delimiter"
+            )
+        if name in names:
+            raise RecordError(f"{path}, row {row}: column {name!r} stands twice; names must differ. Rename one")
+        names.append(name)
+        units.append(match["unit"].strip() if match else None)
+    return Header(row=row, delimiter=delimiter, names=tuple(names), unit_texts=tuple(units), comments=tuple(comments))
+
+
+def _delimiter(line: str, row: int, path: Path) -> str:
+    """Tell what separates the columns, from the header row outside its units."""
+    outside = re.sub(r"\[[^\[\]]*\]", "[]", line)
+    found = [d for d in (",", ";", "\t") if d in outside]
+    if len(found) > 1:
+        raise RecordError(
+            f"{path}, row {row}: the header holds both {found[0]!r} and {found[1]!r}; one delimiter only. Use commas"
+        )
+    if not found and outside.count("[]") > 1:
+        raise RecordError(f"{path}, row {row}: the columns are not separated by commas. Write 'time [s],voltage [V],…'")
+    return found[0] if found else ","
+
+
+def read_plain(data: bytes, path: Path) -> tuple[Header, Array] | None:
+    """Read a long file without any fault; None for a short one, and for one that wants a closer look."""
+    head = data[:_HEAD] if len(data) >= _LONG else b""
+    if not head.isascii() or b"\r" in head or b"\0" in head:
+        return None
+    lines = head.decode().split("\n")[:-1]
+    try:
+        header = find_header(lines, path)
+    except RecordError:
+        return None
+    at = sum(len(line) + 1 for line in lines[: header.row])
+    data = data if data.endswith(b"\n") else data + b"\n"
+    values = np.empty((data.count(b"\n", at), len(header.names)))
+
+    from ambid.record.csv_kernels import powers_of_ten, read_rows
+
+    text = np.frombuffer(data, dtype=np.uint8)
+    end = read_rows(text, at, ord(header.delimiter), powers_of_ten(), values)
+    return (header, values) if end == len(data) else None
+
+
+def data_rows(lines: list[str], header_row: int, path: Path, at_least: int) -> list[str]:
+    """Return the rows of numbers, without empty lines at the end."""
+    end = len(lines)
+    while end > header_row and not lines[end - 1].strip():
+        end -= 1
+    body = lines[header_row:end]
+    if not body:
+        raise RecordError(f"{path} has a header row and no data. Record at least {at_least} rows")
+    if len(body) < at_least:
+        rows = "row" if len(body) == 1 else "rows"
+        raise RecordError(f"{path} has {len(body)} {rows} of data; at least {at_least} are needed. Record for longer")
+    return body
+
+
+def read_values(body: list[str], header: Header, path: Path, gaps: GapPolicy) -> Array:
+    """Turn the rows into numbers, shape (n_rows, n_columns): by blocks, and cell by cell where a block is not sound."""
+    values = np.empty((len(body), len(header.names)))
+    for start in range(0, len(body), _BLOCK):
+        block = body[start : start + _BLOCK]
+        numbers = _sound_block(block, header)
+        if numbers is None:
+            numbers = _cell_by_cell(block, header, header.row + 1 + start, path, gaps)
+        values[start : start + len(block)] = numbers
+    return values
+
+
+def _sound_block(block: list[str], header: Header) -> Array | None:
+    """Return the numbers of rows without any fault; None if there is one."""
+    if "" in block:  # np.loadtxt would skip an empty line without a word
+        return None
+    try:
+        numbers = np.loadtxt(block, delimiter=header.delimiter, comments=None, ndmin=2)
+    except ValueError:
+        return None
+    return numbers if numbers.shape[1] == len(header.names) and np.isfinite(numbers).all() else None
+
+
+def _cell_by_cell(block: list[str], header: Header, first_row: int, path: Path, gaps: GapPolicy) -> Array:
+    """Read row by row; name the first bad cell, or mark bad cells NaN where the policy treats gaps."""
+    values = np.empty((len(block), len(header.names)))
+    for k, line in enumerate(block):
+        cells = line.split(header.delimiter)
+        if len(cells) != len(header.names):
+            fault = _ragged(line, len(cells), len(header.names), header.delimiter)
+            raise RecordError(f"{path}, row {first_row + k}: {fault}")
+        for j, cell in enumerate(cells):
+            number = _number(cell)
+            if not np.isfinite(number):
+                fault = _faulty_cell(cell.strip(), gaps)
+                if fault:
+                    raise RecordError(f"{path}, row {first_row + k}, column {header.names[j]!r}: {fault}")
+                number = np.nan
+            values[k, j] = number
+    return values
+
+
+def _faulty_cell(text: str, gaps: GapPolicy) -> str:
+    """Say what is wrong with a cell that holds no finite number; nothing if it is a gap that the policy treats."""
+    if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", text):
+        return f"{text!r} has a decimal comma; numbers need a decimal point. Export again with a point"
+    if gaps != "error":
+        return ""
+    what = f"{text!r} is not a finite number" if text else "the value is missing"
+    return f"{what}; every cell must be one. Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
+
+
+def _ragged(line: str, got: int, wanted: int, delimiter: str) -> str:
+    """Say what is wrong with a row that has too many or too few cells."""
+    if not line.strip():
+        return "the line is empty; each line must be a row of data. Remove it"
+    if line.lstrip().startswith("#"):
+        return "a comment stands among the data; comments go before the header row. Move it"
+    other = [d for d in (",", ";", "\t") if d != delimiter and d in line]
+    if other and got == 1:
+        return f"the data are separated by {other[0]!r} but the header by {delimiter!r}. Use commas in both"
+    hint = "; if the numbers have decimal commas, export them with a point" if delimiter == "," and got > wanted else ""
+    cells = "cell" if got == 1 else "cells"
+    return (
+        f"{got} {cells} where the header names {wanted} columns{hint}. Correct the row, or remove it if it was cut off"
+    )
+
+
+def _number(cell: str) -> float:
+    """Return the number in a cell, NaN if it holds none."""
+    try:
+        return float("nan") if "_" in cell else float(cell)
+    except ValueError:
+        return float("nan")

@@ -19,8 +19,7 @@ import numpy as np
 
 from ambid.errors import RecordError
 from ambid.record._hdf5_file import new_hdf5
-from ambid.record.files import file_bytes, sha256_of
-from ambid.record.record import Channel, Record, Step
+from ambid.record.record import Channel, Record, Step, file_bytes, sha256_of
 from ambid.record.sampling import JITTER, GapPolicy, Table, check_gap_policy, sample_uniformly
 
 SCHEMA = "ambid.record/1"

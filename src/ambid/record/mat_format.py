@@ -17,8 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError
 from ambid.record.csv_format import column_channel
-from ambid.record.files import file_bytes, sha256_of
-from ambid.record.record import Record, Step
+from ambid.record.record import Record, Step, file_bytes, sha256_of
 from ambid.record.sampling import GapPolicy, Table, check_gap_policy, sample_uniformly
 from ambid.units import UNKNOWN, parse_unit
 

@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.predictor import scales_for
-from ambid.physics.discretise import DiscreteSpace, discretise
-from ambid.physics.linear_model import LinearModel, StateSpace
-from ambid.physics.models import model as model_named
+from ambid.physics.linear_model import DiscreteSpace, LinearModel, StateSpace, discretise
+from ambid.physics.linear_model import model as model_named
 from ambid.recursive.estimator import as_blocks, kernels
 from ambid.recursive.square_root import covariance_of, factors_of
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
 from ambid.estimation.estimate import Estimate, Judged
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import (
     WIDTH,

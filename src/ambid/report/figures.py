@@ -15,7 +15,7 @@ from ambid.bearing.magnet_result import Curve, Curves, NonlinearBearingEstimate
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.model import StateSpaceModel, pole_covariance
 from ambid.estimation.estimate import Estimate
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.report.drawing import (
     MEASURED,
     Pole,

@@ -14,7 +14,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.report.drawing import save
 from ambid.report.estimate_text import (
     curve_rows,

@@ -1,11 +1,9 @@
 """The rig file: what is known of a bench, and its records seen through that."""
 
-from ambid.rig.bench import bench_record, mat_variables, read_bench
 from ambid.rig.draft import draft_rig
-from ambid.rig.load import default_rig, load_rig, rig_from_text
+from ambid.rig.load import bench_record, default_rig, load_rig, mat_variables, read_bench, rig_from_text
 from ambid.rig.preset_rig import preset_text, rig_of_preset
-from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet
-from ambid.rig.write import rig_text, write_rig
+from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet, rig_text, write_rig
 
 __all__ = [
     "Daq",

@@ -7,11 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.models import model
+from ambid.physics.linear_model import LinearModel, model
 from ambid.record.record import Channel, Record
-from ambid.rig.load import OPTIONAL_ROLES, role_units
-from ambid.rig.write import toml_text
+from ambid.rig.rig import OPTIONAL_ROLES, role_units, toml_text
 from ambid.units import UNKNOWN, parse_unit
 
 _NAMES = {

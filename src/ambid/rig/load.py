@@ -1,28 +1,29 @@
-"""From a rig file to a rig: units become SI, the entries are checked against the model and each other."""
+"""From a rig file to a rig, and a record through its eyes.
+
+Units become SI, the entries are checked against the model and each other. Columns of a record become roles, calibrated,
+in the units that the model wants.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
-from ambid.errors import AmbidError, ModelError, RigError, nearest
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter, ParameterSpec
+from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
+from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
+from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
+from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
+from ambid.record import Channel, GapPolicy, Record, Step, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
-from ambid.rig._daq import daq_of
-from ambid.rig._known import magnet_of, parameter_of, unit_of
-from ambid.rig.rig import RecordSettings, Rig, RigChannel
+from ambid.rig.rig import DAQ_RATE_HZ, OPTIONAL_ROLES, Daq, RecordSettings, Rig, RigChannel, RigMagnet, role_units
+from ambid.units import UNKNOWN, Unit, parse_unit
 
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
-
-OPTIONAL_ROLES: Mapping[str, str] = MappingProxyType({"reference": "m", "speed": "rad/s", "angle": "rad"})
-"""Roles that every model may have beside its own, with their units: set point, speed and angle of a turning rotor."""
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -81,7 +82,7 @@ def default_rig(model_name: str = "one-axis") -> Rig:
     Parameters
     ----------
     model_name : str
-        One of :func:`ambid.physics.models.model_names`.
+        One of :func:`ambid.physics.linear_model.model_names`.
 
     Returns
     -------
@@ -100,14 +101,6 @@ def default_rig(model_name: str = "one-axis") -> Rig:
         channels=_default_channels(plant),
         parameters=tuple(_unnamed(spec) for spec in plant.parameters),
     )
-
-
-def role_units(plant: LinearModel) -> dict[str, str]:
-    """Return the roles that a rig of this model may name, with their SI units.
-
-    `plant`: a model. Returns its inputs, its outputs, and `OPTIONAL_ROLES`.
-    """
-    return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **OPTIONAL_ROLES}
 
 
 def _build(file: RigFile, path: Path) -> Rig:
@@ -297,3 +290,328 @@ def _noise(entry: NoiseEntry) -> Noise:
         current_resolution=entry.resolutions.current,
         voltage_resolution=entry.resolutions.voltage,
     )
+
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import DaqEntry
+
+_BAUD = (300, 12_000_000)
+_HOST_MS = (20, 2000)
+_LIFT_MS = (0, 2000)
+
+
+def daq_of(
+    entry: DaqEntry,
+    *,
+    channels: Sequence[RigChannel],
+    plant: LinearModel,
+    limits: Limits | None,
+    record_rate_hz: float | None,
+    where: str,
+) -> Daq:
+    """Check the entries of ``[daq]`` against each other and the rest of the rig.
+
+    `entry`: as written; `channels`: of the rig; `plant`: its model; `limits`: its limits, SI; `record_rate_hz`:
+    ``record.rate_hz``, the default of the rate, Hz; `where`: the file, for messages. Returns all numbers SI, counts or
+    ms.
+    """
+    place = f"{where}: daq"
+    if entry.duty is not None and not entry.duty[0] < entry.duty[1]:
+        raise RigError(f"{place}.duty is {list(entry.duty)}; the lower comes first. Swap or correct them")
+    if not _BAUD[0] <= entry.baud <= _BAUD[1]:
+        raise RigError(
+            f"{place}.baud is {entry.baud}; a serial line goes at {_BAUD[0]} to {_BAUD[1]} bit/s."
+            " Give the firmware's, 1000000"
+        )
+    for name, (low, high) in (("host_ms", _HOST_MS), ("lift_ms", _LIFT_MS)):
+        value = getattr(entry, name)
+        if not low <= value <= high:
+            raise RigError(f"{place}.{name} is {value}; the controller takes {low} to {high} ms. Correct it")
+    _check_third(entry.third, channels, plant, place)
+    return Daq(
+        rate_hz=entry.rate_hz or record_rate_hz or DAQ_RATE_HZ,
+        baud=entry.baud,
+        duty=entry.duty,
+        duty_off=entry.duty_off,
+        host_ms=entry.host_ms,
+        lift_ms=entry.lift_ms,
+        third=entry.third,
+        bench=entry.bench,
+        position_trip=_trip("position", entry.trip.position, limits, plant, place),
+        current_trip=_trip("current", entry.trip.current, limits, plant, place),
+    )
+
+
+def _check_third(third: str | None, channels: Sequence[RigChannel], plant: LinearModel, place: str) -> None:
+    """Refuse a third input under the name of a column that comes from elsewhere; speed or angle may come from it."""
+    elsewhere = {*plant.inputs, *plant.outputs, "reference"}
+    for c in channels:
+        if c.column == third and c.role in elsewhere:
+            raise RigError(
+                f"{place}.third is {third!r}, the column of channels.{c.role}, which comes otherwise. Give another name"
+            )
+
+
+def _trip(
+    role: Literal["position", "current"],
+    given: float | Interval | None,
+    limits: Limits | None,
+    plant: LinearModel,
+    place: str,
+) -> Interval | None:
+    """Return the interval of a trip, which has to lie inside the limits of the bench."""
+    if given is None:
+        return None
+    if role not in plant.outputs and role not in plant.inputs:
+        raise RigError(f"{place}.trip.{role} is given; model {plant.name!r} has no {role}. Remove it")
+    low, high = given if isinstance(given, tuple) else (-given, given)
+    if not low < high:
+        raise RigError(f"{place}.trip.{role} is [{low}, {high}]; the lower comes first. Swap or correct them")
+    least, most = UNLIMITED if limits is None else getattr(limits, role)
+    if low < least or high > most:
+        raise RigError(
+            f"{place}.trip.{role} is [{low}, {high}], outside loop.limits.{role} = [{least}, {most}]; the controller"
+            " must trip before the bench is at its limit. Narrow the trip, or correct the limit"
+        )
+    return low, high
+
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import MagnetEntry, ParameterEntry
+
+_EXPONENTIAL, _HYPERBOLIC = ("L_g", "zeta"), ("k", "s")
+
+
+def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
+    """Convert one parameter to SI and check it against what it is.
+
+    `spec`: what it is; `entry`: as written; `place`: where it stands, for messages. Returns SI.
+    """
+    unit = None
+    if entry.unit is not None:
+        unit = unit_of(entry.unit, f"{place}.unit")
+        if unit.si != parse_unit(spec.unit).si:
+            raise RigError(
+                f"{place} ({spec.meaning}) is in [{entry.unit}]; it is measured in [{spec.unit}]. Correct unit"
+            )
+    elif entry.value is not None:
+        raise RigError(f'{place} has a value but no unit. Give unit, e.g. unit = "{spec.unit}"')
+    if entry.role != "free" and entry.value is None:
+        raise RigError(f'{place} is {entry.role} but has no value. Give value, or set role = "free"')
+    if entry.role == "prior" and (entry.sd is None or entry.sd <= 0):
+        got = "no sd" if entry.sd is None else f"sd = {entry.sd}"
+        raise RigError(f"{place} is a prior with {got}; it needs a positive standard deviation. Give sd")
+    if entry.role != "prior" and entry.sd is not None:
+        raise RigError(f'{place} is {entry.role} but has an sd. Remove sd, or set role = "prior"')
+    if spec.positive and entry.value is not None and entry.value <= 0:
+        raise RigError(f"{place} ({spec.meaning}) is {entry.value} {entry.unit}; it must be positive. Correct value")
+    value = unit.to_si(entry.value) if unit is not None and entry.value is not None else None
+    sd = unit.to_si(entry.sd) if unit is not None and entry.sd is not None else None
+    return Parameter(name=spec.name, unit=spec.unit, role=entry.role, value=value, sd=sd)
+
+
+def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
+    """Check ``[magnet]`` against the model and itself.
+
+    `entry`: as written; `plant`: the rig's model; `where`: the file, for messages. Returns SI.
+    """
+    if plant.name != "one-axis":
+        raise RigError(
+            f"{where}: [magnet] is given; model {plant.name!r} has no nonlinear magnet. Remove it, or take 'one-axis'"
+        )
+    specs = {spec.name: spec for spec in BEARING_NUMBERS}
+    for name, given in entry.parameters.items():
+        place = f"{where}: magnet.parameters.{name}"
+        if name in ("m", "R", "c"):
+            raise RigError(f"{place} is the linear model's too. Write it in [parameters]")
+        if name not in specs:
+            raise RigError(
+                f"{where}: unknown parameter {name!r} in [magnet.parameters]; a magnet has {', '.join(specs)}."
+                f"{nearest(name, list(specs))}"
+            )
+        if name in NOT_NEGATIVE and given.value is not None and not _allowed(given.value, given.role):
+            rule = "must not be negative" if given.value < 0 else "must be positive unless it is fixed"
+            raise RigError(f"{place} ({specs[name].meaning}) is {given.value} {given.unit}; it {rule}. Correct value")
+    known = tuple(parameter_of(specs[n], p, f"{where}: magnet.parameters.{n}") for n, p in entry.parameters.items())
+    try:
+        return RigMagnet(
+            kind=entry.kind,
+            gap=_gap(entry, where),
+            asymmetric=entry.asymmetric,
+            saturation=entry.saturation,
+            rise=entry.rise,
+            eddy=entry.eddy,
+            drift=entry.drift,
+            off_below=entry.off_below,
+            parameters=known,
+        )
+    except RigError as error:
+        raise RigError(f"{where}: {error}") from None
+
+
+def _allowed(value: float, role: str) -> bool:
+    """The search moves the logarithm: a zero has to be fixed."""
+    return value > 0 or (value == 0 and role == "fixed")
+
+
+def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"] | None:
+    """The gap law, which numbers may tell too."""
+    told: list[Literal["hyperbolic", "exponential"]] = []
+    told += ["hyperbolic"] if any(n in entry.parameters for n in _HYPERBOLIC) else []
+    told += ["exponential"] if any(n in entry.parameters for n in _EXPONENTIAL) else []
+    if len(told) == 2:
+        raise RigError(
+            f"{where}: [magnet.parameters] names numbers of both gap laws (k, s and L_g, zeta). Leave one pair out"
+        )
+    return entry.gap or (told[0] if told else None)
+
+
+def unit_of(text: str, place: str) -> Unit:
+    """Read a unit of a rig file.
+
+    `text`, `place`: the unit, and where it stands, for messages.
+    """
+    try:
+        return parse_unit(text)
+    except UnitError as error:
+        raise RigError(f"{place}: {error}") from None
+
+
+def read_bench(path: str | Path, rig: Rig, *, rate_hz: float | None = None, gaps: GapPolicy | None = None) -> Record:
+    """Read a record file as the rig says, and name its columns by their roles.
+
+    Parameters
+    ----------
+    path : str or Path
+        The record.
+    rig : Rig
+        Its `record` settings are used where the arguments do not override them; ``record.from`` and ``to`` are left to
+        the caller, who knows of other ones.
+    rate_hz : float, optional
+        Sampling rate in Hz.
+    gaps : {"error", "interpolate", "cut"}, optional
+        What to do about gaps.
+
+    Returns
+    -------
+    Record
+        As :func:`bench_record` gives it.
+
+    Raises
+    ------
+    AmbidError
+        If the file or its columns break a rule.
+    """
+    record = read_record(
+        path,
+        rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz,
+        gaps=gaps or rig.record.gaps or "error",
+        variables=mat_variables(rig) if Path(path).suffix.lower() == ".mat" else None,
+    )
+    return bench_record(record, rig)
+
+
+def mat_variables(rig: Rig) -> dict[str, tuple[str, str]]:
+    """Return which variable of a ``.mat`` file is which column, for :func:`ambid.record.read_record`.
+
+    Parameters
+    ----------
+    rig : Rig
+        With ``channels.<role>.variable`` and ``unit``.
+
+    Returns
+    -------
+    dict of str to (str, str)
+        Column name to (variable, unit); the unit is ``"?"`` where the rig gives none. ``time`` stands in it if the rig
+        names a time variable.
+    """
+    variables = {c.column: (c.variable or c.column, c.unit or UNKNOWN) for c in rig.channels}
+    if rig.record.time is not None:
+        variables["time"] = rig.record.time
+    return variables
+
+
+def bench_record(record: Record, rig: Rig) -> Record:
+    """Select the rig's columns, check their units, calibrate them and name them by their roles.
+
+    Parameters
+    ----------
+    record : Record
+        As read from a file: columns by name, SI units.
+    rig : Rig
+        Which column is which role, and its calibration.
+
+    Returns
+    -------
+    Record
+        Channels named by role, in the rig's order, in the units of the model; the history says what was done.
+
+    Raises
+    ------
+    RecordError
+        If a column is missing.
+    UnitError
+        If a column's unit is missing or unknown, or is not the role's and no gain or table turns it into that.
+    """
+    wanted = role_units(model(rig.model))
+    for c in rig.channels:
+        if c.column not in record.names:
+            raise RecordError(
+                f"the record has no column {c.column!r} (wanted by channels.{c.role}); it has"
+                f" {', '.join(record.names)}."
+                f"{nearest(c.column, record.names)} Correct channels.{c.role}.column"
+            )
+    found = {c.role: _in_declared_unit(record.channel(c.column), c) for c in rig.channels}
+    _refuse_swapped(found, wanted, rig)
+    channels, steps = [], []
+    for c in rig.channels:
+        channel, step = _calibrated(found[c.role], c, wanted[c.role])
+        channels.append(replace(channel, name=c.role))
+        steps += [step] if step else []
+    columns = MappingProxyType({c.role: c.column for c in rig.channels})
+    history = (*record.history, *steps, Step(name="select", settings=columns))
+    return replace(record, channels=tuple(channels), history=history)
+
+
+def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
+    """Apply channels.<role>.unit, which says in what unit the column was written, whatever its header says."""
+    if c.unit is not None and c.unit != channel.source_unit:
+        raw = channel.values
+        if channel.unit != UNKNOWN:
+            raw = raw / parse_unit(channel.source_unit).scale
+        declared = parse_unit(c.unit)
+        return Channel(name=channel.name, unit=declared.si, values=declared.to_si(raw), source_unit=declared.symbol)
+    if channel.unit == UNKNOWN:
+        unknown = channel.source_unit != UNKNOWN
+        what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
+        raise UnitError(
+            f"column {channel.name!r} {what} (wanted by channels.{c.role}). Write '{channel.name} [unit]' in the header"
+            f" ([1] for a plain number), or give channels.{c.role}.unit"
+        )
+    return channel
+
+
+def _refuse_swapped(found: dict[str, Channel], wanted: dict[str, str], rig: Rig) -> None:
+    """Refuse two columns each of which has exactly the unit of the other's role."""
+    plain = [c.role for c in rig.channels if c.calibration is None and found[c.role].unit != wanted[c.role]]
+    for a in plain:
+        for b in plain:
+            if a != b and found[a].unit == wanted[b] and found[b].unit == wanted[a]:
+                raise UnitError(
+                    f"swapped columns? channels.{a} is column {found[a].name!r} in [{found[a].unit}] and channels.{b}"
+                    f" is column {found[b].name!r} in [{found[b].unit}]. Swap the two, or fix the header"
+                )
+
+
+def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, Step | None]:
+    """Return the channel in the role's unit, and the line for the history if it was calibrated."""
+    if c.calibration is None:
+        if channel.unit != unit:
+            raise UnitError(
+                f"column {channel.name!r} is in [{channel.source_unit}]; the rig wants a {c.role} in [{unit}]."
+                f" Fix the header, or give channels.{c.role}.gain or table"
+            )
+        return channel, None
+    # A gain is per SI unit of whatever the column is in, so its input unit is known only now.
+    calibration = c.calibration if c.calibration.unit_in else replace(c.calibration, unit_in=channel.unit)
+    return calibration.apply(channel), calibration.step(c.column)

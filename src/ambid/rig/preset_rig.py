@@ -7,13 +7,11 @@ from pathlib import Path
 
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.coenergy_law import law_numbers
+from ambid.physics.linear_model import Parameter, model
 from ambid.physics.magnet import CoEnergy
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.parameters import Parameter
 from ambid.physics.presets import Preset
-from ambid.rig.rig import RecordSettings, Rig, RigChannel, RigMagnet
-from ambid.rig.write import rig_text
+from ambid.rig.rig import RecordSettings, Rig, RigChannel, RigMagnet, rig_text
 
 _FIXED = frozenset({"m", "c", "g", "i0"})  # what is weighed or set on a bench; the rest is to be found
 

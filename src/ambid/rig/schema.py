@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from ambid.errors import RigError, nearest
-from ambid.record.files import file_bytes, utf8_text
+from ambid.record.record import file_bytes, utf8_text
 
 SCHEMA = "ambid.rig/1"
 

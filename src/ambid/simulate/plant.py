@@ -14,12 +14,10 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.coenergy_law import law_numbers
-from ambid.physics.discretise import discretise
 from ambid.physics.law_magnet import LawMagnet
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop
 from ambid.physics.magnet import CoEnergy
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 
 Equations = tuple[Array, Array, Array, Array] | tuple[Array, Array, tuple[float, float, int]]
@@ -32,7 +30,7 @@ class LinearPlant:
     Attributes
     ----------
     model : LinearModel
-        One of `ambid.physics.models.model`.
+        One of `ambid.physics.linear_model.model`.
     parameters : Mapping[str, float]
         All of the model's parameters in SI units.
     """

@@ -17,8 +17,8 @@ from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import IDEAL, PowerStage
 from ambid.physics.presets import Preset

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, nearest
-from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import LinearModel
+from ambid.physics.linear_model import LinearModel, discretise
 from ambid.simulate.plant import Equations
 
 _PER_TIME_CONSTANT = 50  # corners of a warm-up: the lines leave the exponential by 5e-5 of its rise at most

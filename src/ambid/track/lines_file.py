@@ -16,7 +16,7 @@ from typing import Any, Self, TextIO, TypeVar
 
 from ambid.errors import AmbidError, RecordError
 from ambid.estimation.estimate import fields_json, plain_json, read_as
-from ambid.record.files import file_bytes
+from ambid.record.record import file_bytes
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 
 T = TypeVar("T")

@@ -22,9 +22,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.predictor import NoiseForm, PredictorProblem, Scales, assemble, predictor_gain, scales_for
-from ambid.physics.discretise import discretise
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.models import model
+from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.sensor_gain import SensorGains
 from ambid.record import Record
 

@@ -22,7 +22,7 @@ from ambid.estimation.likelihood import (
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.validate.physical import innovation_products, innovation_tests
 from ambid.validate.residuals import fit_of, residual_check
 

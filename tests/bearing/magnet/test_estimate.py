@@ -10,7 +10,7 @@ from ambid.bearing.magnet_estimate import balance, estimate_bearing
 from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.validate.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, problem_of, unstable
 

@@ -9,7 +9,7 @@ from ambid.bearing.magnet_estimate import estimate_bearing
 from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.coenergy_law import MagnetLaw
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.physics.power_stage import PowerStage
 from ambid.physics.presets import preset
 from ambid.validate.nonlinear_bearing import whiteness

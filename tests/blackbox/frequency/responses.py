@@ -7,9 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ambid.physics.discretise import discretise
-from ambid.physics.models import model
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter, discretise, model
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.signals.periodic_response import frf_periodic

@@ -8,7 +8,7 @@ import pytest
 from ambid.bearing.frequency import Channels, greybox_frf, response
 from ambid.blackbox.frequency import Lines
 from ambid.errors import EstimationError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from tests.blackbox.frequency.responses import RATE, closed_loop, continuous, extrapolated, free, noisy, plant
 

@@ -13,7 +13,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.polynomial import missed_minimum
 from ambid.blackbox.polynomial_predictor import Layout, predictor, scale_data
 from ambid.blackbox.polynomial_search import search, separable_starts, starts
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from tests.bearing.benches import BEARING, run
 from tests.blackbox.polynomial.systems import SYSTEMS, record
 

@@ -14,7 +14,7 @@ from ambid.blackbox.fit import structure
 from ambid.blackbox.model import pole_covariance, response_covariance
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
 from ambid.errors import EstimationError
-from ambid.physics.discretise import discretise
+from ambid.physics.linear_model import discretise
 from tests.bearing.benches import run
 from tests.blackbox.subspace.systems import COLOURED, DT, SERIES, UNSTABLE, modal, record
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from ambid.acquire.scales import ADC_TOP, Scale, scale_of
 from ambid.acquire.settings import has_position
 from ambid.errors import DeviceError, nearest
+from ambid.physics.linear_model import model
 from ambid.physics.magnet import CoEnergy, DifferentialPair
-from ambid.physics.models import model
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset, preset, preset_names

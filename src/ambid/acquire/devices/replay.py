@@ -14,10 +14,9 @@ import numpy as np
 from ambid.acquire.device import Column, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquire.devices.played import Pace, PlayedDevice
 from ambid.errors import DeviceError, RecordError
-from ambid.physics.models import model
+from ambid.physics.linear_model import model
 from ambid.record import Record, read_rows
-from ambid.rig.load import role_units
-from ambid.rig.rig import Rig
+from ambid.rig.rig import Rig, role_units
 from ambid.track.blocks import Block
 from ambid.track.replay import Replay, blocks_of
 from ambid.units import UNKNOWN
