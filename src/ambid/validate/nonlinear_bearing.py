@@ -13,6 +13,7 @@ from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, B
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
+from ambid.estimation.linear import triangle_of
 from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validate.second_record import conclude, consistency_check
 
@@ -48,22 +49,27 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     outputs = (1,) if fit.problem.records[r].held else (0, 1)
     n, first = found.e.shape[0], fit.problem.skip
     white = np.nan_to_num(found.e[:, outputs] / np.sqrt(found.s[:, outputs]))
-    begin = first + max(*_LAGS, *_INPUT_LAGS)
-    lagged = np.hstack([white[begin - k : n - k] for k in _LAGS])
-    u = fit.problem.records[r].u
-    inputs = np.column_stack([u[begin - k : n - k] for k in _INPUT_LAGS])
-    target, groups = white[begin:], [x - x.mean(axis=0) for x in (lagged, inputs)]
-    triangles: list[list[Array]] = [[], []]
+    begin, u = first + max(*_LAGS, *_INPUT_LAGS), fit.problem.records[r].u[:, None]
+    past = [(white, k) for k in _LAGS] + [(u, k) for k in _INPUT_LAGS]
+    mean = np.concatenate([x[begin - k : n - k].mean(axis=0) for x, k in past])
+    target, n_own = white[begin:], len(outputs) * len(_LAGS)
+    triangles: list[list[Array]] = [[] for _ in outputs]
     for part in sweep(fit.problem, fit.vector, r, found, slopes=True):
         assert part is not None
-        late = max(begin - part.first, 0)
-        slopes = part.rows[late:, [2 * c for c in outputs], :-1]
-        at = slice(part.first + late - begin, part.first + late - begin + len(slopes))
-        for own_triangles, x in zip(triangles, groups, strict=True):
-            own_triangles.append(joint_triangle(slopes, target[at], x[at]))
-    own, by_input = (score_of(x, slopes.shape[2])[0] for x in triangles)
+        at = max(begin, part.first)
+        slopes = part.rows[at - part.first :, [2 * c for c in outputs], :-1]
+        end = at + len(slopes)
+        regressors = np.hstack([x[at - k : end - k] for x, k in past]) - mean
+        for o, blocks in enumerate(triangles):
+            blocks.append(triangle_of([np.column_stack([slopes[:, o], regressors, white[at:end, o]])]))
+    whole, p = np.stack([triangle_of([np.vstack(blocks)]) for blocks in triangles], axis=1), slopes.shape[2]
+    own, by_input = (
+        score_of(joint_triangle(whole[..., :p], whole[..., -1], whole[..., which]), p)
+        for which in (slice(p, p + n_own), slice(p + n_own, -1))
+    )
     spread = np.std(target, axis=0)
-    correlation = np.abs(lagged.T @ target) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
+    products = np.vstack([white[begin - k : n - k].T @ target for k in _LAGS])
+    correlation = np.abs(products) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
     rms = [float(np.sqrt(np.nanmean(found.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
     return WhitenessTest(
         p=min(1.0, 2.0 * min(own, by_input)), p_own=own, p_input=by_input, largest=float(correlation.max()),

@@ -160,23 +160,22 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
 def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
     """Return the triangle of a test whether regressors explain any of several residuals of unit variance.
 
-    `slopes`: (n_used, n_outputs, n_directions); `residuals`: (n_used, n_outputs); `regressors`: (n_used,
-    n_regressors). Of part of the samples: not all have to be held at once.
+    `slopes`: (n_rows, n_outputs, n_directions); `residuals`: (n_rows, n_outputs); `regressors`: (n_rows, n_outputs,
+    n_regressors). Rows are samples, or those of each output's triangle of [slopes, regressors, residual].
     """
-    (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[1]
+    (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[2]
     rows = np.zeros((n, n_y, p + n_y * width + 1))
     rows[:, :, :p], rows[:, :, -1] = slopes, residuals
     for o in range(n_y):
-        rows[:, o, p + o * width : p + (o + 1) * width] = regressors
+        rows[:, o, p + o * width : p + (o + 1) * width] = regressors[:, o]
     return triangle_of([rows.reshape(n * n_y, -1)])
 
 
-def score_of(triangles: Sequence[Array], n_directions: int) -> tuple[float, float, int]:
-    """Return p of a test, its statistic and its degrees of freedom, from the triangles of all samples."""
-    L, rest, _ = _project(triangle_of([np.vstack(triangles)]), n_directions)
+def score_of(triangle: Array, n_directions: int) -> float:
+    """Return p of a test from the triangle of all samples, see `joint_triangle`."""
+    L, rest, _ = _project(triangle, n_directions)
     _, z = _explain(L, rest @ L, _SAME)
-    statistic = float(z @ z)
-    return (chi_squared_tail(z.size, statistic) if z.size else 1.0), statistic, z.size
+    return chi_squared_tail(z.size, float(z @ z)) if z.size else 1.0
 
 
 def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array | None) -> Score:
