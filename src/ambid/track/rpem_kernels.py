@@ -24,27 +24,6 @@ _MOST = 0.5  # part of a positive number by which one block may lower it
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def _step(M: Array, D: Array, s: Array, w: Array, f: Array) -> None:
-    """Fill f with what w makes of state, sensitivities and weighted innovations; see `advance`."""
-    (n_x, width), high = s.shape, f.shape[0]
-    for i in range(high):
-        for q in range(width):
-            f[i, q] = M[i, 0] * s[0, q]
-        for j in range(1, n_x):
-            v = M[i, j]
-            for q in range(width):
-                f[i, q] += v * s[j, q]
-    for c in range(w.size):
-        v = w[c]
-        for i in range(n_x):
-            for q in range(width - 1):
-                f[i, q] += v * D[c, i, q]
-        if c >= n_x:
-            for i in range(high):
-                f[i, width - 1] += v * M[i, c]
-
-
-@compiled(error_model="numpy", fastmath={"contract"})
 def advance(
     first: int, u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array,
     s: Array, rows: Array, counts: Integers, unit: Array, errors: Array, w: Array, f: Array,
@@ -60,7 +39,7 @@ def advance(
     block, samples still to settle, samples of a block. `w` (n_l,) and `f` (n_x + n_y, p + 1) are scratch.
     """
     n_x, n_u, n_y, p = s.shape[0], u.shape[1], y.shape[1], s.shape[1] - 1
-    depth, n_f, room = history.shape[0], forcing.shape[1], rows.shape[1]
+    depth, n_f, room, high, n_l = history.shape[0], forcing.shape[1], rows.shape[1], f.shape[0], w.size
     for k in range(first, y.shape[0]):
         now, column, total = counts[0], n_x, 0.0
         for j in range(n_u):
@@ -83,7 +62,21 @@ def advance(
         counts[0] = (now + 1) % depth
         for j in range(n_x):
             w[j] = s[j, p]
-        _step(M, D, s, w, f)
+        for i in range(high):
+            for q in range(p + 1):
+                f[i, q] = M[i, 0] * s[0, q]
+            for j in range(1, n_x):
+                v = M[i, j]
+                for q in range(p + 1):
+                    f[i, q] += v * s[j, q]
+        for c in range(n_l):
+            v = w[c]
+            for i in range(n_x):
+                for q in range(p):
+                    f[i, q] += v * D[c, i, q]
+            if c >= n_x:
+                for i in range(high):
+                    f[i, p] += v * M[i, c]
         r, settled = counts[1], counts[3] == 0
         for i in range(n_y):
             v = 0.0
