@@ -336,7 +336,7 @@ class Predictor:
             yield max(k * m, self.first_row), w[:, :n]
 
     def rows(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
-        """Return the gradients and, last, the residual from `first_row` on; complex where the coefficients are."""
+        """Return the gradients and, last, the residual from `first_row` on."""
         w, n, _ = next(self._blocks(y, u, self.coefficients(theta, nuisance), y.size))
         return w[:, :n]
 

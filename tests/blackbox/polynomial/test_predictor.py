@@ -30,9 +30,11 @@ def case(layout: Layout, n: int = 160) -> tuple[np.ndarray, ...]:
     return rng.standard_normal(n), rng.standard_normal((layout.n_inputs, n)), theta, rng.standard_normal(p.n_nuisance)
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
-def test_gradients_agree_with_fourth_differences(name: str) -> None:
-    layout = LAYOUTS[name]
+AT_REST = Layout(na=1, nb=(2,), nc=2, nd=1, nf=(2,), nk=(1,), at_rest=True)
+
+
+@pytest.mark.parametrize("layout", [*LAYOUTS.values(), AT_REST], ids=[*LAYOUTS, "at rest"])
+def test_gradients_agree_with_fourth_differences(layout: Layout) -> None:
     p, (y, u, theta, nuisance) = predictor(layout), case(layout)
     rows = p.rows(y, u, theta, nuisance)
     vector = np.concatenate([nuisance, theta])

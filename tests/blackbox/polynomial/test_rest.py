@@ -55,21 +55,6 @@ def test_arx_is_least_squares_on_all_samples() -> None:
     np.testing.assert_allclose(fit.covariance[np.ix_(use, use)], expected, rtol=1e-7)
 
 
-def test_gradients_are_exact() -> None:
-    rng = np.random.default_rng(3)
-    layout = Layout(na=1, nb=(2,), nc=2, nd=1, nf=(2,), nk=(1,), at_rest=True)
-    p, theta = predictor(layout), layout.start()
-    theta[layout.free] = 0.3 * rng.standard_normal(layout.free.size)
-    y, u = rng.standard_normal(80), rng.standard_normal((1, 80))
-    rows = p.rows(y, u, theta, np.zeros(0))
-    assert rows.shape == (layout.free.size + 1, 80)
-    for k, place in enumerate(layout.free):
-        moved = theta.astype(complex)
-        moved[place] += 1e-30j
-        step = p.rows(y, u, moved, np.zeros(0))[-1].imag / 1e-30
-        np.testing.assert_allclose(rows[k], step, rtol=1e-9, atol=1e-12)
-
-
 @pytest.mark.parametrize("name", ["armax", "oe", "bj"])
 def test_short_records_reach_the_cramer_rao_bound(name: str) -> None:
     system, n, runs = SYSTEMS[name], 120, 150
