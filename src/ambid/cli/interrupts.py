@@ -7,8 +7,10 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from threading import current_thread, main_thread
 from types import FrameType
+from typing import TYPE_CHECKING
 
-from ambid.estimation.estimate import Tick
+if TYPE_CHECKING:
+    from ambid.estimation.estimate import Tick
 
 INTERRUPTED = 130  # exit code
 
