@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import pytest
 
-from ambid.estimation.estimate import guessed, part_of, portions, silent
+from ambid.estimation.progress import guessed, part_of, portions, silent
 
 
 def test_parts_count_from_nothing_to_all_and_make_up_the_whole() -> None:

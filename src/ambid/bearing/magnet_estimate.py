@@ -28,10 +28,10 @@ from ambid.bearing.multistart import Signals
 from ambid.bearing.rescue import EVALUATIONS as LINEAR_EVALUATIONS
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, portions
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import noise_floor
+from ambid.estimation.progress import Tick, portions
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import OneAxis, Parameter
 

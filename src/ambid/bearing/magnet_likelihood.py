@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
-from ambid.estimation.estimate import Tick
 from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.progress import Tick
 from ambid.estimation.search import Status
 
 _BATCHES = 30  # stretches of all records together for the robust covariance

@@ -11,9 +11,9 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
 from ambid.bearing.rescue import FAR, PAST, look_elsewhere
-from ambid.estimation.estimate import Tick, silent
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.predictor import noise_floor
+from ambid.estimation.progress import Tick, silent
 from ambid.estimation.uncertainty import explained_by_past
 
 _ITERATIONS = 15  # iterations from each place found

@@ -34,10 +34,10 @@ from ambid.bearing.multistart import (
     fixed_values,
     race,
 )
-from ambid.estimation.estimate import Tick, silent
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.likelihood import Fit, evaluate, search
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
+from ambid.estimation.progress import Tick, silent
 from ambid.estimation.sensitivity import Workspace, innovations
 from ambid.estimation.uncertainty import explained_by_past
 from ambid.physics.linear_model import LinearModel, Parameter

@@ -10,7 +10,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from ambid.estimation.estimate import Tick
+    from ambid.estimation.progress import Tick
 
 INTERRUPTED = 130  # exit code
 

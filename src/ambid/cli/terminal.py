@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import TaskID
 
-    from ambid.estimation.estimate import Tick
+    from ambid.estimation.progress import Tick
     from ambid.report.text import Paint, Style
 
 _PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
@@ -70,7 +70,7 @@ def progress(title: str) -> Iterator[Tick]:
     over where it is known.
     """
     if not sys.stderr.isatty():
-        from ambid.estimation.estimate import silent  # only a run wants it: help needs no NumPy
+        from ambid.estimation.progress import silent
 
         yield silent
         return
@@ -108,7 +108,7 @@ class _Display:
         if done is not None:
             self._told = True
         elif self._count >= _FEWEST and not self._told:
-            from ambid.estimation.estimate import guessed
+            from ambid.estimation.progress import guessed
 
             done = guessed(self._count, _EXPECTED)
         self._share = max(self._share, min(done or 0.0, 1.0))

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Tick, silent
+from ambid.estimation.progress import Tick, silent
 
 STAGE = "global search"
 _MUTATION = (0.5, 1.0)  # factor of the difference vectors, drawn anew for each generation

@@ -17,8 +17,8 @@ from typing import Literal, Protocol
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Tick, guessed
 from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.progress import Tick, guessed
 
 Status = Literal["converged", "stalled", "failed"]
 

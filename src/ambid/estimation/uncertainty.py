@@ -35,8 +35,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.estimate import Tick
 from ambid.estimation.linear import BLIND, directions, information_inverse, least_squares, triangle_of
+from ambid.estimation.progress import Tick
 
 CRITERIA: tuple[str, ...] = ("ebic", "bic", "mdl", "aic", "aicc", "fpe", "lilc")
 EXACT = 1e-26  # part of the output's energy below which nothing is left to explain

@@ -14,7 +14,7 @@ import numpy as np
 
 from ambid.bearing.magnet_problem import BearingRecord, touching
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick
+from ambid.estimation.progress import Tick
 from ambid.job.data import Reading, Source, known_rig, load, origin
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter

@@ -19,7 +19,8 @@ from ambid.acquire.device import Device
 from ambid.acquire.recording import Acquired, Listeners, acquire
 from ambid.acquire.session import Course
 from ambid.errors import AmbidError
-from ambid.estimation.estimate import Estimate, Tick, silent
+from ambid.estimation.estimate import Estimate
+from ambid.estimation.progress import Tick, silent
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Step, StepName, Wishes
 from ambid.job.data import load

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any, Unpack, get_args
 
 from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
 from ambid.errors import EstimationError, nearest, refuse_given
-from ambid.estimation.estimate import Tick, guessed, part_of, silent
 from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, guessed, part_of, silent
 from ambid.job.data import Channels, Clock, Columns, Source, check_same_bench, known_rig
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model

@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Any, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate, Tick, silent
+from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, rig_entry, signals_of
 from ambid.physics.linear_model import model
 from ambid.record import Record

@@ -16,8 +16,8 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, silent
 from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Channels, Clock, Columns, Source
 from ambid.physics.linear_model import model
 from ambid.rig import Rig

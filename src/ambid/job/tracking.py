@@ -12,8 +12,9 @@ from typing import Any, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate, Tick, silent
+from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Reading, Source, known_rig
 from ambid.job.following import EstimatorWords, Following, TrackWords, check_settings
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of

@@ -17,8 +17,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, portions
 from ambid.estimation.linear import least_squares
+from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.nonlinear.blocks import Block, Mask, Table, Terms
 from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit

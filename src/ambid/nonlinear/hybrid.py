@@ -26,8 +26,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, guessed, part_of, portions
 from ambid.estimation.linear import information_inverse
+from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import penalty
 from ambid.nonlinear.blocks import Block, Linear, Table, Tanh

@@ -16,8 +16,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.estimate import Tick, portions
 from ambid.estimation.linear import information_inverse, least_squares, triangle_of
+from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.blocks import Mask

@@ -19,9 +19,10 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.model import reflect, roots_of
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.estimate import Tick, plain_json, portions
+from ambid.estimation.estimate import plain_json
 from ambid.estimation.linear import information_inverse, triangle_of
 from ambid.estimation.linear import least_squares as solve
+from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import information
 from ambid.nonlinear.cloud import cloud_of

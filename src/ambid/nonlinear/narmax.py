@@ -16,7 +16,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, part_of, portions
+from ambid.estimation.progress import Tick, part_of, portions
 from ambid.nonlinear.blocks import Terms
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged import Rows

@@ -28,8 +28,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, guessed, part_of
 from ambid.estimation.linear import least_squares
+from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import CRITERIA, information, penalty
 from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, problem_at

@@ -20,7 +20,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, portions
+from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import bootstrapped
 from ambid.nonlinear.blocks import Block, Linear, Tanh

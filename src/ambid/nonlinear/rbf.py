@@ -28,8 +28,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, portions
 from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.progress import Tick, portions
 from ambid.nonlinear.blocks import Block, Linear, Radial
 from ambid.nonlinear.fit import NO_WEIGHTS, LearningCurve, NonlinearFit, Settings, failed_fit
 from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags

@@ -19,10 +19,10 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Tick, guessed, silent
 from ambid.estimation.global_search import STAGE, GlobalFound, global_search
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.predictor import noise_floor
+from ambid.estimation.progress import Tick, guessed, silent
 from ambid.nonlinear.fit import LearningCurve
 from ambid.nonlinear.records import Parts, Scaled
 from ambid.nonlinear.state_network import ONE_AXIS, Layout

@@ -14,8 +14,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.estimate import Tick, part_of, portions
 from ambid.estimation.linear import information_inverse
+from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped, explained_by_past
 from ambid.nonlinear.cloud import cloud_of
