@@ -123,11 +123,11 @@ class _Display:
         with _bar(40) as bar:
             task = bar.add_task(self._stage, total=None, text="")
             while not self._done.wait(0.1):
-                left, text = bar.tasks[0].time_remaining, f"{time.monotonic() - self._begin:.0f} s"
-                text += f", {100 * self._share:.0f} %" if self._told else ""
-                text += "" if left is None else f", {in_words(left)}"
-                total = 1.0 if self._share else None
-                bar.update(task, total=total, completed=self._share, description=self._stage, text=text)
+                elapsed, share = time.monotonic() - self._begin, self._share
+                text = f"{elapsed:.0f} s" + (f", {100 * share:.0f} %" if self._told else "")
+                text += f", {in_words(elapsed * (1.0 - share) / share)}" if share else ""
+                total = 1.0 if share else None
+                bar.update(task, total=total, completed=share, description=self._stage, text=text)
 
 
 def in_words(seconds: float) -> str:
