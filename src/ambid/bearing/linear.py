@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.columns import refuse_mistaken, refuse_silent, refuse_units
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
@@ -96,17 +97,22 @@ def _greybox(
     def follow(candidates: Sequence[Candidate]) -> Fit:
         return _follow(candidates, tick, noise, search_delay=delay == "auto")
 
+    refuse_silent(model, signals)
     try:
         candidates = starts(model, signals, parameters, delay, tick=tick)
     except EstimationError as failure:
+        refuse_mistaken(model, signals, parameters, delay, (), follow)
+        refuse_units(model, signals, parameters, delay, follow)
         fit = rescue(None, str(failure), model, signals, parameters, delay, how, follow, tick)
         if fit is None:
             raise
         return fit
+    refuse_mistaken(model, signals, parameters, delay, candidates, follow)
     start_s = perf_counter() - begun
     fit = follow(candidates)
     why = reason(fit) if how.evaluations else ""
     if why:
+        refuse_units(model, signals, parameters, delay, follow)
         fit = rescue(fit, why, model, signals, parameters, delay, how, follow, tick) or fit
     return replace(fit, start_s=start_s)
 

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import compress
 from typing import Literal
 
 import numpy as np
@@ -339,12 +340,17 @@ def _coarse(
     ]
     if not possible:
         return []
-    scales = all_scales(model, [values for _, values, _ in possible], spread, floor, centred.rate_hz)
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):  # of a plant that explodes within a sample
+        scales = all_scales(model, [values for _, values, _ in possible], spread, floor, centred.rate_hz)
+    finite = [bool(np.all(np.isfinite(own.disturbance))) for own in scales]
+    possible, scales = list(compress(possible, finite)), list(compress(scales, finite))
     skip = int(max(delays)) + 2
     problems = [
         candidate_problem(model, part, parameters, sizes, own, d, skip)
         for (d, _, sizes), own in zip(possible, scales, strict=True)
     ]
+    if not problems:
+        return []
     vectors = [_vector(problem, values) for problem, (_, values, _) in zip(problems, possible, strict=True)]
     found, work = list[Candidate](), Workspace(problems[0])
     for problem, vector, predictor in zip(problems, vectors, assemble_all(problems, vectors), strict=True):

@@ -5,6 +5,7 @@ Read -> cut -> identify -> validate. Each arrow is one call below; what a step d
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,7 @@ from ambid.rig import Rig
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
+    from ambid.bearing.multistart import Signals
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
     from ambid.job.bearing_records import BearingWords, TakenRecord
@@ -126,6 +128,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
     checks |= physical.assumption_checks(fit, known, delay_how)
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
+    if problem.model.name == "one-axis":
+        checks["units"] = _units(fit, rig, signals_of(bench, problem.model), doubt=not checks["fixed_agree"].passed)
     y, error = problem.y[problem.skip :], simulation_error(fit)
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
@@ -134,6 +138,27 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     return replace(estimate, global_search=fit.global_search)
+
+
+def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
+    """Check the sizes of an estimate; where the rig's values are in doubt, of one that does without them.
+
+    `doubt`: whether the record speaks against a fixed value.
+    """
+    from ambid.bearing.linear import greybox
+    from ambid.bearing.sizes import check_units
+
+    check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals)
+    known = [p for p in rig.parameters if p.role != "free" and p.value]
+    if not known or not (doubt or check.values["unusual"]):
+        return check
+    free = [replace(p, role="free", value=None, sd=None) if p in known else p for p in rig.parameters]
+    with contextlib.suppress(EstimationError):
+        alone = greybox(fit.problem.model, signals, free, delay=fit.problem.delay, evaluations=0)
+        again = check_units(alone.problem.parameters(alone.vector), rig.parameters, signals)
+        if alone.status == "converged" and not again.passed:
+            return again
+    return check
 
 
 def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:

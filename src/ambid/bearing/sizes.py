@@ -1,0 +1,184 @@
+"""Slips of commissioning that leave a sound fit: a channel in another unit than its column says.
+
+A factor on one channel is an exact symmetry of the model. With voltage, current and position read too large by s_v, s_i
+and s_x, the same residuals belong to R s_v/s_i, L s_v/s_i, k_i s_v/s_x, k_x s_v s_i/s_x^2 and m s_v s_i/s_x^2: only
+sizes can tell. Each size below has a usual range over the machines that are built, wide because it holds micro-bearings
+and turbines alike; together they leave a factor of 1000 hardly any room. What a rig says of a parameter is one more
+size, of a narrow range.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.multistart import Signals
+from ambid.estimation.estimate import Check
+from ambid.physics.parameters import Parameter
+
+CHANNELS = {"voltage": "V", "current": "A", "position": "m"}
+_SYMMETRY = {  # exponents of s_v, s_i, s_x
+    "R": (1, -1, 0),
+    "L": (1, -1, 0),
+    "k_i": (1, 0, -1),
+    "k_x": (1, 1, -2),
+    "m": (1, 1, -2),
+    "c": (1, 1, -2),
+    "voltage": (1, 0, 0),
+    "current": (0, 1, 0),
+    "position": (0, 0, 1),
+}
+_NAMED = 0.1  # half width, as a power of ten, of the range around what a rig says
+# Of squared half widths: what a rarer slip costs, within which two are both named, and what a slip has to gain.
+_RARE, _ALIKE, _GAIN = 2.0, 1.2, 1.8
+_FACTORS = {  # what a value is multiplied by when its unit is mistaken, for every channel
+    1e3: "a thousand times too large (values in m{unit} read as {unit})",
+    1e-3: "a thousand times too small (values in {unit} read as m{unit})",
+    1e6: "a million times too large (values in u{unit} read as {unit})",
+    1e-6: "a million times too small (values in {unit} read as u{unit})",
+}
+_LENGTHS = {  # and for a position
+    1 / 0.0254: "39.4 times too large (values in inches read as m)",
+    1 / 25.4e-6: "39 370 times too large (values in mil read as m)",
+    0.0254e3: "25.4 times too large",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Size:
+    """A size of a bench: a product of powers of parameters and of signals' largest values."""
+
+    name: str
+    of: Mapping[str, int]  # exponents of parameters in SI, and of the largest voltage, current and travel
+    unit: str
+    usual: tuple[float, float]
+    possible: tuple[float, float]
+    source: str
+
+    @property
+    def symmetry(self) -> Array:
+        """Exponents of s_v, s_i, s_x."""
+        return np.asarray(np.sum([e * np.array(_SYMMETRY[k], dtype=float) for k, e in self.of.items()], axis=0))
+
+
+# Usual: of micro-bearings of a few grams to turbines of several tons. The presets, the benches that the thesis names
+# (sec. 1.4, ch. 4 to 6) and the measured levitation lie inside, most near the middle.
+SIZES = (
+    Size(name="coil resistance", of={"R": 1}, unit="ohm", usual=(0.02, 300.0), possible=(1e-4, 1e5),
+         source="0.1 ohm for coils of 50 A, 100 ohm for those of 50 mA"),
+    Size(name="coil inductance", of={"L": 1}, unit="H", usual=(1e-5, 10.0), possible=(1e-7, 1e3),
+         source="60 mH in thesis table 4.1, 0.12 H for the measured levitation; of flat micro-coils some 0.1 mH"),
+    Size(name="largest current", of={"current": 1}, unit="A", usual=(3e-3, 300.0), possible=(1e-6, 1e4),
+         source="from the noise of a small sensor to the amplifiers of turbines"),
+    Size(name="largest voltage", of={"voltage": 1}, unit="V", usual=(0.02, 2000.0), possible=(1e-5, 1e5),
+         source="supplies of 5 V to 600 V; an excitation is a part of them"),
+    Size(name="travel", of={"position": 1}, unit="m", usual=(3e-7, 0.03), possible=(1e-9, 1.0),
+         source="air gaps of 0.1 to 1 mm, of which a record uses a part; 20 mm for balls under a magnet"),
+    Size(name="mass", of={"m": 1}, unit="kg", usual=(3e-4, 3e4), possible=(1e-5, 1e6),
+         source="from micro-bearings to turbines"),
+    Size(name="force-current factor", of={"k_i": 1}, unit="N/A", usual=(0.01, 1e4), possible=(1e-5, 1e6),
+         source="1 N/A for a ball, 61 N/A in thesis eq. 1.6, some 1000 N/A for rotors of tons"),
+    Size(name="bias current over gap, k_x/k_i", of={"k_x": 1, "k_i": -1}, unit="A/m", usual=(5.0, 3e5),
+         possible=(1e-3, 1e8), source="k_x/k_i = -i0/x0 (thesis eq. 1.6: 2460 A/m; 95 A/m for a ball at 10 mm)"),
+    Size(name="acceleration per current, k_i/m", of={"k_i": 1, "m": -1}, unit="m/s^2/A", usual=(0.01, 1e4),
+         possible=(1e-5, 1e7), source="2 g/i0 for one magnet against gravity (theory.md sec. 1)"),
+    Size(name="acceleration, k_i i/m", of={"k_i": 1, "m": -1, "current": 1}, unit="m/s^2", usual=(0.01, 1e4),
+         possible=(1e-4, 1e6), source="from a hundredth of the weight to the largest force of a magnet, some 100 g"),
+    Size(name="power", of={"voltage": 1, "current": 1}, unit="V A", usual=(1e-4, 1e6), possible=(1e-10, 1e9),
+         source="largest voltage and current together"),
+)  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class UnitSlip:
+    """A factor on one channel that would bring every size back to where it usually is."""
+
+    channel: str
+    factor: float  # values are too large by this
+    text: str
+
+
+def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], signals: Signals) -> Check:
+    """Check that the sizes of parameters and signals are those of a bench, and name the slip of a unit if they are not.
+
+    `values`: estimates in SI, all of them free where a rig's value is to count as evidence; `parameters`: what the rig
+    says; `signals`: of the record, of model one-axis.
+    """
+    sizes = [*SIZES, *_said(parameters)]
+    largest = {
+        "voltage": float(np.max(np.abs(signals.u[:, 0]))),
+        "current": float(np.max(np.abs(signals.y[:, 1]))),
+        "position": float(np.ptp(signals.y[:, 0])),
+    }
+    logs = np.array([_log(size, {**values, **largest}) for size in sizes])
+    low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
+    far = (logs - (low + high) / 2) / ((high - low) / 2)
+    odd = [j for j in np.flatnonzero(~(np.abs(far) <= 1.0)) if np.isfinite(far[j])]
+    if not odd:
+        return Check(passed=True, values={"unusual": 0.0}, detail="every size is usual for a magnetic bearing")
+    symmetry = np.array([size.symmetry for size in sizes])
+    slips = _slips(far, symmetry / ((high - low) / 2)[:, None])
+    worst = max(odd, key=lambda j: abs(far[j]))
+    what = f"{sizes[worst].name} = {10 ** logs[worst]:.3g} {sizes[worst].unit}"
+    what += f" is unusual (usual {sizes[worst].usual[0]:.3g} to {sizes[worst].usual[1]:.3g})"
+    if slips:
+        factors: dict[str, float] = {}
+        for slip in slips:
+            factors.setdefault(f"{slip.channel}_factor", slip.factor)
+        words = ", or ".join(f"{slip.channel} is {slip.text}" for slip in slips)
+        return Check(
+            passed=False,
+            values={**factors, "unusual": float(len(odd))},
+            detail=f"{what}. Every size is usual if {words}. Correct the unit in the record's header, or give "
+            f"channels.{slips[0].channel}.gain",
+        )
+    possible = all(s.possible[0] <= 10**x <= s.possible[1] for s, x in zip(sizes, logs, strict=True) if np.isfinite(x))
+    return Check(
+        passed=possible,
+        values={"unusual": float(len(odd))},
+        detail=f"{what}, and no single unit explains it. Check units, calibration and sampling rate",
+    )
+
+
+def _log(size: Size, values: Mapping[str, float]) -> float:
+    """Logarithm of a size; not a number where it does not apply."""
+    if "k_x" in size.of and len(size.of) > 1 and values["k_x"] >= 0:
+        return float("nan")  # a spring outweighs the magnet, and says nothing of bias and gap
+    factors = [abs(values.get(name, 0.0)) for name in size.of]
+    if not all(factors):
+        return float("nan")
+    return float(np.dot(list(size.of.values()), np.log10(factors)))
+
+
+def _said(parameters: Sequence[Parameter]) -> list[Size]:
+    """What a rig says of parameters, as sizes of a narrow range."""
+    found = []
+    for p in parameters:
+        if p.role != "free" and p.value and p.name != "c":
+            wide = 10 ** max(_NAMED, 3.0 * np.log10(1.0 + (p.sd or 0.0) / abs(p.value)))
+            usual = (abs(p.value) / wide, abs(p.value) * wide)
+            found.append(
+                Size(name=p.name, of={p.name: 1}, unit=p.unit, usual=usual, possible=(0.0, np.inf), source="rig")
+            )
+    return found
+
+
+def _slips(far: Array, moves: Array) -> list[UnitSlip]:
+    """The factors on one channel after which every size is usual: the most likely, and those that are nearly as likely.
+
+    `far`: (n,), distances from the middles of the ranges in half widths; `moves`: (n, 3), what a power of ten moves.
+    """
+    applies, found = np.isfinite(far), []
+    most = float(np.sum(far[applies] ** 2)) - _GAIN
+    for j, (channel, unit) in enumerate(CHANNELS.items()):
+        for factor, text in {**_FACTORS, **(_LENGTHS if channel == "position" else {})}.items():
+            after = (far - moves[:, j] * np.log10(factor))[applies]
+            if np.all(np.abs(after) <= 1.0):
+                rare = 0.0 if factor in (1e3, 1e-3) else _RARE
+                words = text.format(unit=unit)
+                found.append((float(np.sum(after**2)) + rare, UnitSlip(channel=channel, factor=factor, text=words)))
+    found = sorted((f for f in found if f[0] < most), key=lambda f: f[0])
+    return [slip for score, slip in found if score < found[0][0] + _ALIKE]

@@ -1,0 +1,176 @@
+"""Slips of commissioning: units, signs and columns that are not what the rig says are named, and sound records pass."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.bearing.linear import Signals, greybox
+from ambid.bearing.sizes import SIZES, check_units
+from ambid.errors import EstimationError
+from ambid.job import identify
+from ambid.physics.parameters import Parameter
+from ambid.physics.presets import preset
+from ambid.record import Channel, Record
+from ambid.rig import default_rig
+from tests.bearing.benches import parameters, run
+
+# m, k_x, k_i, R, L, and the largest voltage, current and travel: grams to tons, and the presets
+BENCHES = {
+    "micro": ((4e-3, -400.0, 0.8, 12.0, 2.4e-3), (2.6, 0.16, 49e-6)),
+    "ball": ((0.06, -118.0, -1.24, 4.2, 0.117), (12.4, 1.11, 0.3e-3)),
+    "thesis": ((0.1, 587.2, -310.1, 1.25, 59.6e-3), (3.9, 0.09, 0.77e-3)),
+    "prototype": ((0.3, -6700.0, 20.1, 6.0, 0.06), (11.0, 0.9, 0.4e-3)),
+    "pump": ((1.2, -6e4, 45.0, 3.0, 40e-3), (17.0, 0.4, 0.25e-3)),
+    "bearing": ((4.0, -1.29e5, 55.7, 0.8, 13e-3), (16.7, 1.1, 0.25e-3)),
+    "spindle": ((15.0, -2.5e6, 180.0, 1.2, 17e-3), (43.0, 5.0, 0.6e-3)),
+    "compressor": ((400.0, -2e7, 600.0, 0.4, 25e-3), (166.0, 46.0, 0.5e-3)),
+}
+NAMES = ("m", "k_x", "k_i", "R", "L")
+SLIPS = [(c, f) for c in ("voltage", "current", "position") for f in (1e3, 1e-3, 1e6, 1e-6)]
+
+
+def signals(voltage, current, travel):
+    """Two samples that reach these largest values."""
+    return Signals(u=np.array([[voltage], [-voltage]]), y=np.array([[travel, current], [0.0, -current]]), rate_hz=1e4)
+
+
+def slipped(name, channel, factor):
+    """Parameters and signals of a bench as an identification gives them with one channel too large by a factor."""
+    values, largest = BENCHES[name]
+    s = dict.fromkeys(("voltage", "current", "position"), 1.0) | {channel: factor}
+    v, i, x = s.values()
+    power = v * i / x**2
+    scale = {"m": power, "k_x": power, "k_i": v / x, "R": v / i, "L": v / i}
+    return {k: value * scale[k] for k, value in zip(NAMES, values, strict=True)}, signals(
+        *(a * b for a, b in zip(largest, s.values(), strict=True))
+    )
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_every_size_of_a_sound_bench_is_usual(name):
+    assert check_units(*slipped_free(name, "voltage", 1.0)).passed
+
+
+def slipped_free(name, channel, factor):
+    values, seen = slipped(name, channel, factor)
+    return values, (), seen
+
+
+@pytest.mark.parametrize("name", BENCHES)
+def test_a_slip_of_one_unit_is_named(name):
+    for channel, factor in SLIPS:
+        check = check_units(*slipped_free(name, channel, factor))
+        assert not check.passed
+        assert check.values[f"{channel}_factor"] == factor, (channel, factor, check.detail)
+        assert next(iter(check.values)) == f"{channel}_factor"  # the most likely comes first
+        assert f"channels.{channel}.gain" in check.detail
+
+
+def test_a_known_mass_shows_a_slip_that_sizes_alone_do_not():
+    values, _, seen = slipped_free("pump", "position", 1 / 0.0254)
+    assert check_units(values, (), seen).passed
+    weighed = Parameter(name="m", unit="kg", role="fixed", value=1.2)
+    check = check_units(values, (weighed,), seen)
+    assert "inches" in check.detail
+    assert check.values["position_factor"] == 1 / 0.0254
+
+
+def test_what_no_unit_explains_is_refused_only_where_it_is_impossible():
+    values, _, seen = slipped_free("pump", "voltage", 1.0)
+    odd = check_units({**values, "L": 50.0}, (), seen)
+    assert odd.passed
+    assert "no single unit explains it" in odd.detail
+    assert not check_units({**values, "L": 5e4}, (), seen).passed
+
+
+def test_sizes_scale_as_the_model_does():
+    """The exponents of every size against the model: the same trajectory in other units."""
+    theta = dict(zip(NAMES, BENCHES["pump"][0], strict=True))
+    moved, _ = slipped("pump", "voltage", 2.0)
+    for channel, s in (("voltage", (2.0, 1.0, 1.0)), ("current", (1.0, 2.0, 1.0)), ("position", (1.0, 1.0, 2.0))):
+        moved, _ = slipped("pump", channel, 2.0)
+        # m x'' = k_i i - k_x x and V = R i + L i' + k_i x' hold for x s_x, i s_i, V s_v with the moved parameters
+        v, i, x = s
+        assert moved["k_i"] / moved["m"] * i / x == pytest.approx(theta["k_i"] / theta["m"])
+        assert moved["k_x"] / moved["m"] == pytest.approx(theta["k_x"] / theta["m"])
+        for k, beside in (("R", i), ("L", i), ("k_i", x)):
+            assert moved[k] * beside / v == pytest.approx(theta[k])
+    for size in SIZES:
+        low, high = size.usual
+        assert size.possible[0] < low < high < size.possible[1]
+
+
+@pytest.mark.parametrize("name", ["thesis", "unstable-bearing", "rmit", "levitated-ball", "prototype"])
+def test_the_presets_lie_inside_the_usual_ranges(name):
+    bench = preset(name)
+    largest = signals(bench.limits.voltage[1], bench.limits.current[1], bench.limits.position[1])
+    check = check_units(bench.parameters, (), largest)
+    assert check.passed
+    assert "every size" in check.detail
+
+
+def reversed_voltage(s):
+    return replace(s, u=-s.u)
+
+
+def reversed_current(s):
+    return replace(s, y=s.y * [1.0, -1.0])
+
+
+def swapped(s):
+    return replace(s, u=s.y[:, 1:], y=np.hstack([s.y[:, :1], s.u]))
+
+
+def swapped_outputs(s):
+    return replace(s, y=s.y[:, ::-1].copy())
+
+
+def silent(role):
+    def change(s):
+        rng = np.random.default_rng(3)
+        dead = 1e-3 * rng.standard_normal(len(s.u))
+        y = s.y.copy()
+        y[:, ("position", "current").index(role)] = dead
+        return replace(s, y=y)
+
+    return change
+
+
+MISTAKEN = [
+    (reversed_voltage, "channel 'voltage' is reversed"),
+    (reversed_current, "reversed (or else 'current')"),
+    (swapped, "channels 'voltage' and 'current' are swapped"),
+    (swapped_outputs, "channels 'position' and 'current' are swapped"),
+    (silent("current"), "channel 'current' holds no signal that belongs to voltage and position"),
+    (silent("position"), "channel 'position' holds no signal that belongs to voltage and current"),
+]
+
+
+@pytest.mark.parametrize(("change", "words"), MISTAKEN, ids=[w for _, w in MISTAKEN])
+def test_a_mistaken_column_is_named(change, words):
+    bench = run("bearing", 6000, 11)
+    with pytest.raises(EstimationError, match=re.escape(words)):
+        greybox(bench.model, change(bench.signals), parameters(bench, fixed=("c",)))
+
+
+def test_a_current_of_one_sign_says_which_channel_is_reversed():
+    bench = run("bearing", 6000, 11)
+    offset = bench.signals.y + np.array([0.0, 3.0 * np.ptp(bench.signals.y[:, 1])])
+    changed = reversed_current(replace(bench.signals, y=offset))
+    with pytest.raises(EstimationError, match=r"channel 'current' is reversed"):
+        greybox(bench.model, changed, parameters(bench, fixed=("c",)))
+
+
+@pytest.mark.parametrize("mass", ["free", "fixed"])
+def test_an_estimate_names_a_current_in_another_unit(mass):
+    bench = run("bearing", 6000, 11)
+    v, (x, i) = bench.signals.u[:, 0], bench.signals.y.T
+    columns = (("voltage", "V", v), ("current", "A", 1e3 * i), ("position", "m", x))
+    record = Record(rate_hz=2e4, channels=tuple(Channel(name=n, unit=u, values=c) for n, u, c in columns))
+    rig = replace(default_rig(), parameters=tuple(parameters(bench, fixed=("c", "m") if mass == "fixed" else ("c",))))
+    check = identify(record, rig).checks["units"]
+    assert not check.passed
+    assert check.values["current_factor"] == 1e3
+    assert "current is a thousand times too large (values in mA read as A)" in check.detail
