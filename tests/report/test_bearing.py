@@ -44,9 +44,10 @@ def test_the_text_holds_all_and_keeps_its_width(estimate):
     assert text.index("warning: one thing") < text.index("value ± sd")
     (row,) = [x.split() for x in text.splitlines() if x.startswith("held.csv ")]
     assert row[1] == "held"
-    assert "– stalled" in estimate_text(replace(estimate, status="stalled")).splitlines()[0]
     unfinished = estimate_text(replace(estimate, status="stalled"))
-    assert "UNFINISHED" in unfinished
+    assert unfinished.splitlines()[0] == "verdict: do not use"
+    assert "– stalled" in unfinished
+    assert next(x for x in unfinished.splitlines() if x.startswith("R ")).endswith("do not use")
     assert "identified" not in unfinished
 
 

@@ -46,11 +46,38 @@ def test_failed_checks_and_warnings_are_shown_once(unstable):
         warnings=("the search did not converge: treat the numbers as a first guess", failed.detail),
     )
     text = estimate_text(e)
-    assert "– stalled" in text.splitlines()[0]
-    assert line_of(text, "k_x").endswith("UNFINISHED")
+    assert text.splitlines()[0] == "verdict: do not use"
+    assert text.splitlines()[1].startswith("  ✗ status: the search did not converge")
+    assert text.splitlines()[3].startswith("  ✗ plausible: the coil gives energy out")
+    assert "✗ plausible  see the verdict" in text
+    assert "– stalled" in text
+    assert line_of(text, "k_x").endswith("do not use")
     assert text.count("the coil gives energy out") == 1
     assert "warning: the search did not converge" in text
     assert max(map(len, text.splitlines())) <= 80
+
+
+def test_a_failed_check_leaves_no_parameter_identified(unstable):
+    failed = Check(passed=False, detail="white they are not. Excite less")
+    e = replace(unstable.estimate, checks={"residuals_white": failed})
+    assert e.verdict.word == "caution"
+    assert not e.passed
+    text = estimate_text(e, paint=lambda text, style: f"<{style}>{text}</>")
+    assert "verdict: <bad>use with caution</>" in text
+    assert "<good>identified</>" not in text
+    assert '"verdict": {\n  "word": "caution"' in e.dumps()
+    unseen = replace(
+        e, checks={"identifiable": failed}, parameters=(replace(e.parameters[0], identifiable=False), *e.parameters[1:])
+    )
+    text = estimate_text(unseen)
+    assert text.splitlines()[0] == "verdict: use with caution"
+    assert line_of(text, unseen.parameters[0].name).endswith("NOT SHOWN")
+    assert "identified" in text  # what the record does show
+
+
+def test_a_failed_second_record_is_in_the_verdict(judged):
+    e = judged.estimate
+    assert [r.check for r in e.verdict.reasons] == ["validation.residuals_white"]
 
 
 def test_colour_changes_no_letter(unstable):

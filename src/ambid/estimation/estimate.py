@@ -100,6 +100,29 @@ class OutputFit:
     innovation_sd: float  # SI
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reason:
+    """Why a result is not simply usable."""
+
+    check: str  # its name; ``"status"`` for the search itself
+    text: str  # what was found, and what to do
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Whether a result may be used, and what stands against it."""
+
+    word: Literal["usable", "caution", "unusable"]
+    reasons: tuple[Reason, ...]
+
+
+_GRAVE = frozenset({"units", "plausible", "delay_in_range"})  # checks after whose failure no number is to be used
+_UNFINISHED = {
+    "stalled": "the search did not converge: its numbers are a first guess. Excite more, or give start values",
+    "failed": "the search found no model of this record. Check columns, signs and fixed values",
+}
+
+
 class Judged:
     """A result with a status and checks."""
 
@@ -110,7 +133,21 @@ class Judged:
     @property
     def passed(self) -> bool:
         """Whether the search converged and every check passed."""
-        return self.status == "converged" and all(c.passed for c in self.checks.values())
+        return self.verdict.word == "usable"
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used, with each check that failed as a reason."""
+        failed = {name: c.detail for name, c in self.checks.items() if not c.passed}
+        second = (getattr(self, "validation", None) or {}).get("checks", {})
+        failed |= {f"validation.{name}": str(c["detail"]) for name, c in second.items() if not c["passed"]}
+        grave = self.status != "converged" or not _GRAVE.isdisjoint(failed)
+        if self.status != "converged":
+            failed = {"status": _UNFINISHED[self.status], **failed}
+        return Verdict(
+            word="unusable" if grave else "caution" if failed else "usable",
+            reasons=tuple(Reason(check=name, text=text) for name, text in failed.items()),
+        )
 
 
 class Parametric:
@@ -201,8 +238,9 @@ def plain_json(value: Any) -> Any:
 
 
 def fields_json(value: Any, *, without: tuple[str, ...] = ()) -> dict[str, Any]:
-    """Return the fields of a dataclass as JSON values, by name."""
-    return {f.name: plain_json(getattr(value, f.name)) for f in fields(value) if f.name not in without}
+    """Return the fields of a dataclass as JSON values, by name, and the verdict of a result that has one."""
+    found = {f.name: plain_json(getattr(value, f.name)) for f in fields(value) if f.name not in without}
+    return {"verdict": plain_json(value.verdict), **found} if isinstance(value, Judged) else found
 
 
 def covariance_together(document: dict[str, Any]) -> dict[str, Any]:

@@ -30,6 +30,7 @@ from ambid.report.text import (
     status_words,
     timing_lines,
     title_line,
+    verdict_lines,
     warning_lines,
 )
 
@@ -47,17 +48,17 @@ def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = p
     """Write an estimate, linear or of a nonlinear bearing, for people; colour does not change the layout."""
     curves = curve_lines(estimate, width=width) if isinstance(estimate, NonlinearBearingEstimate) else []
     warnings = warning_lines(other_warnings(estimate.checks, estimate.warnings), width=width, paint=paint)
-    finished = estimate.status == "converged"
     validation = estimate.validation
     return joined(
         [
+            verdict_lines(estimate.verdict, width=width, paint=paint),
             header_lines(estimate, width=width, paint=paint),
             warnings if curves else [],
-            parameter_lines(estimate.parameters, width=width, paint=paint, finished=finished),
+            parameter_lines(estimate.parameters, width=width, paint=paint, found=estimate.verdict),
             curves,
             delay_lines(estimate),
             columns(output_rows(estimate)),
-            check_lines(estimate.checks, width=width, paint=paint),
+            check_lines(estimate.checks, width=width, paint=paint, above=True),
             [] if validation is None else validation_lines(validation, width=width, paint=paint),
             [] if curves else warnings,
             timing_lines(estimate.timing_s, paint=paint),

@@ -33,6 +33,7 @@ from ambid.report.text import (
     status_words,
     timing_lines,
     title_line,
+    verdict_lines,
     warning_lines,
     wrapped,
 )
@@ -68,13 +69,14 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
     second = [] if fit.validation is None else [paint("on the second record", "strong"), *second_lines(fit.validation)]
     return joined(
         [
+            verdict_lines(fit.verdict, width=width, paint=paint),
             _header(fit, width, paint),
             *own,
             columns(fit_rows(fit.fit, fit.units, none)) if fit.fit else [],
             second,
             criteria_lines(fit.criteria, fit.n_estimated, width),
             trainings,
-            check_lines(fit.checks, width=width, paint=paint),
+            check_lines(fit.checks, width=width, paint=paint, above=True),
             warning_lines(other_warnings(fit.checks, fit.warnings), width=width, paint=paint),
             timing_lines(fit.timing_s, width=width, paint=paint),
         ]

@@ -25,7 +25,7 @@ from ambid.report.estimate_text import (
     validation_rows,
 )
 from ambid.report.figures import BearingEvidence, Evidence, figures
-from ambid.report.text import other_warnings, parameter_rows
+from ambid.report.text import WORDS, other_warnings, parameter_rows
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,9 +84,10 @@ def _content(evidence: Evidence | BearingEvidence, made: str) -> dict[str, Any]:
     provenance += [("versions", ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]
     return {
         **about,
-        "status": e.status,
+        "conclusion": WORDS[e.verdict.word],
+        "reasons": e.verdict.reasons,
         "warnings": other_warnings(e.checks, e.warnings),
-        "parameters": parameter_rows(e.parameters, finished=e.status == "converged"),
+        "parameters": parameter_rows(e.parameters, e.verdict),
         "meaning": meaning,
         "method": e.covariance_method,
         "correlation_names": list(e.covariance_names),

@@ -11,13 +11,14 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, Verdict
 from ambid.report.numbers import Quantity, quantity, sized
 
 Style = Literal["good", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
 
 WIDTH = 80
+_USABLE = Verdict(word="usable", reasons=())
 
 
 def plain(text: str, style: Style) -> str:
@@ -54,32 +55,54 @@ def title_line(name: object, what: str, samples: int, rate_hz: float, status: st
     )
 
 
+WORDS: dict[str, tuple[str, Style]] = {
+    "usable": ("usable", "good"),
+    "caution": ("use with caution", "bad"),
+    "unusable": ("do not use", "bad"),
+}
+
+
+def verdict_lines(found: Verdict, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+    """Say whether a result may be used, and what stands against it, a reason a paragraph."""
+    words, style = WORDS[found.word]
+    lines = [f"verdict: {paint(words, style)}"]
+    for r in found.reasons:
+        lines += hanging(f"  {paint('✗', 'bad')} {r.check}: ", r.text, width, 4, first=len(r.check) + 6)
+    return lines
+
+
 def status_words(status: str, paint: Paint = plain) -> str:
     """Name a status that is not the wished one."""
     return "" if status == "converged" else paint(f" – {status}", "bad")
 
 
 def parameter_lines(
-    parameters: Sequence[EstimatedParameter], *, width: int = WIDTH, paint: Paint = plain, finished: bool = True
+    parameters: Sequence[EstimatedParameter],
+    *,
+    width: int = WIDTH,
+    paint: Paint = plain,
+    found: Verdict = _USABLE,
 ) -> list[str]:
-    """Return the table of parameters; of a search that is not `finished` nothing is called identified.
+    """Return the table of parameters; where the verdict on all of them is not good, none is called identified.
 
     Where the terminal is too narrow the column of SI values is left out.
     """
-    rows = parameter_rows(parameters, finished=finished)
+    rows = parameter_rows(parameters, found)
     head = ("", "value ± sd", "95 % interval", "in SI", "verdict")
     return verdict_table(head, rows, right=2, spare=3, width=width, paint=paint)
 
 
 def parameter_rows(
-    parameters: Sequence[EstimatedParameter], *, finished: bool = True
+    parameters: Sequence[EstimatedParameter], found: Verdict = _USABLE
 ) -> list[tuple[str, str, str, str, str, Style]]:
     """Return name, value, interval, value in SI and verdict of each parameter, and how the verdict is painted."""
     rows: list[tuple[str, str, str, str, str, Style]] = []
     for p in parameters:
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
-        style: Style = "dim" if p.role == "fixed" else "good" if p.identifiable and finished else "bad"
-        rows.append((p.name, q.text, interval_words(q), q.si, verdict(p, finished=finished), style))
+        words = verdict(p, found)
+        good = p.identifiable and _word_for_all(found) == "usable"
+        style: Style = "dim" if p.role == "fixed" else "good" if good else "bad"
+        rows.append((p.name, q.text, interval_words(q), q.si, words, style))
     return rows
 
 
@@ -110,16 +133,23 @@ def verdict_table(
     return [lines[0], *(line.removesuffix(x) + paint(x, style) if x else line for line, (x, style) in body)]
 
 
-def verdict(p: EstimatedParameter, *, finished: bool = True) -> str:
+def verdict(p: EstimatedParameter, found: Verdict = _USABLE) -> str:
     """Say in a word or two where a parameter's value comes from, such as ``"prior, 87 % data"``."""
     if p.role == "fixed":
         return "fixed"
-    if not finished:
-        return "UNFINISHED"
+    word = _word_for_all(found)
+    if word != "usable":
+        return WORDS[word][0]
     if p.role == "prior":
         share = "" if p.data_share is None else f", {100 * p.data_share:.0f} % data"
         return f"prior{share}" if p.identifiable else f"prior, NOT SHOWN{share}"
     return "identified" if p.identifiable else "NOT SHOWN"
+
+
+def _word_for_all(found: Verdict) -> str:
+    """The verdict on every parameter: what the record does not show concerns some of them alone."""
+    alone = all(r.check == "identifiable" for r in found.reasons)
+    return "usable" if alone and found.word == "caution" else found.word
 
 
 def delay_line(what: str, d: Delay, rate_hz: float) -> str:
@@ -199,13 +229,16 @@ def criteria_lines(criteria: Mapping[str, float], n_estimated: int, width: int) 
     return textwrap.wrap(f"criteria: {text}; {n_estimated} numbers estimated", width)
 
 
-def check_lines(checks: Mapping[str, Check], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
-    """Write checks, one after the other, each with its mark and what it found."""
+def check_lines(
+    checks: Mapping[str, Check], *, width: int = WIDTH, paint: Paint = plain, above: bool = False
+) -> list[str]:
+    """Write checks, one after the other, each with its mark and what it found; `above`: failed ones stand there."""
     wide = max((len(name) for name in checks), default=0)
     lines: list[str] = []
     for name, check in checks.items():
         mark = paint("✓", "good") if check.passed else paint("✗", "bad")
-        lines += hanging(f"{mark} {name.ljust(wide)}  ", check.detail, width, wide + 4)
+        detail = check.detail if check.passed or not above else "see the verdict"
+        lines += hanging(f"{mark} {name.ljust(wide)}  ", detail, width, wide + 4)
     return lines
 
 
