@@ -94,7 +94,7 @@ def command(
     between = opt.band_of(band)
     replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
     with Outputs(rig, None if track in (None, "auto") else Path(str(track)), replayed) as outputs:
-        outputs.claim(record, "-o", _ENDINGS)
+        outputs.claim(record, "-o", _ENDINGS, force=force)
         outputs.claim(json_path(json), "--json")
     known = load_rig(rig)
     chosen = course_mode(port, known, mode, excitation)

@@ -35,9 +35,7 @@ def command(
     if preset is not None and (rate is not None or gaps is not None):
         raise AmbidError("--rate and --gaps are for reading a record; with --preset none is read. Leave them out")
     with Outputs(record) as outputs:
-        outputs.claim(rig, "-o")
-        if rig is not None and rig.exists() and not force:
-            raise AmbidError(f"-o {rig} exists already; it may hold your changes. Choose another name, or give --force")
+        outputs.claim(rig, "-o", force=force)
         text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps)
         if rig is not None:
             outputs.stage_text(rig, text)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import gzip
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -18,6 +20,7 @@ if TYPE_CHECKING:
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm")
 FAILED_CHECK = 3
+_LOOKED = 4096  # bytes of a file that say what it is
 _STREAMED = ("--json",)  # options that take - for standard output
 
 
@@ -53,16 +56,20 @@ class Outputs:
         self.claim(plot, "--plot", FIGURE_ENDINGS)
         self.claim(report, "--report", PAGE_ENDINGS)
 
-    def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = ()) -> None:
+    def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = (), *, force: bool | None = None) -> None:
         """Check that a file can be written, before any work is done.
 
         `path`: the file; None: the option was not given; `option`: the option that names it, for messages; `suffixes`:
-        endings that it may have; any if empty.
+        endings that it may have; any if empty; `force`: what the verb's --force says, None where it has none. Without
+        it only figures, reports, results and simulated records are written over, and that is told.
         """
         if path is None:
             return
         try:
             self._check(path, option, suffixes)
+            if path.is_file() and not force and not _made_here(path):
+                remedy = "Choose another name" + ("" if force is None else ", or give --force")
+                raise AmbidError(f"{option} {path} exists already, and cannot be made again. {remedy}")
         except OSError as failure:  # a name that no file can have
             raise AmbidError(f"{option} {path} cannot be: {failure.strerror or failure}. Give another name") from None
         self._claimed.append(path)
@@ -139,10 +146,27 @@ class Outputs:
         try:
             if kind is None:
                 for path, beside in self._staged.items():
+                    if path.exists() and path.stat().st_size:
+                        typer.echo(f"{path.name} is replaced", err=True)
                     os.replace(beside, path)
         finally:
             for beside in self._staged.values():
                 beside.unlink(missing_ok=True)
+
+
+def _made_here(path: Path) -> bool:
+    """Whether a file is empty, a figure, a report, or says that it is a result or a simulated record."""
+    if path.name.lower().endswith((*FIGURE_ENDINGS, *PAGE_ENDINGS)):
+        return True
+    if path.suffix in (".h5", ".hdf5"):
+        import h5py
+
+        with contextlib.suppress(OSError, KeyError), h5py.File(path) as file:
+            return b"simulat" in file["provenance"][()]
+        return False
+    with (gzip.open if path.suffix == ".gz" else Path.open)(path, "rb") as file:
+        begin = file.read(_LOOKED)
+    return not begin or begin.startswith(b"# simulated by ambid") or b'"schema": "ambid.' in begin
 
 
 def _same(a: Path, b: Path) -> bool:

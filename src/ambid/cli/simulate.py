@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.cli.options import argument, band_of, option, preset_of, switch
+from ambid.cli.options import Force, argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError, refuse_given
@@ -68,6 +68,7 @@ def command(
         float | None,
         option("--position M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
     ] = None,
+    force: Force = False,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records.
 
@@ -84,14 +85,14 @@ def command(
         refuse_given(of_excitation, "--scenario has no {}. Leave {} out")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
                  "closed": closed, "log_excitation": log_excitation}  # fmt: skip
-        _run_scenario(scenario, preset, rig, record, seed, words)
+        _run_scenario(scenario, preset, rig, record, seed, words, force=force)
         return
     refuse_given({"--at": at, "--size": size}, "a simulation without --scenario has no {}. Leave {} out")
     if not nonlinear:
         refuse_given({"--position": position}, "a simulation without --nonlinear has no {}. Leave {} out")
     kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(source) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", _ENDINGS)
+        outputs.claim(record, "-o", _ENDINGS, force=force)
         bench = _bench(rig, rate, closed, nonlinear, position)
         rate_hz = bench.rate_hz
         n = _samples(duration, rate_hz)
@@ -160,7 +161,7 @@ def _recipe(rig: str, what: str, seed: int) -> str:
 
 
 def _run_scenario(
-    name: str, preset: Preset | None, rig: str, record: Path, seed: int, words: Mapping[str, Any]
+    name: str, preset: Preset | None, rig: str, record: Path, seed: int, words: Mapping[str, Any], *, force: bool
 ) -> None:
     """Simulate a scenario, write the record and say what is in it; `words` are those of `simulate_scenario`.
 
@@ -172,7 +173,7 @@ def _run_scenario(
 
     what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", _ENDINGS[:2] if what.dropped else _ENDINGS)
+        outputs.claim(record, "-o", _ENDINGS[:2] if what.dropped else _ENDINGS, force=force)
         done = simulate_scenario(what, preset or load_rig(Path(rig)), seed=seed, **words)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")

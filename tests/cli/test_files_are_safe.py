@@ -1,0 +1,67 @@
+"""No verb writes over a file that cannot be made again; what it does replace, it names."""
+
+import pytest
+
+from ambid.cli import run
+
+MEASURED = "time [s],voltage [V],current [A],position [m]\n0,1,2,3\n"
+RECORD = ("simulate", "thesis", "--duration", "0.3", "-o")
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """A folder with a simulated record, its estimate and a rig of the acquisition's bench."""
+    folder = tmp_path_factory.mktemp("made")
+    for words in (
+        ("simulate", "thesis", "--duration", "0.3", "-o", folder / "r.csv"),
+        ("identify", folder / "r.csv", "--json", folder / "e.json"),
+        ("init", "--preset", "prototype", "-o", folder / "rig.toml"),
+    ):
+        assert run([str(word) for word in words]) == 0
+    return folder
+
+
+VERBS = {
+    "simulate": ("simulate", "thesis", "--duration", "0.1", "-o"),
+    "init": ("init", "r.csv", "-o"),
+    "identify": ("identify", "r.csv", "--json"),
+    "validate": ("validate", "e.json", "r.csv", "--json"),
+    "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
+            "na=1,nb=1,nk=1", "--json"),
+    "compare": ("compare", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--json"),
+    "frf": ("frf", "r.csv", "--input", "voltage", "--output", "current", "--json"),
+    "track": ("track", "r.csv", "--start", "e.json", "--json"),
+    "acquire": ("acquire", "--port", "simulated", "--rig", "rig.toml", "--seconds", "1", "-o"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
+    target = made / "measured.csv"
+    target.write_text(MEASURED)
+    monkeypatch.chdir(made)
+    done = ambid(*VERBS[verb], "measured.csv")
+    assert done.code == 2, done.out
+    assert len(done.err.splitlines()) == 1
+    assert "measured.csv exists already" in done.err
+    assert target.read_text() == MEASURED
+
+
+def test_what_was_simulated_is_replaced_and_named(made, ambid, monkeypatch):
+    monkeypatch.chdir(made)
+    for name in ("s.csv", "s.csv.gz", "s.h5"):
+        assert ambid(*RECORD, name).err == ""
+        done = ambid(*RECORD, name)
+        assert done.code == 0
+        assert done.err == f"{name} is replaced\n"
+    done = ambid("identify", "r.csv", "--json", "e.json")
+    assert done.code == 0
+    assert done.err == "e.json is replaced\n"
+
+
+def test_force_writes_over_it(made, ambid, monkeypatch):
+    monkeypatch.chdir(made)
+    (made / "m.csv").write_text(MEASURED)
+    done = ambid(*RECORD, "m.csv", "--force")
+    assert done.code == 0
+    assert "m.csv is replaced" in done.err
