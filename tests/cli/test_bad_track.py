@@ -9,6 +9,8 @@ import pytest
 
 from tests.cli.test_bad_input import columns, with_columns
 
+OLDER = '{"schema": "ambid.track/1"}\n'
+
 
 @pytest.fixture
 def start(bench, ambid):
@@ -34,9 +36,9 @@ def refused(found, *parts):
     ],
 )
 def test_a_refusal_leaves_an_older_track_as_it_was(ambid, bench, start, words, said):
-    (bench / "track.jsonl").write_text("older\n", encoding="utf-8")
+    (bench / "track.jsonl").write_text(OLDER, encoding="utf-8")
     refused(ambid("track", "record.csv", *start, "--json", "track.jsonl", *words), said)
-    assert (bench / "track.jsonl").read_text(encoding="utf-8") == "older\n"
+    assert (bench / "track.jsonl").read_text(encoding="utf-8") == OLDER
 
 
 def test_a_flag_behind_the_end_of_the_record_is_told(ambid, start):

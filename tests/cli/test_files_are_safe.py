@@ -28,7 +28,7 @@ VERBS = {
     "validate": ("validate", "e.json", "r.csv", "--json"),
     "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
             "na=1,nb=1,nk=1", "--json"),
-    "compare": ("compare", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--json"),
+    "compare": ("compare", "r.csv", "arx:na=1,nb=1,nk=1", "--input", "voltage", "--output", "current", "--json"),
     "frf": ("frf", "r.csv", "--input", "voltage", "--output", "current", "--json"),
     "track": ("track", "r.csv", "--start", "e.json", "--json"),
     "acquire": ("acquire", "--port", "simulated", "--rig", "rig.toml", "--seconds", "1", "-o"),

@@ -46,7 +46,8 @@ def test_several_records_to_file_figure_and_table(at, ambid) -> None:
     assert found.code == 0, found.out
     assert max(map(len, found.out.splitlines())) <= 80
     lines = found.out.splitlines()
-    assert lines[0].startswith("2 records: narmax, 1000 samples")
+    assert lines[0] == "verdict: usable"
+    assert lines[2].startswith("2 records: narmax, 1000 samples")
     assert any(x.startswith("u(t-1)^2 ") and x.endswith("%") and "±" in x for x in lines)
     assert "on the second record" in found.out
     document = json.loads(out.read_text())

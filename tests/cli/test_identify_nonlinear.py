@@ -56,7 +56,8 @@ def test_several_records_to_files_and_table(at, ambid) -> None:
     assert found.code == 0, found.out + found.err
     lines = found.out.splitlines()
     assert max(map(len, lines)) <= 80
-    assert lines[0] == "2 records: hyperbolic single magnet, 4 s"
+    assert lines[0] == "verdict: usable"
+    assert lines[2] == "2 records: hyperbolic single magnet, 4 s"
     assert any(x.startswith("k ") and "±" in x and x.endswith("identified") for x in lines)
     assert any(x.startswith("k_i [N/A]") for x in lines)
     assert any(x.startswith("✓ carries_its_weight") for x in lines)
@@ -153,7 +154,8 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
     document = json.loads(out.read_text())
     assert document["status"] == "stalled"
     assert any("did not converge" in w for w in document["warnings"])
-    assert "– stalled" in found.out.splitlines()[0]
+    assert found.out.splitlines()[0] == "verdict: do not use"
+    assert "– stalled" in found.out
 
 
 def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:

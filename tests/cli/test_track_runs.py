@@ -113,7 +113,6 @@ def test_flags_on_the_command_line(here, ambid):
 def test_starts_that_do_not_fit_are_refused_on_one_line(here, ambid):
     whole = json.loads((here / "e.json").read_text())
     (here / "coil.json").write_text(json.dumps({**whole, "model": "coil"}))
-    (here / "fit.json").write_text("{}")
     assert ambid("fit", "change.csv", "--structure", "arx", "--input", "voltage", "--output", "current", "--to", "0.5",
                  "--orders", "na=2,nb=2,nk=1", "--json", "fit.json").code == 0  # fmt: skip
     cases = (

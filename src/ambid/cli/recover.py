@@ -60,7 +60,7 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
     if not journal.name:
         raise AmbidError(f"journal {str(journal)!r} is a folder; a file is wanted. Name the file inside it")
     path = record_path(journal) if output is None else output
-    Outputs(journal).claim(path, "-o")
+    Outputs(journal).claim(path, "-o", force=True)
     with JournalReader.open(journal) as reader, progress("recover"):
         there = recorded_already(reader, path) if path.exists() and not force else None
         made = there or recorded_from(reader, path, force=force)
