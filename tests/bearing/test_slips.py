@@ -10,7 +10,7 @@ from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
 from ambid.job import identify
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig

@@ -18,8 +18,7 @@ from ambid.bearing.rescue import reason
 from ambid.bearing.sizes import check_units
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
-from ambid.physics.linear_model import LinearModel
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter
 
 _LOOKED = 8192  # samples that show whether a column holds a signal
 _LAGS = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)  # before and after

@@ -17,7 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.estimation.estimate import Check
-from ambid.physics.parameters import Parameter
+from ambid.physics.linear_model import Parameter
 
 CHANNELS = {"voltage": "V", "current": "A", "position": "m"}
 _SYMMETRY = {  # exponents of s_v, s_i, s_x
