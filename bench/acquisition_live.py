@@ -11,16 +11,16 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.acquire.devices.emulated import EmulatedDevice
-from ambid.acquire.program import program
-from ambid.acquire.recording import acquire
-from ambid.acquire.session import Course
+from ambid.acquisition.devices.emulated import EmulatedDevice
+from ambid.acquisition.program import program
+from ambid.acquisition.recording import acquire
+from ambid.acquisition.session import Course
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.job.track_live import track_live
 from ambid.recursive.lines import TrackLine
 from ambid.rig import load_rig
-from ambid.track.blocks import Frame
+from ambid.tracking.blocks import Frame
 from table import Table
 from tests.bars.identified import BAND_HZ, BENCHES
 from timing import quantity

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.acquire.scales import PWM_HZ
+from ambid.acquisition.scales import PWM_HZ
 from table import Table
 from tests.bars.host import prototype
 from tests.bars.rates import at_rate

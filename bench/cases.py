@@ -17,7 +17,7 @@ from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.rig import default_rig
 from ambid.signals import multisine
-from ambid.simulate import Simulation, largest_amplitude, noise_at_snr, simulate_preset
+from ambid.simulation import Simulation, largest_amplitude, noise_at_snr, simulate_preset
 
 Array = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.rig import default_rig
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from cases import SEED, Array, Case, bearing_excitation
 from timing import Line, Timing, alternate
 

@@ -16,7 +16,7 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from table import Table
 from timing import quantity
 

@@ -20,9 +20,9 @@ for place in (str(HERE), str(HERE.parent)):  # the second one for the kills, whi
 
 import numpy as np  # noqa: E402
 
-from ambid.acquire.device import Column  # noqa: E402
-from ambid.acquire.recorder import JournalHeader, Recorder, journal_path  # noqa: E402
-from ambid.track.blocks import Block  # noqa: E402
+from ambid.acquisition.device import Column  # noqa: E402
+from ambid.acquisition.recorder import JournalHeader, Recorder, journal_path  # noqa: E402
+from ambid.tracking.blocks import Block  # noqa: E402
 from table import Table  # noqa: E402
 from timing import quantity  # noqa: E402
 
@@ -104,7 +104,7 @@ def recorder_tables() -> Iterator[Table]:
 
 def kill_table() -> Table:
     """Recordings under full load, killed at random moments, recovered, and compared bit by bit."""
-    from tests.acquire.recorder.kills import killed
+    from tests.acquisition.recorder.kills import killed
 
     with tempfile.TemporaryDirectory() as folder:
         found = list(killed(folder, KILLS, seed=11))

@@ -14,9 +14,9 @@ from ambid.physics.presets import preset
 from ambid.recursive.fusion import FusedSensor, SensorFusion
 from ambid.recursive.joint import JointEkf, JointStart, JointUkf
 from ambid.recursive.kalman import constant_velocity
-from ambid.track.evidence import Samples
-from ambid.track.rpem import PhysicalRpem
-from ambid.track.window import MovingWindow
+from ambid.tracking.evidence import Samples
+from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.window import MovingWindow
 from peers import Array, Bench
 from tracking_benches import PHYSICAL, RATE, preset_bench, start_of
 from tracking_job import Job, Same

@@ -18,14 +18,14 @@ from ambid.physics.presets import Preset, preset
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Event
 from ambid.signals import multisine
-from ambid.simulate.bench import VaryingLoop
-from ambid.simulate.plant import LinearPlant
-from ambid.simulate.scenarios import scenario_blocks
-from ambid.simulate.variation import Variation
-from ambid.track.evidence import Samples
-from ambid.track.numbers import TrackedNumbers, tracked_numbers
-from ambid.track.rpem import PhysicalRpem
-from ambid.track.supervisor import Supervisor
+from ambid.simulation.bench import VaryingLoop
+from ambid.simulation.plant import LinearPlant
+from ambid.simulation.scenarios import scenario_blocks
+from ambid.simulation.variation import Variation
+from ambid.tracking.evidence import Samples
+from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
+from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.supervisor import Supervisor
 
 Array = NDArray[np.float64]
 Streams = Callable[[str, int, float, float], Iterator[tuple[int, Samples]]]
@@ -69,8 +69,8 @@ def preset_bench() -> TrackBench:
 @cache
 def _amplitude() -> float:
     """What `ambid scenario` chooses, once for all seeds."""
-    from ambid.simulate.rig_bench import Bench
-    from ambid.simulate.scenarios import amplitude_for, one_period
+    from ambid.simulation.rig_bench import Bench
+    from ambid.simulation.scenarios import amplitude_for, one_period
 
     b = Bench.of(preset("unstable-bearing"), None, None)
     return amplitude_for(b, one_period(b, 1), 1)
@@ -111,8 +111,8 @@ def second_bench() -> TrackBench:
 
 
 def _variation(scenario: str, bench: Preset, at_s: float, seconds: float) -> Variation:
-    from ambid.simulate.rig_bench import Bench
-    from ambid.simulate.scenarios import scenario as named
+    from ambid.simulation.rig_bench import Bench
+    from ambid.simulation.scenarios import scenario as named
 
     found, b = named(scenario), Bench.of(bench, None, None)
     return found.vary(b, at_s, found.size_for(b, None), seconds)

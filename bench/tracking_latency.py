@@ -9,12 +9,12 @@ from dataclasses import asdict
 import numpy as np
 
 from ambid.recursive.lines import Latency
-from ambid.track.blocks import Stretch
-from ambid.track.engine import StreamReport, run
-from ambid.track.evidence import Samples
-from ambid.track.guard import StreamGuard
-from ambid.track.replay import blocks_of
-from ambid.track.reporter import Reporter
+from ambid.tracking.blocks import Stretch
+from ambid.tracking.engine import StreamReport, run
+from ambid.tracking.evidence import Samples
+from ambid.tracking.guard import StreamGuard
+from ambid.tracking.replay import blocks_of
+from ambid.tracking.reporter import Reporter
 from table import Table
 from timing import quantity
 from tracking_benches import RATE, preset_bench, record_of, start_of, supervised

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.stats import chi2
 
 from ambid.recursive.lines import Event
-from ambid.track.numbers import tracked_numbers
-from ambid.track.supervisor import Supervisor
+from ambid.tracking.numbers import tracked_numbers
+from ambid.tracking.supervisor import Supervisor
 from table import Table
 from timing import quantity
 from tracking_benches import BENCHES, BLOCK, RATE, Array, identified, supervised, told_of

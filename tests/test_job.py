@@ -12,7 +12,7 @@ from ambid.physics.presets import preset
 from ambid.record import Channel, Record, write_record
 from ambid.rig import default_rig
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 BEARING = preset("unstable-bearing")

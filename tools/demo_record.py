@@ -11,7 +11,7 @@ from pathlib import Path
 from ambid.cli.demo import PRESET
 from ambid.physics.presets import preset
 from ambid.signals import excitation
-from ambid.simulate import Simulation, simulate_preset
+from ambid.simulation import Simulation, simulate_preset
 
 SEED = 3
 DURATION_S = 0.4

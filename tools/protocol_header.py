@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from ambid.acquire.protocol.codec import frame, message, pack
-from ambid.acquire.protocol.table import CRC_BYTES, FORMATS, Entry, FieldType, MessageType, Table, table
+from ambid.acquisition.protocol.codec import frame, message, pack
+from ambid.acquisition.protocol.table import CRC_BYTES, FORMATS, Entry, FieldType, MessageType, Table, table
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -71,8 +71,8 @@ _TYPES = {"u8": "uint8_t", "u16": "uint16_t", "u32": "uint32_t", "i8": "int8_t",
 
 _HEADER_HEAD = """\
 /*
- * The wire protocol, version {version}: made from src/ambid/acquire/protocol/messages.toml by tools/protocol_header.py.
- * Change the table, not this file.
+ * The wire protocol, version {version}: made by tools/protocol_header.py
+ * from src/ambid/acquisition/protocol/messages.toml. Change the table, not this file.
  *
  * A frame is COBS( code | fields, little endian | CRC-16/XMODEM, low byte first ) 0x00.
  * read_NAME(p) takes the bytes from the code on, already found sound and long enough (LENGTH_NAME); write_NAME(p, ...)
@@ -207,7 +207,7 @@ _PAGE_HEAD = """\
 # The wire protocol
 
 What host and controller say to each other, version {version}. This page, the host's codec and the controller's header
-`firmware/amb_daq/protocol.h` are made from one table, `src/ambid/acquire/protocol/messages.toml`;
+`firmware/amb_daq/protocol.h` are made from one table, `src/ambid/acquisition/protocol/messages.toml`;
 `python tools/protocol_header.py` makes page and header anew, and a test says when one of them is stale.
 
 The line is asynchronous serial, {baud} baud, 8 data bits, no parity, 1 stop bit.

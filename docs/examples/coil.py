@@ -14,7 +14,7 @@ from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.rig import default_rig
 from ambid.signals import multisine
-from ambid.simulate import LinearPlant, noise_at_snr, simulate
+from ambid.simulation import LinearPlant, noise_at_snr, simulate
 
 GAIN, POLE = 550.0, 860.0  # A/(V s) and rad/s, thesis eq. 4.2
 PRINTED = {"gain": 519.8, "pole": 812.5}  # thesis eq. 4.3

@@ -17,7 +17,7 @@ import numpy as np
 from ambid.job import track
 from ambid.physics.presets import preset
 from ambid.recursive.lines import Event, Track
-from ambid.simulate import simulate_scenario, truth_columns
+from ambid.simulation import simulate_scenario, truth_columns
 
 START_S, CHANGE_S, LENGTH_S = 1.0, 2.0, 4.0
 CLOSE = 0.02  # what counts as found again

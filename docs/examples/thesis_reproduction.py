@@ -17,7 +17,7 @@ from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import noise_at_snr, simulate_preset
+from ambid.simulation import noise_at_snr, simulate_preset
 
 # What the thesis prints: A and B of eq. 4.10 (from table 4.1) and of eq. 4.11 (identified by its network).
 PRINTED_4_10 = {"a21": -5872.2, "a23": -3100.8, "a32": 5202.7, "a33": -20.97, "b3": 16.78}

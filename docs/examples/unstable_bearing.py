@@ -15,7 +15,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import Simulation, largest_amplitude, simulate_preset
+from ambid.simulation import Simulation, largest_amplitude, simulate_preset
 
 N_SAMPLES = 20_000
 

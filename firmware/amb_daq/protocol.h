@@ -1,6 +1,6 @@
 /*
- * The wire protocol, version 1: made from src/ambid/acquire/protocol/messages.toml by tools/protocol_header.py.
- * Change the table, not this file.
+ * The wire protocol, version 1: made by tools/protocol_header.py
+ * from src/ambid/acquisition/protocol/messages.toml. Change the table, not this file.
  *
  * A frame is COBS( code | fields, little endian | CRC-16/XMODEM, low byte first ) 0x00.
  * read_NAME(p) takes the bytes from the code on, already found sound and long enough (LENGTH_NAME); write_NAME(p, ...)

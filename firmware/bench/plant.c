@@ -134,7 +134,7 @@ static void runge_kutta(struct plant *p, double h, int open, double volts)
 
 /* ---- both ------------------------------------------------------------------------------------------------------ */
 
-/* Without rebound, as `ambid.simulate` does it. */
+/* Without rebound, as `ambid.simulation` does it. */
 static void hold_at_stops(struct plant *p)
 {
     p->touching = p->x >= p->is.stop[1] ? 1 : p->x <= p->is.stop[0] ? -1 : 0;

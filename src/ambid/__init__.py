@@ -30,12 +30,12 @@ if TYPE_CHECKING:
     from ambid.rig import read_bench as read_bench
     from ambid.rig import write_rig as write_rig
     from ambid.signals import excitation as excitation
-    from ambid.simulate import simulate_preset as simulate_preset
-    from ambid.simulate import simulate_rig as simulate_rig
+    from ambid.simulation import simulate_preset as simulate_preset
+    from ambid.simulation import simulate_rig as simulate_rig
 
 _ROOMS = (
     "bearing", "blackbox", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive", "report",
-    "rig", "signals", "simulate", "track", "units", "validate",
+    "rig", "signals", "simulation", "tracking", "units", "validate",
 )  # fmt: skip
 
 _exported, __dir__, __all__ = exports(__name__)

@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 
 import ambid
-from ambid.acquire.devices.benches import plant_text
-from ambid.acquire.devices.emulated import Emulator
-from ambid.acquire.devices.port import open_port
-from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
-from ambid.acquire.protocol.table import table
-from ambid.acquire.settings import controller_settings
+from ambid.acquisition.devices.benches import plant_text
+from ambid.acquisition.devices.emulated import Emulator
+from ambid.acquisition.devices.port import open_port
+from ambid.acquisition.protocol.codec import FrameDecoder, encode, message, unpack
+from ambid.acquisition.protocol.table import table
+from ambid.acquisition.settings import controller_settings
 from ambid.rig import load_rig
 
 DATA = Path(ambid.__file__).parent / "data"

@@ -4,11 +4,11 @@ from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
 
-from ambid.acquire.devices.benches import bench_of
-from ambid.acquire.devices.emulated import EmulatedDevice
-from ambid.acquire.program import program
-from ambid.acquire.recording import acquire
-from ambid.acquire.session import Course
+from ambid.acquisition.devices.benches import bench_of
+from ambid.acquisition.devices.emulated import EmulatedDevice
+from ambid.acquisition.program import program
+from ambid.acquisition.recording import acquire
+from ambid.acquisition.session import Course
 from ambid.job import identify
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.rig import load_rig

@@ -2,8 +2,8 @@
 
 from dataclasses import dataclass, replace
 
-from ambid.acquire.protocol.table import table
-from ambid.acquire.scales import PWM_HZ
+from ambid.acquisition.protocol.table import table
+from ambid.acquisition.scales import PWM_HZ
 from tests.bars.host import Host, Refused
 
 COUNTED = ("overruns", "dropped", "rx_errors", "rx_lost")  # by the controller

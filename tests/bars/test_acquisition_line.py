@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquire.devices.emulated import EmulatedDevice
-from ambid.acquire.program import program
-from ambid.acquire.recording import acquire
-from ambid.acquire.scales import SHORTEST_PERIOD
-from ambid.acquire.session import Course
+from ambid.acquisition.devices.emulated import EmulatedDevice
+from ambid.acquisition.program import program
+from ambid.acquisition.recording import acquire
+from ambid.acquisition.scales import SHORTEST_PERIOD
+from ambid.acquisition.session import Course
 from ambid.record import read_record
 from tests.bars.rates import COUNTED, run, stream_of
 

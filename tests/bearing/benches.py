@@ -14,7 +14,7 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import LinearPlant, simulate
+from ambid.simulation import LinearPlant, simulate
 from tests.estimation.reference import riccati, sampled
 
 THESIS = dict(preset("thesis").parameters)

@@ -12,8 +12,8 @@ from io import FileIO
 
 import pytest
 
-from ambid.acquire.default_daq import fault_words
-from ambid.acquire.device import DeviceEvent
+from ambid.acquisition.default_daq import fault_words
+from ambid.acquisition.device import DeviceEvent
 from ambid.cli import _BestEffort
 from ambid.cli.interrupts import Stop, signals
 

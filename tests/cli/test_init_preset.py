@@ -2,7 +2,7 @@
 
 import pytest
 
-from ambid.acquire.settings import controller_settings
+from ambid.acquisition.settings import controller_settings
 from ambid.rig import load_rig
 
 

@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
-from ambid.acquire.recorder import Recorded, Recorder, journal_path
-from ambid.acquire.recorder.reader import Damage, Survey
+from ambid.acquisition.recorder import Recorded, Recorder, journal_path
+from ambid.acquisition.recorder.reader import Damage, Survey
 from ambid.cli.recover import _lacks
 from ambid.record import read_record
-from tests.acquire.recorder.signals import ROWS, block, header, same_bits, values_at
+from tests.acquisition.recorder.signals import ROWS, block, header, same_bits, values_at
 
 BLOCKS = 30
 

@@ -9,7 +9,7 @@ import pytest
 from ambid.physics.presets import preset
 from ambid.record import read_record
 from ambid.rig import default_rig, write_rig
-from ambid.simulate import scenario_names, simulate_scenario, truth_columns
+from ambid.simulation import scenario_names, simulate_scenario, truth_columns
 
 SHORT = ("--duration", "0.1", "--seed", "3", "--amplitude", "8")
 

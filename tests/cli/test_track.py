@@ -16,9 +16,9 @@ import pytest
 from ambid.cli.live import Keys
 from ambid.errors import AmbidError
 from ambid.recursive.lines import Event
-from ambid.track.lines_file import read_track
+from ambid.tracking.lines_file import read_track
 from tests.conventions.sources import ROOT
-from tests.track.tracks import track_of
+from tests.tracking.tracks import track_of
 
 SECONDS, EVERY = 12.0, 0.05
 
@@ -238,7 +238,7 @@ ON_A_TERMINAL = f"""
 import fcntl, importlib, sys, termios, time
 fcntl.ioctl(0, termios.TIOCSCTTY, 0)
 sys.path.insert(0, {str(ROOT)!r})
-from tests.track.tracks import track_of
+from tests.tracking.tracks import track_of
 job = importlib.import_module("ambid.job.tracking")
 def stand_in(record, rig, *, on_header, on_line, **settings):
     track = track_of(seconds=600.0, every_s=1.0, names=("R",))

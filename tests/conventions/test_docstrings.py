@@ -203,7 +203,7 @@ REFERRING = '''
 """A module."""
 
 class Bench:
-    """A bench. See `ambid.acquire.device.Device` for what its methods promise."""
+    """A bench. See `ambid.acquisition.device.Device` for what its methods promise."""
 
     def start(self, mode: str) -> None:
         """As `Device.start`."""
@@ -217,7 +217,7 @@ def test_a_method_may_refer_to_the_contract_that_its_class_names():
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("See `ambid.acquire.device.Device`", "See it"), ("`Device.start`", "`Device.stop`"), ("As `", "Like `")],
+    [("See `ambid.acquisition.device.Device`", "See it"), ("`Device.start`", "`Device.stop`"), ("As `", "Like `")],
     ids=["not named", "another method", "no reference"],
 )
 def test_a_method_that_refers_to_nothing_is_found(old, new):

@@ -51,7 +51,7 @@ def test_every_room_stands_in_a_tier_and_on_the_map():
 
 
 FABRICATED = {
-    "upward": ("ambid.physics.linear_model", "from ambid.simulate.bench import simulate", "upward"),
+    "upward": ("ambid.physics.linear_model", "from ambid.simulation.bench import simulate", "upward"),
     "upward, the room itself": ("ambid.record.record", "from ambid import rig", "upward"),
     "upward by two dots": ("ambid.record.csv_format", "from ..physics import models", "upward"),
     "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
@@ -67,7 +67,7 @@ FABRICATED = {
     "private module": ("ambid.rig.schema", "from ambid.record._files import file_bytes", "_files is private to record"),
     "private module as a name": ("ambid.rig.schema", "from ambid.record import _files", "_files is private to record"),
     "private name": (
-        "ambid.simulate.bench",
+        "ambid.simulation.bench",
         "from ambid.physics.linear_model import _blocks",
         "_blocks is private to physics",
     ),

@@ -11,7 +11,7 @@ from ambid.estimation.estimate import estimate_from_json, estimate_text, estimat
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 
 
 @pytest.fixture(scope="module")

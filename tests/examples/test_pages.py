@@ -46,7 +46,7 @@ def test_rig_files_on_the_pages_load(page, k, text, tmp_path):
 
 def test_the_bench_of_the_rig_page_is_stable_and_keeps_its_limits(tmp_path):
     from ambid.signals import multisine
-    from ambid.simulate import simulate_rig
+    from ambid.simulation import simulate_rig
 
     text = next(t for t in blocks(ROOT / "docs" / "rig.md", "toml") if "[loop]" in t)
     (tmp_path / "rig.toml").write_text(text, encoding="utf-8")

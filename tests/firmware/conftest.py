@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ambid.acquire.devices.emulated import INSTALL, Emulator, find_firmware, find_program
+from ambid.acquisition.devices.emulated import INSTALL, Emulator, find_firmware, find_program
 from ambid.errors import DeviceError
 
 HERE = Path(__file__).resolve().parent

@@ -6,7 +6,7 @@ import select
 import time
 import tty
 
-from ambid.acquire.protocol.codec import FrameDecoder, encode, message, unpack
+from ambid.acquisition.protocol.codec import FrameDecoder, encode, message, unpack
 from tests.firmware.native.console import GAINS, LIMITS
 
 LIMIT_S = 45.0  # of the wall clock; only ends a hang

@@ -4,7 +4,7 @@ import subprocess
 
 import pytest
 
-from ambid.acquire.devices.emulated import INSTALL
+from ambid.acquisition.devices.emulated import INSTALL
 from tests.firmware.conftest import BENCH, lacking
 
 FIRMWARE = BENCH.parent

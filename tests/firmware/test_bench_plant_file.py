@@ -6,8 +6,8 @@ import subprocess
 import numpy as np
 import pytest
 
-from ambid.acquire.devices.benches import plant_text
-from ambid.acquire.scales import scale_of
+from ambid.acquisition.devices.benches import plant_text
+from ambid.acquisition.scales import scale_of
 from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Limits
 from ambid.physics.power_stage import PowerStage

@@ -10,7 +10,7 @@ import time
 
 import pytest
 
-from ambid.acquire.devices.emulated import Emulator, find_firmware, find_program
+from ambid.acquisition.devices.emulated import Emulator, find_firmware, find_program
 from ambid.errors import DeviceError
 from tests.firmware.probe_host import LIMIT_S, Line
 
@@ -75,7 +75,7 @@ def test_it_ends_while_it_waits(emulated, probe_elf, plant, lockstep_ms):
 
 def test_it_ends_with_its_parent(bench_program, probe_elf, plant):
     code = (
-        "import sys, time\nfrom pathlib import Path\nfrom ambid.acquire.devices.emulated import Emulator\n"
+        "import sys, time\nfrom pathlib import Path\nfrom ambid.acquisition.devices.emulated import Emulator\n"
         "e = Emulator(Path(sys.argv[1]), firmware=Path(sys.argv[2]), program=Path(sys.argv[3]))\n"
         "e.start()\nprint(e.pid, flush=True)\ntime.sleep(600)\n"
     )

@@ -2,7 +2,7 @@
 
 import pytest
 
-from ambid.acquire.protocol.codec import unpack
+from ambid.acquisition.protocol.codec import unpack
 from tests.firmware.native.console import (
     DRIVING,
     EXCITATION,

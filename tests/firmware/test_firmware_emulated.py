@@ -5,7 +5,7 @@ import subprocess
 
 import pytest
 
-from ambid.acquire.devices.emulated import Emulator
+from ambid.acquisition.devices.emulated import Emulator
 from ambid.physics.loop import placed_loop
 from tests.firmware.conftest import AVR
 from tests.firmware.controller_host import Host

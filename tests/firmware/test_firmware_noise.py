@@ -7,7 +7,7 @@ import time
 import numpy as np
 import pytest
 
-from ambid.acquire.protocol.codec import encode, message, unpack
+from ambid.acquisition.protocol.codec import encode, message, unpack
 from tests.firmware.controller_host import LIMIT_S
 from tests.firmware.native.console import FAULT, LEVITATING
 from tests.firmware.test_firmware_emulated import SILENT, bench, gains_for  # noqa: F401

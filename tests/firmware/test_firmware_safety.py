@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from ambid.acquire.devices import _kernels as k_
-from ambid.acquire.protocol.codec import unpack
-from ambid.acquire.scales import LIFTED_MS
+from ambid.acquisition.devices import _kernels as k_
+from ambid.acquisition.protocol.codec import unpack
+from ambid.acquisition.scales import LIFTED_MS
 from tests.firmware.native.console import (
     DRIVING,
     EXCITATION,

@@ -5,15 +5,15 @@ import re
 import numpy as np
 import pytest
 
-from ambid.acquire import scales as board
-from ambid.acquire.default_daq import with_default_daq
-from ambid.acquire.device import Program
-from ambid.acquire.program import expected, program
-from ambid.acquire.protocol.table import table
-from ambid.acquire.scales import scale_of
-from ambid.acquire.settings import controller_settings, in_si, realised
-from tests.acquire.rigs import bench
-from tests.acquire.test_default_daq import of_preset
+from ambid.acquisition import scales as board
+from ambid.acquisition.default_daq import with_default_daq
+from ambid.acquisition.device import Program
+from ambid.acquisition.program import expected, program
+from ambid.acquisition.protocol.table import table
+from ambid.acquisition.scales import scale_of
+from ambid.acquisition.settings import controller_settings, in_si, realised
+from tests.acquisition.rigs import bench
+from tests.acquisition.test_default_daq import of_preset
 from tests.firmware.native.console import FIRMWARE, Console, build, code, command
 
 TOLD = ("prototype", "unstable-bearing", "rmit", "thesis")

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
-from ambid.acquire.scales import PWM_HZ
+from ambid.acquisition.scales import PWM_HZ
 from tests.firmware.controller_host import Host
 from tests.firmware.test_firmware_emulated import BENCH, PLANT, gains_for
 

@@ -3,8 +3,8 @@
 from dataclasses import replace
 from pathlib import Path
 
-from ambid.acquire.device import DeviceEvent, SelfTest
-from ambid.acquire.devices.simulated import SimulatedDevice
+from ambid.acquisition.device import DeviceEvent, SelfTest
+from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import DeviceError
 from ambid.physics.presets import preset
 from ambid.rig import load_rig, rig_from_text
@@ -144,7 +144,7 @@ class Spoiled(SimulatedDevice):
 
     def become(self, *changes):
         """From now on another bench: parameters of the linear or nonlinear plant, by factor."""
-        from ambid.acquire.devices.simulated import _plant_of
+        from ambid.acquisition.devices.simulated import _plant_of
 
         plant = self._bench.plant
         plant = replace(plant, **{name: factor * getattr(plant, name) for name, factor in changes})

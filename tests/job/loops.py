@@ -10,7 +10,7 @@ import numpy as np
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record, write_record
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 
 
 def loop_record(

@@ -9,7 +9,7 @@ from ambid.job.identification import identify_nonlinear
 from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.rig import RigMagnet, default_rig
-from ambid.simulate import simulate
+from ambid.simulation import simulate
 
 
 def test_a_wrong_gain_of_the_position_is_not_seen_while_the_mass_is_free_and_that_is_said():

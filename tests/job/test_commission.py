@@ -8,8 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ambid.acquire.device import SelfTest
-from ambid.acquire.devices.simulated import SimulatedDevice
+from ambid.acquisition.device import SelfTest
+from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import commissioning as room
 from ambid.job import commissioning_steps as judge
@@ -18,7 +18,7 @@ from ambid.job.commissioning_steps import STEPS, Wishes, tracking
 from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
 from ambid.rig import load_rig
-from tests.acquire.test_look import WHOLE
+from tests.acquisition.test_look import WHOLE
 from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
 
 SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
@@ -404,8 +404,8 @@ def test_an_interruption_while_numbers_are_worked_out(tmp_path):
 
 
 def test_a_disk_that_failed_is_the_reason(finished):
-    from ambid.acquire.quality import Quality
-    from ambid.acquire.recording import Acquired
+    from ambid.acquisition.quality import Quality
+    from ambid.acquisition.recording import Acquired
     from ambid.errors import DeviceError
 
     info = SimulatedDevice(prototype()).info

@@ -12,7 +12,7 @@ from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
 from ambid.rig import load_rig
-from ambid.simulate import simulate
+from ambid.simulation import simulate
 
 RIG = """schema = "ambid.rig/1"
 name = "ball under one magnet"

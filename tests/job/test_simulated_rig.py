@@ -9,7 +9,7 @@ from scipy.stats import chi2
 from ambid.job.identification import identify_nonlinear
 from ambid.physics.presets import preset
 from ambid.rig import preset_text, rig_from_text
-from ambid.simulate import simulate_rig
+from ambid.simulation import simulate_rig
 
 HEAD = """schema = "ambid.rig/1"
 model = "one-axis"

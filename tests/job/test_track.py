@@ -14,8 +14,8 @@ from ambid.job import identify, track
 from ambid.physics.presets import preset
 from ambid.record import Record, write_record
 from ambid.rig import default_rig
-from ambid.simulate import simulate_scenario, truth_columns
-from tests.track.runs import RATE, START_S, TRUE, simulated, start, step
+from ambid.simulation import simulate_scenario, truth_columns
+from tests.tracking.runs import RATE, START_S, TRUE, simulated, start, step
 
 BENCH = preset("unstable-bearing")
 ROLES = ("voltage", "current", "position")
@@ -158,7 +158,7 @@ def test_a_damaged_file_ends_at_the_same_estimate_and_says_what_was_left_out(tmp
 
 
 def test_lost_samples_all_over(tmp_path):
-    from ambid.simulate.scenarios import losses
+    from ambid.simulation.scenarios import losses
 
     record = simulated(seconds=3.0, seed=2)
     lines = rows(record)

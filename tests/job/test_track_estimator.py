@@ -13,8 +13,8 @@ from ambid.job import track
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
-from ambid.simulate import simulate_scenario
-from ambid.track.lines_file import read_track
+from ambid.simulation import simulate_scenario
+from ambid.tracking.lines_file import read_track
 
 A1, B1, N, RATE = -0.8, 0.5, 4000, 1000.0
 ARX = {"na": 1, "nb": 1, "nk": 1}

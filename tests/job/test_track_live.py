@@ -6,15 +6,15 @@ from functools import cache
 
 import pytest
 
-from ambid.acquire.program import program
-from ambid.acquire.recording import acquire
-from ambid.acquire.session import Course
+from ambid.acquisition.program import program
+from ambid.acquisition.recording import acquire
+from ambid.acquisition.session import Course
 from ambid.errors import AmbidError, DeviceError
 from ambid.job import identify
 from ambid.job.track_live import track_live
 from ambid.record import read_record
 from ambid.rig import rig_from_text
-from tests.acquire.scripted import Listener
+from tests.acquisition.scripted import Listener
 from tests.job.benches import PROTOTYPE_FILE, Spoiled, prototype
 
 RIG = prototype()
@@ -228,7 +228,7 @@ def test_a_line_that_is_lost_is_raised(start, tmp_path):
 
 
 def test_a_record_made_meanwhile_is_whole(start, tmp_path):
-    from ambid.acquire.recording import recording
+    from ambid.acquisition.recording import recording
 
     with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
         track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)

@@ -15,7 +15,7 @@ from ambid.nonlinear.state_network import ONE_AXIS, Layout, StateNetwork, StateP
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from tests.nonlinear.systems import smooth
 
 

@@ -6,7 +6,7 @@ import pytest
 from ambid.errors import ModelError
 from ambid.physics.linear_model import model
 from ambid.physics.presets import preset, preset_names
-from ambid.simulate import closed_loop_poles
+from ambid.simulation import closed_loop_poles
 
 
 @pytest.mark.parametrize("name", preset_names())

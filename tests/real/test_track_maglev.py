@@ -12,9 +12,9 @@ import pytest
 from ambid.job import identify
 from ambid.job.track_start import rows_of
 from ambid.rig import load_rig
-from ambid.track.evidence import Samples
-from ambid.track.rpem import PhysicalRpem
-from ambid.track.supervisor import Supervisor
+from ambid.tracking.evidence import Samples
+from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.supervisor import Supervisor
 from tests.real.test_maglev import AXIS_RIG, MAGLEV, written
 
 pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured records are not beside this checkout")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.track.rpem import PhysicalRpem
-from ambid.track.window import MovingWindow
+from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.window import MovingWindow
 from tests.recursive.cases import Case
-from tests.track.starts import bearing, bearing_start, columns
+from tests.tracking.starts import bearing, bearing_start, columns
 
 _N, _START = 3000, 4000
 

@@ -12,7 +12,7 @@ from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.recursive.joint import JointEkf, JointUkf
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from tests.bearing.benches import run
 from tests.recursive.joint_starts import start_of
 

@@ -10,7 +10,7 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.nn import nn
 from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 
 ENTRIES = ("a21", "a23", "a32", "a33", "b3")
 PUBLISHED = {"a21": -6231.1, "a23": -3279.2, "a32": 5315.7, "a33": -18.9, "b3": 16.61}  # eq. 4.11

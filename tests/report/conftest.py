@@ -8,7 +8,7 @@ from ambid.physics.presets import preset
 from ambid.report.figures import Evidence
 from ambid.rig import default_rig
 from ambid.signals import excitation
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from ambid.validate.second_record import replay
 
 

@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
-from ambid.acquire.device import Counters, DeviceInfo
-from ambid.acquire.quality import ColumnQuality, QualityReport
-from ambid.acquire.session import RunReport
+from ambid.acquisition.device import Counters, DeviceInfo
+from ambid.acquisition.quality import ColumnQuality, QualityReport
+from ambid.acquisition.session import RunReport
 from ambid.job.commissioning_steps import STEPS
 from ambid.report.device_text import acquired_text, next_text, progress_line, step_text
 

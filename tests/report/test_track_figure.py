@@ -12,7 +12,7 @@ from matplotlib.colors import to_hex
 from ambid.recursive.lines import Event, TrackedValue
 from ambid.report.drawing import save
 from ambid.report.track_figures import STATES, TrackHistory, event_words, runs, track_figure, truth_words
-from tests.track.tracks import track_of, truth_of
+from tests.tracking.tracks import track_of, truth_of
 
 
 @pytest.fixture(scope="module")

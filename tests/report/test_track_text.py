@@ -10,7 +10,7 @@ import pytest
 
 from ambid.recursive.lines import Event, Latency, TrackedValue, TrackLine
 from ambid.report.track_text import change_words, speed_words, track_text, troubles_of, value_words
-from tests.track.tracks import header, track_of
+from tests.tracking.tracks import header, track_of
 
 
 @pytest.fixture(scope="module")

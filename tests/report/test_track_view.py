@@ -10,7 +10,7 @@ from rich.console import Console
 
 from ambid.recursive.lines import Event
 from ambid.report.track_text import TrackView, interval_bar, live_view, sparkline
-from tests.track.tracks import track_of
+from tests.tracking.tracks import track_of
 
 
 @pytest.fixture(scope="module")

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ambid.track.change import ChangeDetector
-from tests.track.evidences import BLOCK_S, Filter, evidence, triangle
+from ambid.tracking.change import ChangeDetector
+from tests.tracking.evidences import BLOCK_S, Filter, evidence, triangle
 
 N = 12_000  # blocks: a minute of record
 P7 = tuple(f"q{i}" for i in range(7))

@@ -8,10 +8,10 @@ import pytest
 from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import scenario_blocks, simulate_preset
-from ambid.track.numbers import tracked_numbers
-from ambid.track.rpem import PhysicalRpem
-from tests.track.starts import BEARING, bearing, bearing_start, columns
+from ambid.simulation import scenario_blocks, simulate_preset
+from ambid.tracking.numbers import tracked_numbers
+from ambid.tracking.rpem import PhysicalRpem
+from tests.tracking.starts import BEARING, bearing, bearing_start, columns
 
 
 def ball(n, seed):

@@ -9,7 +9,7 @@ from ambid.job import identify
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import default_rig
-from ambid.simulate import LinearPlant, simulate
+from ambid.simulation import LinearPlant, simulate
 
 RATE = 1000.0
 

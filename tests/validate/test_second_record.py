@@ -12,7 +12,7 @@ from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 from ambid.validate.second_record import replay, validation
 
 BEARING = preset("unstable-bearing")

@@ -23,10 +23,10 @@ from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError, refuse_given
 
 if TYPE_CHECKING:
-    from ambid.acquire.amplitude import Trial
-    from ambid.acquire.device import Device, Mode
-    from ambid.acquire.recording import Acquired, Progress
-    from ambid.acquire.session import Course, RunReport
+    from ambid.acquisition.amplitude import Trial
+    from ambid.acquisition.device import Device, Mode
+    from ambid.acquisition.recording import Acquired, Progress
+    from ambid.acquisition.session import Course, RunReport
     from ambid.cli.terminal import Watch
     from ambid.estimation.estimate import Estimate
     from ambid.recursive.lines import Track
@@ -86,7 +86,7 @@ def command(
     PORT is a serial port, 'emulated' (the firmware on an emulated controller before a simulated bench), 'simulated'
     (a simulated bench alone), or 'replay:FILE'. What is recorded is in a journal at once: see 'ambid recover'.
     """
-    from ambid.acquire.amplitude import Trial
+    from ambid.acquisition.amplitude import Trial
     from ambid.rig import load_rig
 
     if json is not None and track is None:
@@ -147,8 +147,8 @@ class Recording:
 
     def course(self, device: Device, watch: Watch, *, played: bool, amplitude: float | None) -> Course:
         """Say what the device is to do; find the amplitude of its excitation where none is given."""
-        from ambid.acquire.amplitude import band_for
-        from ambid.acquire.session import Course
+        from ambid.acquisition.amplitude import band_for
+        from ambid.acquisition.session import Course
         from ambid.record.sampling import MIN_SAMPLES
 
         rate_hz, trial = device.info.rate_hz, self.trial
@@ -166,7 +166,7 @@ class Recording:
 
     def _amplitude(self, device: Device, trial: Trial, watch: Watch) -> float:
         """Try small excitations first, and say which one was taken."""
-        from ambid.acquire.amplitude import fitting_amplitude
+        from ambid.acquisition.amplitude import fitting_amplitude
 
         watch.show("amplitude", 0.0, "trials, small first")
         brief = replace(trial, seconds=_TRIAL_S)
@@ -186,7 +186,7 @@ class Recording:
 
     def record_only(self, device: Device, course: Course, watch: Watch) -> Acquired:
         """Record without a tracker."""
-        from ambid.acquire.recording import acquire
+        from ambid.acquisition.recording import acquire
         from ambid.report.device_text import progress_line
 
         def show(now: Progress) -> None:
@@ -204,7 +204,7 @@ class Recording:
 
         The second result prints the track, and raises what it ends with.
         """
-        from ambid.acquire.recording import recording
+        from ambid.acquisition.recording import recording
         from ambid.cli.live import Follower
         from ambid.job.track_live import track_live
 
@@ -281,7 +281,7 @@ class Recording:
         stored = done.run.samples - done.not_stored - done.quality.repeated
         kept = f"{self.path} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
         if done.run.fault is not None:
-            from ambid.acquire.default_daq import fault_words
+            from ambid.acquisition.default_daq import fault_words
             from ambid.rig.rig import Daq
 
             rate_hz = done.info.rate_hz
@@ -321,7 +321,7 @@ def _changed(record: Path) -> int | None:
 
 
 def _journal(record: Path) -> Path:
-    from ambid.acquire.recorder.layout import journal_path
+    from ambid.acquisition.recorder.layout import journal_path
 
     return journal_path(record)
 

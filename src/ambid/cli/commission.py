@@ -18,7 +18,7 @@ from ambid.cli.terminal import painter, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquire.recording import Progress
+    from ambid.acquisition.recording import Progress
     from ambid.job.commissioning_steps import Step, StepName
 
 

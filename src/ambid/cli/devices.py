@@ -13,7 +13,7 @@ import typer
 from ambid.cli.options import preset_of
 
 if TYPE_CHECKING:
-    from ambid.acquire.device import Device, Mode
+    from ambid.acquisition.device import Device, Mode
     from ambid.physics.presets import Preset
     from ambid.rig import Rig
 
@@ -44,7 +44,7 @@ def open_bench(
     `port`: see ``--port``; `rig`: of the device; `bench`: see ``--bench``; `pace`: of a device that is no hardware;
     `seed`: of simulated noise. Returns idle.
     """
-    from ambid.acquire.devices.choose import open_device
+    from ambid.acquisition.devices.choose import open_device
 
     behind = _bench(bench)
     for line in _notes(port, rig, behind):
@@ -57,10 +57,10 @@ def open_bench(
 
 def _notes(port: str, rig: Rig, bench: Preset | Rig | None) -> tuple[str, ...]:
     """What is made up for a rig, and what its controller will do only roughly."""
-    from ambid.acquire.default_daq import default_daq_notes, with_default_daq
-    from ambid.acquire.devices.benches import bench_parameters
-    from ambid.acquire.review import review
-    from ambid.acquire.settings import controller_settings
+    from ambid.acquisition.default_daq import default_daq_notes, with_default_daq
+    from ambid.acquisition.devices.benches import bench_parameters
+    from ambid.acquisition.review import review
+    from ambid.acquisition.settings import controller_settings
 
     if port.startswith("replay:"):
         return ()

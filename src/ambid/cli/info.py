@@ -40,7 +40,7 @@ def models() -> None:
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
     from ambid.signals import EXCITATIONS
-    from ambid.simulate import scenario, scenario_names
+    from ambid.simulation import scenario, scenario_names
 
     paint = painter()
     for name in model_names():

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_figures import TrackHistory
     from ambid.report.track_text import TrackView
-    from ambid.track.lines_file import Tally
+    from ambid.tracking.lines_file import Tally
 
 T = TypeVar("T")
 Flag = Literal["track", "hold", "accept", "revert"]
@@ -59,7 +59,7 @@ class Follower:
 
     def __init__(self, json: str | None, *, keep: bool, quiet: bool, real_time: bool) -> None:
         """Begin before the run."""
-        from ambid.track.lines_file import TrackWriter
+        from ambid.tracking.lines_file import TrackWriter
 
         self.path, self.table = json_path(json), json != "-"
         self.header: TrackHeader | None = None
@@ -185,7 +185,7 @@ class Follower:
         """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
         one.
         """
-        from ambid.track.lines_file import Tally
+        from ambid.tracking.lines_file import Tally
 
         self._before_header.close()
         self._tally = Tally(header)

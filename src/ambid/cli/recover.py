@@ -13,7 +13,7 @@ from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquire.recorder import Recorded
+    from ambid.acquisition.recorder import Recorded
 
 
 def command(
@@ -53,8 +53,8 @@ def command(
 
 def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -> bool:
     """Make the record of one journal, say what was found, and return whether nothing of it was damaged."""
-    from ambid.acquire.recorder import JournalReader, record_path, recorded_already, recorded_from
-    from ambid.acquire.recorder.disk import sync_folder
+    from ambid.acquisition.recorder import JournalReader, record_path, recorded_already, recorded_from
+    from ambid.acquisition.recorder.disk import sync_folder
     from ambid.errors import DeviceError
 
     if not journal.name:

@@ -17,8 +17,8 @@ from ambid.errors import AmbidError, refuse_given
 if TYPE_CHECKING:
     from ambid.arrays import Array
     from ambid.physics.presets import Preset
-    from ambid.simulate import Simulation
-    from ambid.simulate.rig_bench import Bench
+    from ambid.simulation import Simulation
+    from ambid.simulation.rig_bench import Bench
 
 _ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
@@ -121,7 +121,7 @@ def command(
 def _bench(rig: str, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
     """Return the bench of a preset or a rig file, its rotor held at a position where one is given."""
     from ambid.rig import load_rig
-    from ambid.simulate.rig_bench import Bench
+    from ambid.simulation.rig_bench import Bench
 
     preset = preset_of(rig)
     if preset is not None:
@@ -169,7 +169,7 @@ def _run_scenario(
     """
     from ambid.record import write_record
     from ambid.rig import load_rig
-    from ambid.simulate import damage, scenario, simulate_scenario
+    from ambid.simulation import damage, scenario, simulate_scenario
 
     what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
@@ -214,7 +214,7 @@ def truth_words(done: Simulation) -> str:
 
 def _words(done: Simulation, told: Mapping[str, Any]) -> str:
     """Say what varies, from where to where, and from when."""
-    from ambid.simulate import truth_columns
+    from ambid.simulation import truth_columns
 
     moved = []
     for name, c in truth_columns(done.record).items():

@@ -14,10 +14,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
-from ambid.acquire.amplitude import Room, make_look
-from ambid.acquire.device import Device
-from ambid.acquire.recording import Acquired, Listeners, acquire
-from ambid.acquire.session import Course
+from ambid.acquisition.amplitude import Room, make_look
+from ambid.acquisition.device import Device
+from ambid.acquisition.recording import Acquired, Listeners, acquire
+from ambid.acquisition.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.progress import Tick, silent
@@ -27,7 +27,7 @@ from ambid.job.data import load
 from ambid.job.identification import evidence_of, identify, report_of
 from ambid.job.track_live import track_live
 from ambid.rig import Rig, rig_text
-from ambid.track.lines_file import TrackWriter
+from ambid.tracking.lines_file import TrackWriter
 
 FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl", "commission.json")
 """What a commissioning leaves in its folder."""
@@ -92,7 +92,7 @@ def commission(
     tick : callable, optional
         Sign of life while computing.
     **listeners
-        See `ambid.acquire.recording.Listeners`.
+        See `ambid.acquisition.recording.Listeners`.
 
     Returns
     -------

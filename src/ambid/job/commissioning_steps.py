@@ -13,10 +13,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ambid.acquire.amplitude import Look, Room, Trial, find_amplitude, moving_band, why_incomplete
-from ambid.acquire.device import Device
-from ambid.acquire.recording import Acquired
-from ambid.acquire.session import Course
+from ambid.acquisition.amplitude import Look, Room, Trial, find_amplitude, moving_band, why_incomplete
+from ambid.acquisition.device import Device
+from ambid.acquisition.recording import Acquired
+from ambid.acquisition.session import Course
 from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate, fields_json
 from ambid.job.track_live import LiveTrack

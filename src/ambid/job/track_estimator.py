@@ -38,7 +38,7 @@ from ambid.recursive import (
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig
 from ambid.signals.conditioning import cut
-from ambid.track.lines_file import Tally
+from ambid.tracking.lines_file import Tally
 
 REGRESSIONS = ("rls", "lms", "nlms", "iv")
 POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")

@@ -18,10 +18,10 @@ from typing import Unpack
 
 import numpy as np
 
-from ambid.acquire.default_daq import fault_words
-from ambid.acquire.device import Device, DeviceEvent
-from ambid.acquire.session import Course, RunReport, Tap, run
-from ambid.acquire.view import BenchView
+from ambid.acquisition.default_daq import fault_words
+from ambid.acquisition.device import Device, DeviceEvent
+from ambid.acquisition.session import Course, RunReport, Tap, run
+from ambid.acquisition.view import BenchView
 from ambid.arrays import Array
 from ambid.errors import AmbidError, DeviceError
 from ambid.estimation.estimate import Estimate
@@ -32,9 +32,9 @@ from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.rig import Rig
-from ambid.track.blocks import Block, Frame
-from ambid.track.replay import Replay
-from ambid.track.ring import BlockRing
+from ambid.tracking.blocks import Block, Frame
+from ambid.tracking.replay import Replay
+from ambid.tracking.ring import BlockRing
 
 _BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided
 _QUEUE_S = 30.0  # of samples that the ring holds while a start is identified, or the machine is busy

@@ -20,10 +20,10 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, read_rows
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
-from ambid.track.guard import ABSURD
-from ambid.track.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
-from ambid.track.replay import Replay, blocks_of
-from ambid.track.rpem import PhysicalRpem
+from ambid.tracking.guard import ABSURD
+from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
+from ambid.tracking.replay import Replay, blocks_of
+from ambid.tracking.rpem import PhysicalRpem
 
 _START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much
 _SETTLED_S, _SETTLED_PART = 5.0, 1 / 3  # longest time, and part of the record, until a predictor has settled

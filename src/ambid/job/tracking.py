@@ -21,15 +21,15 @@ from ambid.job.track_start import BenchRows, Start, check_settling, credible_lim
 from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackLine
 from ambid.rig import Rig, load_rig
-from ambid.track.blocks import Block, Stretch
-from ambid.track.engine import run
-from ambid.track.evidence import Samples
-from ambid.track.guard import ABSURD, StreamGuard
-from ambid.track.numbers import Forcing
-from ambid.track.reporter import Reporter, header
-from ambid.track.ring import BlockRing
-from ambid.track.rpem import PhysicalRpem
-from ambid.track.supervisor import Supervisor, warm_up
+from ambid.tracking.blocks import Block, Stretch
+from ambid.tracking.engine import run
+from ambid.tracking.evidence import Samples
+from ambid.tracking.guard import ABSURD, StreamGuard
+from ambid.tracking.numbers import Forcing
+from ambid.tracking.reporter import Reporter, header
+from ambid.tracking.ring import BlockRing
+from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.supervisor import Supervisor, warm_up
 
 
 def track(

@@ -154,7 +154,7 @@ def placed_loop(
     """Return the PID with current feedback that places the four poles of the continuous ``one-axis`` loop.
 
     Equates m L s^4 + (m r + c L) s^3 + (k_x L + c r + k_i^2 + k_i kd) s^2 + (k_x r + k_i kp) s + k_i ki, r = R + kc,
-    with m L prod(s - p). Filter, sampling and delay are left out: check with `ambid.simulate.closed_loop_poles`.
+    with m L prod(s - p). Filter, sampling and delay are left out: check with `ambid.simulation.closed_loop_poles`.
 
     Parameters
     ----------

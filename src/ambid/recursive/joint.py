@@ -361,7 +361,7 @@ class JointEkf(JointFilter):
     with excitation far above the noise a factor of ten does not move it. Where the start is wrong by more than the
     plant is linear (20 % on that bearing, 5 % on a lightly damped resonance), it settles beside the truth and claims a
     standard deviation that is far too small; `warnings` says so where it must be feared. `JointUkf` keeps the second
-    order. The recursive prediction error method of `ambid.track.rpem`, whose noise is estimated off-line with the
+    order. The recursive prediction error method of `ambid.tracking.rpem`, whose noise is estimated off-line with the
     parameters and whose gain knows of them, is the one to prefer.
 
     Parameters
@@ -455,7 +455,7 @@ class JointUkf(JointFilter):
     along the others (states, offsets) the points of the full transform are known in closed form, and the result is that
     of all 2 n + 1 points. Measurements are linear and are taken in exactly. It converges from farther than `JointEkf`
     (5 % on a lightly damped resonance) at about a quarter of its speed; near the truth they agree to a hundredth of a
-    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.track.rpem`.
+    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.tracking.rpem`.
 
     Parameters
     ----------

@@ -12,9 +12,9 @@ from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, pla
 if TYPE_CHECKING:
     from pathlib import Path
 
-    from ambid.acquire.device import Counters, DeviceInfo
-    from ambid.acquire.quality import ColumnQuality, QualityReport
-    from ambid.acquire.session import RunReport
+    from ambid.acquisition.device import Counters, DeviceInfo
+    from ambid.acquisition.quality import ColumnQuality, QualityReport
+    from ambid.acquisition.session import RunReport
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
 _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise

@@ -21,7 +21,7 @@ from ambid.report.text import (
     verdict_table,
     warning_lines,
 )
-from ambid.track.lines_file import NORMAL_95
+from ambid.tracking.lines_file import NORMAL_95
 
 if TYPE_CHECKING:
     from rich.console import Group

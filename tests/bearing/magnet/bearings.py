@@ -8,7 +8,7 @@ from ambid.bearing.magnet_problem import BODY, SIGNED, BearingProblem, BearingRe
 from ambid.physics.coenergy_law import MagnetLaw, law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.presets import Preset, preset
-from ambid.simulate import Simulation, simulate
+from ambid.simulation import Simulation, simulate
 
 MAGNITUDE = {"x_offset": 1e-6, "v_offset": 1e-2, "i_offset": 1e-3, "g": 9.81, "v_drop": 0.1, "k_asym": 0.1,
              "i0_asym": 0.1}  # fmt: skip

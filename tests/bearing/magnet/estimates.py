@@ -9,7 +9,7 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
-from ambid.simulate import Simulation, simulate
+from ambid.simulation import Simulation, simulate
 from tests.bearing.magnet.bearings import as_seen, truth_of
 
 LEVELS = {"position": 2e-6, "current": 1e-3, "force": 2e-3, "voltage": 0.02}  # of the preset, rms of one sample

@@ -12,7 +12,7 @@ from ambid.bearing.magnet_rescue import bearing_cost, failure, global_problems
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
-from ambid.simulate import simulate
+from ambid.simulation import simulate
 from tests.bearing.magnet.bearings import LARGE, as_seen, truth_of, unstable
 
 BENCH = preset("levitated-ball")

@@ -12,7 +12,7 @@ from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.signals.periodic_response import frf_periodic
 from ambid.signals.response import FrequencyResponse
-from ambid.simulate import simulate_preset
+from ambid.simulation import simulate_preset
 
 RATE = 20_000.0
 

@@ -4,7 +4,7 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-from ambid.acquire.protocol.codec import message, pack
+from ambid.acquisition.protocol.codec import message, pack
 
 HERE = Path(__file__).resolve().parent
 FIRMWARE = HERE.parents[2] / "firmware" / "amb_daq"

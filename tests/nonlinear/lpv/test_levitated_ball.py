@@ -9,7 +9,7 @@ from ambid.blackbox.data import io_data
 from ambid.nonlinear.lpv import lpv
 from ambid.physics.loop import placed_loop
 from ambid.physics.presets import preset
-from ambid.simulate import simulate
+from ambid.simulation import simulate
 
 GAPS = (0.008, 0.010, 0.012)
 

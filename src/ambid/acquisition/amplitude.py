@@ -1,0 +1,278 @@
+"""Short looks at a bench, kept in memory and seen through the rig, and the size of an excitation found by them.
+
+An excitation may use a part of the way from rest to the trips of position and current, and most of the voltage. The
+first trial is so small that a bench which is hard to hold stands it; one that was too large is followed by a smaller.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.acquisition.default_daq import fault_words, with_default_daq
+from ambid.acquisition.device import Device, Mode
+from ambid.acquisition.program import program
+from ambid.acquisition.scales import scale_of
+from ambid.acquisition.session import Course, RunReport, run
+from ambid.acquisition.view import BenchView
+from ambid.arrays import Array
+from ambid.errors import DeviceError
+from ambid.physics.linear_model import model
+from ambid.rig import Rig
+from ambid.tracking.blocks import Frame
+
+_FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
+_TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
+_ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
+_AIM = 0.9  # of that part
+_VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
+_NEAR = 0.85  # of the way to a trip: no room left
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Room:
+    """Where a bench may work, SI."""
+
+    # of position and current, those of them that the bench has: the controller's limits
+    trips: Mapping[str, tuple[float, float]]
+    voltage: tuple[float, float]  # that may be ordered: inside the limits of the loop and ``daq.duty``
+
+    @classmethod
+    def of(cls, rig: Rig) -> Room:
+        """Take it from a rig.
+
+        `rig`: with ``[daq]``. Returns infinite where the rig knows no limit.
+        """
+        unlimited = (-math.inf, math.inf)
+        roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
+        trips: dict[str, tuple[float, float]] = {role: rig.trip(role) or unlimited for role in roles}
+        return cls(
+            trips=MappingProxyType(trips), voltage=_ordered(rig, rig.limits.voltage if rig.limits else unlimited)
+        )
+
+    def used(self, role: str, values: Array, rest: float) -> float:
+        """Return which part of the way from rest to the nearer trip is used, 0 to 1 and beyond.
+
+        `role`: ``position`` or ``current``; `values`: (n_samples,), SI, measured; `rest`: where the bench rests, SI.
+        Returns 0 where there is no limit.
+        """
+        low, high = self.trips[role]
+        up, down = float(values.max()) - rest, rest - float(values.min())
+        return max(
+            up / (high - rest) if high > rest else math.inf, down / (rest - low) if rest > low else math.inf, 0.0
+        )
+
+
+def _ordered(rig: Rig, limits: tuple[float, float]) -> tuple[float, float]:
+    """Return what of the limits of the voltage the pulse widths allowed can order."""
+    if rig.daq is None or rig.daq.duty is None:
+        return limits
+    low, high = sorted(scale_of(with_default_daq(rig), "voltage").to_si(rig.daq.duty).tolist())
+    return max(low, limits[0]), min(high, limits[1])
+
+
+Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
+
+
+def make_look(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
+    """Return a way of running a course: it gives the report, and by role what came, SI, seen through the rig.
+
+    `device`: opened, idle; `stopped`: as `session.run`.
+    """
+    plant = model(rig.model)
+    view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
+
+    def look(course: Course) -> tuple[RunReport, dict[str, Array]]:
+        kept = Kept(view)
+        report = run(device, course, taps=[kept], stopped=stopped)
+        values = np.concatenate([np.empty((0, len(view.units))), *kept.values])
+        return report, {role: values[:, k] for k, role in enumerate(view.units)}
+
+    return look
+
+
+class Kept:
+    """Keeps what a run passes on, seen through a view."""
+
+    def __init__(self, view: BenchView) -> None:
+        self._view = view
+        self.values: list[Array] = []
+
+    def take(self, frame: Frame) -> None:
+        """Take a block as it came."""
+        self.values.append(self._view.block(frame.block).values)
+
+
+def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
+    """Say why a run is not whole.
+
+    `report`: of the run; `what`: what it was for. Returns empty where it is whole.
+    """
+    if report.fault is not None:
+        return (f"the controller went to its safe state during {what}: {fault_words(report.fault)}",)
+    if report.interrupted:
+        return (f"{what} was interrupted after {report.samples} of {report.wanted} samples",)
+    if report.lost:
+        return (f"{report.lost} of {report.wanted} samples were lost during {what}: look at cable, baud rate and load",)
+    if not report.complete:
+        return (f"{what} ended after {report.samples} of {report.wanted} samples",)
+    return ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Trial:
+    """What is played, and how long."""
+
+    name: str  # excitation, as `ambid.acquisition.program` knows it
+    band: tuple[float, float] | None  # in Hz
+    mode: Mode  # of the device
+    settle_s: float  # time after the start, and length of the trial, s
+    seconds: float
+    seed: int  # of the excitation
+
+    def course(self, amplitude_v: float, rate_hz: float) -> Course:
+        """Return the course that plays it with a peak in V; refuse what a controller of this rate cannot play."""
+        wave = program(
+            self.name, amplitude_v=amplitude_v, band=self.band, rate_hz=rate_hz, seconds=self.seconds, seed=self.seed
+        )
+        return Course(mode=self.mode, seconds=self.seconds, settle_s=self.settle_s, program=wave)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Size:
+    """What trials found."""
+
+    amplitude_v: float  # peak of the excitation, V
+    used: float  # part of the room that it used, 0 to 1 and beyond
+    findings: tuple[str, ...]  # what each trial showed; why the size is not good
+    reasons: tuple[str, ...] = ()
+
+
+def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
+    """Return the band in which a levitated rotor moves: an excitation above it tells of the coil alone.
+
+    `rate_hz`: of the device, Hz. Returns from a thousandth of the rate to a thirtieth, Hz.
+    """
+    return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
+
+
+def band_for(trial: Trial, rate_hz: float) -> tuple[float, float] | None:
+    """Return the band as wished; without one, of a multisine that is to levitate, that in which the rotor moves."""
+    if trial.band is not None or trial.mode != "levitate" or trial.name not in ("multisine", "schroeder"):
+        return trial.band
+    low, high = moving_band(rate_hz, trial.seconds)
+    return (low, high) if 3.0 * low < high else None  # a short record has no room for slow lines
+
+
+def find_amplitude(
+    look: Look,
+    room: Room,
+    trial: Trial,
+    resting: Mapping[str, float],
+    *,
+    rate_hz: float,
+    use: float,
+    given: float | None = None,
+) -> Size:
+    """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
+
+    `look`: see `make_look`; `room`: limits; `trial`: what is played; `resting`: position in m and current
+    in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
+    reasons where it tripped, or used too much. It may use less than its part where trials have run out.
+    """
+    low, high = room.voltage
+    if given is None and not math.isfinite(high - low):
+        why = "the rig has no loop.limits.voltage to choose an amplitude from: give one"
+        return Size(amplitude_v=math.nan, used=math.nan, findings=(), reasons=(why,))
+    size = _FIRST * (high - low) / 2.0 if given is None else given
+    tried: list[tuple[float, float]] = []  # size, and what it used
+    findings: list[str] = []
+    while True:
+        report, seen = look(trial.course(size, rate_hz))
+        reasons = why_incomplete(report, f"excitation of {size:.3g} V")
+        if reasons:
+            return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
+        worst, used = _used(seen, room, resting, use)
+        tried.append((size, used))
+        findings.append(f"{size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}")
+        larger_or_smaller = _next_size(tried, use) if given is None else None
+        if larger_or_smaller is None:
+            break
+        size = larger_or_smaller
+    return Size(
+        amplitude_v=size, used=used, findings=tuple(findings),
+        reasons=_too_much(tried, worst, _TOO_MUCH * use if given is None else _NEAR),
+    )  # fmt: skip
+
+
+def fitting_amplitude(
+    device: Device, rig: Rig, trial: Trial, *, use: float = 0.3, stopped: Callable[[], bool] = lambda: False
+) -> float:
+    """Find an amplitude for a device that has not run yet.
+
+    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `use`: part of the room; `stopped`: as
+    `session.run`. Returns peak in V.
+    """
+    look, room = make_look(device, rig, stopped), Room.of(rig)
+    report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
+    reasons = why_incomplete(report, "the look before the excitation")
+    if not reasons:
+        resting = {role: float(seen[role].mean()) for role in room.trips}
+        found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=use)
+        if not found.reasons:
+            return found.amplitude_v
+        reasons = found.reasons
+    raise DeviceError(f"{device.info.port}: no amplitude was found: {'; '.join(reasons)}. Give --amplitude")
+
+
+def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
+    """Return the size to try next; None where the last one is good, or another would not be better."""
+    size, used = tried[-1]
+    good = _ENOUGH * use <= used <= _TOO_MUCH * use
+    if good or len(tried) == _TRIALS or (used > use and _at_the_floor(tried)):
+        return None
+    wanted = size * (_GROWTH if used <= 0.0 else min(max(_AIM * use / used, 1.0 / _GROWTH), _GROWTH))
+    # Where more is used than in proportion, the good size lies between two that were tried.
+    below = max((s for s, part in tried if part <= use), default=0.0)
+    above = min((s for s, part in tried if part > use), default=math.inf)
+    return wanted if below < wanted < above else math.sqrt(below * above)
+
+
+def _at_the_floor(tried: list[tuple[float, float]]) -> bool:
+    """Whether a smaller size used hardly less: by less than half of what is in proportion."""
+    if len(tried) < 2 or tried[-1][0] >= tried[-2][0]:
+        return False
+    (larger, before), (smaller, now) = tried[-2:]
+    return now / before > (1.0 + smaller / larger) / 2.0
+
+
+def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tuple[str, ...]:
+    """Say that the last trial used more of the room than `most`; nothing where it did not."""
+    size, used = tried[-1]
+    if used <= most:
+        return ()
+    said = f"an excitation of {size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}, {100.0 * most:.0f} % are"
+    if _at_the_floor(tried):
+        return (
+            f"{said} allowed, and a larger one used hardly more: the bench moves by itself; see to noise and gains",
+        )
+    return (f"{said} allowed: give a smaller one",)
+
+
+def _used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
+    """Return which quantity uses most of its room, and how much of it."""
+    shares = {role: room.used(role, seen[role], resting[role]) for role in room.trips}
+    low, high = room.voltage
+    if math.isfinite(high - low):
+        volts = seen["voltage"]
+        rest = min(max(float(volts.mean()), low), high)  # an excitation has no mean; what holds the rotor may have one
+        up, down = float(volts.max()) - rest, rest - float(volts.min())
+        reach = max(up / (high - rest) if high > rest else 1.0, down / (rest - low) if rest > low else 1.0)
+        # A voltage that is used as far as it may be counts like a position at the part that is wished.
+        shares["voltage"] = reach * use / _VOLTAGE
+    worst = max(shares, key=lambda role: shares[role])
+    return worst, shares[worst]

@@ -1,0 +1,199 @@
+"""The simulated controller's tick, compiled: converter, checks, law in whole numbers, excitation, plant.
+
+It follows ``protocol/messages.toml`` and the firmware's ``control.h``; what a call leaves off, the next one continues.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.compiled import compiled
+from ambid.simulation.kernels import Linear, Nonlinear, advance_plant
+
+Integers = NDArray[np.int64]
+
+# States and causes: as in messages.toml; a test compares them.
+IDLE, SAMPLING, DRIVING, LEVITATING, FAULT = 0, 1, 2, 3, 4
+OVER_CURRENT, OUT_OF_GAP = 3, 4
+NONE, STEP, PRBS, TABLE = 0, 1, 2, 3
+
+# Places in `settings`.
+KP, KI, KD, POLE, KC, SETPOINT, REST, BIAS = range(8)
+POSITION_LOW, POSITION_HIGH, CURRENT_LOW, CURRENT_HIGH, DUTY_LOW, DUTY_HIGH, DUTY_OFF, LIFT = range(8, 16)
+KIND, AMPLITUDE, HOLD, LENGTH, CYCLES, TOP, TOP_DUTY = 16, 17, 18, 19, 20, 21, 22
+SETTLED = 23  # ticks inside its limits after which the position counts
+N_SETTINGS = 24
+
+# Places in `memory`.
+STATE, CAUSE, INTEGRAL, DERIVATIVE, LAST, FRESH, TICK, FAULT_TICK, LIFTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
+PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY, INSIDE = 9, 10, 11, 12, 13, 14, 15
+N_MEMORY = 16
+
+_ONE = 1 << 12  # a count in the law's fixed point
+_TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
+_MASKS = np.array([0, 0, 0, 0x3, 0x3, 0x5, 0x3, 0x3, 0x1D, 0x11, 0x9, 0x5, 0x53, 0x1B, 0x443, 0x3], dtype=np.int64)
+
+
+@compiled
+def mapped(value: float, x: Array, y: Array) -> float:
+    """Return y at `value` on the polyline through (x, y), its ends continued; x increases."""
+    k = min(max(int(np.searchsorted(x, value)) - 1, 0), x.size - 2)
+    return float(y[k] + (y[k + 1] - y[k]) / (x[k + 1] - x[k]) * (value - x[k]))
+
+
+@compiled
+def converted(value: float, x: Array, y: Array, top: int) -> int:
+    """Return the counts of a quantity, limited as a converter limits them."""
+    return int(min(max(math.floor(mapped(value, x, y) + 0.5), 0.0), float(top)))
+
+
+@compiled
+def parity(word: int) -> int:
+    """Return 1 for an odd number of ones."""
+    odd = 0
+    while word:
+        odd ^= 1
+        word &= word - 1
+    return odd
+
+
+@compiled
+def played(settings: Integers, memory: Integers, table: Integers) -> int:
+    """Return the excitation of this tick in counts, and move on."""
+    if memory[PLAYING] == 0:
+        return 0
+    kind, amplitude, length = settings[KIND], settings[AMPLITUDE], settings[LENGTH]
+    if kind == STEP:
+        value, elements = (amplitude if memory[ELEMENT] == 0 else -amplitude), 2
+    elif kind == PRBS:
+        value, elements = (amplitude if memory[SHIFT] & 1 else -amplitude), (1 << length) - 1
+    else:
+        product, elements = amplitude * table[memory[ELEMENT]], length
+        value = (2 * abs(product) + 127) // 254 * (1 if product >= 0 else -1)
+    memory[HELD] += 1
+    if memory[HELD] >= settings[HOLD]:
+        memory[HELD] = 0
+        memory[ELEMENT] += 1
+        if kind == PRBS:
+            s = memory[SHIFT]
+            memory[SHIFT] = s >> 1 | parity(s & _MASKS[length]) << (length - 1)
+        if memory[ELEMENT] >= elements:
+            memory[ELEMENT] = 0
+            memory[PLAYED] += 1
+            if settings[CYCLES] and memory[PLAYED] >= settings[CYCLES]:
+                memory[PLAYING] = 0
+    return int(value)
+
+
+@compiled
+def within(value: int, largest: int) -> int:
+    """Return `value` limited to both sides."""
+    return min(max(value, -largest), largest)
+
+
+@compiled
+def ordered(position: int, current: int, excitation: int, settings: Integers, memory: Integers) -> int:
+    """Return the pulse width that the law orders, in counts: the firmware's fixed point, number by number."""
+    low, high = settings[DUTY_LOW], settings[DUTY_HIGH]
+    if memory[STATE] == DRIVING:
+        return int(min(max(settings[BIAS] + excitation, low), high))
+    error = settings[SETPOINT] - position
+    growth = settings[KI] * error
+    derivative = (memory[DERIVATIVE] * settings[POLE] + 0x8000) >> 16
+    if memory[FRESH] == 0:
+        derivative -= settings[KD] * (position - memory[LAST])
+    memory[DERIVATIVE], memory[LAST], memory[FRESH] = within(derivative, _TERM), position, 0
+    wanted = settings[KP] * error + (memory[INTEGRAL] >> 4) + memory[DERIVATIVE]
+    wanted = within(wanted - settings[KC] * (current - settings[REST]), _SUM) + (settings[BIAS] + excitation) * _ONE
+    duty, beyond = (wanted + _ONE // 2) >> 12, 0
+    if wanted > high * _ONE:
+        duty, beyond = high, 1
+    elif wanted < low * _ONE:
+        duty, beyond = low, -1
+    # Anti-windup: while the pulse width is limited the integral may only move back.
+    if beyond * growth <= 0:
+        memory[INTEGRAL] = within(memory[INTEGRAL] + growth, _INTEGRAL)
+    return int(duty)
+
+
+@compiled
+def tripped(position: int, current: int, settings: Integers, memory: Integers) -> int:
+    """Return the cause of a fault that this tick's inputs are, 0 for none."""
+    if memory[STATE] != DRIVING and memory[STATE] != LEVITATING:
+        return 0
+    if not settings[CURRENT_LOW] <= current <= settings[CURRENT_HIGH]:
+        return OVER_CURRENT
+    outside = not settings[POSITION_LOW] <= position <= settings[POSITION_HIGH]
+    if memory[TICK] - memory[LIFTED] < settings[LIFT]:
+        memory[INSIDE] = 0 if outside else memory[INSIDE] + 1
+        if memory[INSIDE] >= settings[SETTLED]:
+            memory[LIFTED] = memory[TICK] - settings[LIFT]
+        return 0
+    return OUT_OF_GAP if outside else 0
+
+
+@compiled
+def tick_on(
+    counts: Integers,
+    noise: Array,
+    noise_size: Array,
+    settings: Integers,
+    memory: Integers,
+    table: Integers,
+    x: Array,
+    line: Array,
+    roles: tuple[int, int],
+    maps: tuple[Array, Array, Array, Array, Array, Array],
+    centre: Array,
+    centre_input: float,
+    equations: Linear | Nonlinear,
+    stops: tuple[float, float],
+    room: Array,
+) -> int:
+    """Carry controller and plant over some ticks.
+
+    `noise` (n, 2 + n_disturbances) are standard normal numbers, `noise_size` what they are multiplied with: position,
+    current, disturbances. `maps` are x and y of position to counts, current to counts, pulse width to volts. `roles`
+    are the states of position and current (-1: none). `line` (whole delay + 2,) are the newest voltages.
+
+    Filled: counts (n, 6): position, current, pulse width, excitation, set point, state. Returns the first tick whose
+    state is not finite, -1 for none.
+    """
+    disturbance = np.empty(noise_size.size - 2)
+    whole = line.size - 2
+    for k in range(counts.shape[0]):
+        position = current = 0
+        if roles[0] >= 0:
+            if not math.isfinite(x[roles[0]]):
+                return k
+            position = converted(x[roles[0]] + noise[k, 0] * noise_size[0], maps[0], maps[1], settings[TOP])
+        if roles[1] >= 0:
+            if not math.isfinite(x[roles[1]]):
+                return k
+            current = converted(x[roles[1]] + noise[k, 1] * noise_size[1], maps[2], maps[3], settings[TOP])
+        cause = tripped(position, current, settings, memory)
+        if cause:
+            memory[STATE], memory[CAUSE], memory[FAULT_TICK] = FAULT, cause, memory[TICK]
+            memory[PLAYING] = 0
+        on = memory[STATE] == DRIVING or memory[STATE] == LEVITATING
+        excitation, duty = 0, settings[DUTY_OFF]
+        if on:
+            excitation = played(settings, memory, table)
+            duty = ordered(position, current, excitation, settings, memory)
+        memory[DUTY] = duty
+        counts[k, 0], counts[k, 1], counts[k, 2], counts[k, 3] = position, current, duty, excitation
+        counts[k, 4], counts[k, 5] = settings[SETPOINT], memory[STATE]
+        for j in range(whole + 1, 0, -1):
+            line[j] = line[j - 1]
+        # Output off: the bridge is open and the coil is taken to see no voltage.
+        line[0] = mapped(float(duty), maps[4], maps[5]) if on else 0.0
+        for j in range(disturbance.size):
+            disturbance[j] = noise[k, 2 + j] * noise_size[2 + j]
+        voltages = (line[whole + 1], line[whole], centre_input)
+        advance_plant(x, centre, voltages, disturbance, equations, stops, room)
+        memory[TICK] += 1
+    return -1

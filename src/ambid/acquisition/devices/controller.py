@@ -1,0 +1,415 @@
+"""The controller as the host talks to it: commands that are answered or told why not, and a sign of life from the host.
+
+A command has a number. Without an answer in time it is sent again with the same number, which the controller answers
+again without carrying it out twice. Pings go out from a thread of their own, whatever the rest of the program does, and
+under a number of their own: else a command after 254 of them would have that of the last one, and be taken for it.
+
+Bytes and their time of arrival are taken by a thread that does nothing else, into a queue of limited size: a consumer
+that is late never holds the port up. What finds no room is dropped whole, and counted.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from itertools import groupby
+from types import MappingProxyType
+
+from ambid.acquisition.devices.port import Port, PortEnded
+from ambid.acquisition.protocol.codec import FrameDecoder, Message, encode, message, unpack
+from ambid.acquisition.protocol.table import table
+from ambid.errors import DeviceError
+
+_ROOM = 1 << 24  # bytes: almost three minutes at 1 Mbaud
+_ANSWERS = {"identify": "identity", "ask_status": "status", "self_test": "self_test_result"}
+_SLOW = {"self_test": 10.0}  # times as long as another command's answer: the program memory is summed up
+_LOOK_S = 0.2
+_PATIENCE_S = 10.0  # for a thread to end
+_TRIES = 5  # how often a command is sent
+_PING_S = 0.05  # of the host's clock, or
+_PING_SAMPLES_S = 0.025  # of samples received, whichever comes first
+_SILENT_S = 0.5  # without a sample: it is asked for its status
+_LAST_ID, _PING_ID = 254, 255  # of a command, of every ping
+_NONE: Mapping[str, int] = MappingProxyType({})
+_LOST = "the controller goes to its safe state by itself"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Chunk:
+    """Bytes that came together."""
+
+    data: bytes
+    arrived_s: float  # when they were there, by `time.perf_counter`, s
+
+
+class Reader:
+    """Reads a port until it is closed or lost.
+
+    `port`: nobody else may read from it; `room`: bytes that wait at most.
+
+    `overruns`: reads dropped for want of room; `overrun_bytes`: bytes in them; `failure`: why the line is lost.
+    """
+
+    def __init__(self, port: Port, *, room: int = _ROOM) -> None:
+        self._port, self._room = port, room
+        self._chunks: deque[Chunk] = deque()
+        self._held = 0
+        self.overruns = self.overrun_bytes = 0
+        self.failure: OSError | None = None
+        self._stopping = False
+        self._over = False
+        self._news = threading.Condition()
+        self._thread = threading.Thread(target=self._run, name=f"read {port.name}", daemon=True)
+        self._thread.start()
+
+    def take(self, timeout_s: float) -> list[Chunk]:
+        """Take all that has come.
+
+        `timeout_s`: how long to wait for something, s. Returns empty if nothing came.
+        """
+        with self._news:
+            self._news.wait_for(lambda: self._chunks or self._over, timeout_s)
+            found = list(self._chunks)
+            self._chunks.clear()
+            self._held = 0
+        return found
+
+    @property
+    def over(self) -> bool:
+        """True once nothing more will come and all was taken."""
+        with self._news:
+            return self._over and not self._chunks
+
+    def close(self) -> None:
+        """Stop reading; again is harmless. The port stays open."""
+        self._stopping = True
+        if self._thread is not threading.current_thread():
+            self._thread.join(_PATIENCE_S)
+
+    def _run(self) -> None:
+        failure: OSError | None = None
+        try:
+            while not self._stopping:
+                data = self._port.read()
+                if data:
+                    self._put(data, time.perf_counter())
+        except OSError as lost:
+            failure = lost
+        except Exception as defect:  # else nobody would learn that nothing is read any more
+            failure = OSError(f"{type(defect).__name__}: {defect}")
+        finally:
+            with self._news:
+                self.failure = None if self._stopping else failure
+                self._over = True
+                self._news.notify_all()
+
+    def _put(self, data: bytes, arrived_s: float) -> None:
+        with self._news:
+            if self._held + len(data) > self._room:
+                self.overruns += 1
+                self.overrun_bytes += len(data)
+                return
+            self._chunks.append(Chunk(data=data, arrived_s=arrived_s))
+            self._held += len(data)
+            self._news.notify_all()
+
+
+@dataclass(slots=True)
+class _Waiting:
+    """A command under way."""
+
+    name: str
+    answer: Message | None = None
+
+
+class Controller:
+    """Commands, answers and the sign of life. Its methods may be called from any thread, except from `heard`.
+
+    `port`: open; nobody else may use it. It is closed with the controller; `samples`: given frames of samples and their
+    time of arrival, from the listener's thread; `told`: given messages that nobody asked for, and statuses, from the
+    listener's thread; `lost`: given the error, once, when the line is lost, from whichever thread sees it; `paused`:
+    tells whether the controller's time stands still: then it is not pinged; `answer_s`: how long to wait for an answer
+    before a command is sent again, s.
+
+    `resent`: commands sent again; `odd`: sound frames that are no message; `counters`, `reader`: what came over the
+    line; `failure`: why it is lost, once it is.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        *,
+        samples: Callable[[list[bytes], float], None],
+        told: Callable[[Message], None],
+        lost: Callable[[DeviceError], None],
+        paused: Callable[[], bool] = lambda: False,
+        answer_s: float = 0.3,
+    ) -> None:
+        self._port, self._samples, self._told, self._lost = port, samples, told, lost
+        self._answer_s, self._paused = answer_s, paused
+        self._id = 0
+        self.resent = self.odd = 0
+        self.failure: DeviceError | None = None
+        self._other: DeviceError | None = None
+        self._waiting: dict[int, _Waiting] = {}
+        self._news = threading.Condition()
+        self._asking = threading.Lock()
+        self._writing = threading.Lock()
+        self._due = threading.Condition()
+        self._unpinged, self._per_ping = 0, 0
+        self._closing = False
+        self._heard_s = time.monotonic()
+        self._decoder, self.reader = FrameDecoder(), Reader(port)
+        self.counters = self._decoder.counters
+        self._sample = table().messages["sample"].code
+        self._listener = threading.Thread(target=self._listen, name=f"listen {port.name}", daemon=True)
+        self._listener.start()
+        self._pinger = threading.Thread(target=self._keep_alive, name=f"ping {port.name}", daemon=True)
+        self._pinger.start()
+
+    @property
+    def asking(self) -> bool:
+        """Whether an answer is waited for."""
+        return bool(self._waiting)
+
+    def identify(self) -> Message:
+        """Ask who is there.
+
+        Returns ``identity``.
+        """
+        try:
+            return self.ask("identify")
+        except DeviceError:
+            if self._other is not None:
+                raise self._other from None
+            if self.failure is not None:
+                raise
+            raise DeviceError(self._nobody()) from None
+
+    def ask(self, name: str, fields: Mapping[str, int] = _NONE, *, values: tuple[int, ...] = ()) -> Message:
+        """Send a command and wait for its answer.
+
+        `name`: of the message; `fields`: its fields but ``id``; `values`: elements of its last field, where that is an
+        array. Returns the answer: ``ack``, or the command's own.
+        """
+        with self._asking:
+            number = self._next_id()
+            asked = message(name, values=values, id=number, **fields)
+            data, waiting = encode(asked), _Waiting(name)
+            self._waiting[number] = waiting
+            try:
+                answer = self._answered(data, waiting)
+            finally:
+                del self._waiting[number]
+        if answer is None:
+            if self.failure is not None:
+                raise DeviceError(str(self.failure))
+            raise DeviceError(
+                f"{self._port.name}: the controller did not answer {name!r}, sent {_TRIES} times; each command is"
+                f" answered. Look at cable and supply, and open the port again; {_LOST}"
+            )
+        if answer.name == "ack" and answer["code"]:
+            raise DeviceError(f"{self._port.name}: {refusal(asked, answer)}")
+        return answer
+
+    def pace(self, rate_hz: float) -> None:
+        """Begin with pings, and count samples as the time between them.
+
+        `rate_hz`: samples in a second.
+        """
+        with self._due:
+            self._per_ping = max(1, int(_PING_SAMPLES_S * rate_hz))
+            self._due.notify_all()
+
+    def close(self) -> None:
+        """End all threads and let the port go; again is harmless."""
+        with self._due:
+            self._closing = True
+            self._due.notify_all()
+        if self._pinger is not threading.current_thread():
+            self._pinger.join(_PATIENCE_S)
+        self.reader.close()
+        if self._listener is not threading.current_thread():
+            self._listener.join(_PATIENCE_S)
+        self._port.close()
+
+    def _next_id(self) -> int:
+        self._id = self._id % _LAST_ID + 1
+        return self._id
+
+    def _answered(self, data: bytes, waiting: _Waiting) -> Message | None:
+        limit = self._answer_s * _SLOW.get(waiting.name, 1.0)
+        for attempt in range(_TRIES):
+            if attempt:
+                self.resent += 1
+            self._send(data)
+            with self._news:
+                self._news.wait_for(lambda: waiting.answer or self._over(waiting), limit)
+                if waiting.answer or self._over(waiting):
+                    return waiting.answer
+        return None
+
+    def _over(self, waiting: _Waiting) -> bool:
+        """Whether no answer will come: the line is lost, or what was to be identified is something else."""
+        return self.failure is not None or (waiting.name == "identify" and self._other is not None)
+
+    def _send(self, data: bytes) -> None:
+        if self.failure is not None:
+            return
+        try:
+            with self._writing:
+                self._port.write(data)
+        except OSError as failure:
+            self._line_lost(failure)
+
+    def _keep_alive(self) -> None:
+        with self._due:  # whoever is not known yet is not talked at
+            self._due.wait_for(lambda: self._per_ping or self._closing or self.failure is not None)
+        due = time.monotonic() + _PING_S
+        while True:
+            with self._due:
+                self._due.wait_for(self._ping_is_due, max(0.0, due - time.monotonic()))
+                if self._closing or self.failure is not None:
+                    return
+                self._unpinged = 0
+                silent = time.monotonic() - self._heard_s > _SILENT_S
+            # A controller that was reset still answers pings: only its status tells.
+            if not self._paused():
+                self._send(encode(message("ask_status" if silent else "ping", id=_PING_ID)))
+            due = time.monotonic() + _PING_S
+
+    def _ping_is_due(self) -> bool:
+        enough = 0 < self._per_ping <= self._unpinged
+        return enough or self._closing or self.failure is not None
+
+    def _listen(self) -> None:
+        try:
+            while not self.reader.over:
+                for chunk in self.reader.take(_LOOK_S):
+                    self._take(self._decoder.feed(chunk.data), chunk.arrived_s)
+            failure = self.reader.failure
+        except Exception as defect:  # nobody hears the controller any more: it must not be pinged on
+            failure = OSError(f"a defect of ambid, {type(defect).__name__}: {defect}")
+        if failure is not None:
+            self._line_lost(failure)
+
+    def _take(self, payloads: list[bytes], arrived_s: float) -> None:
+        for sampled, together in groupby(payloads, lambda payload: payload[0] == self._sample):
+            if sampled:
+                self._heard_samples(list(together), arrived_s)
+                continue
+            for payload in together:
+                try:
+                    what = unpack(payload)
+                except DeviceError as failure:
+                    self._odd(failure)
+                else:
+                    self._heard(what)
+
+    def _heard_samples(self, payloads: list[bytes], arrived_s: float) -> None:
+        with self._due:
+            self._heard_s = time.monotonic()
+            self._unpinged += len(payloads)
+            if self._per_ping and self._unpinged >= self._per_ping:
+                self._due.notify_all()
+        self._samples(payloads, arrived_s)
+
+    def _heard(self, what: Message) -> None:
+        waiting = self._waiting.get(what.fields.get("id", 0))
+        if what.name in ("status", "fault"):
+            self._told(what)
+        if waiting is not None and what.name in ("ack", _ANSWERS.get(waiting.name, "ack")):
+            with self._news:
+                waiting.answer = what
+                self._news.notify_all()
+
+    def _odd(self, failure: DeviceError) -> None:
+        """A sound frame that is no message of this protocol: the identity of another version."""
+        with self._news:
+            self.odd += 1
+            self._other = self._other or DeviceError(f"{self._port.name}: {failure}")
+            self._news.notify_all()
+
+    def _line_lost(self, failure: OSError) -> None:
+        with self._news:
+            if self.failure is not None or self._closing:
+                return
+            self.failure = DeviceError(
+                str(failure)
+                if isinstance(failure, PortEnded)
+                else f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port"
+                " anew"
+            )
+            self._news.notify_all()
+        with self._due:
+            self._due.notify_all()
+        self._lost(self.failure)
+
+    def _nobody(self) -> str:
+        """Say what may stand behind a port that gives no identity."""
+        seen, name = self.counters, self._port.name
+        if seen.frames:
+            return (
+                f"port {name}: sound frames come, but no answer to 'identify'; the controller does not hear the host."
+                " Look at its receive line, and reset the board"
+            )
+        if seen.discarded_bytes or seen.empty or seen.damaged:
+            total = seen.discarded_bytes + seen.empty
+            return (
+                f"port {name}: {total} bytes came, and no sound frame among them; this is another speed or another"
+                " program. Give the firmware's baud (daq.baud), or put the firmware amb_daq on the board"
+            )
+        return (
+            f"port {name}: nobody answers; a controller with the firmware amb_daq answers 'identify' at once. Look at"
+            " the cable and the supply, reset the board, or put the firmware on it"
+        )
+
+
+_REMEDY = {
+    "unknown": "Put the firmware of this ambid on the board",
+    "length": "Put the firmware of this ambid on the board",
+    "range": "Correct the rig",
+    "state": "Stop it first, or clear its fault",
+    "unready": "Give the rig a loop with gains, and open the device anew",
+    "interlock": "Close the interlock loop (emergency stop, cable), then try again",
+}
+
+
+def refusal(asked: Message, answer: Message) -> str:
+    """Return what was refused, why, and what to do.
+
+    `asked`: the command; `answer`: its ``ack`` with a code that is not 0. Returns one line.
+    """
+    known = table()
+    code = known.name("code", answer["code"])
+    about = next((e.about for e in known.enums["code"] if e.value == answer["code"]), "an unknown code")
+    return (
+        f"the controller refuses {asked.name!r}: {_why(asked, code, answer['detail'], about)}."
+        f" {_REMEDY.get(code, 'Put the firmware of this ambid on the board')}"
+    )
+
+
+def _why(asked: Message, code: str, detail: int, about: str) -> str:
+    known = table()
+    if code == "range" and asked.name == "start":
+        return (
+            f"mode {known.name('mode', asked['mode'])!r} does not go with what it was told: with the output on, a tick"
+            " is neither very short nor very long (daq.rate_hz), and set point and bias are within the limits"
+        )
+    if code == "range":
+        fields = known.messages[asked.name].fields
+        if 1 <= detail <= len(fields):
+            field = fields[detail - 1]
+            value = asked.fields.get(field.name, asked.values)
+            return f"{field.name} = {value} is outside what it allows ({field.about})"
+        return f"a value is outside what it allows (field {detail})"
+    if code == "state":
+        return f"not in state {known.name('state', detail)}"
+    if code == "unready":
+        there = known.names_of_bits("ready", detail)
+        missing = [e.name for e in known.bits["ready"] if e.name not in there]
+        return f"it has not been given {', '.join(missing)} yet"
+    return about

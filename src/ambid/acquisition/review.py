@@ -1,0 +1,147 @@
+"""What a rig's controller holds only roughly: one line with remedy each, before anything is switched on."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+import numpy as np
+
+from ambid.acquisition.scales import output_rates, scale_of, who
+from ambid.acquisition.settings import ControllerSettings, exact_gains, has_position, realised
+from ambid.errors import ModelError, RigError
+from ambid.physics.linear_model import model
+from ambid.rig.rig import Rig
+
+_ROUNDED = 0.01  # of a gain: more is worth a line
+_BENT = 1.5  # largest over least slope of a calibration between the trips
+_NEAR_TRIP = 8  # counts between rest and a trip, under which noise may trip it
+_COARSE = 64  # counts between the trips
+_SLOW_PERIODS = 2000.0  # ticks in which a mode of the loop should have settled
+
+
+def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] | None = None) -> tuple[str, ...]:
+    """Say what a rig's controller will do only roughly, or what speaks against closing its loop.
+
+    `rig`: the rig; `settings`: made from it by `ambid.acquisition.settings.controller_settings`. Returns one line each,
+    with its remedy; empty where nothing is to be said.
+    """
+    lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
+    if not settings.drives:
+        lines.append(
+            f"at {settings.rate_hz:g} Hz the controller only samples: its output is on at {output_rates()} only."
+            " Give daq.rate_hz such a rate to drive or levitate"
+        )
+    if settings.closed:
+        lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings, parameters)]
+    elif has_position(rig):
+        lines.append("the rig has no [loop] with a gain: it can sample and drive, not levitate. Add [loop]")
+    return tuple(lines)
+
+
+def _voltage(rig: Rig, settings: ControllerSettings) -> list[str]:
+    """Say where the pulse widths given go beyond the limits of the loop."""
+    if rig.limits is None or not all(map(math.isfinite, rig.limits.voltage)):
+        return []
+    volts = np.sort(scale_of(rig, "voltage").to_si([settings.duty_low, settings.duty_high]))
+    low, high = rig.limits.voltage
+    slack = 0.5 * abs(scale_of(rig, "voltage").slope(settings.duty_bias))
+    if volts[0] >= low - slack and volts[1] <= high + slack:
+        return []
+    return [
+        f"daq.duty lets the voltage go from {volts[0]:.4g} to {volts[1]:.4g} V, beyond loop.limits.voltage ({low:.4g}"
+        f" to {high:.4g} V): a simulation is limited earlier than the bench. Make them agree"
+    ]
+
+
+def _trips(rig: Rig, settings: ControllerSettings) -> list[str]:
+    """Say where noise could trip at rest, and where the converter hardly sees the range it is to protect."""
+    found = [("current", settings.current_low, settings.current_rest, settings.current_high)]
+    if has_position(rig):
+        found.append(("position", settings.position_low, settings.setpoint, settings.position_high))
+    lines = []
+    for role, low, rest, high in found:
+        near = min(rest - low, high - rest)
+        # an end at the converter's own end cannot trip: nothing to be near to
+        if near < _NEAR_TRIP and not (low == 0 and rest - low == near):
+            lines.append(f"{role} rests {near} counts from its trip: noise may trip it. Widen daq.trip.{role}")
+        if high - low < _COARSE:
+            lines.append(
+                f"{role} has {high - low} counts between its trips: too coarse to control or to identify with. Use a"
+                " sensor or a divider that fills the converter"
+            )
+    return lines
+
+
+def _tables(rig: Rig) -> list[str]:
+    """Say where a table ends before the converter does: a sample beyond it makes the record unreadable."""
+    roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
+    lines = []
+    for role in roles:
+        scale = scale_of(rig, role)
+        if scale.ends is not None and (scale.ends[0] > 0 or scale.ends[1] < scale.top):
+            lines.append(
+                f"the table of channels.{role} covers {scale.ends[0]:g} to {scale.ends[1]:g} of 0 to {scale.top}"
+                f" counts: a record beyond it cannot be read. Extend it, or set channels.{role}.extrapolate = true"
+            )
+    return lines
+
+
+def _rounding(rig: Rig, settings: ControllerSettings) -> list[str]:
+    exact = exact_gains(rig, (settings.duty_bias, settings.current_rest, settings.setpoint))
+    lines = []
+    for name, value in exact.items():
+        error = abs(getattr(settings, name) - value) / abs(value) if value else 0.0
+        if error > _ROUNDED:
+            lines.append(
+                f"loop.{name} is {value:.2f} steps of the controller, rounded by {error:.1%}. Use a sensor with fewer"
+                f" counts, or a larger loop.{name}"
+            )
+    return lines
+
+
+def _slopes(rig: Rig, settings: ControllerSettings) -> list[str]:
+    """Say where a bent calibration gives the loop another gain than at rest."""
+    lines = []
+    for role, low, high in (
+        ("position", settings.position_low, settings.position_high),
+        ("current", settings.current_low, settings.current_high),
+        ("voltage", settings.duty_low, settings.duty_high),
+    ):
+        least, most = scale_of(rig, role).slopes(low, high)
+        if most > _BENT * least:
+            lines.append(
+                f"the slope of channels.{role}.table changes by a factor {most / least:.2g} over its range; the loop"
+                " has the gains of the rest point everywhere. Narrow the range, or see that the loop bears it"
+            )
+    return lines
+
+
+def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float] | None) -> list[str]:
+    """Say where the loop as the controller closes it does not hold the plant that the rig knows."""
+    from ambid.simulation import closed_loop_poles
+
+    known = {p.name: p.value for p in rig.parameters if p.value is not None}
+    values, whose = (known, "the rig's own") if parameters is None else (parameters, "the bench's")
+    missing = [p.name for p in rig.parameters if p.name not in values]
+    if missing:
+        return [
+            f"the loop could not be checked for stability, as the rig has no value for {', '.join(missing)}. A rough"
+            " value of each is enough"
+        ]
+    loop = realised(settings, rig)
+    try:
+        largest = float(np.abs(closed_loop_poles(values, loop, settings.rate_hz, of=rig.model)[0]))
+    except ModelError as failure:
+        raise RigError(f"{who(rig)}: on {whose} plant {failure}") from None
+    if largest >= 1.0:
+        return [
+            f"the loop is unstable on {whose} plant at {settings.rate_hz:g} Hz with the controller's delay of"
+            f" {loop.delay:.2g} samples (largest pole {largest:.4f}). Design [loop] for that rate and delay"
+        ]
+    if largest > 1.0 - 1.0 / _SLOW_PERIODS:
+        return [
+            f"the loop hardly damps {whose} plant: a mode takes {-1.0 / math.log(largest) / settings.rate_hz:.2g} s"
+            f" to fall to a third (largest pole {largest:.5f}). Raise loop.kd or loop.ki"
+        ]
+    return []

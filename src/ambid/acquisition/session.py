@@ -1,0 +1,236 @@
+"""One run of a device: started, settled, excited, listened to for a time, stopped; nothing is lost uncounted.
+
+Blocks go to taps (recorder, quality, ring to a tracker) in the order in which they came. A fault of the device ends the
+run: what was sampled before it has been passed on. What an earlier run left unread is not of this one.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Protocol
+
+import numpy as np
+
+from ambid.acquisition.device import Device, DeviceEvent, Mode, Program
+from ambid.acquisition.program import period_ticks
+from ambid.errors import DeviceError
+from ambid.tracking.blocks import Block, Frame
+
+_LOOK_S = 0.1  # how often a wait looks whether the run should end
+_SILENT_LOOKS = 50  # without a sample: the line is dead. Looks, not seconds: a host that slept has not listened
+_LONGEST_LEAD_S = 1.0  # of excitation before samples are passed on
+_LONGEST_WAIT_S = 10.0  # of samples until an excitation shows
+_ENDING = ("fault",)  # kinds of events that end a run
+
+
+class Tap(Protocol):
+    """Whoever listens to a run."""
+
+    def take(self, frame: Frame) -> None:
+        """Take a block; must not keep the run waiting.
+
+        `frame`: a block with its time of arrival.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Course:
+    """What a run is to do."""
+
+    mode: Mode
+    seconds: float  # length of what is passed on, s of the device's clock
+    settle_s: float = 0.0  # time after the start that is not passed on: lift-off and its transient, s
+    # excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
+    # periodic from its first sample.
+    program: Program | None = None
+
+
+@dataclass(slots=True, kw_only=True)
+class RunReport:
+    """What came of a run; counted while it goes on."""
+
+    wanted: int  # samples that the course asks for
+    samples: int = 0  # passed on
+    # samples of the wanted ones, up to the last one that came, that never came; those that come again make up for none
+    lost: int = 0
+    first: int = 0  # number of the first sample that was passed on, and of the one after the last; equal where none was
+    after: int = 0
+    fault: DeviceEvent | None = None  # what ended the run early
+    interrupted: bool = False  # whether it was ended by request
+    events: tuple[DeviceEvent, ...] = ()  # all that the device told meanwhile
+
+    @property
+    def complete(self) -> bool:
+        """Whether every wanted sample came."""
+        return self.samples == self.wanted
+
+
+def run(
+    device: Device,
+    course: Course,
+    *,
+    taps: Sequence[Tap],
+    on_event: Callable[[DeviceEvent], object] | None = None,
+    stopped: Callable[[], bool] = lambda: False,
+) -> RunReport:
+    """Let a device do a course, and pass on what it samples.
+
+    `device`: opened, idle; `taps`: each is given every block, cut to the wanted part; `on_event`: told of each event of
+    the device as it comes; `stopped`: asked between blocks; True ends the run in an orderly way.
+    """
+    made = _Run(device, course, taps, on_event)
+    try:
+        made.forget()
+        device.start(course.mode)
+        made.settle(stopped)
+        if made.going and course.program is not None:
+            device.excite(course.program)
+            made.lead_in(course.program)
+        made.listen(stopped)
+    except BaseException:
+        with suppress(DeviceError):  # a line that is lost cannot be told to stop; what went wrong first is raised
+            device.stop()
+        made.hear()
+        raise
+    device.stop()
+    made.hear()
+    return made.report
+
+
+class _Run:
+    """The numbers of a run under way."""
+
+    def __init__(
+        self, device: Device, course: Course, taps: Sequence[Tap], on_event: Callable[[DeviceEvent], object] | None
+    ) -> None:
+        self._rate_hz = rate_hz = device.info.rate_hz
+        self._device, self._taps, self._on_event = device, taps, on_event
+        self.report = RunReport(wanted=max(1, round(course.seconds * rate_hz)))
+        self._settling = round(course.settle_s * rate_hz)
+        self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
+        self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
+        self._unheard = 0
+        self._from: int | None = None  # number from which samples are passed on, once that is known
+
+    @property
+    def going(self) -> bool:
+        """Whether nothing has ended the run yet."""
+        return self.report.fault is None and not self.report.interrupted
+
+    def forget(self) -> None:
+        """Throw away what an earlier run left unread: its samples are of another course."""
+        while self._device.read(0.0) is not None:
+            pass
+
+    def settle(self, stopped: Callable[[], bool]) -> None:
+        """Let the first samples pass."""
+        settled = None
+        for frame in self._frames(stopped) if self._settling else ():
+            block = frame.block
+            settled = block.first + self._settling if settled is None else settled
+            if block.first + len(block.values) >= settled:
+                return
+
+    def listen(self, stopped: Callable[[], bool]) -> None:
+        """Pass blocks on until all wanted samples are there."""
+        if not self.going:
+            return
+        made = self.report
+        for frame in self._frames(stopped):
+            block = self._after_lead(frame.block)
+            if block is None:
+                continue
+            if not made.samples:
+                made.first = made.after = block.first
+            end = made.first + made.wanted
+            if block.first >= end:
+                return
+            kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
+            for tap in self._taps:
+                tap.take(replace(frame, block=kept))
+            made.samples += len(kept.values)
+            made.lost += max(0, kept.first - made.after)
+            made.after = max(made.after, kept.first + len(kept.values))
+            if made.after >= end:
+                return
+
+    def lead_in(self, program: Program) -> None:
+        """Let the excitation settle before samples are passed on."""
+        if self._excited is not None:
+            self._lead = min(period_ticks(program), round(_LONGEST_LEAD_S * self._rate_hz))
+
+    def _after_lead(self, block: Block) -> Block | None:
+        """Return what of a block comes after the lead; what was under way when the excitation was ordered does not."""
+        if self._lead is None:
+            return block
+        if self._from is None:
+            assert self._excited is not None
+            plays = np.flatnonzero(block.values[:, self._excited])
+            if not plays.size:
+                self._unheard += len(block.values)
+                if self._unheard > _LONGEST_WAIT_S * self._rate_hz:
+                    raise DeviceError(
+                        f"{self._device.info.port}: the excitation was ordered and does not show in"
+                        f" {_LONGEST_WAIT_S:g} s of samples. Give a larger amplitude"
+                    )
+                return None
+            self._from = block.first + int(plays[0]) + self._lead
+        passed = self._from - block.first
+        if passed >= len(block.values):
+            return None
+        if passed <= 0:
+            return block
+        later = block.time_s + passed / self._rate_hz
+        return Block(first=self._from, time_s=later, values=block.values[passed:])
+
+    def hear(self) -> None:
+        """Take what the device tells."""
+        for event in self._device.events():
+            self.report.events += (event,)
+            if event.kind in _ENDING and self.report.fault is None:
+                self.report.fault = event
+            if self._on_event is not None:
+                self._on_event(event)
+
+    def _frames(self, stopped: Callable[[], bool]) -> Iterator[Frame]:
+        """Blocks as they come, until a fault, a wish to end, or the device's own end."""
+        silent = 0
+        while True:
+            if stopped():
+                self.report.interrupted = True
+                return
+            frame = self._device.read(_LOOK_S)
+            self.hear()
+            if frame is not None:
+                silent = 0
+                sound = _before(frame, self.report.fault)
+                if sound is not None:
+                    yield sound
+                if sound is not frame:
+                    return
+                continue
+            if self.report.fault is not None or self._device.ended:
+                return
+            silent += 1
+            if silent > _SILENT_LOOKS:
+                raise DeviceError(
+                    f"{self._device.info.port}: no sample came for {_SILENT_LOOKS * _LOOK_S:g} s; the device should"
+                    f" send {self._device.info.rate_hz:g} in a second. Look at cable and supply, and start again"
+                )
+
+
+def _before(frame: Frame, fault: DeviceEvent | None) -> Frame | None:
+    """Return what of a block was sampled before a fault: that is sound; after it the bench is another one."""
+    block = frame.block
+    if fault is None or (fault.sample is not None and fault.sample >= block.first + len(block.values)):
+        return frame
+    if fault.sample is None or fault.sample <= block.first:
+        return None
+    return replace(frame, block=_cut(block, fault.sample - block.first))
+
+
+def _cut(block: Block, n: int) -> Block:
+    return replace(block, values=block.values[:n])

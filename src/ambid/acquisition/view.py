@@ -1,0 +1,57 @@
+"""What a device samples, seen through a rig: blocks in the units and the order that a model wants."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.acquisition.device import Column, DeviceInfo
+from ambid.arrays import Array
+from ambid.record import Channel, Record
+from ambid.rig import Rig, bench_record
+from ambid.tracking.blocks import Block
+
+
+def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start_s: float = 0.0) -> Record:
+    """Return samples of a device as a record.
+
+    `values`: (n_samples, n_columns), in the columns' units, as blocks hold them; `columns`: of the device; `rate_hz`:
+    sampling rate in Hz; `start_s`: time of the first sample, s. Returns one channel per column, named like it.
+    """
+    channels = tuple(Channel(name=c.name, unit=c.unit, values=values[:, k]) for k, c in enumerate(columns))
+    return Record(channels=channels, rate_hz=rate_hz, start_s=start_s, provenance=MappingProxyType({}), history=())
+
+
+class BenchView:
+    """Turns raw blocks of a device into blocks of roles, SI.
+
+    `info`: of the opened device; `rig`: its columns and calibrations; `roles`: which, in which order.
+
+    `units`: SI unit of each role, in the order given; `rate_hz`: sampling rate in Hz.
+    """
+
+    def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
+        self.rate_hz = info.rate_hz
+        self._columns, self._rig = info.columns, rig
+        spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
+        seen = self.record(np.array([spare]))  # so that what does not fit is told at once
+        self.units = {role: seen.channel(role).unit for role in roles}
+
+    def block(self, raw: Block) -> Block:
+        """Return a block in the order of the roles.
+
+        `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
+        """
+        seen = self.record(raw.values)
+        values = np.column_stack([seen[role] for role in self.units])
+        return Block(first=raw.first, time_s=raw.time_s, values=values)
+
+    def record(self, values: Array, *, start_s: float = 0.0) -> Record:
+        """Return samples as a record whose channels are named by role.
+
+        `values`: (n_samples, n_columns), in the device's units, as blocks hold them; `start_s`: time of the first
+        sample, s. Returns all of the rig's channels, SI.
+        """
+        return bench_record(as_record(values, self._columns, self.rate_hz, start_s=start_s), self._rig)

@@ -1,0 +1,699 @@
+"""Scenarios: named courses of a bench whose truth is known, to try on-line identification on.
+
+Each says what changes, from when, and by how much; the bench is any preset or rig of a linear model with a loop, and
+chooses the excitation that suits it.
+
+A position sensor of gain g hides behind the parameters: z = g x obeys the same equations with m/g^2, k_x/g^2, c/g^2 and
+k_i/g. Who does not know the mass cannot tell the two apart.
+"""
+
+from __future__ import annotations
+
+import gzip
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import TYPE_CHECKING, TypedDict, Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import ModelError, RecordError, nearest
+from ambid.physics.presets import Preset
+from ambid.record import write_record
+from ambid.record.record import Channel, Record, Step
+from ambid.signals import multisine
+from ambid.simulation.bench import TRUE, Simulation, Stretch, VaryingLoop, join
+from ambid.simulation.rig_bench import Bench, as_columns
+from ambid.simulation.variation import Schedule, Unbalance, Variation
+
+_MEAN_BURST = 8  # samples
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Loss:
+    """One burst of lost samples.
+
+    Attributes
+    ----------
+    first, stop : int
+        Samples ``first`` to ``stop - 1`` are lost.
+    kind : {"cells", "rows", "skipped"}
+        One channel's cells are empty; all cells but the time are; or the rows are missing, so that time jumps.
+    column : int
+        Which channel, for ``"cells"``; any number, to be taken modulo the number of channels.
+    """
+
+    first: int
+    stop: int
+    kind: str
+    column: int
+
+
+_KINDS = ("cells", "rows", "skipped")
+
+
+def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[Loss, ...]:
+    """Return which samples are lost: bursts of some samples each, of all kinds in turn, apart from each other.
+
+    Parameters
+    ----------
+    n_samples : int
+        Length of the record.
+    share : float
+        Of the samples from `first` on that is lost, above 0 and at most 0.5.
+    seed : int
+        Equal seeds give equal losses.
+    first : int
+        No sample before this one is lost; nor are the record's first and last eight.
+
+    Returns
+    -------
+    tuple of Loss
+        In order; at least one of each kind where there is room.
+
+    Raises
+    ------
+    RecordError
+        If the share is out of range, or the record too short.
+    """
+    begin, end = max(first, 8), n_samples - 8
+    if not 0.0 < share <= 0.5:
+        raise RecordError(f"the share of lost samples is {share}; it is above 0 and at most 0.5. Correct it")
+    if end - begin < 64:
+        raise RecordError(
+            f"{max(0, end - begin)} samples can be lost from sample {first} on; losses need 64. Record for longer"
+        )
+    rng = np.random.default_rng([seed, 0x1055])
+    count = max(3, round(share * (end - begin) / _MEAN_BURST))
+    cell = (end - begin) / count
+    lengths = np.minimum(rng.geometric(1.0 / _MEAN_BURST, count), int(cell) - 2)
+    starts = begin + np.floor(np.arange(count) * cell + rng.random(count) * (cell - lengths - 2)).astype(np.int64)
+    columns = rng.integers(0, 1000, count)
+    return tuple(
+        Loss(first=int(a), stop=int(a + n), kind=_KINDS[j % 3], column=int(columns[j]))
+        for j, (a, n) in enumerate(zip(starts, lengths, strict=True))
+    )
+
+
+def damage(
+    record: Record, path: str | Path, *, share: float, seed: int, first: int = 0, comments: Sequence[str] = ()
+) -> tuple[Loss, ...]:
+    """Write a record as a CSV file in which samples are lost.
+
+    Parameters
+    ----------
+    record : Record
+        The whole record; it stays as it is. Channels whose names begin with ``true_`` lose no cells.
+    path : str or Path
+        ``.csv`` or ``.csv.gz``.
+    share, seed, first
+        As in `losses`.
+    comments : sequence of str
+        Comment lines on top.
+
+    Returns
+    -------
+    tuple of Loss
+        What is lost.
+
+    Raises
+    ------
+    RecordError
+        If the file is no CSV file, cannot be written, or the record is too short.
+    """
+    path = Path(path)
+    if not path.name.lower().endswith((".csv", ".csv.gz")):
+        raise RecordError(f"{path}: lost samples can be written as CSV only. Write .csv or .csv.gz")
+    lost = losses(record.n_samples, share, seed, first=first)
+    write_record(record, path, comments=comments)
+    packed = path.suffix.lower() == ".gz"
+    data = path.read_bytes()
+    lines = (gzip.decompress(data) if packed else data).decode().split("\n")
+    top = next(k for k, line in enumerate(lines) if not line.startswith("#")) + 1
+    measured = [j + 1 for j, c in enumerate(record.channels) if not c.name.startswith("true_")]
+    for loss in lost:
+        empty = [measured[loss.column % len(measured)]] if loss.kind == "cells" else measured
+        for k in range(loss.first + top, loss.stop + top):
+            cells = lines[k].split(",")
+            for j in empty:
+                cells[j] = ""
+            lines[k] = "" if loss.kind == "skipped" else ",".join(cells)
+    text = "\n".join(line for line in lines if line) + "\n"
+    path.write_bytes(gzip.compress(text.encode(), compresslevel=6, mtime=0) if packed else text.encode())
+    return lost
+
+
+_PERIOD = 20_000  # samples in which the excitation repeats
+_FLATTEN = 40  # iterations that lower the peaks of an excitation
+_FRACTION = 0.4  # of the limits that an amplitude chosen here uses: a bench that changes needs room
+
+
+def input_room(bench: Bench) -> float:
+    """From the operating point to the nearer limit of the input; infinite where it has none."""
+    name = bench.linear.model.inputs[0]
+    rest = float(getattr(bench.point, name))
+    low, high = getattr(bench.limits, name)
+    return float(min(abs(low - rest), abs(high - rest)))
+
+
+def one_period(bench: Bench, seed: int, *, fast: bool = False) -> Array:
+    """Return one period of a multisine of peak one from 1/4000 to 1/20 of the rate, shape (n_samples,).
+
+    There the rotor and the coil both answer: 5 Hz to 1 kHz at 20 kHz. A `fast` one, from 1/40 to 1/5 of the rate, the
+    rotor hardly follows.
+    """
+    rate = bench.rate_hz
+    band = (rate / 40.0, rate / 5.0) if fast else (rate / 4000.0, rate / 20.0)
+    return multisine(_PERIOD, rate, amplitude=1.0, band=band, seed=seed, crest_iterations=_FLATTEN)
+
+
+def amplitude_for(bench: Bench, shape: Array, seed: int) -> float:
+    """Return the amplitude that uses 0.4 of the limits, to three digits."""
+    if not any(math.isfinite(e) for pair in (bench.limits.voltage, bench.limits.current) for e in pair):
+        raise ModelError(
+            f"bench {bench.name!r} limits neither voltage nor current; no amplitude can be chosen. Give one"
+        )
+    return bench.largest(np.tile(shape, 2), seed, _FRACTION)
+
+
+DRIFT_S = 60.0
+"""Time in s over which the drift is complete."""
+
+WARM_UP_S = 20.0
+"""Time constant of the warm-up in s."""
+
+TOP_SPEED = 15_000 * math.pi / 30
+"""Speed in rad/s to which the spin-up goes."""
+
+HEAVY_SPOT = 0.6
+"""Phase of the unbalance in rad."""
+
+_GRADE = 2.5e-3  # m/s: eccentricity times speed of balance quality G 2.5 (ISO 21940-11)
+_MAX_LOAD = 0.1  # of the force that the current's limit allows
+
+
+def _nothing(_: Bench, __: float, ___: float, ____: float) -> Variation:
+    return Variation()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """What happens to a bench.
+
+    Attributes
+    ----------
+    name, summary : str
+        Name for the command line, and one line that describes it.
+    duration_s : float
+        Length in s unless told otherwise.
+    begins : float
+        Part of the duration after which it begins, unless told otherwise.
+    size : float or None
+        How much, unless told otherwise; None where the bench says it.
+    size_is : str
+        What the size is, with its unit; empty where there is none.
+    vary : Callable
+        Takes the bench, the beginning in s, the size and the duration in s; gives the `Variation`.
+    own_size : Callable or None
+        Takes the bench, gives the size where `size` is None.
+    excited : bool
+        Whether the bench is excited persistently.
+    driven : bool
+        Whether a second, larger excitation is added from the beginning on: its peak is `size` times the voltage's room.
+    dropped : bool
+        Whether samples are lost; `size` is their share.
+    """
+
+    name: str
+    summary: str
+    duration_s: float
+    begins: float = 0.5
+    size: float | None = None
+    size_is: str = ""
+    vary: Callable[[Bench, float, float, float], Variation] = _nothing
+    own_size: Callable[[Bench], float] | None = None
+    excited: bool = True
+    driven: bool = False
+    dropped: bool = False
+
+    def size_for(self, bench: Bench, given: float | None) -> float:
+        """Return how much happens.
+
+        Parameters
+        ----------
+        bench : Bench
+            The bench, for the scenarios whose size it says.
+        given : float or None
+            What the user says.
+
+        Returns
+        -------
+        float
+            In the unit of `size_is`; 0 where the scenario has none.
+
+        Raises
+        ------
+        ModelError
+            If a size is given that is not finite, or the scenario has none.
+        """
+        if given is not None and not self.size_is:
+            raise ModelError(f"scenario {self.name!r} has no size. Leave the size out")
+        if given is not None and not math.isfinite(given):
+            raise ModelError(f"the size of scenario {self.name!r} is {given}; it must be finite. Give {self.size_is}")
+        found = self.size if given is None else given
+        if found is None:
+            found = self.own_size(bench) if self.own_size else 0.0
+        if self.dropped and not 0.0 < found <= 0.5:
+            raise ModelError(f"the size of scenario {self.name!r} is {found}; it is a share above 0 and at most 0.5")
+        return found
+
+
+def scenario_names() -> tuple[str, ...]:
+    """Return the names of all scenarios.
+
+    Returns
+    -------
+    tuple of str
+        Names for the command line.
+    """
+    return tuple(SCENARIOS)
+
+
+def scenario(name: str) -> Scenario:
+    """Return the scenario called `name`.
+
+    Parameters
+    ----------
+    name : str
+        One of `scenario_names`.
+
+    Returns
+    -------
+    Scenario
+        The scenario.
+
+    Raises
+    ------
+    ModelError
+        If there is none of that name; the message names the nearest.
+    """
+    if name not in SCENARIOS:
+        known = list(SCENARIOS)
+        raise ModelError(
+            f"there is no scenario {name!r}; there are {', '.join(known)}.{nearest(name, known)} Give one of them"
+        )
+    return SCENARIOS[name]
+
+
+def _ramp(bench: Bench, at: float, size: float, _: float) -> Variation:
+    r = _parameter(bench, "R")
+    return Variation(parameters={"R": Schedule.ramp(r, r * (1.0 + size), at, at + DRIFT_S)})
+
+
+def _warm_up(bench: Bench, at: float, size: float, _: float) -> Variation:
+    r = _parameter(bench, "R")
+    return Variation(parameters={"R": Schedule.warm_up(r, r * (1.0 + size), at, WARM_UP_S)})
+
+
+def _jump(name: str) -> Callable[[Bench, float, float, float], Variation]:
+    def vary(bench: Bench, at: float, size: float, _: float) -> Variation:
+        value = _parameter(bench, name)
+        return Variation(parameters={name: Schedule.step(value, value * (1.0 + size), at)})
+
+    return vary
+
+
+def _sensor(_: Bench, at: float, size: float, __: float) -> Variation:
+    return Variation(gains={"position": Schedule.step(1.0, 1.0 + size, at)})
+
+
+def _spin_up(_: Bench, at: float, size: float, duration: float) -> Variation:
+    # The last tenth of the time is spent at full speed.
+    speed = Schedule.ramp(0.0, TOP_SPEED, at, at + 0.9 * (duration - at))
+    return Variation(unbalance=Unbalance(moment=size, phase=HEAVY_SPOT, speed=speed))
+
+
+def _load(_: Bench, at: float, size: float, __: float) -> Variation:
+    return Variation(force=Schedule.step(0.0, size, at))
+
+
+def _unbalance_of(bench: Bench) -> float:
+    return _parameter(bench, "m") * _GRADE / TOP_SPEED
+
+
+def _load_of(bench: Bench) -> float:
+    room = min(abs(end - bench.point.current) for end in bench.limits.current)
+    return (
+        _MAX_LOAD * abs(_parameter(bench, "k_i")) * room if math.isfinite(room) else 0.5 * 9.81 * _parameter(bench, "m")
+    )
+
+
+def _parameter(bench: Bench, name: str) -> float:
+    of, known = bench.linear.model, bench.linear.parameters
+    if name not in known:
+        raise ModelError(
+            f"the scenario changes {name!r}, which model {of.name!r} of bench {bench.name!r} does not have; it has"
+            f" {', '.join(known)}. Choose another scenario, or a rig with model 'one-axis'"
+        )
+    return known[name]
+
+
+_PART = "relative change"
+
+SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
+    {
+        s.name: s
+        for s in (
+            Scenario(name="steady", summary="nothing changes; excited throughout", duration_s=10.0),
+            Scenario(
+                name="drift",
+                summary="the coil warms evenly: R +20 % over 60 s",
+                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R after 60 s", vary=_ramp,
+            ),
+            Scenario(
+                name="warm-up",
+                summary="the coil warms exponentially: R +20 %, time constant 20 s",
+                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R in the end", vary=_warm_up,
+            ),
+            Scenario(
+                name="change",
+                summary="k_i jumps by -15 %, in the force and in the motional voltage",
+                duration_s=4.0, size=-0.15, size_is=f"{_PART} of k_i", vary=_jump("k_i"),
+            ),
+            Scenario(
+                name="added-mass",
+                summary="the rotor becomes 10 % heavier at once",
+                duration_s=4.0, size=0.1, size_is=f"{_PART} of m", vary=_jump("m"),
+            ),
+            Scenario(
+                name="sensor-gain",
+                summary="the position sensor loses 20 % of its gain, and the controller does not know",
+                duration_s=4.0, size=-0.2, size_is=f"{_PART} of the position sensor's gain", vary=_sensor,
+            ),
+            Scenario(name="quiet", summary="nothing changes and nothing excites", duration_s=60.0, excited=False),
+            Scenario(
+                name="spin-up",
+                summary="the rotor spins up to 15 000 rpm, out of balance (G 2.5 there)",
+                duration_s=20.0, begins=0.05, size_is="unbalance in kg m", vary=_spin_up, own_size=_unbalance_of,
+            ),
+            Scenario(
+                name="saturation",
+                summary="a fast excitation is added that meets the limits of the voltage",
+                duration_s=4.0, size=1.5, size_is="its peak over the room of the voltage", driven=True,
+            ),
+            Scenario(
+                name="dropped",
+                summary="samples are lost: empty cells, empty rows, missing rows",
+                duration_s=4.0, begins=0.1, size=0.01, size_is="share of the samples that is lost", dropped=True,
+            ),
+            Scenario(
+                name="offset",
+                summary="a constant load comes on: a tenth of what the current's limit can hold",
+                duration_s=4.0, size_is="force in N", vary=_load, own_size=_load_of,
+            ),
+        )
+    }
+)  # fmt: skip
+"""All scenarios by name."""
+
+
+if TYPE_CHECKING:  # the rig room reads files; a simulation needs its values only
+    from ambid.rig.rig import Rig
+
+
+_CHUNK = 16384  # samples that are simulated at once
+_LARGEST = 10**8  # samples of one record: it has to fit into memory
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ScenarioBlock:
+    """Consecutive samples of a scenario.
+
+    Attributes
+    ----------
+    first : int
+        Number of the first sample.
+    time_s : ndarray, shape (n_samples,)
+        Sampling instants in s.
+    signals : Mapping[str, ndarray of shape (n_samples,)]
+        As logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns. Lost
+        samples of the scenario ``dropped`` are NaN.
+    truth : Mapping[str, ndarray of shape (n_samples,)]
+        What varies, SI, by name: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``.
+    """
+
+    first: int
+    time_s: Array
+    signals: Mapping[str, Array]
+    truth: Mapping[str, Array]
+
+
+class Course(TypedDict, total=False):
+    """How a scenario runs; what is left out is the scenario's, or the bench's, own."""
+
+    duration_s: float | None  # length in s
+    rate_hz: float | None  # sampling rate in Hz
+    seed: int  # of excitation and noise; 0 if left out
+    # peak of the persistent excitation in the unit of the input; default what 0.4 of the limits allows before anything
+    # changes
+    amplitude: float | None
+    at_s: float | None  # when it begins, in s
+    size: float | None  # how much, as `Scenario.size_is` says
+    closed: bool | None  # closed or open loop; default closed, unless a rig says ``open_loop``
+
+
+def simulate_scenario(
+    name: str | Scenario, bench: Preset | Rig, *, log_excitation: bool = False, **course: Unpack[Course]
+) -> Simulation:
+    """Simulate a scenario on the linear model of a bench.
+
+    Parameters
+    ----------
+    name : str or Scenario
+        One of `scenario_names`.
+    bench : Preset or Rig
+        With a loop that holds it, also after the change.
+    log_excitation : bool
+        Add a column ``excitation``.
+    **course
+        ``duration_s``, ``rate_hz``, ``seed``, ``amplitude``, ``at_s``, ``size`` and ``closed``, see `Course`.
+
+    Returns
+    -------
+    Simulation
+        Its record (a rig's has the rig's columns, uncalibrated) has a column ``true_<name>`` for all that varies,
+        e.g. ``true_k_i``, ``true_gain_position``, ``true_force``, ``true_unbalance`` and ``true_unbalance_phase``, and
+        ``speed`` and ``angle`` where the rotor turns; `Simulation.truth` are the parameters at the beginning. That of
+        ``dropped`` is whole: `ambid.simulation.damage` writes the damaged file.
+
+    Raises
+    ------
+    ModelError
+        If a number is out of range, there is no such scenario, or the bench does not survive it.
+    RigError
+        If a rig lacks what a simulation needs.
+    """
+    run = _Run(name, bench, **course)
+    if run.n_samples > _LARGEST:
+        raise ModelError(
+            f"{run.duration_s:g} s at {run.bench.rate_hz:g} Hz is {run.n_samples:g} samples; one record takes"
+            f" {_LARGEST:g}. Make it shorter"
+        )
+    stretches, excitations = [], []
+    for first in range(0, run.n_samples, _CHUNK):
+        u = run.excitation(first, min(_CHUNK, run.n_samples - first))
+        stretches.append(run.running.advance(u))
+        excitations.append(u)
+    done = join(run.running, stretches, run.seed)
+    record = done.record.with_step(Step(name="scenario", settings=MappingProxyType(run.settings())))
+    if log_excitation:
+        unit = run.bench.linear.model.units[run.bench.linear.model.inputs[0]]
+        logged = Channel(name="excitation", unit=unit, values=np.concatenate(excitations))
+        record = replace(record, channels=(*record.channels, logged))
+    if run.bench.rig is not None:
+        record = as_columns(record, run.bench.rig, np.full(record.n_samples, run.bench.point.position))
+    return replace(done, record=record)
+
+
+def scenario_blocks(
+    name: str | Scenario, bench: Preset | Rig, *, block: int = 1000, **course: Unpack[Course]
+) -> Iterator[ScenarioBlock]:
+    """Simulate a scenario block by block; the numbers are those of `simulate_scenario`, whatever the block's size.
+
+    Memory is that of some blocks: an hour at 20 kHz costs no more than a second.
+
+    Parameters
+    ----------
+    name, bench
+        As in `simulate_scenario`.
+    block : int
+        Samples of a block; the last one may be shorter.
+    **course
+        As in `simulate_scenario`.
+
+    Yields
+    ------
+    ScenarioBlock
+        In order. Its arrays are views that nobody else writes to.
+
+    Raises
+    ------
+    ModelError
+        As `simulate_scenario`, at once; the bench may also fail on the way.
+    """
+    if block < 1:
+        raise ModelError(f"a block of {block} samples; it has at least one. Give another size")
+    return _blocks(_Run(name, bench, **course), block)
+
+
+def truth_columns(record: Record) -> Mapping[str, Channel]:
+    """Return the true values that a simulated record holds.
+
+    Parameters
+    ----------
+    record : Record
+        As simulated or read from a file, before a rig has selected its columns.
+
+    Returns
+    -------
+    Mapping[str, Channel]
+        The channels whose names begin with ``true_``, by what follows: ``k_i`` for ``true_k_i``. Empty for a record
+        without truth.
+    """
+    found = {c.name.removeprefix(TRUE): c for c in record.channels if c.name.startswith(TRUE)}
+    return MappingProxyType(found)
+
+
+class _Run:
+    """A scenario with all its numbers settled, ready to go."""
+
+    def __init__(
+        self,
+        name: str | Scenario,
+        bench: Preset | Rig,
+        *,
+        duration_s: float | None = None,
+        rate_hz: float | None = None,
+        seed: int = 0,
+        amplitude: float | None = None,
+        at_s: float | None = None,
+        size: float | None = None,
+        closed: bool | None = None,
+    ) -> None:
+        self.scenario = scenario(name) if isinstance(name, str) else name
+        always = closed is None and isinstance(bench, Preset)
+        self.bench = b = Bench.of(bench, rate_hz, True if always else closed)
+        self.seed, self.duration_s = seed, self.scenario.duration_s if duration_s is None else duration_s
+        if not (math.isfinite(b.rate_hz) and b.rate_hz > 0.0):
+            raise ModelError(f"rate_hz is {b.rate_hz}; it must be positive. Correct it")
+        count = self.duration_s * b.rate_hz
+        if not (math.isfinite(count) and count >= 1.0):
+            raise ModelError(
+                f"{self.duration_s:g} s at {b.rate_hz:g} Hz is {count:g} samples; it must be at least one. Correct one"
+            )
+        self.n_samples = round(count)
+        if at_s is not None and not self.scenario.size_is:
+            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Leave the time out")
+        self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s
+        if not 0.0 <= self.at_s < self.duration_s:
+            raise ModelError(
+                f"scenario {self.scenario.name!r} begins at {self.at_s:g} s; the record runs from 0 to"
+                f" {self.duration_s:g} s. Give a time in it"
+            )
+        if amplitude is not None and not (math.isfinite(amplitude) and amplitude >= 0.0):
+            raise ModelError(f"amplitude is {amplitude}; it must be zero or positive. Correct it")
+        if amplitude and not self.scenario.excited:
+            raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Leave the amplitude out")
+        self.size = self.scenario.size_for(b, size)
+        self.amplitude, self._period, self._extra = 0.0, np.zeros(1), np.zeros(1)
+        self._prepare_excitation(amplitude)
+        self.running = VaryingLoop(
+            b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
+            loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
+        )  # fmt: skip
+
+    def _prepare_excitation(self, amplitude: float | None) -> None:
+        b = self.bench
+        if self.scenario.excited:
+            shape = one_period(b, self.seed)
+            self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
+            self._period = self.amplitude * shape
+        if self.scenario.driven:
+            room = input_room(b)
+            if not math.isfinite(room):
+                raise ModelError(
+                    f"bench {b.name!r} does not limit its {b.linear.model.inputs[0]}; nothing can saturate. Set"
+                    " loop.limits, or choose another scenario"
+                )
+            self._extra = self.size * room * one_period(b, self.seed + 1, fast=True)
+
+    @property
+    def first_sample(self) -> int:
+        """The sample at which it begins."""
+        return round(self.at_s * self.bench.rate_hz)
+
+    def excitation(self, first: int, n: int) -> Array:
+        """Return the excitation of n samples."""
+        k = first + np.arange(n)
+        u = self._period[k % self._period.size]
+        if self.scenario.driven:
+            u += np.where(k >= self.first_sample, self._extra[k % self._extra.size], 0.0)
+        return u
+
+    def settings(self) -> dict[str, object]:
+        """Return what the history says."""
+        found: dict[str, object] = {"name": self.scenario.name, "seed": self.seed, "amplitude": self.amplitude}
+        if self.scenario.size_is:
+            found |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
+        return found
+
+
+def _blocks(run: _Run, block: int) -> Iterator[ScenarioBlock]:
+    lost = _lost(run)
+    chunk = block * math.ceil(_CHUNK / block)
+    for first in range(0, run.n_samples, chunk):
+        u = run.excitation(first, min(chunk, run.n_samples - first))
+        stretch = run.running.advance(u)
+        signals = _signals(run, stretch, u)
+        if lost.size:
+            _lose(signals, lost, first)
+        time = (first + np.arange(u.size)) / run.bench.rate_hz
+        for k in range(0, u.size, block):
+            part = slice(k, min(k + block, u.size))
+            yield ScenarioBlock(
+                first=first + k,
+                time_s=time[part],
+                signals=MappingProxyType({name: x[part] for name, x in signals.items()}),
+                truth=MappingProxyType({name: x[part] for name, x in stretch.truth.items()}),
+            )
+
+
+def _signals(run: _Run, stretch: Stretch, excitation: Array) -> dict[str, Array]:
+    of = run.bench.linear.model
+    found = {of.inputs[0]: stretch.command}
+    found.update({o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)})
+    found["excitation"] = excitation
+    if stretch.speed is not None and stretch.angle is not None:
+        found |= {"speed": stretch.speed, "angle": stretch.angle}
+    return found
+
+
+def _lost(run: _Run) -> NDArray[np.int64]:
+    """Return first, stop and column (-1: all) of what is lost, shape (n_losses, 3)."""
+    if not run.scenario.dropped:
+        return np.zeros((0, 3), dtype=np.int64)
+    found = losses(run.n_samples, run.size, run.seed, first=run.first_sample)
+    return np.array([(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in found], dtype=np.int64)
+
+
+def _lose(signals: dict[str, Array], lost: NDArray[np.int64], first: int) -> None:
+    columns = list(signals.values())
+    stop = first + columns[0].size
+    for a, b, column in lost[(lost[:, 1] > first) & (lost[:, 0] < stop)].tolist():
+        part = slice(max(a - first, 0), min(b, stop) - first)
+        for values in columns if column < 0 else [columns[column % len(columns)]]:
+            values[part] = np.nan

@@ -1,0 +1,416 @@
+"""What changes while a bench runs: parameters, sensors and loads by schedule, and the matrices that follow from them.
+
+All times are seconds of the record; a jump or a corner happens at the sample nearest to its time. Stretches of equal
+parameters lie on a grid of the record, not of the call, so that the numbers do not depend on how a record is cut up.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal, NamedTuple, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import ModelError, nearest
+from ambid.physics.linear_model import LinearModel, discretise
+from ambid.simulation.plant import Equations
+
+_PER_TIME_CONSTANT = 50  # corners of a warm-up: the lines leave the exponential by 5e-5 of its rise at most
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Schedule:
+    """A piecewise linear function of time, constant before its first and after its last knot.
+
+    Attributes
+    ----------
+    times_s : tuple of float
+        Knots in s, not falling; the same time twice is a jump, at which the later value holds.
+    values : tuple of float
+        One for each knot, in the unit of what is scheduled.
+    """
+
+    times_s: tuple[float, ...]
+    values: tuple[float, ...]
+
+    def __post_init__(self) -> None:
+        t, v = np.asarray(self.times_s, dtype=np.float64), np.asarray(self.values, dtype=np.float64)
+        if t.size == 0 or t.shape != v.shape or not (np.isfinite(t).all() and np.isfinite(v).all()):
+            raise ModelError(
+                f"a schedule has {t.size} times and {v.size} values; it wants as many finite numbers of each, at least"
+                " one. Correct them"
+            )
+        if (np.diff(t) < 0.0).any():
+            raise ModelError("the times of a schedule fall; they must rise or stay (a jump). Sort them")
+
+    @classmethod
+    def constant(cls, value: float) -> Self:
+        """Return the schedule that is `value` always."""
+        return cls(times_s=(0.0,), values=(value,))
+
+    @classmethod
+    def step(cls, before: float, after: float, at_s: float) -> Self:
+        """Return a jump.
+
+        Parameters
+        ----------
+        before, after : float
+            Values before and from `at_s` on.
+        at_s : float
+            In s.
+
+        Returns
+        -------
+        Schedule
+            With two knots.
+        """
+        return cls(times_s=(at_s, at_s), values=(before, after))
+
+    @classmethod
+    def ramp(cls, before: float, after: float, from_s: float, to_s: float) -> Self:
+        """Return a straight line between two levels.
+
+        Parameters
+        ----------
+        before, after : float
+            Values until `from_s` and after `to_s`.
+        from_s, to_s : float
+            In s.
+
+        Returns
+        -------
+        Schedule
+            With two knots.
+        """
+        return cls(times_s=(from_s, to_s), values=(before, after))
+
+    @classmethod
+    def warm_up(cls, before: float, after: float, from_s: float, time_constant_s: float) -> Self:
+        """Return before + (after - before) (1 - exp(-(t - from)/tau)), as a body heats up.
+
+        Parameters
+        ----------
+        before, after : float
+            Value until `from_s`, and where it goes.
+        from_s, time_constant_s : float
+            In s.
+
+        Returns
+        -------
+        Schedule
+            Lines between 50 points of the exponential in each time constant, for ten of them.
+
+        Raises
+        ------
+        ModelError
+            If the time constant is not positive.
+        """
+        if not time_constant_s > 0.0:
+            raise ModelError(f"the time constant of a warm-up is {time_constant_s} s; it must be positive. Correct it")
+        t = np.arange(10 * _PER_TIME_CONSTANT + 1) / _PER_TIME_CONSTANT
+        values = before + (after - before) * -np.expm1(-t)
+        return cls(times_s=tuple((from_s + time_constant_s * t).tolist()), values=tuple(values.tolist()))
+
+    def knots(self, rate_hz: float) -> Array:
+        """Return the knots in whole samples at `rate_hz` in Hz, shape (n_knots,)."""
+        return np.rint(np.asarray(self.times_s) * rate_hz)
+
+    def at(self, samples: Array, rate_hz: float, *, before: bool = False) -> Array:
+        """Return the values at sample numbers, fractions allowed; at a jump the later value.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n,)
+            Sample numbers since the record began.
+        rate_hz : float
+            Sampling rate in Hz.
+        before : bool
+            At a jump the earlier value instead.
+
+        Returns
+        -------
+        ndarray, shape (n,), in the unit of the schedule
+            The values.
+        """
+        knots, values = self.knots(rate_hz), np.asarray(self.values)
+        if values.size == 1:
+            return np.full(samples.shape, values[0])
+        after = _segments(knots, samples, "left" if before else "right")
+        start, length = knots[after - 1], knots[after] - knots[after - 1]
+        # Beyond the ends, and at a jump that is the last knot, the clip holds the end value.
+        jumped = samples > start if before else samples >= start
+        part = np.where(length > 0.0, (samples - start) / np.where(length > 0.0, length, 1.0), jumped)
+        part = np.clip(part, 0.0, 1.0)
+        return np.asarray(values[after - 1] + part * (values[after] - values[after - 1]))
+
+    def integral(self, samples: Array, rate_hz: float) -> Array:
+        """Return the integral from the record's beginning, exactly.
+
+        Parameters
+        ----------
+        samples : ndarray, shape (n,)
+            Sample numbers since the record began, zero or positive, fractions allowed.
+        rate_hz : float
+            Sampling rate in Hz.
+
+        Returns
+        -------
+        ndarray, shape (n,), unit of the schedule times s
+            The angle, for a schedule of a speed.
+        """
+        inside = self.knots(rate_hz)
+        edges = np.concatenate(([0.0], np.unique(inside[inside > 0.0])))
+        # A line is integrated exactly by its middle: strictly inside a stretch there is no jump.
+        ends = np.append(edges[1:], edges[-1] + 2.0)
+        area = np.concatenate(([0.0], np.cumsum((ends - edges) * self.at(0.5 * (edges + ends), rate_hz))[:-1]))
+        k = _segments(np.append(edges, np.inf), samples, "right") - 1
+        return np.asarray((area[k] + (samples - edges[k]) * self.at(0.5 * (edges[k] + samples), rate_hz)) / rate_hz)
+
+
+def _segments(knots: Array, samples: Array, side: Literal["left", "right"]) -> NDArray[np.intp]:
+    """Return the knot that ends the segment of each sample, shape (n,), or (1,) where all lie in one segment."""
+    found = np.searchsorted(knots, [samples.min(), samples.max()] if samples.size else samples, side=side)
+    if samples.size and found[0] != found[1]:  # else all lie in one segment: nothing to look up for each sample
+        found = np.searchsorted(knots, samples, side=side)
+    elif samples.size:
+        found = found[:1]
+    return np.asarray(np.clip(found, 1, knots.size - 1), dtype=np.intp)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Unbalance:
+    """A rotor that is out of balance and turns: f = moment speed^2 cos(angle + phase).
+
+    The angle is the exact integral of the speed from the record's beginning. As every disturbance of the simulator the
+    force is held over a sample, at its value in the middle of it. The tangential part, moment times the angular
+    acceleration, is left out: after a steady start from rest it is 1/(2 angle) of the whole.
+
+    Attributes
+    ----------
+    moment : float
+        Mass times eccentricity in kg m.
+    phase : float
+        In rad, of the heavy spot against the mark of the angle.
+    speed : Schedule
+        In rad/s.
+    """
+
+    moment: float
+    speed: Schedule
+    phase: float = 0.0
+
+
+_NOTHING: Mapping[str, Schedule] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variation:
+    """What changes while a bench runs.
+
+    Attributes
+    ----------
+    parameters : Mapping[str, Schedule]
+        Parameters of the model, SI; the others stay as the plant has them.
+    gains : Mapping[str, Schedule]
+        Of the sensors by output: logged = gain times true value + noise, and the controller sees the logged one.
+    force : Schedule or None
+        Load in N beside the process noise.
+    unbalance : Unbalance or None
+        Of a turning rotor.
+    """
+
+    parameters: Mapping[str, Schedule] = field(default_factory=lambda: _NOTHING)
+    gains: Mapping[str, Schedule] = field(default_factory=lambda: _NOTHING)
+    force: Schedule | None = None
+    unbalance: Unbalance | None = None
+
+
+def check_variation(variation: Variation, of: LinearModel) -> None:
+    """Refuse what a model does not have.
+
+    `variation`: what is to change; `of`: the model that is simulated.
+    """
+    specs = {s.name: s for s in of.parameters}
+    for name, schedule in variation.parameters.items():
+        if name not in specs:
+            raise ModelError(
+                f"model {of.name!r} has no parameter {name!r} that could vary; it has {', '.join(specs)}."
+                f"{nearest(name, list(specs))} Correct the variation"
+            )
+        if specs[name].positive and min(schedule.values) <= 0.0:
+            raise ModelError(
+                f"parameter {name!r} falls to {min(schedule.values):.6g} {specs[name].unit}; it must stay positive."
+                " Change it less"
+            )
+    for name in variation.gains:
+        if name not in of.outputs:
+            raise ModelError(
+                f"model {of.name!r} has no sensor of {name!r}; it has {', '.join(of.outputs)}."
+                f"{nearest(name, list(of.outputs))} Correct the variation"
+            )
+    if (variation.force is not None or variation.unbalance is not None) and "force" not in of.disturbances:
+        raise ModelError(f"model {of.name!r} has no rotor that a force could act on. Leave force and unbalance out")
+
+
+Integers = NDArray[np.int64]
+
+_DEGREE = 14  # at a norm of 0.5 the Taylor polynomial of the exponential is right to 3e-17
+_NODE = 20  # cells from one exact discretisation to the next
+
+
+class Pieces(NamedTuple):
+    """What the loop needs for some samples: `edges` (n_pieces + 1,), and matrices and values for each piece."""
+
+    edges: Integers
+    gains: Array
+    equations: Equations
+    theta: Mapping[str, Array]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Part:
+    middles: Array
+    matrices: tuple[Array, Array, Array, Array]
+
+
+class Tables:
+    """Cuts a record into stretches, and gives their matrices."""
+
+    def __init__(
+        self,
+        of: LinearModel,
+        fixed: Mapping[str, float],
+        parameters: Mapping[str, Schedule],
+        gains: Mapping[str, Schedule],
+        rate_hz: float,
+        fraction: float,
+        grid: int,
+    ) -> None:
+        self._of, self._fixed, self._rate, self._fraction, self._grid = of, dict(fixed), rate_hz, fraction, grid
+        self._schedules = {**parameters, **{f"gain_{name}": s for name, s in gains.items()}}
+        knots = [s.knots(rate_hz) for s in self._schedules.values()]
+        inside = np.unique(np.concatenate([np.zeros(1), *knots]))
+        self._corners = inside[inside >= 0.0].astype(np.int64)
+        self._moving = [self._moves(j) for j in range(self._corners.size)]
+        self._halvings = max(0, math.ceil(math.log2(max(self._norm(), 1e-9) / 0.5)))
+        self._known: dict[tuple[float, ...], tuple[Array, Array, Array, Array]] = {}
+
+    @property
+    def corners(self) -> Integers:
+        """Samples at which anything begins or ends to change, shape (n_corners,), the first of them 0."""
+        return self._corners
+
+    def _moves(self, j: int) -> bool:
+        if j + 1 == self._corners.size:
+            return False
+        near = self._corners[j] + np.array([0.25, 0.75]) * (self._corners[j + 1] - self._corners[j])
+        values = [s.at(near, self._rate) for s in self._schedules.values()]
+        return any(v[0] != v[1] for v in values)
+
+    def pieces(self, first: int, stop: int) -> Pieces:
+        """Return the stretches of samples `first` to `stop`, counted from `first`."""
+        edges: list[int] = [first]
+        parts: list[_Part] = []
+        j = int(np.searchsorted(self._corners, first, side="right")) - 1
+        while edges[-1] < stop:
+            begin = int(self._corners[j])
+            end = int(self._corners[j + 1]) if j + 1 < self._corners.size else max(stop, begin + 1)
+            if self._moving[j]:
+                part, ends = self._drifting(begin, end, edges[-1], min(end, stop))
+                edges.extend(ends)
+            else:
+                part = self._still(begin)
+                edges.append(min(end, stop))
+            parts.append(part)
+            j += 1
+        middles = np.concatenate([p.middles for p in parts])
+        a, b, late, e = (
+            np.ascontiguousarray(np.concatenate(m)) for m in zip(*(p.matrices for p in parts), strict=True)
+        )
+        theta = {name: s.at(middles, self._rate) for name, s in self._schedules.items()}
+        one = np.ones(middles.size)
+        gains = np.ascontiguousarray(np.column_stack([theta.get(f"gain_{o}", one) for o in self._of.outputs]))
+        return Pieces(np.array(edges, dtype=np.int64) - first, gains, (a, b, late, e), theta)
+
+    def _still(self, begin: int) -> _Part:
+        """Return one stretch, with matrices to the last bit as `Standing.equations` has them."""
+        middle = np.array([begin + 0.5])
+        (theta,) = self._parameters(middle)
+        key = tuple(theta.values())
+        if key not in self._known:
+            d, _ = discretise(self._of.matrices(theta), 1.0 / self._rate, fraction=self._fraction)
+            self._known[key] = (d.A[None], d.B[None, :, 0], d.B_late[None, :, 0], d.E[None])
+        return _Part(middles=middle, matrices=self._known[key])
+
+    def _drifting(self, begin: int, end: int, first: int, stop: int) -> tuple[_Part, list[int]]:
+        """Return the cells of an interval in which something moves, and where each ends.
+
+        Matrices are exact at nodes, every `_NODE` cells, and linear between them: right to second order in the change
+        from node to node, where held ones are right to first order in the change over a cell.
+        """
+        cells = np.arange((first - begin) // self._grid, -((begin - stop) // self._grid))
+        starts = begin + cells * self._grid
+        ends = np.minimum(starts + self._grid, end)
+        middles = np.asarray(0.5 * (starts + ends), dtype=np.float64)
+        stride = _NODE * self._grid
+        numbers = np.arange(cells[0] // _NODE, cells[-1] // _NODE + 2)
+        nodes = np.minimum(begin + numbers * stride, end).astype(np.float64)
+        at = cells // _NODE - numbers[0]
+        weight = (middles - nodes[at]) / (nodes[at + 1] - nodes[at])
+        exact = self._exact(self._parameters(nodes, before=nodes > begin))
+        matrices = [m[at] + weight.reshape(-1, *[1] * (m.ndim - 1)) * (m[at + 1] - m[at]) for m in exact]
+        part = _Part(middles=middles, matrices=(matrices[0], matrices[1], matrices[2], matrices[3]))
+        return part, np.minimum(ends, stop).tolist()
+
+    def _parameters(self, samples: Array, before: NDArray[np.bool_] | None = None) -> list[dict[str, float]]:
+        """Return all parameters of the model at sample numbers; where `before`, the value ahead of a jump."""
+        values = {name: s.at(samples, self._rate) for name, s in self._schedules.items() if name in self._fixed}
+        if before is not None:
+            ahead = {name: self._schedules[name].at(samples, self._rate, before=True) for name in values}
+            values = {name: np.where(before, ahead[name], v) for name, v in values.items()}
+        rows = zip(*(v.tolist() for v in values.values()), strict=True) if values else [()] * samples.size
+        return [{**self._fixed, **dict(zip(values, row, strict=True))} for row in rows]
+
+    def _exact(self, thetas: list[dict[str, float]]) -> tuple[Array, Array, Array, Array]:
+        """Discretise many at once: exp([[A, B, E], [0, 0, 0]] T) holds all three (Van Loan 1978)."""
+        stack = self._stacked(thetas)
+        n, inside = len(self._of.states), slice(0, len(self._of.states))
+        full = exponentials(stack, self._halvings)
+        now = full if self._fraction == 0.0 else exponentials(stack * (1.0 - self._fraction), self._halvings)
+        return full[:, inside, :n], now[:, inside, n], full[:, inside, n] - now[:, inside, n], full[:, inside, n + 1 :]
+
+    def _stacked(self, thetas: list[dict[str, float]]) -> Array:
+        spaces = [self._of.matrices(theta) for theta in thetas]
+        n, nd = spaces[0].E.shape
+        stack = np.zeros((len(spaces), n + 1 + nd, n + 1 + nd))
+        stack[:, :n, :n] = [s.A for s in spaces]
+        stack[:, :n, n] = [s.B[:, 0] for s in spaces]
+        stack[:, :n, n + 1 :] = [s.E for s in spaces]
+        return np.asarray(stack / self._rate)
+
+    def _norm(self) -> float:
+        """Return the largest 1-norm at the corners: in between the parameters, and about so the norm, are smaller."""
+        at = self._corners.astype(np.float64)
+        thetas = self._parameters(at) + self._parameters(at, before=np.ones(at.size, dtype=np.bool_))
+        return float(np.abs(self._stacked(thetas)).sum(axis=1).max())
+
+
+def exponentials(stack: Array, halvings: int) -> Array:
+    """Return exp of each matrix by a Taylor polynomial of 2^-halvings times it, squared as often.
+
+    `stack` is (n_matrices, n, n). SciPy's expm solves equations on the threads of the linear algebra library, which on
+    a busy machine takes a hundred times as long for matrices as small as these; products stay on this thread.
+    """
+    x = stack * 0.5**halvings
+    unit = np.eye(x.shape[1])
+    found = unit + x / _DEGREE
+    for k in range(_DEGREE - 1, 0, -1):
+        found = unit + np.matmul(x, found) / k
+    for _ in range(halvings):
+        found = np.matmul(found, found)
+    return np.asarray(found)

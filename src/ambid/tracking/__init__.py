@@ -1,0 +1,14 @@
+"""On-line identification under supervision: evidence, filter, change detection, gate, stream."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.tracking.lines_file import read_track as read_track
+    from ambid.tracking.rpem import PhysicalRpem as PhysicalRpem
+    from ambid.tracking.window import MovingWindow as MovingWindow
+
+__getattr__, __dir__, __all__ = exports(__name__)

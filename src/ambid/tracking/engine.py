@@ -1,0 +1,417 @@
+"""The engine around a tracker: blocks go source -> ring -> guard -> consumer, timed, until they end or are interrupted.
+
+In process, the blocks come straight from the source. With a producer of its own, another process, they
+come through the ring, so that the source is never kept waiting by the consumer. Every wait is one that can be ended.
+"""
+
+from __future__ import annotations
+
+import pickle
+import signal
+import threading
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from math import ceil, log10
+from multiprocessing import get_context, parent_process
+from multiprocessing.connection import Connection
+from types import FrameType, MappingProxyType
+from typing import Any, Literal
+
+from ambid.errors import EstimationError
+from ambid.recursive.lines import Latency
+from ambid.tracking.blocks import Block, Frame, Rejection, RejectionKind, Stretch
+from ambid.tracking.guard import StreamGuard
+from ambid.tracking.replay import paced
+from ambid.tracking.ring import BlockRing
+
+_LOWEST = 1e-7  # s: upper edge of the first bin
+_PER_DECADE = 100
+_DECADES = 11  # up to 10 000 s; what is beyond is in the last bin
+
+
+class LatencyStatistics:
+    """Counts latencies, overruns and late blocks.
+
+    `count`: blocks; `largest`: s; `overruns`: blocks that were lost because the ring was full; `late`: blocks whose
+    work ended after the next one had come.
+    """
+
+    def __init__(self) -> None:
+        self._bins = [0] * (_PER_DECADE * _DECADES + 1)
+        self.count = self.overruns = self.late = 0
+        self.largest = 0.0
+
+    def add(self, latency_s: float) -> None:
+        """Count a block."""
+        if latency_s <= _LOWEST:
+            at = 0
+        elif latency_s < float("inf"):
+            at = min(ceil(_PER_DECADE * log10(latency_s / _LOWEST)), len(self._bins) - 1)
+            self.largest = max(self.largest, latency_s)
+        else:
+            raise EstimationError(
+                f"a latency of {latency_s} s cannot be counted; it must be a number. Correct the clock"
+            )
+        self._bins[at] += 1
+        self.count += 1
+
+    def quantile(self, fraction: float) -> float:
+        """Return the latency that this fraction of the blocks does not exceed.
+
+        `fraction`: 0 to 1. Returns s; upper edge of its bin, or the largest latency if that is less; NaN without any
+        block.
+        """
+        if not 0 <= fraction <= 1:
+            raise EstimationError(f"the fraction of a quantile is {fraction}; it must lie within 0 and 1. Correct it")
+        if not self.count:
+            return float("nan")
+        wanted, seen = max(fraction * self.count, 1.0), 0
+        for at, n in enumerate(self._bins):
+            seen += n
+            if seen >= wanted and at < len(self._bins) - 1:
+                return min(_LOWEST * float(10.0 ** (at / _PER_DECADE)), self.largest)
+        return self.largest
+
+    def summary(self) -> Latency | None:
+        """Return what a track reports of them; None without any block."""
+        if not self.count:
+            return None
+        return Latency(
+            median=self.quantile(0.5),
+            p99=self.quantile(0.99),
+            largest=self.largest,
+            overruns=self.overruns,
+            late=self.late,
+        )
+
+
+Pace = Literal["fastest", "real-time"]
+
+_LOOK_S = 0.1  # how often a wait looks whether it should end
+_PATIENCE_S = 5.0  # for a producer that was asked to stop
+
+
+@contextmanager
+def produced_beside(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> Iterator[_Producer]:
+    """Run a source, which can be pickled, in another process while the context lasts.
+
+    On leaving, it is told to stop; an exception of the source is raised then, unless another is on its way.
+    """
+    maker = _Producer(source, ring, rate_hz, pace)
+    try:
+        yield maker
+    except BaseException:
+        ring.stop()
+        maker.end()
+        raise
+    ring.stop()
+    failure = maker.end()
+    if failure is not None:
+        raise failure
+
+
+def fill(
+    source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace, *, alone: Callable[[], bool] = lambda: False
+) -> None:
+    """Put the blocks of a source into a ring until they end or the consumer wants no more.
+
+    `alone`: tells whether the consumer is dead.
+    """
+
+    def stopped() -> bool:
+        return ring.stopping or alone()
+
+    try:
+        if pace == "real-time":
+            for frame in paced(source, rate_hz, stopped=stopped):
+                if stopped():
+                    return
+                ring.put(frame.block, frame.arrived_s)
+            return
+        for block in source:
+            while not ring.wait_for_room(_LOOK_S):
+                if stopped():
+                    return
+            if ring.stopping:
+                return
+            ring.put(block)
+    finally:
+        ring.end()
+
+
+class _Producer:
+    """The source in a fresh process; a forked one could inherit locks that nobody will open."""
+
+    def __init__(self, source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> None:
+        try:
+            packed = pickle.dumps(source)
+        except (pickle.PicklingError, TypeError, AttributeError) as failure:
+            raise EstimationError(
+                f"the source of blocks cannot be sent to another process ({failure}). Use a Replay"
+            ) from None
+        context = get_context("spawn")
+        self._ours, theirs = context.Pipe(duplex=False)
+        self._process = context.Process(target=_child, args=(packed, ring.name, rate_hz, pace, theirs), daemon=True)
+        with _ignoring_interrupts():  # the child begins so, and one that comes before it runs does not end it
+            self._process.start()
+        theirs.close()
+
+    def alive(self) -> bool:
+        """Return whether something may still come."""
+        return self._process.is_alive()
+
+    def end(self) -> BaseException | None:
+        try:
+            told: BaseException | None = self._ours.recv() if self._ours.poll(_PATIENCE_S) else None
+            dead = False
+        except EOFError:
+            told, dead = None, True
+        self._process.join(_PATIENCE_S)
+        if self._process.is_alive():
+            self._process.terminate()
+            self._process.join()
+        if dead:
+            return EstimationError(
+                f"the process of the source died with exit code {self._process.exitcode} before its end. Start it again"
+            )
+        return told
+
+
+@contextmanager
+def _ignoring_interrupts() -> Iterator[None]:
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connection) -> None:
+    """Fill the ring from another process; interrupts are the consumer's business."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    outcome: BaseException | None = None
+    parent = parent_process()
+    with BlockRing.attach(name) as ring:
+        try:
+            fill(pickle.loads(packed), ring, rate_hz, pace, alone=lambda: parent is not None and not parent.is_alive())
+        except Exception as failure:
+            outcome = failure
+    with suppress(BrokenPipeError):  # the consumer was killed: nobody is there to be told
+        try:
+            tell.send(outcome)
+        except BrokenPipeError:
+            raise
+        except Exception:
+            tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Mend the source"))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StreamReport:
+    """What went through an engine."""
+
+    blocks: int  # that came
+    samples: int
+    given: int  # samples that the consumer got; that came and were not given; that never came
+    rejected: int
+    missing: int
+    reordered: int  # blocks that came too late but in time to be put right
+    drift: float  # of the acquisition's clock, relative to the stated rate
+    events: Mapping[RejectionKind, int]  # rejections of each kind, and the samples in them
+    rejected_samples: Mapping[RejectionKind, int]
+    seconds: float  # from the first wait to the end, s of clock
+    working_s: float  # of these, in the guard and the consumer
+    # none if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
+    latency: Latency | None
+    torn: int  # blocks lost because their check value was wrong
+    interrupted: bool  # whether it ended by an interrupt, everything up to then being delivered
+
+
+def run(
+    source: Iterable[Block] | BlockRing,
+    consume: Callable[[Stretch], object],
+    reject: Callable[[Rejection], object] | None = None,
+    *,
+    guard: StreamGuard,
+    pace: Pace = "fastest",
+    producer: Literal["none", "process"] = "none",
+    ring_blocks: int = 64,
+    block_samples: int = 200,
+    stopped: Callable[[], bool] = lambda: False,
+) -> StreamReport:
+    """Pump blocks from a source through the guard to a consumer.
+
+    An interrupt (Ctrl-C) between two blocks ends the stream: what was acquired up to then is delivered, and the report
+    says so. A second one interrupts the consumer itself. An exception of source or consumer ends everything and is
+    raised again; the ring is removed in any case.
+
+    `consume`: given each clean stretch; `reject`: given each rejection; `guard`: a fresh one, of this stream; `pace`:
+    of a source that is no ring; `ring_blocks`, `block_samples`: capacity of the ring, with a producer; `stopped`: asked
+    between blocks; True ends the stream as an interrupt does.
+    """
+    pump = _Pump(guard, consume, reject)
+    with _Interrupt() as interrupt:
+
+        def ending() -> bool:
+            return interrupt.came or stopped()
+
+        if isinstance(source, BlockRing):
+            pump.drain(source, ending, None)
+        elif producer == "none":
+            frames = paced(source, guard.rate_hz, stopped=ending) if pace == "real-time" else _at_once(source)
+            pump.pull(frames, ending, interrupt)
+        else:
+            names = [f"c{k}" for k in range(guard.n_channels)]
+            with (
+                BlockRing.create(
+                    rate_hz=guard.rate_hz, channels=names, slots=ring_blocks, block_samples=block_samples
+                ) as ring,
+                produced_beside(source, ring, guard.rate_hz, pace) as maker,
+            ):
+                pump.drain(ring, ending, maker)
+        pump.finish()
+        return pump.report(interrupted=interrupt.came)
+
+
+def _at_once(source: Iterable[Block]) -> Iterator[Frame]:
+    for block in source:
+        yield Frame(block=block, arrived_s=time.perf_counter())
+
+
+class _Pump:
+    """Takes frames through guard and consumer, and the time of each."""
+
+    def __init__(
+        self, guard: StreamGuard, consume: Callable[[Stretch], object], reject: Callable[[Rejection], object] | None
+    ) -> None:
+        self._guard, self._consume, self._reject = guard, consume, reject
+        self._statistics = LatencyStatistics()
+        self._arrivals: deque[float] = deque()  # of blocks whose work is not done: some wait in the guard
+        self._done = float("-inf")
+        self._begun = time.perf_counter()
+        self._working = 0.0
+        self.blocks = self.torn = 0
+
+    def take(self, frame: Frame) -> None:
+        """Work on one frame."""
+        began = time.perf_counter()
+        self._statistics.late += frame.arrived_s < self._done
+        self.blocks += 1
+        self._arrivals.append(frame.arrived_s)
+        for passed in self._guard.take(frame.block):
+            if isinstance(passed, Stretch):
+                self._consume(passed)
+            elif self._reject is not None:
+                self._reject(passed)
+        self._count(self._guard.n_waiting)
+        self._working += self._done - began
+
+    def _count(self, waiting: int) -> None:
+        """Count the latency of blocks that are done with."""
+        self._done = time.perf_counter()
+        while len(self._arrivals) > waiting:
+            self._statistics.add(self._done - self._arrivals.popleft())
+
+    def pull(self, frames: Iterator[Frame], ending: Callable[[], bool], interrupt: _Interrupt) -> None:
+        """Take all frames of a source; a source that keeps us waiting is interrupted there."""
+        while not ending():
+            try:
+                with interrupt.now():
+                    frame = next(frames, None)
+            except _Interrupted:
+                return
+            if frame is None:
+                return
+            self.take(frame)
+
+    def drain(self, ring: BlockRing, ending: Callable[[], bool], maker: _Producer | None) -> None:
+        """Take all frames of a ring; when it should end, those that it holds by then."""
+        left: int | None = None
+        while left is None or left > 0:
+            if left is None and ending():
+                if maker is not None:  # a ring of others is left to go on
+                    ring.stop()
+                left = ring.filled
+                continue
+            frame = ring.read(_LOOK_S if left is None else 0.0)
+            left = None if left is None else left - 1
+            if frame is not None:
+                self.take(frame)
+            elif ring.ended or (maker is not None and not maker.alive() and not ring.filled):
+                break
+        self._statistics.overruns, self.torn = ring.overruns, ring.torn
+
+    def finish(self) -> None:
+        """Deliver what waits in the guard."""
+        for passed in self._guard.flush():
+            if isinstance(passed, Stretch):
+                self._consume(passed)
+            elif self._reject is not None:
+                self._reject(passed)
+        self._count(0)
+
+    def report(self, *, interrupted: bool) -> StreamReport:
+        guard = self._guard
+        return StreamReport(
+            blocks=self.blocks,
+            samples=guard.n_received,
+            given=guard.n_given,
+            rejected=guard.n_rejected,
+            missing=guard.n_missing,
+            reordered=guard.n_reordered,
+            drift=guard.drift,
+            events=MappingProxyType(dict(guard.events)),
+            rejected_samples=MappingProxyType(dict(guard.samples)),
+            seconds=time.perf_counter() - self._begun,
+            working_s=self._working,
+            latency=self._statistics.summary(),
+            torn=self.torn,
+            interrupted=interrupted,
+        )
+
+
+class _Interrupted(BaseException):
+    """An interrupt that came while a source kept us waiting."""
+
+
+class _Interrupt:
+    """Turns the first interrupt into a wish to end; the second is an ordinary one."""
+
+    def __init__(self) -> None:
+        self.came = False
+        self._waiting = False
+        self._before: Any = None
+
+    def __enter__(self) -> _Interrupt:
+        if threading.current_thread() is threading.main_thread():
+            before = signal.getsignal(signal.SIGINT)
+            if before is signal.default_int_handler:  # whoever handles interrupts otherwise, keeps doing so
+                self._before = before
+                signal.signal(signal.SIGINT, self._handle)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _handle(self, number: int, frame: FrameType | None) -> None:
+        del number, frame
+        if self.came:
+            raise KeyboardInterrupt
+        self.came = True
+        if self._waiting:
+            raise _Interrupted
+
+    @contextmanager
+    def now(self) -> Iterator[None]:
+        """Let an interrupt act at once while the context lasts."""
+        self._waiting = True
+        try:
+            yield
+        finally:
+            self._waiting = False

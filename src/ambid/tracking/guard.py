@@ -1,0 +1,420 @@
+"""Guard of a stream: whatever happens to the blocks, only clean samples under their right numbers go on, in order.
+
+Three judgements: is it a block of this stream, where does it belong (order.py), and which rows are sound: not those
+that hold NaN, are absurd or saturated, or belong to a frozen channel.
+
+A frozen channel repeats its last value. It is noticed where a channel that normally moves holds one value much longer
+than it ever did; the rows of such a run are refused from the first repetition on, so a run that has not been decided
+at the end of a block is held back until the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from math import isinf
+from operator import index
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.tracking.blocks import Block, Ledger, Part, Passed, RejectionKind, RowKind, Stretch
+from ambid.tracking.order import BlockOrder, SampleClock
+
+Mask = NDArray[np.bool_]
+Stuck = Literal["auto"] | None | int | Sequence[int | Literal["auto"] | None]
+
+ABSURD = 1e15  # no quantity of a bearing in SI units is that large; squares stay far from overflow
+_NORMAL_RUN = 20  # a channel with longer runs in normal work (coarse steps, a set point) is not watched
+_LEARN = 2000  # samples of normal work before a channel is watched
+_SHORTEST = 16  # repetitions below this are never called frozen
+_FACTOR = 4  # a frozen run is that many times longer than the longest normal one
+_NEVER = np.iinfo(np.int64).max
+
+
+class RowCheck:
+    """Judges rows in the order of their numbers, remembering what each channel last held and how long.
+
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2).
+    """
+
+    def __init__(
+        self,
+        n_channels: int,
+        *,
+        limits: ArrayLike | None = None,
+        saturation: ArrayLike | None = None,
+        stuck: Stuck = "auto",
+    ) -> None:
+        if n_channels < 1:
+            raise EstimationError(f"the stream has {n_channels} channels; it needs at least one. Correct n_channels")
+        self._limits = np.full(n_channels, ABSURD) if limits is None else _per_channel(limits, n_channels, "limits")
+        self._widest = float(self._limits.min())
+        self._rails = None if saturation is None else _rails(saturation, n_channels)
+        self._learns = np.zeros(n_channels, dtype=bool)
+        self._threshold = np.full(n_channels, _NEVER, dtype=np.int64)
+        self._set_stuck(stuck, n_channels)
+        self._watches = bool(self._learns.any() or (self._threshold < _NEVER).any())
+        self._usual = np.ones(n_channels, dtype=np.int64)  # longest run in normal work
+        self._moving = np.zeros(n_channels, dtype=np.int64)  # samples of normal work
+        self._last = np.full(n_channels, np.nan)
+        self._run = np.zeros(n_channels, dtype=np.int64)
+
+    def _set_stuck(self, stuck: Stuck, n_channels: int) -> None:
+        if stuck is None:
+            return
+        if stuck == "auto":
+            self._learns[:] = True
+            return
+        each = [stuck] * n_channels if isinstance(stuck, int) else list(stuck)
+        wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
+        if isinstance(stuck, str) or len(each) != n_channels or wrong:
+            raise EstimationError(
+                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None or a run of at least"
+                " 2 samples, for all or for each. Correct stuck"
+            )
+        self._learns[:] = [n == "auto" for n in each]
+        self._threshold[:] = [n if isinstance(n, int) else _NEVER for n in each]
+
+    def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
+        """Say which rows must not be used, and how many at the end are not decided yet.
+
+        `values`: (n_samples, n_channels), follows on the rows that were decided before. Returns (n_samples,), rows
+        refused, by kind; a kind without any is not there, and no row is in two kinds; rows at the end that have to be
+        given again, before the next ones.
+        """
+        found = self.unsound(values)
+        if not self._watches:
+            return found, 0
+        stuck, held = self._frozen(self._filled(values) if "nan" in found else values, last)
+        if stuck is not None:
+            _add(found, "stuck", stuck[:, None])
+        return found, held
+
+    def unsound(self, values: Array) -> dict[RowKind, Mask]:
+        """Say which rows must not be used by their own values alone.
+
+        `values`: (n_samples, n_channels). Returns (n_samples,), as `judge` gives it.
+        """
+        found: dict[RowKind, Mask] = {}
+        # The peak is NaN if anything is: one comparison tells that all is well.
+        if not np.abs(values).max() <= self._widest:
+            _add(found, "nan", ~np.isfinite(values))
+            _add(found, "range", np.abs(values) > self._limits)
+        if self._rails is not None:
+            _add(found, "saturated", (values <= self._rails[:, 0]) | (values >= self._rails[:, 1]))
+        return found
+
+    def _filled(self, values: Array) -> Array:
+        """Return the values with each one that is no number replaced by the one before: no frozen run ends there."""
+        known = np.isfinite(values)
+        at = np.maximum.accumulate(np.where(known, np.arange(values.shape[0])[:, None], -1), axis=0)
+        return np.where(at >= 0, np.take_along_axis(values, np.maximum(at, 0), axis=0), self._last)
+
+    def _frozen(self, values: Array, last: bool) -> tuple[Mask | None, int]:
+        """Return the rows of frozen runs (None without any) and the undecided rows; learn normal runs."""
+        n = values.shape[0]
+        same = np.empty(values.shape, dtype=bool)
+        np.equal(values[0], self._last, out=same[0])
+        np.equal(values[1:], values[:-1], out=same[1:])
+        if not same.any():
+            self._learn_all(np.maximum(self._run, 1), n)
+            self._last[:], self._run[:] = values[-1], 1
+            return None, 0
+        stuck = np.zeros(n, dtype=bool)
+        lengths = np.empty(values.shape, dtype=np.int64)
+        held = 0
+        for j in range(values.shape[1]):
+            trailing = self._channel(j, same[:, j], lengths[:, j], stuck)
+            held = max(held, 0 if last else trailing)
+        decided = n - held
+        if decided:
+            self._last[:], self._run[:] = values[decided - 1], lengths[decided - 1]
+        return (stuck if stuck.any() else None), held
+
+    def _channel(self, j: int, same: Mask, lengths: NDArray[np.int64], stuck: Mask) -> int:
+        """Fill in the running length of each row's run, mark frozen rows, and return the undecided ones at the end."""
+        n = same.size
+        rows = np.arange(n)
+        change = np.where(same, -1, rows)
+        start = np.maximum.accumulate(change)  # -1 while the run of the rows before goes on
+        lengths[:] = np.where(start < 0, self._run[j] + rows + 1, rows - start + 1)
+        ends = np.flatnonzero(~np.append(same[1:], False))  # the last one may go on in the next block
+        total = lengths[ends]
+        frozen = total >= self._threshold[j]
+        if frozen.any():
+            size = np.diff(np.concatenate([[-1], ends]))
+            stuck |= np.repeat(frozen, size) & same
+        if self._learns[j]:
+            self._learn(j, total[:-1], n, int(total[-1]))
+        undecided = bool(same[-1]) and not frozen[-1] and self._threshold[j] < _NEVER
+        return n - 1 - int(start[-1]) if undecided else 0
+
+    def _learn(self, j: int, finished: NDArray[np.int64], n: int, going: int) -> None:
+        """Learn from runs of one channel that ended, and from the one that goes on."""
+        below = finished[finished < self._threshold[j]]
+        longest = max(int(below.max(initial=1)), int(self._usual[j]))
+        if self._threshold[j] == _NEVER and max(longest, going) > _NORMAL_RUN:
+            self._usual[j], self._moving[j] = 1, 0
+            return
+        self._usual[j] = min(longest, _NORMAL_RUN)
+        self._moving[j] += n
+        if self._moving[j] >= _LEARN:
+            self._threshold[j] = max(_SHORTEST, _FACTOR * self._usual[j])
+
+    def _learn_all(self, ended: NDArray[np.int64], n: int) -> None:
+        """Learn from a block without any repetition: at most the runs before it ended."""
+        if (self._learns & (self._moving < _LEARN)).any() or (ended > self._usual).any():
+            for j in np.flatnonzero(self._learns):
+                self._learn(int(j), ended[j : j + 1], n, 1)
+
+
+def _add(found: dict[RowKind, Mask], kind: RowKind, cells: Mask) -> None:
+    """Add the rows that hold such a cell and are of no other kind yet."""
+    rows = np.asarray(cells.any(axis=1))
+    for before in found.values():
+        rows &= ~before
+    if rows.any():
+        found[kind] = rows
+
+
+def _per_channel(limits: ArrayLike, n_channels: int, name: str) -> Array:
+    try:
+        each = np.array(np.broadcast_to(np.asarray(limits, dtype=np.float64), (n_channels,)))
+    except ValueError:
+        each = np.array([np.nan])
+    if not (each > 0).all():
+        raise EstimationError(f"{name} does not hold a positive number for each of {n_channels} channels. Correct it")
+    return np.minimum(each, np.finfo(np.float64).max)
+
+
+def _rails(saturation: ArrayLike, n_channels: int) -> Array:
+    rails = np.asarray(saturation, dtype=np.float64)
+    if rails.shape != (n_channels, 2) or (rails[:, 0] >= rails[:, 1]).any():
+        raise EstimationError(
+            f"saturation has shape {rails.shape}; it must hold a lower and a higher rail for each of {n_channels}"
+            " channels. Correct it"
+        )
+    out = rails.copy()
+    out[np.isnan(out[:, 0]), 0] = -np.inf
+    out[np.isnan(out[:, 1]), 1] = np.inf
+    return out
+
+
+_LARGEST = 2**62  # of a sample number
+_TOLERANCE = 0.75  # of a sample: a stamp rounded to samples lies within half of one
+_WHY: Mapping[RowKind, str] = MappingProxyType(
+    {
+        "nan": "hold a value that is not finite",
+        "range": "are beyond the credible limits",
+        "saturated": "lie at a rail",
+        "stuck": "repeat the last value of a channel: it is frozen",
+    }
+)
+
+
+class StreamGuard:
+    """Takes blocks as they come and gives out clean stretches, with a record of everything that it does not give.
+
+    Every sample given out stands under its own number, later than all before. Blocks in wrong order are put right as
+    far as `reorder` blocks wait for a missing one. After any damage the stream goes on with the next sound block; only
+    an acquisition that sets both its counter and its clock back is taken for a repetition until `patience_s` is over.
+    Without stamps a single wrong number is noticed only if it leads by more than one second.
+
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2),
+    rails of each channel; NaN for none; `reorder`: blocks that may wait for a missing one; a gap delays as many;
+    `counter_bits`: width of a sample counter that wraps around, e.g. 32.
+
+    `n_received`: samples that came.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        n_channels: int,
+        *,
+        limits: ArrayLike | None = None,
+        saturation: ArrayLike | None = None,
+        stuck: Stuck = "auto",
+        reorder: int = 1,
+        clock_tolerance_s: float | None = None,
+        counter_bits: int | None = None,
+        patience_s: float = 1.0,
+    ) -> None:
+        if reorder < 0 or not patience_s > 0 or (counter_bits is not None and not 8 <= counter_bits <= 62):
+            raise EstimationError(
+                f"a guard with reorder = {reorder}, patience_s = {patience_s}, counter_bits = {counter_bits} cannot"
+                " work: reorder must not be negative, patience positive, a counter of 8 to 62 bits. Correct it"
+            )
+        self._rows = RowCheck(n_channels, limits=limits, saturation=saturation, stuck=stuck)
+        tolerance = _TOLERANCE / max(rate_hz, 1e-300) if clock_tolerance_s is None else clock_tolerance_s
+        self._clock = SampleClock(rate_hz, tolerance)
+        self.rate_hz, self.n_channels = rate_hz, n_channels
+        self._wrap = None if counter_bits is None else 1 << counter_bits
+        self._ledger = Ledger(rate_hz)
+        self._order = BlockOrder(
+            rate_hz=rate_hz,
+            clock=None if isinf(tolerance) else self._clock,
+            depth=reorder,
+            patience_s=patience_s,
+            ledger=self._ledger,
+            place=self._judge,
+            broke=self._break,
+        )
+        self._restart = True
+        self._given_to = 0  # end of what was given
+        self._undecided: Part | None = None
+        self.n_received = 0
+
+    @property
+    def events(self) -> Mapping[RejectionKind, int]:
+        """Number of rejections of each kind."""
+        return MappingProxyType(self._ledger.events)
+
+    @property
+    def samples(self) -> Mapping[RejectionKind, int]:
+        """Number of samples in the rejections of each kind."""
+        return MappingProxyType(self._ledger.samples)
+
+    @property
+    def n_given(self) -> int:
+        """Number of samples given out."""
+        return self._ledger.n_given
+
+    @property
+    def n_missing(self) -> int:
+        """Number of samples that never came."""
+        return self._ledger.samples.get("gap", 0)
+
+    @property
+    def n_rejected(self) -> int:
+        """Number of samples that came and were not given."""
+        return sum(self._ledger.samples.values()) - self.n_missing
+
+    @property
+    def n_reordered(self) -> int:
+        """Number of blocks that had been missed and came in time."""
+        return self._order.n_reordered
+
+    @property
+    def n_waiting(self) -> int:
+        """Number of blocks that wait for a missing or a confirming one."""
+        return self._order.n_waiting
+
+    @property
+    def drift(self) -> float:
+        """Relative deviation of the acquisition's clock from the stated rate."""
+        return self._clock.drift
+
+    def take(self, block: Block) -> list[Passed]:
+        """Take in a block.
+
+        `block`: possibly damaged; not modified and not kept. Returns in the order of the stream; may be empty while a
+        block waits.
+        """
+        part = self._part(block)
+        if part is not None:
+            self._order.take(part)
+        return self._ledger.taken()
+
+    def flush(self) -> list[Passed]:
+        """Give out what waits: at the end of the stream."""
+        self._order.finish()
+        part, self._undecided = self._undecided, None
+        if part is not None:
+            self._give(part.first, part.values, self._rows.judge(part.values, last=True)[0])
+        return self._ledger.taken()
+
+    def _part(self, block: Block) -> Part | None:
+        """Return the block under its number in the stream; None, with a rejection, if it is no block of this stream."""
+        raw: object = block.values
+        size = int(raw.shape[0]) if isinstance(raw, np.ndarray) and raw.ndim else 0
+        self.n_received += size
+        number = self._number(block.first)
+        if number is None:
+            why = f"the block says that it begins at sample {str(block.first)[:40]}"
+            self._ledger.reject("number", size, self._order.next, why)
+            return None
+        try:
+            time_s = float(block.time_s)
+        except (TypeError, ValueError, OverflowError):
+            time_s = float("nan")
+        wrong: tuple[RejectionKind, str]
+        if not isinstance(raw, np.ndarray) or raw.dtype != np.float64:
+            wrong = "type", f"the block holds {getattr(raw, 'dtype', type(raw).__name__)}, not float64"
+        elif raw.ndim != 2 or raw.shape[1] != self.n_channels:
+            wrong = "shape", f"the block has shape {raw.shape}; the stream has {self.n_channels} channels"
+        elif not size:
+            wrong = "empty", "the block holds no sample"
+        else:
+            return Part(first=number, time_s=time_s, values=np.array(raw, dtype=np.float64, order="C"))
+        self._ledger.reject(wrong[0], size, self._order.next, wrong[1])
+        stamp = Part(first=number, time_s=time_s, values=np.empty((size, 0)))
+        if self._order.fits(stamp):
+            self._order.pass_over(stamp)
+        return None
+
+    def _number(self, first: object) -> int | None:
+        """Return a block's number in the stream, unwrapped; None if it is none."""
+        try:
+            number = index(first)  # type: ignore[arg-type]
+        except TypeError:
+            return None
+        if self._wrap is None:
+            return number + self._order.offset if -_LARGEST < number < _LARGEST else None
+        if not 0 <= number < self._wrap:
+            return None
+        near = self._order.near
+        if near is None:
+            return number
+        half = self._wrap // 2
+        return near + (number + self._order.offset - near + half) % self._wrap - half
+
+    def _judge(self, part: Part) -> None:
+        """Give out the sound rows of a part that is next; undecided ones wait for the part after it."""
+        if self._undecided is not None and self._undecided.end == part.first:
+            whole = np.vstack([self._undecided.values, part.values])
+            part = Part(first=self._undecided.first, time_s=part.time_s, values=whole)
+            self._undecided = None
+        self._drop_undecided()
+        found, held = self._rows.judge(part.values)
+        n = part.size - held
+        if held:
+            self._undecided = Part(first=part.first + n, time_s=part.time_s, values=part.values[n:])
+        if n:
+            self._give(part.first, part.values[:n], {kind: rows[:n] for kind, rows in found.items()})
+
+    def _drop_undecided(self) -> None:
+        """Refuse rows that repeat the last value of a channel when nothing follows to tell whether it was frozen."""
+        part, self._undecided = self._undecided, None
+        if part is not None:
+            why = f"{part.size} samples from {part.first} on repeat the last value of a channel up to a gap"
+            self._ledger.reject("stuck", part.size, part.first, why)
+
+    def _break(self) -> None:
+        """Let the next stretch restart, whatever its number."""
+        self._drop_undecided()
+        self._restart = True
+
+    def _give(self, first: int, values: Array, found: Mapping[RowKind, Mask]) -> None:
+        """Give out each run of sound rows."""
+        sound = np.ones(values.shape[0], dtype=bool)
+        for kind, rows in found.items():
+            count = int(rows.sum())
+            if count:
+                sound &= ~rows
+                at = first + int(np.argmax(rows))
+                self._ledger.reject(kind, count, at, f"{count} samples from {at} on {_WHY[kind]}")
+        for start, stop in [(0, values.shape[0])] if not found else _runs(sound):
+            restart = self._restart or first + start != self._given_to
+            self._ledger.give(Stretch(values=values[start:stop], first=first + start, restart=restart))
+            self._restart, self._given_to = False, first + stop
+
+
+def _runs(sound: NDArray[np.bool_]) -> list[tuple[int, int]]:
+    """Return (start, stop) of every run of True."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], sound.astype(np.int8), [0]])))
+    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

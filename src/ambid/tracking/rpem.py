@@ -1,0 +1,498 @@
+"""Recursive prediction error estimation of physical parameters (Ljung and Söderström 1983, ch. 3; Ljung 1999, ch. 11).
+
+The innovations-form predictor of the off-line estimator runs along the stream with exact sensitivities. Every block
+leaves its evidence, which a Kalman filter of the tracked numbers takes in: square-root covariance, Joseph's form
+(Bierman 1977, ch. 5); numbers that are held enter with their uncertainty but are not moved (Schmidt). The predictor is
+assembled anew where the estimate has moved so far that second-order terms matter. Under feedback it is as consistent as
+the off-line estimator, and with unlimited memory it ends where that does.
+
+How fast each number walks is found by maximum likelihood: over a window of merged evidence the score by each walk
+variance w_j is half the difference of sum(lambda_j^2) and sum(N_jj) of the disturbance smoother (Koopman and Shephard
+1992). At the maximum the two agree; their ratio, raised to a power below one, therefore takes each w_j towards it and
+keeps it positive.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.square_root_kernels import deviations, walk
+from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
+from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
+from ambid.tracking.rpem_kernels import absorb, filter_ring, smooth_ring
+
+Flags = NDArray[np.bool_]
+
+
+class ParameterFilter:
+    """Estimate and covariance of the tracked numbers.
+
+    `start`: (p,); `covariance`: (p, p), positive definite; `positive`: (p,), numbers that are positive and stay so;
+    default none.
+
+    `q`: (p,); `active`: (p,), which numbers evidence may move, and which may walk; `n_shortened`: steps that were
+    shortened because a positive number would have lost more than half of itself.
+    """
+
+    def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
+        self.q, self._F = start.copy(), factors_of(covariance)
+        self._scratch = np.zeros((start.size + 2, start.size))
+        self.active = np.ones(start.size, dtype=np.bool_)
+        self._positive = np.zeros(start.size, dtype=np.bool_) if positive is None else positive
+        self.n_shortened = 0
+
+    @property
+    def covariance(self) -> Array:
+        """Covariance of `q`, shape (p, p)."""
+        return covariance_of(self._F)
+
+    @property
+    def sd(self) -> Array:
+        """Standard deviations of `q`, shape (p,)."""
+        sd = np.empty(self.q.size)
+        deviations(self._F, sd)
+        return sd
+
+    def walk(self, variance: Array, time: float = 1.0) -> None:
+        """Let the active numbers walk.
+
+        `variance`: (p,), of the walks, per second; `time`: s.
+        """
+        walk(self._F, np.where(self.active, time * variance, 0.0), self._scratch[0])
+
+    def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
+        """Take in a block's evidence.
+
+        Returns squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model
+        and the covariance are right.
+        """
+        misfit, part = absorb(
+            self.q, self._F, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise, self._scratch
+        )
+        self.n_shortened += part < 1.0
+        return float(misfit)
+
+    def far(self, at: Array, J: Array, curved: Array, most: float) -> bool:
+        """Return whether the estimate has left the neighbourhood of a point.
+
+        `at`: (p,); `J`: (p, p), upper triangle of a block's evidence; `curved`: (p,), squared moves over standard
+        deviations that are too much; `most`: |J (q - at)|^2 that is too much.
+        """
+        move = self.q - at
+        length = J @ move
+        return bool(length @ length > most or (move * move > curved * self.sd).any())
+
+    def widen(self, place: int, sd: float) -> None:
+        """Forget what is known of one number, but not the others: it may have moved by about `sd`."""
+        variance = np.zeros(self.q.size)
+        variance[place] = sd * sd
+        walk(self._F, variance, self._scratch[0])
+
+    def set(self, q: Array, covariance: Array) -> None:
+        """Go on from other numbers.
+
+        `q`: (p,); `covariance`: (p, p).
+        """
+        fresh = ParameterFilter(q, covariance)
+        self.q, self._F = fresh.q, fresh._F
+
+    def copy(self) -> ParameterFilter:
+        """Return an independent filter in the same state."""
+        other = ParameterFilter.__new__(ParameterFilter)
+        other.__dict__.update(self.__dict__)
+        other.q, other._F, other.active = self.q.copy(), self._F.copy(), self.active.copy()
+        return other
+
+
+CHUNK_S = 0.05  # evidence is merged to this length: the fastest drift that is told from a jump
+_WINDOW = 400  # chunks
+_FEWEST = 20  # chunks before the first adaptation
+_EVERY = 5  # chunks between looks at the recent past
+_SELDOM = 20  # chunks between looks at the whole window
+_SURE = 6.0  # ratio in the recent past that chance seldom makes; what follows from a false one is a wider interval
+_RECENT = (20, 60)  # chunks that alone may show that something has begun to drift
+_POWER = 0.5
+_SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a variance
+_ROUNDS = 5  # of raising a variance at one look
+_NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
+
+
+class DriftRates:
+    """Variances per second of the walks.
+
+    `start`: (p,), first variances per second; `floor`, `ceiling`: (p,), bounds; where floor equals ceiling nothing is
+    adapted; `block_s`: length of the evidence that will come, s.
+
+    `variance`: (p,), per second; `adapts`: whether the variances are found from the data; `walks`: whether any variance
+    is, or may become, positive.
+    """
+
+    def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
+        p = start.size
+        self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
+        self.adapts = bool(np.any(ceiling > floor))
+        self.walks = self.adapts or bool(np.any(start > 0.0))
+        self._per_chunk = max(1, round(CHUNK_S / block_s))
+        self._chunk_s = self._per_chunk * block_s
+        room = _WINDOW if self.adapts else 0
+        self._J, self._r, self._at = np.zeros((room, p, p)), np.zeros((room, p)), np.zeros((room, p))
+        self._q, self._P = np.zeros((room, p)), np.zeros((room, p, p))
+        self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
+        self._chunk = EvidenceSum(p)
+        self._count = self._next = self._since = self._looks = 0
+
+    def add(self, evidence: Evidence, before: ParameterFilter) -> None:
+        """Take in a block.
+
+        `before`: the numbers as they were known before this block.
+        """
+        if not self.adapts:
+            return
+        chunk = self._chunk
+        if not chunk.blocks:
+            self._q[self._next], self._P[self._next] = before.q, before.covariance
+            chunk.clear(evidence.at)
+        chunk.add(evidence)
+        if chunk.blocks < self._per_chunk:
+            return
+        self._J[self._next], self._r[self._next], self._at[self._next] = chunk.T[:, :-1], chunk.T[:, -1], chunk.at
+        chunk.blocks = 0
+        self._next = (self._next + 1) % _WINDOW
+        self._count = min(self._count + 1, _WINDOW)
+        self._since += 1
+
+    def adapt(self, known: ParameterFilter, noise: float) -> None:
+        """Look at the window where a look is due; where something walks faster than thought, filter its end anew.
+
+        `noise`: variance of the evidence's residual.
+        """
+        if not self._chunk.blocks and self._count >= _FEWEST and self._since >= _EVERY:
+            self._since = 0
+            self._adapt(known, noise)
+
+    def restart(self) -> None:
+        """Forget the window: a jump in it would pass for drift."""
+        self._count = self._next = self._since = self._chunk.blocks = 0
+
+    def _adapt(self, known: ParameterFilter, noise: float) -> None:
+        active, before = known.active, self.variance
+        if self._looks % (_SELDOM // _EVERY) == 0:
+            self._raise(self._ratio(self._count, active, noise))
+        self._looks += 1
+        for length in _RECENT:
+            for _ in range(_ROUNDS):
+                recent = self._ratio(min(length, self._count), active, noise)
+                if not np.any(recent > _SURE):
+                    break
+                self._raise(np.where(recent > _SURE, recent, 1.0))
+        if np.any(self.variance > _NOTICED * before):
+            self._catch_up(known, noise)
+
+    def _raise(self, ratio: Array) -> None:
+        factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
+        self.variance = np.clip(self.variance * factor, self._floor, self._ceiling)
+
+    def _ratio(self, count: int, active: NDArray[np.bool_], noise: float) -> Array:
+        """Sum of lambda_j^2 over sum of N_jj in the last `count` chunks: above 1 where number j walks faster."""
+        squares, powers, _, _ = self._run(count, active, noise)
+        told = active & (powers > 0.0)
+        return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
+
+    def _catch_up(self, known: ParameterFilter, noise: float) -> None:
+        """Filter the recent past anew: with the rates as they were, what moved was taken for chance."""
+        _, _, q, P = self._run(min(max(_RECENT), self._count), known.active, noise)
+        held = ~known.active
+        if not (np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0)):
+            return
+        q[held] = known.q[held]
+        known.set(q, P)
+
+    def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
+        step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
+        first = (self._next - count) % _WINDOW
+        q, P, (K, N) = self._q[first].copy(), self._P[first].copy(), self._scratch
+        found = np.empty((4, q.size))
+        filter_ring(self._J, self._r, self._at, count, first, q, P, step, noise, K)
+        smooth_ring(self._J, count, first, K, found, N)
+        return found[0], found[1], q, P
+
+
+Memory = float | Literal["auto", "all"]
+
+BLOCK_S = 0.005  # of one evidence
+_ROWS_PER_NUMBER = 4  # innovations of one evidence for each tracked number, at least: the noise shows in what is left
+_START_MEMORY = 2.0  # times the length of the start's record: memory at the beginning, where it is found from the data
+_LONGEST_S, _SHORTEST_S = 60.0, 0.02
+# square of a move, over the standard deviation, at which second-order terms matter
+_CURVED = {"parameter": 0.05, "gain": 0.05, "noise": 0.5, "offset": np.inf, "unbalance": np.inf}
+_APPROACH = (1.0, 0.5, 0.25, 0.125)  # parts of the way tried where there is no predictor at its end
+_STALE = 0.01  # part of the innovations' variance that a predictor behind the estimate may add
+_NOISE_S = 2.0  # time constant with which the noise level is followed
+_TRANSIENT = 2.0  # times the usual noise in one block: more than chance makes, which is why it says something else
+_LOWEST_NOISE = 0.25  # of the level at identification: less is not believed
+_OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of which nothing is known before
+
+
+class PhysicalEstimator:
+    """What every estimator of a bench's physical parameters has: numbers to track, a filter of them and a predictor."""
+
+    def __init__(self, start: Estimate | TrackedNumbers) -> None:
+        self.numbers = numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
+        at = linearise(numbers, numbers.start)
+        if at is None:
+            raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+        self.filter = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
+        self.stream = EvidenceStream(numbers, at, 1)
+        self.n_used = self.n_rejected = 0
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the physical parameters."""
+        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
+
+    @property
+    def estimate(self) -> Array:
+        """Physical parameters, SI, shape (n_parameters,)."""
+        return self.numbers.physical(self.filter.q)
+
+    @property
+    def covariance(self) -> Array:
+        """Their covariance, SI, shape (n_parameters, n_parameters)."""
+        return self.numbers.physical_covariance(self.filter.covariance)
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state."""
+        return copy.deepcopy(self, {id(self.numbers): self.numbers})
+
+
+class PhysicalRpem(PhysicalEstimator):
+    """Recursive estimator of a bench's physical parameters, started from an off-line estimate.
+
+    Parameters
+    ----------
+    start : Estimate or TrackedNumbers
+        Where tracking begins.
+    memory : float, "auto" or "all"
+        Time constant with which old data are forgotten, s; found for each number by maximum likelihood; or all data
+        count alike.
+    block : int, optional
+        Samples of one evidence; by default 5 ms, and enough innovations to tell noise from numbers.
+
+    Attributes
+    ----------
+    numbers : TrackedNumbers
+    filter : ParameterFilter
+    stream : EvidenceStream
+    drift : DriftRates
+    block_samples : int
+    block_s : float
+        Length of one evidence.
+    noise_level : float
+        Variance of the innovations over that at identification, followed through what no number explains.
+    n_used, n_rejected : int
+    n_linearised : int
+        Times that the predictor was assembled anew.
+    n_unreached : int
+        Times that there was no predictor at the estimate: the one in use is the nearest that was found on the way.
+
+    Raises
+    ------
+    EstimationError
+        If the start cannot be tracked from, or the memory is not positive.
+    """
+
+    def __init__(self, start: Estimate | TrackedNumbers, *, memory: Memory = "auto", block: int | None = None) -> None:
+        super().__init__(start)
+        numbers = self.numbers
+        fewest = -(-_ROWS_PER_NUMBER * numbers.start.size // len(numbers.problem.model.outputs))
+        size = max(round(BLOCK_S * numbers.rate_hz), fewest) if block is None else block
+        if size < 1:
+            raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
+        self.block_samples, self.block_s = size, size / numbers.rate_hz
+        self.filter.active[numbers.places("gain")] = False
+        self.stream = EvidenceStream(numbers, self.stream.at, size)
+        self.drift = _rates(numbers, memory, self.block_s)
+        self.n_linearised = self.n_unreached = 0
+        self.noise_level = 1.0
+        self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
+        self._part = -float(np.expm1(-self.block_s / _NOISE_S))
+
+    def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), SI
+        outputs : array_like, shape (n_outputs,) or (n_samples, n_outputs), SI
+        forcing : array_like, shape (2,) or (n_samples, 2), optional
+            Where the unbalance is tracked: (speed/top speed)^2 times cosine and sine of the angle.
+
+        Returns
+        -------
+        ndarray, shape of `outputs`, SI
+            Innovations; NaN for a rejected sample.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        samples = checked(self.numbers, inputs, outputs, forcing)
+        k, n = 0, samples.y.shape[0]
+        if n == 1:
+            return self._one(samples).reshape(np.shape(outputs))
+        errors = np.full(samples.y.shape, np.nan)
+        while k < n:
+            used, found, evidence = self.stream.feed(samples.part(k))
+            errors[k : k + used] = found
+            k += used
+            self.n_used += used
+            if evidence is not None:
+                self.take(evidence)
+            elif k < n:
+                self.n_rejected += 1
+                k += 1
+                self.stream.restart(self.stream.sample + 1)
+        return errors.reshape(np.shape(outputs))
+
+    def _one(self, samples: Samples) -> Array:
+        """Take in one sample; the same as below, without what only a block needs."""
+        used, errors, evidence = self.stream.feed(samples)
+        self.n_used += used
+        if evidence is not None:
+            self.take(evidence)
+        elif not used:
+            self.n_rejected += 1
+            self.stream.restart(self.stream.sample + 1)
+            return np.full(samples.y.shape, np.nan)
+        return errors
+
+    def take(self, evidence: Evidence) -> None:
+        """Take in the evidence of a block.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        self.predict()
+        self.absorb(evidence)
+
+    def absorb(self, evidence: Evidence) -> None:
+        """Take in the evidence of a block over which the numbers have already walked.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        self.drift.add(evidence, self.filter)
+        self.filter.absorb(evidence, self.noise_of(evidence))
+        self.drift.adapt(self.filter, self.noise)
+        self.follow_noise(evidence)
+        self.refresh()
+
+    def predict(self) -> None:
+        """Let the numbers walk over one block."""
+        if self.drift.walks:
+            self.filter.walk(self.drift.variance, self.block_s)
+
+    def refresh(self) -> None:
+        """Assemble the predictor anew where the estimate has moved too far from it.
+
+        Too far is where second-order terms matter, or where its innovations are noticeably larger than those at the
+        estimate.
+        """
+        latest = self.stream.latest
+        if latest is not None:
+            most = _STALE * self.noise_level * latest.n_samples
+            far = self.filter.far(self.stream.at.at, latest.J, self._curved, most)
+            if far and not self.move_to(self.filter.q):
+                self.filter.q = self.stream.at.at.copy()  # numbers without a predictor are none of a bench
+
+    def noise_of(self, evidence: Evidence) -> float:
+        """Return the variance with which a block's residual is taken.
+
+        Parameters
+        ----------
+        evidence : Evidence
+
+        Returns
+        -------
+        float
+            The usual one; where much more is left unexplained than usual, so much larger: a transient that the model
+            does not know must not move the numbers.
+        """
+        own = evidence.rest / evidence.freedom if evidence.freedom else 0.0
+        usual = max(self.noise_level, _LOWEST_NOISE)
+        return self.numbers.overdispersion * (own if own > _TRANSIENT * usual else usual)
+
+    def follow_noise(self, evidence: Evidence) -> None:
+        """Follow the noise level by the part of a block's innovations that no number explains.
+
+        Parameters
+        ----------
+        evidence : Evidence
+        """
+        if evidence.freedom:
+            self.noise_level += self._part * (evidence.rest / evidence.freedom - self.noise_level)
+
+    @property
+    def noise(self) -> float:
+        """Variance of the evidence's residual: above 1 where the model explains the record only in part."""
+        return self.numbers.overdispersion * max(self.noise_level, _LOWEST_NOISE)
+
+    def move_to(self, q: Array) -> bool:
+        """Linearise at other numbers.
+
+        Parameters
+        ----------
+        q : ndarray, shape (p,)
+
+        Returns
+        -------
+        bool
+            False where there is no predictor: it comes as near as it can, and `n_unreached` counts.
+        """
+        near = self.stream.at
+        for part in _APPROACH:
+            at = linearise(self.numbers, near.at + part * (q - near.at), near.gain)
+            if at is not None:
+                self.stream.relinearise(at)
+                self.n_linearised += 1
+                break
+        self.n_unreached += at is None or part < 1.0
+        return at is not None and part == 1.0
+
+
+def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRates:
+    """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory.
+
+    The information is that on a number if the others are known. Where only ratios of the parameters are known well, a
+    walk as wide as each alone is known would loosen the ratios.
+    """
+    size = np.sqrt(np.diag(numbers.covariance))
+    known = 1.0 / np.diag(np.linalg.inv(numbers.covariance / np.outer(size, size))) * size**2
+    one_second = known * numbers.information_s
+    one_second[numbers.places("offset", "unbalance")] = _OFFSET_RATE
+    one_second[numbers.places("gain")] = 0.0
+    if memory == "all":
+        return DriftRates(np.zeros_like(one_second), np.zeros_like(one_second), np.zeros_like(one_second), block_s)
+    if memory != "auto":
+        if not memory > 0.0:
+            raise EstimationError(f"the memory is {memory} s; it must be positive. Give seconds, 'auto' or 'all'")
+        held = one_second / memory**2
+        return DriftRates(held, held, held, block_s)
+    first = min(max(_START_MEMORY * numbers.information_s, _SHORTEST_S), _LONGEST_S)
+    begin, slowest, fastest = (one_second / s**2 for s in (first, _LONGEST_S, _SHORTEST_S))
+    if numbers.problem.noise == "gain":
+        # entries of a gain that follow every transient leave the region of good predictors
+        own = numbers.places("noise")
+        begin[own] = fastest[own] = slowest[own]
+    return DriftRates(begin, slowest, fastest, block_s)

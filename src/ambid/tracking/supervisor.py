@@ -1,0 +1,272 @@
+"""The supervised tracker: what follows the parameters, what watches it, and who decides (thesis figs 3.1 and 5.8).
+
+Each block's evidence is judged before it is used: does it show that something jumped, does it inform the parameters at
+all? What the recursion makes of it is published only after later data have confirmed it. The operator's flags stand
+above all. Every decision is an event with its reason.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.recursive.lines import Event, State, TrackedValue
+from ambid.tracking.diagnosis import LONGEST_S, Diagnosis
+from ambid.tracking.evidence import Evidence, RecentSamples, Samples
+from ambid.tracking.gate import Accepted, Gate
+from ambid.tracking.monitors import ErrorLevel, ExcitationMonitor
+from ambid.tracking.numbers import TrackedNumbers
+from ambid.tracking.publication import DecisionLog, Operator, Publication, beside, published
+from ambid.tracking.recovery import begin
+from ambid.tracking.rpem import Memory, PhysicalRpem
+
+SILENT_S = 1.0  # without evidence, after which the published numbers are stale; sooner if there never was any
+_RELEASE = 0.8  # part of the limit under which the error has to fall to be acceptable again
+_LEVEL_S = 0.1  # over which the error is taken
+
+
+class Supervisor:
+    """Tracks the parameters of a bench and decides what is published.
+
+    `limit`: acceptable error, in multiples of that at identification; `t0`: time of sample 0, s of record; `listener`:
+    called with each event.
+
+    `rpem`: the working estimate.
+    """
+
+    def __init__(
+        self,
+        rpem: PhysicalRpem,
+        *,
+        limit: float = 1.5,
+        operator: Operator | None = None,
+        false_alarms_per_hour: float = 0.05,
+        t0: float = 0.0,
+        listener: Callable[[Event], None] | None = None,
+    ) -> None:
+        numbers, block_s = rpem.numbers, rpem.block_s
+        self.rpem, self.operator, self._t0 = rpem, operator or Operator(), t0
+        self._rate = numbers.rate_hz
+        own, sd = numbers.places("parameter"), np.sqrt(np.diag(numbers.covariance))
+        self._excitation = ExcitationMonitor(
+            numbers.names,
+            reference_rate={numbers.names[j]: 1.0 / (sd[j] ** 2 * numbers.information_s) for j in own},
+            held=[numbers.names[j] for j in numbers.places("gain")],
+            block_s=block_s,
+            window_s=max(1.0, 4 * block_s),
+        )
+        self.level = ErrorLevel(limit, max(_RELEASE * limit, min(1.1, limit)), max(2, round(_LEVEL_S / block_s)))
+        self.log = DecisionLog(listener=listener)
+        self.publication = Publication(rpem, self.operator, self.log, t0)
+        self.diagnosis = Diagnosis(rpem, self.publication, self.log, t0=t0, false_alarms_per_hour=false_alarms_per_hour)
+        self._silent, self._heard, self._deaf_s = False, 0, 0.0  # no evidence since when: sample, and s
+        self._spoken = False  # whether there has been any
+        self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
+        self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
+        self._parameters: dict[str, TrackedValue] = {}
+
+    @property
+    def gate(self) -> Gate:
+        """What holds the published numbers."""
+        return self.publication.gate
+
+    @property
+    def updates(self) -> int:
+        """Times that published parameters or gains moved."""
+        return self.publication.updates
+
+    @property
+    def changes(self) -> list[Event]:
+        """Changes found, the name being that of the number which explains the data after it."""
+        return self.diagnosis.changes
+
+    @property
+    def update_s(self) -> float:
+        """Computing time of the slowest search after a change, s."""
+        return self.diagnosis.update_s
+
+    @property
+    def state(self) -> State:
+        """What the tracker does at present."""
+        if self.operator.holding:
+            return "hold"
+        beyond = self.level.above and self.level.error > self.level.limit * self.diagnosis.noise**0.5
+        if self.diagnosis.doubted or beyond:
+            return "changed"
+        return "frozen" if self._silent or not any(self._fresh.values()) else "tracking"
+
+    @property
+    def parameters(self) -> dict[str, TrackedValue]:
+        """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
+        shown = (self.publication.accepted, self._fresh, self._trusted())
+        if self._shown is None or any(a is not b for a, b in zip(self._shown, shown, strict=True)):
+            accepted, fresh, trusted = self._shown = shown
+            now = {name: one and trusted for name, one in fresh.items()}
+            self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
+        return dict(self._parameters)
+
+    @property
+    def extra(self) -> dict[str, TrackedValue]:
+        """Published numbers beside the parameters: gains of sensors once they are found to have changed, unbalance."""
+        return beside(self.rpem.numbers, self.publication.accepted, self.rpem.filter.active, stale=not self._trusted())
+
+    @property
+    def error(self) -> float:
+        """Model error, 1 as at identification, and so before the first block; NaN where none tells of the present."""
+        if self._deaf_s > max(_LEVEL_S, 2.0 * self.rpem.block_s):
+            return float("nan")
+        return self.level.error if self._spoken else 1.0
+
+    def begin(self, first: int) -> None:
+        """Say where the stream begins, before anything of it comes.
+
+        `first`: number of the first sample.
+        """
+        self._heard = first
+        self.diagnosis.restart(first)
+
+    def _trusted(self) -> bool:
+        return not (self._silent or self.diagnosis.doubted)
+
+    def feed(self, samples: Samples, first: int, *, restart: bool = False) -> Array:
+        """Take in consecutive samples.
+
+        `samples`: all finite; `first`: number of the first one; `restart`: samples are missing before it. Returns
+        (n_samples, n_outputs), SI, innovations of the working predictor.
+        """
+        if restart or first != self.rpem.stream.sample:
+            self._resume(first)
+        errors = np.empty_like(samples.y)
+        k, n = 0, samples.y.shape[0]
+        while k < n:
+            part = samples.part(k) if k else samples
+            used, found, evidence = self.rpem.stream.feed(part)
+            errors[k : k + used] = found
+            self.diagnosis.keep(part.part(0, used), first + k + used)
+            k += used
+            self.rpem.n_used += used
+            if evidence is not None:
+                self._take(evidence)
+            elif used == 0:
+                raise ValueError(f"sample {first + k} is not finite; the guard of the stream leaves such samples out")
+        return np.asarray(errors * self.rpem.numbers.problem.scales.output)
+
+    def wait(self, sample: int) -> None:
+        """Let time pass: without samples, or with samples on which the predictor only settles.
+
+        `sample`: number of the sample up to which nothing more comes now.
+        """
+        missing = sample > self.rpem.stream.sample
+        self._deaf_s = (sample - self._heard) / self._rate
+        if not missing and self._deaf_s <= self.rpem.block_s:
+            return
+        t = self._t0 + sample / self._rate
+        settling_s = self.rpem.stream.settling_samples / self._rate
+        most_s = SILENT_S if self._spoken else min(SILENT_S, max(_LEVEL_S, 2.0 * settling_s))
+        if not self._silent and self._deaf_s >= most_s:
+            self._silent = True
+            why = (
+                f"the predictor has not settled for {most_s:.3g} s: after each interruption it needs {settling_s:.3g} s"
+            )
+            self.log.add(Event(kind="frozen", t=t, why=f"no usable sample for {most_s:.3g} s" if missing else why))
+        self._obey(t)
+
+    def order(self, flag: str) -> None:
+        """Set a flag of the operator; of two orders before the next block the first counts."""
+        self.publication.order(flag, self._now)
+
+    @property
+    def _now(self) -> float:
+        return self._t0 + self.rpem.stream.sample / self._rate
+
+    def _resume(self, first: int) -> None:
+        """Go on behind a gap: the signals before it are forgotten, the parameters have walked on meanwhile."""
+        rpem = self.rpem
+        gap_s = max(first - rpem.stream.sample, 0) / self._rate
+        if gap_s > rpem.block_s:
+            rpem.filter.walk(rpem.drift.variance, gap_s)
+            if gap_s > LONGEST_S:  # whatever happened in it did not happen before it
+                rpem.drift.restart()
+                self.diagnosis.forget(first)
+        self.diagnosis.restart(first)
+
+    def _take(self, evidence: Evidence) -> None:
+        """Judge a block, use it, and judge what came of it."""
+        rpem, t = self.rpem, self._t0 + evidence.last / self._rate
+        if self._silent:
+            self._silent = False
+            without_s = (evidence.first - self._heard) / self._rate
+            self.log.add(Event(kind="thawed", t=t, why=f"the data speak again after {without_s:.3g} s"))
+        self._heard, self._deaf_s, self._spoken = evidence.last, 0.0, True
+        events = self._excitation.update(evidence, t)
+        for event in events:
+            self.log.add(event)
+        if events:
+            self._activate()
+        rpem.predict()
+        usable = self.diagnosis.look(evidence, t)
+        if usable:
+            self._absorb(evidence, t)
+        if self.diagnosis.renewed:
+            self._activate()
+        if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
+            self._watch_level(evidence, t)
+        self._obey(t)
+
+    def _absorb(self, evidence: Evidence, t: float) -> None:
+        rpem = self.rpem
+        rpem.absorb(evidence)
+        before = self.publication.accepted
+        confirmed = self.publication.judge(evidence, t)
+        if confirmed or (self.diagnosis.settling and self.publication.accepted is not before):
+            self.diagnosis.settling = False
+            self.level.restart()
+
+    def _obey(self, t: float) -> None:
+        if self.operator.waiting and self.publication.obey(t, searching=self.diagnosis.searching):
+            self.level.restart()
+
+    def _watch_level(self, evidence: Evidence, t: float) -> None:
+        """Follow the error of the published numbers; say when it passes its limit, unless it was said why."""
+        before = self.level.above
+        error = self.level.update(evidence, self.publication.accepted.values)
+        told = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
+        if self.level.above and not (before or told):
+            why = f"the error is {error:.2f} times that at identification, over the limit of {self.level.limit:g}"
+            self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
+
+    def _activate(self) -> None:
+        """Let the recursion move what the data inform."""
+        names, active = self.rpem.numbers.names, self.rpem.filter.active
+        self._fresh = dict(self._excitation.fresh)
+        for name, fresh in self._fresh.items():
+            active[names.index(name)] = fresh
+
+
+_BLOCKS = 240  # after as many the walks of the numbers have been adapted once
+
+
+def warm_up(numbers: TrackedNumbers, memory: Memory = "auto") -> None:
+    """Track noise at the operating point, and search a change in it."""
+    supervisor = Supervisor(PhysicalRpem(numbers, memory=memory))
+    rpem, before = supervisor.rpem, supervisor.rpem.filter.copy()
+    n, n_u = _BLOCKS * rpem.block_samples, len(numbers.problem.model.inputs)
+    sizes = np.concatenate(
+        [np.zeros(n_u), np.sqrt(np.diag(numbers.innovation_covariance)) * numbers.problem.scales.output]
+    )
+    values = numbers.point + sizes * np.random.default_rng(0).standard_normal((n, sizes.size))
+    samples = Samples(
+        u=np.ascontiguousarray(values[:, :n_u]),
+        y=np.ascontiguousarray(values[:, n_u:]),
+        forcing=np.zeros((n, 2)) if numbers.synchronous else None,
+    )
+    supervisor.feed(samples, 0)
+    recent = RecentSamples(n)
+    recent.add(samples, n)
+    nothing = Event(kind="disturbed", t=0.0, why="")
+    name = numbers.names[int(numbers.places("parameter")[0])]
+    history = [(rpem.stream.latest, before)] if rpem.stream.latest is not None else []
+    if history:
+        begin(rpem, history, nothing, onset=0, suspects=(name,), size=0.1).attempt(rpem, recent)

@@ -1,0 +1,15 @@
+"""A recorder under full load is killed at random moments: what it had acknowledged is there, and the file opens."""
+
+from tests.acquisition.recorder.kills import killed
+
+CASES = 100
+
+
+def test_nothing_acknowledged_is_lost_by_a_kill(tmp_path):
+    found = list(killed(tmp_path, CASES, seed=4))
+    assert [k for k in found if k.fault] == []
+    assert len(found) == CASES
+    assert sum(k.acknowledged > 0 for k in found) > CASES / 2  # most were killed under load
+    assert sum(k.acknowledged for k in found) > 300 * CASES
+    assert sum(k.when == "while recording" for k in found) > CASES / 2
+    assert any(k.recovered > k.acknowledged for k in found)  # a kill takes less than a power cut

@@ -1,0 +1,274 @@
+"""The engine delivers everything, from this process and another, and ends cleanly however it ends."""
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ambid.errors import EstimationError, RecordError
+from ambid.record import Channel, Record
+from ambid.tracking.blocks import Block
+from ambid.tracking.engine import run
+from ambid.tracking.guard import StreamGuard
+from ambid.tracking.replay import blocks_of
+from ambid.tracking.ring import BlockRing
+from tests.tracking.damage import RATE, blocks
+from tests.tracking.damage import signal as noise
+
+ROOT = Path(__file__).parents[3]
+X = noise(3000)
+EVERYWHERE = ["none", "process"]
+
+
+def replay(values=X, size=100):
+    channels = tuple(Channel(name=f"c{k}", unit="1", values=values[:, k].copy()) for k in range(values.shape[1]))
+    return blocks_of(Record(rate_hz=RATE, channels=channels), size)
+
+
+class Sink:
+    """Keeps what it gets."""
+
+    def __init__(self, at=None, do=lambda: None):
+        self.stretches, self.rejections = [], []
+        self.at, self.do = at, do
+
+    def consume(self, stretch):
+        if self.at is not None and stretch.first >= self.at:
+            self.at = None
+            self.do()
+        self.stretches.append(stretch)
+
+    def values(self):
+        return np.vstack([s.values for s in self.stretches])
+
+
+def engine(source, sink, **settings):
+    settings = {"guard": StreamGuard(RATE, 3)} | settings
+    return run(source, sink.consume, sink.rejections.append, **settings)
+
+
+def raising(error):
+    def do():
+        raise error
+
+    return do
+
+
+def failing(n):
+    yield from blocks(X)[:n]
+    raise RecordError("the disk is gone")
+
+
+class FailingReplay:
+    """A source that fails; it can be sent to another process."""
+
+    def __init__(self, n, error):
+        self.n, self.error = n, error
+
+    def __iter__(self):
+        yield from blocks(X)[: self.n]
+        raise self.error
+
+
+@pytest.mark.parametrize("producer", EVERYWHERE)
+def test_a_record_is_delivered_whole(producer):
+    sink = Sink()
+    report = engine(replay(), sink, producer=producer, ring_blocks=4)
+    np.testing.assert_array_equal(sink.values(), X)
+    assert (report.blocks, report.samples, report.given, report.rejected, report.missing) == (30, 3000, 3000, 0, 0)
+    assert (report.torn, report.interrupted, dict(report.events)) == (0, False, {})
+    assert (report.reordered, report.latency.overruns) == (0, 0)
+    assert 0 < report.latency.median <= report.latency.p99 <= report.latency.largest <= report.seconds
+    assert 0 < report.working_s < report.seconds
+
+
+@pytest.mark.parametrize("producer", EVERYWHERE)
+def test_damage_is_reported_whichever_way_it_comes(producer):
+    stream = blocks(X)
+    stream[7] = Block(first=700, time_s=0.035, values=X[700:800].astype(np.float32))
+    stream[9] = Block(first=900, time_s=0.045, values=X[900:1000, :2])
+    del stream[20]
+    sink = Sink()
+    report = engine(stream, sink, producer=producer)
+    assert dict(report.rejected_samples) == {"type": 100, "shape": 100, "gap": 100}
+    assert [(r.kind, r.samples) for r in sink.rejections] == [("type", 100), ("shape", 100), ("gap", 100)]
+    assert (report.given, report.rejected, report.missing) == (2700, 200, 100)
+    np.testing.assert_array_equal(sink.values(), np.delete(X, np.r_[700:800, 900:1000, 2000:2100], axis=0))
+
+
+def test_real_time_takes_its_time():
+    sink = Sink()
+    report = engine(replay(), sink, pace="real-time")
+    assert report.seconds >= 3000 / RATE
+    assert report.given == 3000
+
+
+def test_a_slow_consumer_costs_blocks_never_the_order():
+    sink = Sink(at=0, do=lambda: time.sleep(0.2))
+    report = engine(replay(), sink, producer="process", pace="real-time", ring_blocks=4)
+    assert report.latency.overruns > 0
+    assert report.latency.largest > 0.1
+    assert report.latency.late > 0
+    for s in sink.stretches:
+        np.testing.assert_array_equal(s.values, X[s.first : s.first + len(s.values)])
+    assert report.given == 3000 - 100 * report.latency.overruns
+
+
+@pytest.mark.parametrize("producer", EVERYWHERE)
+def test_an_exception_of_the_consumer_is_raised_and_nothing_is_left(producer):
+    with pytest.raises(ZeroDivisionError, match="on purpose"):
+        engine(replay(), Sink(at=500, do=raising(ZeroDivisionError("on purpose"))), producer=producer)
+    assert not list(Path("/dev/shm").glob(f"ambid-{os.getpid()}-*"))  # where Linux keeps them
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_exception_of_the_source_is_raised_as_it_is():
+    sink = Sink()
+    with pytest.raises(RecordError, match="the disk is gone"):
+        engine(failing(5), sink)
+    assert len(sink.stretches) == 5
+
+
+def test_an_exception_in_another_process_is_raised_here():
+    with pytest.raises(RecordError, match="gone over there"):
+        engine(FailingReplay(3, RecordError("gone over there")), Sink(), producer="process")
+
+
+class DyingReplay:
+    """A source whose process dies without a word."""
+
+    def __iter__(self):
+        yield from blocks(X)[:3]
+        os._exit(7)
+
+
+def test_a_process_that_dies_is_told_of_when_what_it_left_is_delivered():
+    sink = Sink()
+    with pytest.raises(EstimationError, match="died with exit code 7"):
+        engine(DyingReplay(), sink, producer="process")
+    np.testing.assert_array_equal(sink.values(), X[:300])
+
+
+def test_a_source_that_cannot_be_sent_is_refused():
+    with pytest.raises(EstimationError, match="cannot be sent to another process"):
+        engine(failing(5), Sink(), producer="process")
+
+
+@pytest.mark.parametrize("producer", EVERYWHERE)
+def test_an_interrupt_ends_with_everything_up_to_then_delivered(producer):
+    def endless():
+        k = 0
+        while True:
+            yield Block(first=k, time_s=k / RATE, values=X[:100] + k)
+            k += 100
+
+    source = replay(noise(400_000), 100) if producer == "process" else endless()
+    sink = Sink(at=5000, do=lambda: signal.raise_signal(signal.SIGINT))
+    report = engine(source, sink, producer=producer)
+    assert report.interrupted
+    assert report.given == report.samples == len(sink.values()) >= 5100
+    assert report.given < 400_000
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_reaches_a_source_that_keeps_waiting():
+    waited = []
+
+    def stuck():
+        yield from blocks(X)[:5]
+        threading.Timer(0.05, signal.pthread_kill, [threading.main_thread().ident, signal.SIGINT]).start()
+        time.sleep(20)
+        waited.append(True)
+
+    report = engine(stuck(), Sink())
+    assert report.interrupted
+    assert report.given == 500
+    assert not waited
+
+
+def test_a_second_interrupt_reaches_the_consumer():
+    def twice():
+        signal.raise_signal(signal.SIGINT)
+        signal.raise_signal(signal.SIGINT)
+
+    with pytest.raises(KeyboardInterrupt):
+        engine(replay(), Sink(at=500, do=twice))
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_whoever_calls_may_end_it():
+    sink = Sink()
+    report = engine(replay(), sink, stopped=lambda: len(sink.stretches) >= 10)
+    assert report.given == 1000
+    assert not report.interrupted
+
+
+def test_a_ring_of_others_is_read_and_left_to_them():
+    with BlockRing.create(rate_hz=RATE, channels=["a", "b", "c"]) as ring:
+        for block in blocks(X)[:20]:
+            ring.put(block)
+        sink = Sink()
+        report = engine(ring, sink, stopped=lambda: len(sink.stretches) >= 5)
+        assert report.given == 2000  # all that had been acquired when it was to end
+        assert not ring.stopping
+        for block in blocks(X)[20:]:
+            ring.put(block)
+        ring.end()
+        assert engine(ring, sink).given == 1000
+        np.testing.assert_array_equal(sink.values(), X)
+
+
+SCRIPT = """
+import sys
+import numpy as np
+from ambid.record import Channel, Record
+from ambid.tracking.engine import run
+from ambid.tracking.guard import StreamGuard
+from ambid.tracking.replay import blocks_of
+
+def consume(stretch):
+    if stretch.first == 2000:
+        print("ready", flush=True)
+
+if __name__ == "__main__":
+    x = np.random.default_rng(0).standard_normal(600_000)
+    source = blocks_of(Record(rate_hz=20e3, channels=(Channel(name="a", unit="1", values=x),)), 100)
+    report = run(source, consume, guard=StreamGuard(20e3, 1), producer=sys.argv[1], pace="real-time")
+    print(report.interrupted, report.given == report.samples, report.given, flush=True)
+"""
+
+
+def test_a_producer_whose_consumer_was_killed_ends_too(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    with (tmp_path / "said").open("w") as said:
+        process = subprocess.Popen(
+            [sys.executable, str(script), "process"], stdout=subprocess.PIPE, stderr=said, text=True, cwd=ROOT
+        )
+    assert process.stdout.readline().strip() == "ready"
+    process.kill()
+    assert process.stdout.read() == ""  # returns when nobody holds the pipe any more: the child has ended
+    assert "Traceback" not in (tmp_path / "said").read_text()
+    assert not list(Path("/dev/shm").glob(f"ambid-{process.pid}-*"))
+
+
+@pytest.mark.parametrize("producer", EVERYWHERE)
+def test_an_interrupt_from_the_terminal_reaches_all_processes_and_leaves_no_word(producer, tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(SCRIPT)
+    process = subprocess.Popen(
+        [sys.executable, str(script), producer],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=ROOT, start_new_session=True,
+    )  # fmt: skip
+    assert process.stdout.readline().strip() == "ready"
+    os.killpg(process.pid, signal.SIGINT)  # as a terminal does it
+    out, err = process.communicate(timeout=30)
+    interrupted, whole, given = out.split()
+    assert (interrupted, whole, err, process.returncode) == ("True", "True", "", 0)
+    assert 2000 <= int(given) < 600_000

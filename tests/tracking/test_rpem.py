@@ -1,0 +1,171 @@
+"""The recursive estimator away from the ordinary: odd starts, impossible steps, other models, silence, unbalance."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.errors import EstimationError
+from ambid.job import identify
+from ambid.physics.presets import preset
+from ambid.record import Channel, Record
+from ambid.rig import default_rig
+from ambid.simulation import simulate_scenario
+from ambid.tracking.numbers import amplitude_and_phase, forcing_of, tracked_numbers
+from ambid.tracking.rpem import PhysicalRpem
+from tests.bearing.benches import SETTINGS
+from tests.tracking.starts import BEARING, bearing, bearing_start, bench_record, bench_start, columns, signals
+
+
+def sound(estimator):
+    covariance = estimator.covariance
+    sd = np.sqrt(np.diag(covariance))
+    assert np.all(np.isfinite(estimator.estimate))
+    assert np.all(sd > 0)
+    np.linalg.cholesky(covariance / np.outer(sd, sd) + 1e-12 * np.eye(sd.size))
+
+
+@pytest.mark.parametrize(
+    ("bench", "of", "n"), [("coil", "coil", 6000), ("sprung rotor", "rotor", 6000), ("thesis", "one-axis", 30_000)]
+)
+def test_other_models_are_tracked_to_the_truth(bench, of, n):
+    start = bench_start(bench, 2000, 1, of)
+    r = PhysicalRpem(start, memory="all")
+    r.update(*signals(bench_record(bench, n, 2), of))
+    truth = np.array([SETTINGS[bench].truth[k] for k in r.names])
+    sd = np.sqrt(np.diag(r.covariance))
+    assert np.all(np.abs(r.estimate - truth) < 4.0 * sd)
+    assert np.all(sd < np.sqrt(np.diag(start.covariance)))
+    sound(r)
+
+
+@pytest.mark.parametrize("free", [("k_i",), ("m", "R"), ("L",)])
+def test_few_free_parameters(free):
+    rig = default_rig("one-axis")
+    truth = preset(BEARING).parameters
+    fixed = tuple(p if p.name in free else replace(p, role="fixed", value=truth[p.name]) for p in rig.parameters)
+    start = identify(bearing(4000, 1), replace(rig, parameters=fixed))
+    r = PhysicalRpem(start)
+    assert r.names == free
+    r.update(*columns(bearing(6000, 2)))
+    sd = np.sqrt(np.diag(r.covariance))
+    assert np.all(np.abs(r.estimate - [truth[k] for k in free]) < 4.0 * sd)
+
+
+def test_nothing_free_is_refused():
+    start = bearing_start(4000, 1)
+    nothing = replace(start, covariance_names=(), covariance=np.zeros((0, 0)))
+    with pytest.raises(EstimationError, match="no estimated parameters"):
+        PhysicalRpem(nothing)
+    with pytest.raises(EstimationError):
+        PhysicalRpem(replace(start, status="failed"))
+
+
+@pytest.mark.parametrize("memory", [0.0, -1.0, float("nan")])
+def test_a_memory_that_is_not_positive_is_refused(memory):
+    with pytest.raises(EstimationError, match="must be positive"):
+        PhysicalRpem(bearing_start(4000, 1), memory=memory)
+
+
+def test_a_start_without_a_predictor_is_refused():
+    start = bearing_start(4000, 1)
+    values = tuple(replace(p, value=-1.0) if p.name == "m" else p for p in start.parameters)
+    with pytest.raises(EstimationError):
+        PhysicalRpem(replace(start, parameters=values))
+
+
+def test_a_parameter_that_nothing_is_known_of_comes_in():
+    """A huge standard deviation at the start, and a value half off, as of a parameter that was not identifiable."""
+    start = bearing_start(4000, 1)
+    numbers = tracked_numbers(start)
+    place = numbers.names.index("R")
+    covariance, begin = numbers.covariance.copy(), numbers.start.copy()
+    covariance[place, :] = covariance[:, place] = 0.0
+    covariance[place, place], begin[place] = 100.0, 1.5 * begin[place]
+    r = PhysicalRpem(replace(numbers, start=begin, covariance=covariance), memory="all")
+    r.update(*columns(bearing(20_000, 2)))
+    sd = np.sqrt(np.diag(r.covariance))
+    assert np.all(np.abs(r.estimate - [preset(BEARING).parameters[k] for k in r.names]) < 4.0 * sd)
+    assert sd[r.names.index("R")] < 0.02
+
+
+def test_no_step_makes_a_mass_negative():
+    """Samples of another bench under a start that is sure of nothing."""
+    numbers = tracked_numbers(bearing_start(4000, 1))
+    r = PhysicalRpem(replace(numbers, covariance=1e4 * numbers.covariance))
+    u, y = columns(bearing(6000, 2))
+    place = r.names.index("m")
+    for k in range(0, 6000, 100):
+        r.update(3.0 * u[k : k + 100], y[k : k + 100] * [-2.0, 1.0])
+        assert r.estimate[place] > 0.0
+        sound(r)
+    assert r.filter.n_shortened > 0
+    assert np.isfinite(r.noise_level)
+
+
+def test_numbers_without_a_predictor_are_left_again_and_counted():
+    r = PhysicalRpem(bearing_start(4000, 1))
+    before = r.stream.at.at.copy()
+    beyond = before.copy()
+    beyond[r.names.index("m")] = -0.5
+    assert not r.move_to(beyond)
+    assert r.n_unreached == 1
+    assert 0.0 < r.stream.at.at[r.names.index("m")] < before[r.names.index("m")]
+    r.update(*columns(bearing(6000, 2), 0, 2000))
+    assert r.n_unreached == 1
+    sound(r)
+
+
+@pytest.mark.parametrize("memory", ["auto", "all", 2.0])
+def test_silence_changes_nothing_that_it_does_not_show(memory):
+    simulation = simulate_scenario("quiet", preset(BEARING), duration_s=4.0, seed=3)
+    r = PhysicalRpem(bearing_start(20_000, 1), memory=memory)
+    u, y = columns(simulation.record)
+    truth = np.array([preset(BEARING).parameters[k] for k in r.names])
+    for k in range(0, u.shape[0], 20_000):
+        r.update(u[k : k + 20_000], y[k : k + 20_000])
+        sound(r)
+        assert np.all(np.abs(r.estimate - truth) < 4.0 * np.sqrt(np.diag(r.covariance)))
+    assert r.noise_level == pytest.approx(1.0, abs=0.1)
+
+
+def test_unbalance_is_found_through_a_spin_up():
+    simulation = simulate_scenario("spin-up", preset(BEARING), duration_s=4.0, seed=5)
+    record = simulation.record
+    forcing = forcing_of(record)
+    numbers = tracked_numbers(bearing_start(20_000, 1), synchronous=True, top_speed=forcing.top_speed)
+    r = PhysicalRpem(numbers)
+    r.update(*columns(record), forcing.columns)
+    at = numbers.places("unbalance")
+    size = numbers.magnitude[at]
+    a, b = r.filter.q[at] * size
+    amplitude, sd, phase, phase_sd = amplitude_and_phase(
+        a, b, r.filter.covariance[np.ix_(at, at)] * np.outer(size, size)
+    )
+    truth = {k: record[f"true_{k}"][-1] for k in ("unbalance", "unbalance_phase")}
+    assert abs(amplitude - truth["unbalance"]) < 4.0 * sd
+    assert abs(phase - truth["unbalance_phase"]) < 4.0 * phase_sd
+    assert sd < 0.02 * amplitude
+    values = np.array([preset(BEARING).parameters[k] for k in r.names])
+    assert np.all(np.abs(r.estimate - values) < 4.0 * np.sqrt(np.diag(r.covariance)))
+
+
+def turning(speed_unit=1.0, angle_sign=1.0, lost=()):
+    t = np.arange(20_000) / 10_000.0
+    speed, angle = 300.0 * t, 150.0 * t**2
+    columns = {"speed": speed * speed_unit, "angle": np.mod(angle_sign * np.round(angle / 0.1) * 0.1, 2.0 * np.pi)}
+    kept = np.setdiff1d(np.arange(t.size), lost)
+    channels = tuple(
+        Channel(name=n, unit={"speed": "rad/s", "angle": "rad"}[n], values=v[kept]) for n, v in columns.items()
+    )
+    return Record(channels=channels, rate_hz=10_000.0)
+
+
+def test_a_speed_that_is_not_the_derivative_of_its_angle_is_refused():
+    assert forcing_of(turning()).top_speed == pytest.approx(600.0, rel=1e-3)
+    assert forcing_of(turning(lost=np.arange(4_000, 4_300))) is not None
+    for wrong in (turning(speed_unit=2.0 * np.pi / 60.0), turning(speed_unit=9.55), turning(angle_sign=-1.0)):
+        with pytest.raises(EstimationError, match="times the speed"):
+            forcing_of(wrong)
