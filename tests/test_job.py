@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError, EstimationError
-from ambid.job import identify, load, signals_of
+from ambid.job import identify, load_bench, signals_of
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record, write_record
@@ -241,7 +241,7 @@ def test_times_are_told(estimate):
 
 
 def test_load_cuts_and_signals_take_their_order_from_the_model():
-    rec = load(record(), default_rig(), from_s=0.01)
+    rec = load_bench(record(), default_rig(), from_s=0.01)
     s = signals_of(rec, model("one-axis"))
     assert s.u.shape == (rec.n_samples, 1)
     np.testing.assert_array_equal(s.y[:, 0], rec["position"])

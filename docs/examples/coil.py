@@ -8,8 +8,8 @@ Run: python docs/examples/coil.py
 
 from __future__ import annotations
 
+from ambid import identify
 from ambid.bearing.coil import coil_instrumental, coil_least_squares
-from ambid.job import identify
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.rig import default_rig

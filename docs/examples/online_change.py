@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.job import track
+from ambid import track
 from ambid.physics.presets import preset
 from ambid.recursive.lines import Event, Track
 from ambid.simulation import simulate_scenario, truth_columns

@@ -19,7 +19,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from ambid.estimation.estimate import Estimate
-from ambid.job import identify, load
+from ambid.job import identify, load_bench
 from ambid.record import Record
 from ambid.rig import load_rig
 from ambid.signals import lowpass
@@ -94,7 +94,7 @@ def main(folder: Path = DATA) -> dict[str, Result]:
         path.write_text(RIG.format(table=(folder / "duty_to_voltage.csv").as_posix()), encoding="utf-8")
         rig = load_rig(path)
         for name in RECORDS:
-            record = load(folder / f"{name}.csv", rig)
+            record = load_bench(folder / f"{name}.csv", rig)
             results[name] = Result(
                 balance=gravity_balance(record),
                 least_squares={cutoff: plain_least_squares(record, cutoff) for cutoff in CUTOFFS_HZ},

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ambid import identify
 from ambid.estimation.estimate import Estimate
-from ambid.job import identify
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.physics.presets import preset

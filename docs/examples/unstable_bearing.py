@@ -11,8 +11,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ambid import identify
 from ambid.estimation.estimate import Estimate
-from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulation import Simulation, largest_amplitude, simulate_preset

@@ -1,7 +1,8 @@
 """Physical parameters of active magnetic bearings, with honest uncertainty.
 
-``ambid.job.identify(record, rig)`` is the main job; the names below are what else a script needs. Rooms and names are
-imported when they are first used, so that ``import ambid`` costs next to nothing.
+``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare` and `track` are the functions that the commands
+of these names call, and `load` reads what they wrote. Rooms and names are imported when they are first used, so
+that ``import ambid`` costs next to nothing.
 """
 
 from __future__ import annotations
@@ -16,6 +17,13 @@ if TYPE_CHECKING:
     from ambid.errors import AmbidError as AmbidError
     from ambid.estimation.estimate import Estimate as Estimate
     from ambid.estimation.estimate import estimate_from_json as estimate_from_json
+    from ambid.job import compare as compare
+    from ambid.job import fit as fit
+    from ambid.job import frf as frf
+    from ambid.job import identify as identify
+    from ambid.job import identify_nonlinear as identify_nonlinear
+    from ambid.job import load as load
+    from ambid.job import track as track
     from ambid.physics.linear_model import model as model
     from ambid.physics.linear_model import model_names as model_names
     from ambid.physics.presets import preset as preset

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import fit
-from ambid.job.results import read_estimate
+from ambid.job.results import load
 from ambid.nonlinear.fit_file import nonlinear_fit_text
 from ambid.record import read_record
 
@@ -79,7 +79,7 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
     assert not np.array_equal(thetas[0], thetas[2])
     path = tmp_path / "fit.json"
     path.write_text(nonlinear_fit_text(fits[0]), encoding="utf-8")
-    again = read_estimate(path)
+    again = load(path)
     assert nonlinear_fit_text(again) == path.read_text(encoding="utf-8")  # type: ignore[arg-type]
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from ambid.cli import run
 from ambid.job.identification import identify_nonlinear
-from ambid.job.results import read_estimate
+from ambid.job.results import load
 from ambid.physics.linear_model import Parameter
 from ambid.rig import load_rig
 from tests.measured import ABSENT, MAGLEV
@@ -73,7 +73,7 @@ def files(rig, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def estimate(files):
-    return read_estimate(files / "ball.json")
+    return load(files / "ball.json")
 
 
 @cache

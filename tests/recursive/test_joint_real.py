@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.job import identify, load
+from ambid.job import identify, load_bench
 from ambid.recursive.joint import JointEkf, JointUkf
 from ambid.rig import load_rig
 from tests.real.test_maglev import AXIS_RIG, MAGLEV, written
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(not MAGLEV.is_dir(), reason="the measured record
 @pytest.mark.parametrize("name", ["updown_c"])
 def test_innovations_of_the_second_half_are_those_of_a_model_fitted_to_it(tmp_path, name):
     path, rig = MAGLEV / f"levitate_{name}.csv", load_rig(written(tmp_path, AXIS_RIG))
-    record = load(path, rig, from_s=2.0)
+    record = load_bench(path, rig, from_s=2.0)
     half = record.n_samples // 2
     begun = identify(path, rig, from_s=2.0, to_s=2.0 + half / record.rate_hz)
     later = identify(path, rig, from_s=2.0 + half / record.rate_hz)

@@ -31,13 +31,13 @@ def command(
     Without --rig: the record is read as the one that the estimate came from.
     """
     from ambid.estimation.estimate import json_text, plain_json
-    from ambid.job.results import read_estimate, validate
+    from ambid.job.results import load, validate
     from ambid.report.estimate_text import validation_lines
     from ambid.report.fit_text import second_lines
     from ambid.rig import load_rig
 
     with Outputs(estimate, record, rig, json=json) as outputs:
-        known: Any = read_estimate(estimate)
+        known: Any = load(estimate)
         with progress("validate"):
             bench = None if rig is None else load_rig(rig)
             found = validate(

@@ -156,6 +156,9 @@ class Parametric:
     __slots__ = ()
     parameters: tuple[EstimatedParameter, ...]
 
+    def __getitem__(self, name: str) -> EstimatedParameter:
+        return self.parameter(name)
+
     @property
     def values(self) -> dict[str, float]:
         """All parameter values, SI."""

@@ -11,7 +11,7 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.job.commissioning import commission as commission
-    from ambid.job.data import load as load
+    from ambid.job.data import load_bench as load_bench
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of
     from ambid.job.fits import compare as compare
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from ambid.job.identification import identify as identify
     from ambid.job.identification import identify_nonlinear as identify_nonlinear
     from ambid.job.response import frf as frf
-    from ambid.job.results import read_estimate as read_estimate
+    from ambid.job.results import load as load
     from ambid.job.tracking import track as track
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -15,7 +15,7 @@ import numpy as np
 from ambid.bearing.magnet_problem import BearingRecord, touching
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick
-from ambid.job.data import Reading, Source, known_rig, load, origin
+from ambid.job.data import Reading, Source, known_rig, load_bench, origin
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.rig import Rig, RigMagnet
@@ -107,7 +107,7 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
     if held:
         rig = replace(rig, record=replace(rig.record, from_s=None, to_s=None))
         how = {**how, "from_s": None, "to_s": None}
-    bench = load(record, rig, **how)
+    bench = load_bench(record, rig, **how)
     u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
     warnings, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
     if rig.limits is not None:

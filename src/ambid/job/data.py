@@ -79,7 +79,7 @@ class Reading(TypedDict, total=False):
     gaps: str | None  # ``"error"``, ``"interpolate"`` or ``"cut"``
 
 
-def load(
+def load_bench(
     record: Source,
     rig: Rig,
     *,

@@ -17,7 +17,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, known_rig, load, origin, rig_entry, signals_of
+from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of
 from ambid.physics.linear_model import model
 from ambid.record import Record
 from ambid.rig import Rig
@@ -81,7 +81,7 @@ def identify_used(
     from ambid.bearing.linear import greybox
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
-    bench, plant = load(record, rig, **reading), model(rig.model)
+    bench, plant = load_bench(record, rig, **reading), model(rig.model)
     clock.lap("read")
     say("identify")
     delay = rig.channel(plant.inputs[0]).delay
@@ -100,7 +100,7 @@ def identify_used(
         from ambid.validate.second_record import validation
 
         say("validate")
-        other = signals_of(load(validate, rig, **reading), plant)
+        other = signals_of(load_bench(validate, rig, **reading), plant)
         estimate = replace(estimate, validation=validation(estimate, other))
         clock.lap("validate")
     return replace(estimate, timing_s=clock.laps), bench

@@ -12,7 +12,7 @@ from ambid.blackbox.fit_file import fit_from_json
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Estimate, estimate_from_json
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
-from ambid.job.data import Channels, Reading, Source, check_same_bench, load, signals_of
+from ambid.job.data import Channels, Reading, Source, check_same_bench, load_bench, signals_of
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
@@ -27,7 +27,7 @@ AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate
 
 
-def read_estimate(path: str | Path) -> AnyEstimate | AnyFit:
+def load(path: str | Path) -> AnyEstimate | AnyFit:
     """Read an estimate, linear or nonlinear, or a black-box or nonlinear fit from its file.
 
     Parameters
@@ -69,7 +69,7 @@ def read_estimate(path: str | Path) -> AnyEstimate | AnyFit:
 
 def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:
     """Read an estimate from which linear tracking can begin; `otherwise` is the refusal of any other result."""
-    found = read_estimate(path)
+    found = load(path)
     if not isinstance(found, Estimate):
         raise EstimationError(otherwise)
     return found
@@ -97,7 +97,7 @@ def validate(
         return {"samples": data.n_samples, "fit": found, "passed": not against, "objections": list(against)}
     bench = rig_of(known, path) if rig is None else rig
     if isinstance(known, Estimate):
-        return dict(validation(known, signals_of(load(record, bench, **reading), model(known.model))))
+        return dict(validation(known, signals_of(load_bench(record, bench, **reading), model(known.model))))
     from ambid.job.bearing_records import bearing_rig, take_record
     from ambid.validate.nonlinear_bearing import validation as bearing_validation
 

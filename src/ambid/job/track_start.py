@@ -13,7 +13,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import EstimationError, RecordError
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import Reading, Source, known_rig, load
+from ambid.job.data import Reading, Source, known_rig, load_bench
 from ambid.job.identification import identify
 from ambid.job.results import read_linear_estimate
 from ambid.physics.linear_model import LinearModel, Parameter, model
@@ -94,7 +94,7 @@ def rows_of(record: Source, known: Rig | None, **reading: Unpack[Reading]) -> Be
     """
     rig, rate_hz = known_rig(known), reading.get("rate_hz")
     if isinstance(record, Record) or not str(record).lower().endswith(_ROWS):
-        bench, stamps = load(record, rig, **reading), None
+        bench, stamps = load_bench(record, rig, **reading), None
     else:
         rows = read_rows(record, rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz)
         from_s, to_s = reading.get("from_s"), reading.get("to_s")
