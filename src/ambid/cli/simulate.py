@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -12,16 +11,13 @@ import typer
 from ambid.cli.options import Force, argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError, refuse_given
+from ambid.errors import refuse_given
 
 if TYPE_CHECKING:
-    from ambid.arrays import Array
     from ambid.physics.presets import Preset
     from ambid.simulation import Simulation
-    from ambid.simulation.rig_bench import Bench
 
 _ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
-_FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
 def command(
@@ -74,8 +70,8 @@ def command(
 
     With --scenario something changes on the way, and the record holds the truth of it in columns true_...
     """
-    from ambid.record import Channel, write_record
-    from ambid.signals import excitation as make_excitation
+    from ambid.job.simulation import simulate_used
+    from ambid.record import write_record
 
     preset = preset_of(rig)
     closed, source = None if loop is None else loop == "closed", None if preset else Path(rig)
@@ -90,68 +86,25 @@ def command(
     refuse_given({"--at": at, "--size": size}, "a simulation without --scenario has no {}. Leave {} out")
     if not nonlinear:
         refuse_given({"--position": position}, "a simulation without --nonlinear has no {}. Leave {} out")
-    kind, duration = excitation or "multisine", 1.0 if duration is None else duration
     with Outputs(source) as outputs, progress("simulate"):
         outputs.claim(record, "-o", _ENDINGS, force=force)
-        bench = _bench(rig, rate, closed, nonlinear, position)
-        rate_hz = bench.rate_hz
-        n = _samples(duration, rate_hz)
-        shape = _repeat(
-            lambda part: make_excitation(kind, part, rate_hz, amplitude=1.0, band=band_of(band), seed=seed), n, periods
-        )
-        if amplitude is None and bench.rig is not None and bench.rig.limits is None:
-            raise AmbidError(
-                "no amplitude is given, and the rig has no limits to find one from. Give --amplitude A in V"
-            )
-        peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
-        done = bench.simulate(peak * shape, seed=seed)
-        if log_excitation:
-            logged = Channel(name="excitation", unit="V", values=peak * shape)
-            done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
+        done, told = simulate_used(
+            preset or Path(rig), duration=1.0 if duration is None else duration, rate_hz=rate,
+            excitation=excitation or "multisine", amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
+            closed=closed, nonlinear=nonlinear, position=position, log_excitation=log_excitation,
+        )  # fmt: skip
         comments: tuple[str, ...] = ()
         if record.suffix not in (".h5", ".hdf5"):
             between = "" if band is None else f" in {band} Hz"
-            comments = (_recipe(rig, f"{kind} of {peak:.6g} V{between}", seed), f"truth: {truth_words(done)}")
+            comments = (
+                _recipe(rig, f"{told.kind} of {told.peak:.6g} V{between}", seed),
+                f"truth: {truth_words(done)}",
+            )
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
     warn(done)
-    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {kind} of {peak:.4g} V, seed {seed}")
+    n, rate_hz = done.record.n_samples, done.record.rate_hz
+    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} V, seed {seed}")
     typer.echo("truth: " + truth_words(done))
-
-
-def _bench(rig: str, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
-    """Return the bench of a preset or a rig file, its rotor held at a position where one is given."""
-    from ambid.rig import load_rig
-    from ambid.simulation.rig_bench import Bench
-
-    preset = preset_of(rig)
-    if preset is not None:
-        if position is not None and preset.plant is not None:
-            preset = replace(preset, operating_point=preset.plant.equilibrium(position))
-        return Bench.of(preset, rate, preset.usually_closed if closed is None else closed, nonlinear=nonlinear)
-    found = load_rig(Path(rig))
-    if position is not None:
-        found = replace(found, operating_point={**found.operating_point, "position": position})
-    if rate is None and found.record.rate_hz is None:
-        raise AmbidError(f"rig {Path(rig)} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz")
-    return Bench.of(found, rate, closed, nonlinear=nonlinear)
-
-
-def _samples(duration: float, rate_hz: float) -> int:
-    count = duration * rate_hz
-    if not 1 <= count <= 1e8:
-        raise AmbidError(
-            f"--duration {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
-        )
-    return round(count)
-
-
-def _repeat(make: Callable[[int], Array], n: int, periods: int) -> Array:
-    """Lay equal periods one behind the other."""
-    import numpy as np
-
-    if n % periods:
-        raise AmbidError(f"--periods {periods}: {n} samples are no whole number each. Change --duration or --periods")
-    return np.tile(make(n // periods), periods)
 
 
 def _recipe(rig: str, what: str, seed: int) -> str:
