@@ -22,6 +22,7 @@ from ambid.physics.linear_model import LinearModel, Parameter
 
 _LOOKED = 8192  # samples that show whether a column holds a signal
 _LAGS = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)  # before and after
+_RIDGE = 1e-9  # of the norm of a column: slow signals are nearly the same at neighbouring lags
 _SILENT = 0.02  # part of a column's variance: where the others explain less, it holds no signal
 _POOR = 2.5  # criterion per sample of a start that may be the wrong record's; good ones are below 2
 _GAIN = 0.7  # fall of the criterion per sample by which a change of the record must do better
@@ -34,7 +35,7 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
     roles = (*model.inputs, *model.outputs)
     at = busiest(signals.u, _LOOKED)
     columns = np.column_stack([signals.u[at], signals.y[at]])
-    parts = [_explained(columns[:, j], np.delete(columns, j, axis=1)) for j in range(len(roles))]
+    parts = _explained(columns)
     least = int(np.argmin(parts))
     if parts[least] < _SILENT:
         role, others = roles[least], " and ".join(r for j, r in enumerate(roles) if j != least)
@@ -44,18 +45,23 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
         )
 
 
-def _explained(y: Array, others: Array) -> float:
-    """Part of the variance of y that the others explain around each sample, corrected for chance."""
-    most, n = _LAGS[-1], len(y)
-    moves = sorted({*_LAGS, *(-k for k in _LAGS)})
-    Z = np.hstack([others[most + k : n - most + k] for k in moves])
-    if n - 2 * most < 4 * Z.shape[1]:
-        return 1.0
-    Z, e = Z - Z.mean(axis=0), y[most : n - most]
-    e = e - e.mean()
+def _explained(columns: Array) -> list[float]:
+    """Part of the variance of each column that the others explain around each sample, corrected for chance."""
+    most, (n, width) = _LAGS[-1], columns.shape
+    moves = sorted({*_LAGS, *(-k for k in _LAGS)}, key=abs)  # a column as it is comes first
+    if n - 2 * most < 4 * len(moves) * width:
+        return [1.0] * width
+    Z = np.hstack([columns[most + k : n - most + k] for k in moves])
+    Z = Z - Z.mean(axis=0)
     Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
-    left = e - Z @ np.linalg.lstsq(Z, e, rcond=1e-8)[0]
-    return 1.0 - float((left @ left) / (len(e) - Z.shape[1]) / (e @ e) * len(e))
+    inner = Z.T @ Z + _RIDGE * np.eye(Z.shape[1])
+    parts: list[float] = []
+    for j in range(width):
+        others = np.arange(Z.shape[1]) % width != j
+        along = inner[others, j]
+        left = 1.0 - float(along @ np.linalg.solve(inner[np.ix_(others, others)], along))
+        parts.append(1.0 - left * len(Z) / (len(Z) - np.count_nonzero(others)))
+    return parts
 
 
 def refuse_mistaken(
