@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid.bearing.columns import refuse_silent
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
@@ -138,9 +139,14 @@ def silent(role):
     return change
 
 
+def twice(s):
+    return replace(s, y=np.column_stack([2.0 * s.y[:, 1], s.y[:, 1]]))
+
+
 MISTAKEN = [
     (reversed_voltage, "channel 'voltage' is reversed"),
     (reversed_current, "reversed (or else 'current')"),
+    (twice, "channels 'position' and 'current' hold the same signal"),
     (swapped, "channels 'voltage' and 'current' are swapped"),
     (swapped_outputs, "channels 'position' and 'current' are swapped"),
     (silent("current"), "channel 'current' holds no signal that belongs to voltage and position"),
@@ -153,6 +159,38 @@ def test_a_mistaken_column_is_named(change, words):
     bench = run("bearing", 6000, 11)
     with pytest.raises(EstimationError, match=re.escape(words)):
         greybox(bench.model, change(bench.signals), parameters(bench, fixed=("c",)))
+
+
+def test_a_weak_or_spoiled_signal_is_still_a_signal():
+    """A position 20 dB below its noise, and a current with glitches: what they hold is little, but not nothing."""
+    bench, rng = run("bearing", 20_000, 11), np.random.default_rng(1)
+    x, i = bench.signals.y.T
+    noisy = replace(bench.signals, y=np.column_stack([x + 10.0 * x.std() * rng.standard_normal(len(x)), i]))
+    spoiled = i.copy()
+    spoiled[rng.integers(0, len(i), 6)] += 100.0 * i.std()
+    for changed in (noisy, replace(bench.signals, y=np.column_stack([x, spoiled]))):
+        refuse_silent(bench.model, changed)
+
+
+@pytest.mark.parametrize(("name", "factor", "power"), [("R", 1e3, 3), ("R", 1e-3, -3)])
+def test_a_value_of_the_rig_in_another_unit_is_named(name, factor, power):
+    bench = run("bearing", 6000, 11)
+    v, (x, i) = bench.signals.u[:, 0], bench.signals.y.T
+    columns = (("voltage", "V", v), ("current", "A", i), ("position", "m", x))
+    record = Record(rate_hz=2e4, channels=tuple(Channel(name=n, unit=u, values=c) for n, u, c in columns))
+    known = parameters(bench, fixed=("c", name))
+    wrong = tuple(replace(p, value=factor * p.value) if p.name == name else p for p in known)
+    found = identify(record, replace(default_rig(), parameters=wrong))
+    assert found.verdict.word == "unusable"
+    assert f"10^{power} times what the record shows" in found.checks["units"].detail
+
+
+def test_a_sign_is_named_in_a_long_record_too(monkeypatch):
+    monkeypatch.setattr("ambid.bearing.multistart._REGRESSED", 3000)
+    bench = run("bearing", 6000, 11)
+    with pytest.raises(EstimationError, match="channel 'voltage' is reversed"):
+        greybox(bench.model, reversed_voltage(bench.signals), parameters(bench, fixed=("c",)))
+    assert greybox(bench.model, bench.signals, parameters(bench, fixed=("c",))).status == "converged"
 
 
 def test_a_current_of_one_sign_says_which_channel_is_reversed():

@@ -75,6 +75,13 @@ def test_a_wrong_minimum_of_nearly_the_right_errors_is_noticed() -> None:
     assert not any("wrong minimum" in w for w in fit.warnings)
 
 
+def test_a_wrong_minimum_is_noticed_in_a_short_record() -> None:
+    """One state for a system of two: 70 samples are few for the regression, and enough to see it."""
+    record, *_ = sampled(70, 3, noise=0.05)
+    fit = nn([record], {"states": 1, "neurons": 0})
+    assert any("wrong minimum" in w for w in fit.warnings)
+
+
 def test_it_is_not_called_where_ordinary_starts_work(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("a global search where none is needed")

@@ -158,6 +158,21 @@ def test_compiled_reading_gives_the_nearest_double():
         np.testing.assert_array_equal(found[:, 0], [float(cell) for cell in cells])
 
 
+def test_compiled_reading_is_right_or_leaves_it_where_digits_are_many():
+    rng, powers, found = np.random.default_rng(9), powers_of_ten(), np.empty((1, 1))
+    cells = ["969.4874619156155404", "-952.7811483202159479", "9999999999999999999", "0.0009223372036854775809"]
+    for digits in rng.integers(17, 23, 4000).tolist():
+        number = "".join(map(str, [int(rng.integers(1, 10)), *rng.integers(0, 10, digits - 1).tolist()]))
+        place = int(rng.integers(0, digits))
+        cells.append(f"{number[:place]}.{number[place:]}")
+    read = 0
+    for cell in cells:
+        if read_rows(np.frombuffer(f"{cell}\n".encode(), dtype=np.uint8), 0, ord(","), powers, found) > 0:
+            read += 1
+            assert found[0, 0] == float(cell), cell
+    assert read > 1000
+
+
 @pytest.mark.parametrize(
     "row", ["1,", ",1", "1", "1,2,3", "1,x", "1,nan", "1,2e", "1,.", "1,1e999", "1,1e23", "1, 2", "1;2", ""]
 )

@@ -18,50 +18,70 @@ from ambid.bearing.rescue import reason
 from ambid.bearing.sizes import check_units
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
+from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel, Parameter
 
-_LOOKED = 8192  # samples that show whether a column holds a signal
-_LAGS = (0, 1, 2, 3, 5, 8, 13, 21, 34, 55)  # before and after
+_LOOKED = 16384  # samples that show whether a column holds a signal
+_LAGS = (0, 1, 2, 4, 8, 16, 40)  # before and after
 _RIDGE = 1e-9  # of the norm of a column: slow signals are nearly the same at neighbouring lags
-_SILENT = 0.02  # part of a column's variance: where the others explain less, it holds no signal
-_POOR = 2.5  # criterion per sample of a start that may be the wrong record's; good ones are below 2
+_CHANCE = 1e-4  # probability above which what the others explain of a column, and of its differences, is chance
+_FAR = 12.0  # median distances from the median at which values are held: about eight standard deviations
+_SAME = 1e-9  # from a correlation of one
+POOR = 2.5  # criterion per sample of a start that may be the wrong record's; good ones are below 2
 _GAIN = 0.7  # fall of the criterion per sample by which a change of the record must do better
 
 _FOLLOWED = 2  # changes that are searched from, the best first
 
 
 def refuse_silent(model: LinearModel, signals: Signals) -> None:
-    """Raise where a column holds nothing that the others explain: noise, or another machine's signal."""
+    """Raise where a column has nothing to do with the others, or is one of them a second time."""
     roles = (*model.inputs, *model.outputs)
     at = busiest(signals.u, _LOOKED)
     columns = np.column_stack([signals.u[at], signals.y[at]])
-    parts = _explained(columns)
-    least = int(np.argmin(parts))
-    if parts[least] < _SILENT:
-        role, others = roles[least], " and ".join(r for j, r in enumerate(roles) if j != least)
+    centre = np.median(columns, axis=0)
+    reach = _FAR * np.median(np.abs(columns - centre), axis=0)
+    reach[reach == 0.0] = np.inf  # of a signal that mostly stands still everything counts
+    held = np.clip(columns - centre, -reach, reach)  # a glitch is no reason
+    _refuse_twins(roles, held)
+    chance = [min(pair) for pair in zip(_by_chance(held), _by_chance(np.diff(held, axis=0)), strict=True)]
+    most = int(np.argmax(chance))
+    if chance[most] > _CHANCE:
+        role, others = roles[most], " and ".join(r for j, r in enumerate(roles) if j != most)
         raise EstimationError(
-            f"channel {role!r} holds no signal that belongs to {others}: they explain "
-            f"{100 * max(parts[least], 0.0):.1f} % of it. Check channels.{role}.column in the rig, and the wiring"
+            f"channel {role!r} holds no signal that belongs to {others}: they explain nothing of it. Check "
+            f"channels.{role}.column in the rig, and the wiring"
         )
 
 
-def _explained(columns: Array) -> list[float]:
-    """Part of the variance of each column that the others explain around each sample, corrected for chance."""
+def _refuse_twins(roles: Sequence[str], columns: Array) -> None:
+    """Raise where two columns are the same but for a factor."""
+    size = np.linalg.norm(columns, axis=0)
+    for j, one in enumerate(roles):
+        for k, other in enumerate(roles[:j]):
+            if abs(float(columns[:, j] @ columns[:, k])) > (1.0 - _SAME) * size[j] * size[k]:
+                raise EstimationError(
+                    f"channels {other!r} and {one!r} hold the same signal. Check channels.{one}.column in the rig"
+                )
+
+
+def _by_chance(columns: Array) -> list[float]:
+    """Probability, for each column, that the others explain as much of it if they have nothing to do with it."""
     most, (n, width) = _LAGS[-1], columns.shape
     moves = sorted({*_LAGS, *(-k for k in _LAGS)}, key=abs)  # a column as it is comes first
     if n - 2 * most < 4 * len(moves) * width:
-        return [1.0] * width
+        return [0.0] * width
     Z = np.hstack([columns[most + k : n - most + k] for k in moves])
     Z = Z - Z.mean(axis=0)
     Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
     inner = Z.T @ Z + _RIDGE * np.eye(Z.shape[1])
-    parts: list[float] = []
+    found: list[float] = []
     for j in range(width):
         others = np.arange(Z.shape[1]) % width != j
         along = inner[others, j]
-        left = 1.0 - float(along @ np.linalg.solve(inner[np.ix_(others, others)], along))
-        parts.append(1.0 - left * len(Z) / (len(Z) - np.count_nonzero(others)))
-    return parts
+        part = float(along @ np.linalg.solve(inner[np.ix_(others, others)], along))
+        degrees = int(np.count_nonzero(others))
+        found.append(chi_squared_tail(degrees, (len(Z) - degrees) * part / max(1.0 - part, 1e-12)))
+    return found
 
 
 def refuse_mistaken(
@@ -69,61 +89,74 @@ def refuse_mistaken(
     signals: Signals,
     parameters: Sequence[Parameter],
     delay: Delay,
-    candidates: Sequence[Candidate],
+    as_is: float,
     follow: Callable[[Sequence[Candidate]], Fit],
+    *,
+    searched: bool = False,
 ) -> None:
-    """Raise where the record fits badly, and fits well with one sign reversed or with voltage and current swapped.
+    """Raise where the record fits badly, and fits well with one sign reversed or with two columns swapped.
 
-    `candidates`: start values of the record as it is, best first, or none; `follow`: searches from such.
+    `as_is`: criterion per sample of the best start, infinite where there is none, or (`searched`) of a fit that failed;
+    `follow`: searches from start values.
     """
-    as_is = candidates[0].criterion / candidates[0].problem.n_used if candidates else np.inf
-    if model.name != "one-axis" or as_is < _POOR:
+    if model.name != "one-axis" or (as_is < POOR and not searched):
         return
-    refuse_units(model, signals, parameters, delay, follow, below=as_is - _GAIN)
+    below = as_is - (0.0 if searched else _GAIN)
+    _refuse_units(model, signals, parameters, delay, follow, np.inf if searched else below)
     better: list[tuple[float, str, str, list[Candidate]]] = []
     for text, remedy, changed in _changes(signals):
-        try:
-            found = starts(model, changed, parameters, delay)
-        except EstimationError:
-            continue
-        per_sample = found[0].criterion / found[0].problem.n_used
-        if per_sample < as_is - _GAIN:
+        found = _starts(model, changed, parameters, delay)
+        per_sample = found[0].criterion / found[0].problem.n_used if found else np.inf
+        if per_sample < below:
             better.append((per_sample, text, remedy, found))
     for _, text, remedy, found in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
-        fit = follow(found)
-        if reason(fit) == "" and fit.problem.parameters(fit.vector)["R"] > 0:
+        fit = _try(follow, found)
+        if fit is not None and fit.problem.parameters(fit.vector)["R"] > 0:
             raise EstimationError(
                 f"{text}: as it is no bearing explains the record, and with that changed one explains it "
                 f"({_numbers(fit)}). {remedy}"
             )
 
 
-def refuse_units(
+def _refuse_units(
     model: LinearModel,
     signals: Signals,
     parameters: Sequence[Parameter],
     delay: Delay,
     follow: Callable[[Sequence[Candidate]], Fit],
-    *,
-    below: float = np.inf,
+    below: float,
 ) -> None:
     """Raise where only what the rig says of a parameter stands in the way, and a mistaken unit would explain that.
 
     `below`: criterion per sample that the start values without it have to reach.
     """
+    if all(p.role == "free" for p in parameters if p.value):
+        return
     free = [replace(p, role="free", sd=None, value=None) if p.value else p for p in parameters]
-    if model.name != "one-axis" or all(p.role == "free" for p in parameters if p.value):
+    found = _starts(model, signals, free, delay)
+    if not found or found[0].criterion / found[0].problem.n_used > below:
         return
-    try:
-        found = starts(model, signals, free, delay)
-    except EstimationError:
-        return
-    if found[0].criterion / found[0].problem.n_used > below:
-        return
-    fit = follow(found)
-    check = check_units(fit.problem.parameters(fit.vector), parameters, signals)
-    if reason(fit) == "" and not check.passed:
+    fit = _try(follow, found)
+    check = None if fit is None else check_units(fit.problem.parameters(fit.vector), parameters, signals)
+    if check is not None and not check.passed:
         raise EstimationError(check.detail)
+
+
+def _starts(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> list[Candidate]:
+    """Start values of a trial; none where there are none."""
+    try:
+        return starts(model, signals, parameters, delay)
+    except (EstimationError, np.linalg.LinAlgError):
+        return []
+
+
+def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate]) -> Fit | None:
+    """Return a trial's fit where it explains the record; a trial never ends the job."""
+    try:
+        fit = follow(found)
+    except (EstimationError, np.linalg.LinAlgError):
+        return None
+    return fit if reason(fit) == "" else None
 
 
 def _changes(signals: Signals) -> list[tuple[str, str, Signals]]:

@@ -16,7 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.columns import refuse_mistaken, refuse_silent, refuse_units
+from ambid.bearing.columns import POOR, refuse_mistaken, refuse_silent
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
@@ -101,18 +101,20 @@ def _greybox(
     try:
         candidates = starts(model, signals, parameters, delay, tick=tick)
     except EstimationError as failure:
-        refuse_mistaken(model, signals, parameters, delay, (), follow)
-        refuse_units(model, signals, parameters, delay, follow)
+        refuse_mistaken(model, signals, parameters, delay, np.inf, follow)
         fit = rescue(None, str(failure), model, signals, parameters, delay, how, follow, tick)
         if fit is None:
             raise
         return fit
-    refuse_mistaken(model, signals, parameters, delay, candidates, follow)
+    as_is = candidates[0].criterion / candidates[0].problem.n_used
+    refuse_mistaken(model, signals, parameters, delay, as_is, follow)
     start_s = perf_counter() - begun
     fit = follow(candidates)
     why = reason(fit) if how.evaluations else ""
+    if as_is < POOR and (why or fit.problem.parameters(fit.vector).get("R", 1.0) <= 0.0):
+        as_is = fit.criterion / fit.problem.n_used if fit.status != "failed" else np.inf
+        refuse_mistaken(model, signals, parameters, delay, as_is, follow, searched=True)
     if why:
-        refuse_units(model, signals, parameters, delay, follow)
         fit = rescue(fit, why, model, signals, parameters, delay, how, follow, tick) or fit
     return replace(fit, start_s=start_s)
 

@@ -184,6 +184,7 @@ Delay = float | Literal["auto"]
 MAX_DELAY = 6  # samples, searched when the delay is "auto"; farther where the last one is the best
 FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
+_STEPS = 25  # of a search on the stretch that a candidate of a long record is for; usually it takes ten
 _REGRESSED = 1 << 17  # samples that start values are regressed from, and that a search begins on
 _STRETCH = 8192  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
@@ -268,7 +269,9 @@ def _widen(candidate: Candidate, signals: Signals, tick: Callable[[], None] | No
         return candidate
     whole = _centre(signals)
     problem = replace(part, u=whole.u, y=whole.y)
-    fit, work = search(part, candidate.vector, tick=tick, work=candidate.work), Workspace(problem)
+    fit = search(part, candidate.vector, steps=_STEPS, tick=tick, work=candidate.work)
+    work, share = Workspace(problem), problem.n_used / part.n_used
+    candidate = replace(candidate, criterion=candidate.criterion * share)  # of a record that goes on like the stretch
     if fit.status != "converged":
         return replace(candidate, problem=problem, vector=at_first_sample(problem, candidate.vector), work=work)
     work.near(triangle_of([fit.J]))

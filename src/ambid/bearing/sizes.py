@@ -31,7 +31,8 @@ _SYMMETRY = {  # exponents of s_v, s_i, s_x
     "current": (0, 1, 0),
     "position": (0, 0, 1),
 }
-_NAMED = 0.1  # half width, as a power of ten, of the range around what a rig says
+_HIGH = 0.999
+_NAMED = 0.5  # half width, as a power of ten, of the range around what a rig says
 # Of squared half widths: what a rarer slip costs, within which two are both named, and what a slip has to gain.
 _RARE, _ALIKE, _GAIN = 2.0, 1.2, 1.8
 _FACTORS = {  # what a value is multiplied by when its unit is mistaken, for every channel
@@ -109,9 +110,9 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     """
     sizes = [*SIZES, *_said(parameters)]
     largest = {
-        "voltage": float(np.max(np.abs(signals.u[:, 0]))),
-        "current": float(np.max(np.abs(signals.y[:, 1]))),
-        "position": float(np.ptp(signals.y[:, 0])),
+        "voltage": _largest(signals.u[:, 0]),
+        "current": _largest(signals.y[:, 1]),
+        "position": 2.0 * _largest(signals.y[:, 0] - np.median(signals.y[:, 0])),
     }
     logs = np.array([_log(size, {**values, **largest}) for size in sizes])
     low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
@@ -141,6 +142,26 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
         values={"unusual": float(len(odd))},
         detail=f"{what}, and no single unit explains it. Check units, calibration and sampling rate",
     )
+
+
+def mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:
+    """Say which of a rig's values are a power of thousand off what the record alone gives, `values` in SI."""
+    found = []
+    for p in known:
+        alone = values.get(p.name, 0.0)
+        decades = np.log10(abs(p.value / alone)) if p.value and alone else 0.0
+        thousands = round(decades / 3.0)
+        if thousands and abs(decades - 3.0 * thousands) < _NAMED / 2:
+            found.append(
+                f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times what the record shows "
+                f"({alone:.4g} {p.unit}): correct its unit there"
+            )
+    return found
+
+
+def _largest(signal: Array) -> float:
+    """The size that a thousandth of the samples exceeds: a glitch is none of the bench's."""
+    return float(np.quantile(np.abs(signal), _HIGH))
 
 
 def _log(size: Size, values: Mapping[str, float]) -> float:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import gzip
 import os
+import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm")
 FAILED_CHECK = 3
-_LOOKED = 4096  # bytes of a file that say what it is
+_DRAWN = (FIGURE_ENDINGS, PAGE_ENDINGS)  # what such an option names is replaced
+_LOOKED = 64  # bytes of a file that say what it is
 _STREAMED = ("--json",)  # options that take - for standard output
 
 
@@ -67,11 +68,12 @@ class Outputs:
             return
         try:
             self._check(path, option, suffixes)
-            if path.is_file() and not force and not _made_here(path):
+            if path.is_file() and not force and not (suffixes in _DRAWN or _made_here(path)):
                 remedy = "Choose another name" + ("" if force is None else ", or give --force")
-                raise AmbidError(f"{option} {path} exists already, and cannot be made again. {remedy}")
-        except OSError as failure:  # a name that no file can have
-            raise AmbidError(f"{option} {path} cannot be: {failure.strerror or failure}. Give another name") from None
+                raise AmbidError(f"{option} {path} exists already, and is no result of ambid. {remedy}")
+        except (OSError, RuntimeError) as failure:  # a name that no file can have, a link to itself
+            words = getattr(failure, "strerror", None) or failure
+            raise AmbidError(f"{option} {path} cannot be: {words}. Give another name") from None
         self._claimed.append(path)
 
     def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
@@ -155,18 +157,21 @@ class Outputs:
 
 
 def _made_here(path: Path) -> bool:
-    """Whether a file is empty, a figure, a report, or says that it is a result or a simulated record."""
-    if path.name.lower().endswith((*FIGURE_ENDINGS, *PAGE_ENDINGS)):
-        return True
-    if path.suffix in (".h5", ".hdf5"):
-        import h5py
+    """Whether a file is empty, or says that it is a result or a simulated record."""
+    with path.open("rb") as raw:
+        begin = raw.read(_LOOKED)
+    try:
+        if begin.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as file:
+                begin = file.read(_LOOKED)
+        elif begin.startswith(b"\x89HDF"):
+            import h5py
 
-        with contextlib.suppress(OSError, KeyError), h5py.File(path) as file:
-            return b"simulat" in file["provenance"][()]
+            with h5py.File(path) as found:
+                return b"simulat" in found["provenance"][()]
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zlib.error):  # damaged: nobody knows what it was
         return False
-    with (gzip.open if path.suffix == ".gz" else Path.open)(path, "rb") as file:
-        begin = file.read(_LOOKED)
-    return not begin or begin.startswith(b"# simulated by ambid") or b'"schema": "ambid.' in begin
+    return not begin or begin.startswith((b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.'))
 
 
 def _same(a: Path, b: Path) -> bool:

@@ -139,6 +139,7 @@ class Judged:
     def verdict(self) -> Verdict:
         """Whether the result may be used, with each check that failed as a reason."""
         failed = {name: c.detail for name, c in self.checks.items() if not c.passed}
+        failed = {name: failed[name] for name in sorted(failed, key=lambda name: name not in _GRAVE)}
         second = (getattr(self, "validation", None) or {}).get("checks", {})
         failed |= {f"validation.{name}": str(c["detail"]) for name, c in second.items() if not c["passed"]}
         grave = self.status != "converged" or not _GRAVE.isdisjoint(failed)

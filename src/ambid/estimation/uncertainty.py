@@ -127,24 +127,27 @@ def chi_squared_tail(degrees: int, x: float) -> float:
     return min(1.0, sum(terms, erfc(sqrt(half)) if shift else 0.0))
 
 
-def explained_by_past(parts: Sequence[tuple[Array, Sequence[tuple[Array, int]]]]) -> tuple[float, float, int]:
+def explained_by_past(
+    parts: Sequence[tuple[Array, Sequence[tuple[Array, int]]]], *, least: float = 4.0
+) -> tuple[float, float, int]:
     """Return what a linear regression on the past makes of errors; little where a search ended well.
 
     `parts`: by record the errors (n_samples, n_outputs), and signals (n_samples, n) each with how many of its last
-    samples are looked at; rows that are not finite are left out. Returns the part of the variance that it explains,
-    corrected for chance, and chi-squared with its degrees of freedom if the past says nothing; 0 where rows are few.
+    samples are looked at; rows that are not finite are left out; `least`: rows that each column asks for. Returns the
+    part of the variance that it explains, corrected for chance, and chi-squared with its degrees of freedom if the past
+    says nothing; 0 where rows are fewer.
     """
     rows, targets = [], []
     for e, known in parts:
         first, n = max(most for _, most in known), e.shape[0]
-        past = [x[first - k : n - k] for x, most in known for k in range(1, most + 1)]
+        past = [x[first - k : max(n, first) - k] for x, most in known for k in range(1, most + 1)]
         rows.append(np.hstack([*past, np.ones((max(n - first, 0), 1))]))
         targets.append(e[first:])
     Z, E = np.concatenate(rows), np.concatenate(targets)
     sound = np.all(np.isfinite(Z), axis=1) & np.all(np.isfinite(E), axis=1)
     Z, E = Z[sound], E[sound]
     (n, p), k = E.shape, Z.shape[1]
-    if n < 4 * k:
+    if n < max(least * k, k + 2):
         return 0.0, 0.0, p * k
     left = E - Z @ least_squares(Z, E)
     before, after = (np.linalg.slogdet(x.T @ x / n + _VANISHED * np.eye(p))[1] for x in (E, left))

@@ -325,7 +325,7 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
         (e, [(e, _PAST)] * (state.layout.gain or not inputs) + [(u[:, :-1], _PAST)] * inputs)
         for e, (_, u) in zip(errors, problem.parts, strict=True)
     ]
-    share, statistic, freedom = explained_by_past(parts)
+    share, statistic, freedom = explained_by_past(parts, least=1.0)
     return Misfit(share=share, p=float(chi2.sf(statistic, freedom)))
 
 

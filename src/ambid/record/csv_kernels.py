@@ -44,15 +44,15 @@ def read_rows(text: NDArray[np.uint8], at: int, delimiter: int, powers: Array, v
             while True:
                 byte = text[at]
                 if _ZERO <= byte <= _NINE:
+                    digits += digits > 0 or byte > _ZERO
+                    if digits > _DIGITS:  # before the mantissa grows beyond 63 bits
+                        return -1
                     mantissa = 10 * mantissa + int(byte) - _ZERO
-                    digits += mantissa > 0
                     scale -= point
                 elif byte == _POINT and point == 0:
                     point = 1
                 else:
                     break
-                if digits > _DIGITS:
-                    return -1
                 at += 1
             if at - first - point < 1:
                 return -1
