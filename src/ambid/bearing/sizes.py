@@ -32,6 +32,7 @@ _SYMMETRY = {  # exponents of s_v, s_i, s_x
     "position": (0, 0, 1),
 }
 _HIGH = 0.999
+_EXACT = 0.1  # power of ten within which a rig's value is a thousand times another
 _NAMED = 0.5  # half width, as a power of ten, of the range around what a rig says
 # Of squared half widths: what a rarer slip costs, within which two are both named, and what a slip has to gain.
 _RARE, _ALIKE, _GAIN = 2.0, 1.2, 1.8
@@ -120,6 +121,10 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     odd = [j for j in np.flatnonzero(~(np.abs(far) <= 1.0)) if np.isfinite(far[j])]
     if not odd:
         return Check(passed=True, values={"unusual": 0.0}, detail="every size is usual for a magnetic bearing")
+    if all(sizes[j].source == "rig" for j in odd):
+        wrong = _mistaken_values(parameters, values)
+        if wrong:
+            return Check(passed=False, values={"unusual": float(len(odd))}, detail="; ".join(wrong))
     symmetry = np.array([size.symmetry for size in sizes])
     slips = _slips(far, symmetry / ((high - low) / 2)[:, None])
     worst = max(odd, key=lambda j: abs(far[j]))
@@ -144,14 +149,16 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     )
 
 
-def mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:
+def _mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:
     """Say which of a rig's values are a power of thousand off what the record alone gives, `values` in SI."""
     found = []
     for p in known:
         alone = values.get(p.name, 0.0)
-        decades = np.log10(abs(p.value / alone)) if p.value and alone else 0.0
+        if p.role == "free" or not p.value or not alone:
+            continue
+        decades = float(np.log10(abs(p.value / alone)))
         thousands = round(decades / 3.0)
-        if thousands and abs(decades - 3.0 * thousands) < _NAMED / 2:
+        if thousands and abs(decades - 3.0 * thousands) < _EXACT:
             found.append(
                 f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times what the record shows "
                 f"({alone:.4g} {p.unit}): correct its unit there"
