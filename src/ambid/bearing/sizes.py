@@ -124,7 +124,11 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     if all(sizes[j].source == "rig" for j in odd):
         wrong = _mistaken_values(parameters, values)
         if wrong:
-            return Check(passed=False, values={"unusual": float(len(odd))}, detail="; ".join(wrong))
+            return Check(
+                passed=False,
+                values={"unusual": float(len(odd))},
+                detail=" ".join(f"{w}." for w in wrong).removesuffix("."),
+            )
     symmetry = np.array([size.symmetry for size in sizes])
     slips = _slips(far, symmetry / ((high - low) / 2)[:, None])
     worst = max(odd, key=lambda j: abs(far[j]))
@@ -161,7 +165,7 @@ def _mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) ->
         if thousands and abs(decades - 3.0 * thousands) < _EXACT:
             found.append(
                 f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times what the record shows "
-                f"({alone:.4g} {p.unit}): correct its unit there"
+                f"({alone:.4g} {p.unit}). Correct its unit there"
             )
     return found
 
