@@ -13,11 +13,12 @@ from typing import TYPE_CHECKING, TextIO
 
 import typer
 
+from ambid.estimation.progress import Tick, guessed, silent
+
 if TYPE_CHECKING:
     from rich.progress import Progress as Bar
     from rich.progress import TaskID
 
-    from ambid.estimation.progress import Tick
     from ambid.report.text import Paint, Style
 
 _PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
@@ -70,8 +71,6 @@ def progress(title: str) -> Iterator[Tick]:
     over where it is known.
     """
     if not sys.stderr.isatty():
-        from ambid.estimation.progress import silent
-
         yield silent
         return
     display = _Display(title)
@@ -108,8 +107,6 @@ class _Display:
         if done is not None:
             self._told = True
         elif self._count >= _FEWEST and not self._told:
-            from ambid.estimation.progress import guessed
-
             done = guessed(self._count, _EXPECTED)
         self._share = max(self._share, min(done or 0.0, 1.0))
 
