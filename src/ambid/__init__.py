@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 _ROOMS = (
     "bearing", "blackbox", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive", "report",
-    "rig", "signals", "simulation", "tracking", "units", "validate",
+    "rig", "signals", "simulation", "tracking", "units", "validation",
 )  # fmt: skip
 
 _exported, __dir__, __all__ = exports(__name__)

@@ -14,7 +14,7 @@ from ambid.blackbox.fit_file import fit_from_json, fit_text
 from ambid.blackbox.model import response_covariance
 from ambid.blackbox.prediction import innovations_form
 from ambid.errors import EstimationError
-from ambid.validate.fits import judge
+from ambid.validation.fits import judge
 from tests.blackbox import systems
 
 OMEGA = 2 * np.pi * np.geomspace(0.5, 40, 12)

@@ -12,7 +12,7 @@ TIERS: tuple[tuple[str, ...], ...] = (
     ("report", "control"),
     ("acquisition",),
     ("tracking",),
-    ("validate",),
+    ("validation",),
     ("recursive",),
     ("bearing", "rotor"),
     ("nonlinear",),

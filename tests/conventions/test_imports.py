@@ -63,7 +63,7 @@ FABRICATED = {
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from ambid.record import Record\n",
         "line 3: errors",
     ),
-    "by name": ("ambid.bearing", "import importlib\nm = importlib.import_module('ambid.validate')", "upward"),
+    "by name": ("ambid.bearing", "import importlib\nm = importlib.import_module('ambid.validation')", "upward"),
     "private module": ("ambid.rig.schema", "from ambid.record._files import file_bytes", "_files is private to record"),
     "private module as a name": ("ambid.rig.schema", "from ambid.record import _files", "_files is private to record"),
     "private name": (

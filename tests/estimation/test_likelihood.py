@@ -13,7 +13,7 @@ from ambid.estimation.sensitivity import innovations, linearise
 from tests.bearing.benches import problem_of, run, stationary_gain
 from tests.estimation import reference
 from tests.estimation.reference import complex_step
-from tests.validate.wrong import WithoutMotionalVoltage
+from tests.validation.wrong import WithoutMotionalVoltage
 
 
 def fitted(name, n=1500, seed=1, **settings):

@@ -8,7 +8,7 @@ import pytest
 from ambid.estimation.likelihood import expected_prediction_sd, prediction_error, search, simulation_error
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations
-from ambid.validate.residuals import fit_of
+from ambid.validation.residuals import fit_of
 from tests.bearing.benches import problem_of, run
 from tests.estimation.reference import sampled
 

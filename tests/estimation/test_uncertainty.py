@@ -11,7 +11,7 @@ from ambid.estimation.linear import directions
 from ambid.estimation.uncertainty import WEAK
 from tests.bearing.benches import problem_of, run
 from tests.estimation.kalman import cramer_rao_sd
-from tests.validate.wrong import WithoutMotionalVoltage
+from tests.validation.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 CASES = [("bearing", AXIS, 2500), ("thesis", AXIS, 3000), ("rmit", AXIS, 2500), ("coil", ("R", "L"), 2000),

@@ -9,7 +9,7 @@ from ambid.report.figures import Evidence
 from ambid.rig import default_rig
 from ambid.signals import excitation
 from ambid.simulation import simulate_preset
-from ambid.validate.second_record import replay
+from ambid.validation.second_record import replay
 
 
 def evidence_of(name, n, band, seed=2):

@@ -11,7 +11,7 @@ from scipy.signal import lfilter
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import structure
 from ambid.report.fit_figures import fit_overview
-from ambid.validate.fits import judge
+from ambid.validation.fits import judge
 
 POLES, ZEROS = 0.9 * np.exp(0.4j), 0.8 * np.exp(1.2j)
 

@@ -20,8 +20,8 @@ from ambid.report.fit_text import (
     setting_text,
     term_lines,
 )
-from ambid.validate.fits import judge
-from tests.validate.nonlinear.plants import Static, io, squared, static_fit
+from ambid.validation.fits import judge
+from tests.validation.nonlinear.plants import Static, io, squared, static_fit
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from ambid.estimation.likelihood import weight_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import innovations, linearise
-from ambid.validate.physical import innovation_products, innovation_tests
+from ambid.validation.physical import innovation_products, innovation_tests
 from tests.bearing.benches import parameters, problem_of, run
 
 NAMES = ("m", "k_x", "k_i", "R", "L")

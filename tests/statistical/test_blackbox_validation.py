@@ -9,9 +9,9 @@ import pytest
 
 from ambid.blackbox.polynomial import arma, armax, arx, oe
 from ambid.blackbox.prediction import errors, gradient
-from ambid.validate.fits import judge, linear_residuals
-from ambid.validate.residuals import correlations
-from tests.validate.blackbox.fits import io, polynomial, run
+from ambid.validation.fits import judge, linear_residuals
+from ambid.validation.residuals import correlations
+from tests.validation.blackbox.fits import io, polynomial, run
 
 RUNS, N = 200, 400
 ARX = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))

@@ -16,7 +16,7 @@ from ambid.job.bearing_estimate import judge_bearing
 from ambid.job.bearing_records import TakenRecord
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
-from ambid.validate.nonlinear_bearing import whiteness
+from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
 
 RUNS, SAMPLES = 40, 3000

@@ -146,7 +146,7 @@ def command(
                 other = None if second is None or not nonlinear else read_data(second, part=second_part, **columns)
                 if sensitivity:
                     from ambid.report.tables import sensitivity_text
-                    from ambid.validate.sensitivity import sensitivity_analysis
+                    from ambid.validation.sensitivity import sensitivity_analysis
 
                     extras.append(("sensitivity", sensitivity_analysis(found, data[0]), sensitivity_text))
                 outputs.draw(drawn, lambda: fit_overview(found, data, other), show)
@@ -179,7 +179,7 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
 
 def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
     """Say why a fit does not hold on the second record, a line for each reason; empty where it was not judged there."""
-    from ambid.validate.fits import objections
+    from ambid.validation.fits import objections
 
     validation: Any = found.validation
     against = () if validation is None else objections(found, validation)
@@ -188,7 +188,7 @@ def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
 
 def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
     from ambid.report.response_figures import stabilisation_figure
-    from ambid.validate.stabilisation import stabilisation
+    from ambid.validation.stabilisation import stabilisation
 
     method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
     return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))

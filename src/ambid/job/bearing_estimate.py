@@ -19,7 +19,7 @@ from ambid.bearing.rescue import describe_search
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
-from ambid.validate.nonlinear_bearing import WhitenessTest, whiteness
+from ambid.validation.nonlinear_bearing import WhitenessTest, whiteness
 
 _P_LEAST = 1e-3  # as for the linear model
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error

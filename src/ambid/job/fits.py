@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from ambid.blackbox.data import IOData, Orders
     from ambid.blackbox.fit import BlackBoxFit
     from ambid.nonlinear.fit import NonlinearFit, Settings
-    from ambid.validate.comparison import Comparison
+    from ambid.validation.comparison import Comparison
 
 _ORDERS = 0.95  # of a job's time goes into the choice of orders, where they are chosen
 _USUAL_ORDERS = 12  # fits, about half of those that it takes
@@ -62,7 +62,7 @@ def fit(
     orders : Mapping[str, int, "auto" or tuple of int], optional
         Of a linear structure; a tuple has one number for each input. None: all are chosen by `criterion`.
     criterion : str, optional
-        For the choice of orders, see `ambid.validate.orders`.
+        For the choice of orders, see `ambid.validation.orders`.
     fixed : Mapping[str, float], optional
         Coefficients that are known, for polynomial structures, by name (``a1``, ``b2``).
     at_rest : bool, optional
@@ -144,7 +144,7 @@ def _estimate_linear(
     clock: Clock,
     say: Tick,
 ) -> BlackBoxFit:
-    from ambid.validate.fits import judge
+    from ambid.validation.fits import judge
 
     chosen: dict[str, object] = {}
     if orders is None:
@@ -167,7 +167,7 @@ def _estimate_nonlinear(
     clock: Clock,
     say: Tick,
 ) -> NonlinearFit:
-    from ambid.validate.fits import judge
+    from ambid.validation.fits import judge
 
     found = nonlinear_structure(name).estimator(data, settings, seed=seed, tick=part_of(say, 0.0, _SEARCH))
     clock.lap("fit")
@@ -239,7 +239,7 @@ def compare(
     AmbidError
         If the record, its channels or the orders break a rule.
     """
-    from ambid.validate.comparison import compare as compare_fits
+    from ambid.validation.comparison import compare as compare_fits
 
     channels = Channels.of(columns)
     for name, _ in candidates:
@@ -253,7 +253,7 @@ def compare(
 
 
 def _choose_orders(of: Structure, data: IOData, criterion: str, say: Tick) -> tuple[Any, dict[str, object]]:
-    from ambid.validate.orders import select
+    from ambid.validation.orders import select
 
     say("orders", 0.0)
     tried = count()
@@ -266,7 +266,7 @@ def _choose_orders(of: Structure, data: IOData, criterion: str, say: Tick) -> tu
 
 
 def _check_criterion(criterion: str, orders: Orders | None) -> None:
-    from ambid.validate.orders import Criterion
+    from ambid.validation.orders import Criterion
 
     known = get_args(Criterion)
     if criterion not in known:

@@ -97,7 +97,7 @@ def identify_used(
         estimate = judge(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
     clock.lap("checks")
     if validate is not None:
-        from ambid.validate.second_record import validation
+        from ambid.validation.second_record import validation
 
         say("validate")
         other = signals_of(load_bench(validate, rig, **reading), plant)
@@ -114,8 +114,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
-    from ambid.validate import physical
-    from ambid.validate.residuals import fit_of
+    from ambid.validation import physical
+    from ambid.validation.residuals import fit_of
 
     problem = fit.problem
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
@@ -235,7 +235,7 @@ def identify_nonlinear_used(
     from ambid.bearing.magnet_likelihood import uncertainty
     from ambid.job.bearing_estimate import judge_bearing
     from ambid.job.bearing_records import bearing_rig, laws_of, numbers_of, take_all
-    from ambid.validate.nonlinear_bearing import validation
+    from ambid.validation.nonlinear_bearing import validation
 
     say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
     taken, second = take_all(records, held, validate, bench, words, say)
@@ -265,7 +265,7 @@ def identify_nonlinear_used(
 def evidence_of(estimate: Estimate | NonlinearBearingEstimate, used: Any) -> Evidence | BearingEvidence:
     """Return what figures and report show beside an estimate: the record or records `used`, run through it again."""
     from ambid.report.figures import Evidence, bearing_evidence
-    from ambid.validate.second_record import replay
+    from ambid.validation.second_record import replay
 
     if not isinstance(estimate, Estimate):
         return bearing_evidence(estimate, [(t.record, t.start_s) for t in used])

@@ -19,9 +19,9 @@ from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 from ambid.physics.linear_model import model
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
-from ambid.validate.fits import objections
-from ambid.validate.fits import validation as fit_validation
-from ambid.validate.second_record import validation
+from ambid.validation.fits import objections
+from ambid.validation.fits import validation as fit_validation
+from ambid.validation.second_record import validation
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate
@@ -99,7 +99,7 @@ def validate(
     if isinstance(known, Estimate):
         return dict(validation(known, signals_of(load_bench(record, bench, **reading), model(known.model))))
     from ambid.job.bearing_records import bearing_rig, take_record
-    from ambid.validate.nonlinear_bearing import validation as bearing_validation
+    from ambid.validation.nonlinear_bearing import validation as bearing_validation
 
     return dict(bearing_validation(known, take_record(record, bearing_rig(bench), reading).record))
 

@@ -197,7 +197,7 @@ class NonlinearFit(FittedModel):
     criteria : Mapping[str, float]
         ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
     checks : Mapping[str, Check]
-        Made by `ambid.validate.fits`.
+        Made by `ambid.validation.fits`.
     validation : Mapping[str, object] or None
         By output, on a second record.
     warnings : tuple of str

@@ -5,7 +5,7 @@ of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.e
 then with the name of the stage and the share of the whole search that is over; it may raise KeyboardInterrupt, upon
 which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers that are not finite, end
 in status ``failed`` with the reason, never in an exception; an exception is a request that makes no sense. The
-estimator leaves `fit`, `criteria` and `checks` to `ambid.validate.fits`. It is imported only when it is asked for.
+estimator leaves `fit`, `criteria` and `checks` to `ambid.validation.fits`. It is imported only when it is asked for.
 `tests/nonlinear/test_conformance.py` runs on every entry.
 """
 

@@ -34,8 +34,8 @@ from ambid.report.drawing import (
 from ambid.report.estimate_text import names_words
 from ambid.report.numbers import prefixed
 from ambid.report.text import pole_table
-from ambid.validate import nonlinear_bearing
-from ambid.validate.second_record import Replay
+from ambid.validation import nonlinear_bearing
+from ambid.validation.second_record import Replay
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -41,8 +41,8 @@ from ambid.report.drawing import (
 from ambid.report.fit_text import is_weight, pole_lines, term_ratios
 from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
-from ambid.validate.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
-from ambid.validate.residuals import Correlation, correlations
+from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
+from ambid.validation.residuals import Correlation, correlations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -25,7 +25,7 @@ from ambid.report.drawing import (
     unwrapped,
 )
 from ambid.report.numbers import sized
-from ambid.validate.stabilisation import Stabilisation
+from ambid.validation.stabilisation import Stabilisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

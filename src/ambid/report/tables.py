@@ -16,8 +16,8 @@ from ambid.signals import find_dropouts, find_outliers, find_saturation, persist
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
-    from ambid.validate.comparison import Comparison, Entry
-    from ambid.validate.sensitivity import SensitivityAnalysis
+    from ambid.validation.comparison import Comparison, Entry
+    from ambid.validation.sensitivity import SensitivityAnalysis
 
 _ORDER = 20  # of persistent excitation: far above what a plant of three states needs
 _LONGEST = 100_000  # samples from which the order of excitation is told

@@ -10,7 +10,7 @@ from ambid.bearing.magnet_likelihood import search, uncertainty
 from ambid.bearing.magnet_problem import touching, weight_carried
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
-from ambid.validate.nonlinear_bearing import whiteness
+from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import problem_of
 from tests.bearing.magnet.stops import NOISE, RATE, STOPS, TRUTH, ball_between_stops, lying
 

@@ -11,7 +11,7 @@ from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.errors import EstimationError
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
-from ambid.validate.nonlinear_bearing import whiteness
+from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, problem_of, unstable
 
 KNOWN = {

@@ -11,7 +11,7 @@ import pytest
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.nonlinear.lpv import lpv
-from ambid.validate.fits import judge
+from ambid.validation.fits import judge
 from tests.nonlinear.lpv.plants import damped, levitated, record, truth
 
 KNOWN = {"schedule": "p", "degree": 2, "form": "output", "error_form": "ar"}

@@ -14,8 +14,8 @@ from ambid.blackbox.model import Offsets, StateSpaceModel, TransferModel
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.prediction import errors, gradient, innovations_form, polynomial_gradient
 from ambid.blackbox.subspace import n4sid, pbsid
-from ambid.validate.fits import judge
-from tests.validate.blackbox.fits import DT, arx, io, polynomial, run
+from ambid.validation.fits import judge
+from tests.validation.blackbox.fits import DT, arx, io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
 BJ = polynomial(F=((1, -1.5, 0.7),), B=((0, 1.0, 0.5),), C=(1, 0.4), D=(1, -0.8))

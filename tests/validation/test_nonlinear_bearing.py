@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.validate.nonlinear_bearing import replay, validation
+from ambid.validation.nonlinear_bearing import replay, validation
 from tests.bearing.magnet.estimates import LEVELS, by_hand, seen
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.report.tables import comparison_text
-from ambid.validate.comparison import compare
-from ambid.validate.orders import folds, hold_out
-from tests.validate.blackbox.fits import io, polynomial, run
+from ambid.validation.comparison import compare
+from ambid.validation.orders import folds, hold_out
+from tests.validation.blackbox.fits import io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
 RIGHT = ("arx", {"na": 2, "nb": 2, "nk": 1})

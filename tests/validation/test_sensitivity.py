@@ -10,8 +10,8 @@ import pytest
 from ambid.blackbox.polynomial import fir, oe
 from ambid.blackbox.prediction import errors
 from ambid.errors import EstimationError
-from ambid.validate.sensitivity import sensitivity_analysis
-from tests.validate.blackbox.fits import arx, io, polynomial, run
+from ambid.validation.sensitivity import sensitivity_analysis
+from tests.validation.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
 

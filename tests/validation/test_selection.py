@@ -7,8 +7,8 @@ import pytest
 
 from ambid.blackbox.fit import structure
 from ambid.errors import EstimationError
-from ambid.validate.orders import arx_candidates, select
-from tests.validate.blackbox.fits import arx, io, polynomial, run
+from ambid.validation.orders import arx_candidates, select
+from tests.validation.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = {
     "arx": polynomial(A=(1, -1.5, 0.7), B=((0, 0, 0, 1.0, 0.5),)),

@@ -13,7 +13,7 @@ from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulation import simulate_preset
-from ambid.validate.second_record import replay, validation
+from ambid.validation.second_record import replay, validation
 
 BEARING = preset("unstable-bearing")
 

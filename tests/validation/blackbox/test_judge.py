@@ -7,8 +7,8 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.uncertainty import criteria, skipped
-from ambid.validate.fits import judge
-from tests.validate.blackbox.fits import arx, io, polynomial, run
+from ambid.validation.fits import judge
+from tests.validation.blackbox.fits import arx, io, polynomial, run
 
 TRUTH = polynomial(A=(1, -1.5, 0.7), B=((0, 1.0, 0.5),))
 

@@ -8,9 +8,9 @@ from scipy.stats import chi2, kstest
 
 from ambid.estimation.likelihood import search
 from ambid.estimation.sensitivity import innovations
-from ambid.validate.physical import innovation_products, innovation_tests
+from ambid.validation.physical import innovation_products, innovation_tests
 from tests.bearing.benches import problem_of, run
-from tests.validate.wrong import WithoutMotionalVoltage
+from tests.validation.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 KNOWN = {

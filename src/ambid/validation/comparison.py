@@ -13,8 +13,8 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import fields_json
-from ambid.validate.fits import judge
-from ambid.validate.orders import HELD_OUT, hold_out, select
+from ambid.validation.fits import judge
+from ambid.validation.orders import HELD_OUT, hold_out, select
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -80,7 +80,7 @@ def compare(
     """Fit structures to the same samples and judge them on others.
 
     `candidates`: structures with their orders; None chooses them by `criterion`; `second`: other data to judge on; then
-    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validate.orders.select`; `tick`:
+    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validation.orders.select`; `tick`:
     called with the structure before each fit; may raise to interrupt. Returns a structure that cannot be fitted is in
     it, with the reason.
     """

@@ -23,7 +23,7 @@ from ambid.blackbox.prediction import errors, errors_elsewhere
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.uncertainty import criteria, skipped
 from ambid.signals.delay import lagged_triangle
-from ambid.validate.residuals import autoregression
+from ambid.validation.residuals import autoregression
 
 Criterion = Literal["aic", "aicc", "bic", "mdl", "fpe", "holdout", "kfold"]
 

@@ -23,8 +23,8 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.linear_model import model
-from ambid.validate.physical import innovation_products, innovation_tests
-from ambid.validate.residuals import fit_of, residual_check
+from ambid.validation.physical import innovation_products, innovation_tests
+from ambid.validation.residuals import fit_of, residual_check
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _HORIZONS = (1, 10, 100)  # samples ahead

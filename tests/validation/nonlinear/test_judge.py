@@ -10,8 +10,8 @@ import pytest
 from ambid.errors import EstimationError
 from ambid.estimation.uncertainty import criteria
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.fits import beyond, judge, validation
-from tests.validate.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit
+from ambid.validation.fits import beyond, judge, validation
+from tests.validation.nonlinear.plants import Static, io, levitated, output_error, squared, static_fit
 
 
 def static_record(n: int, seed: int, *, level: float = 0.0, noise: float = 0.2, size: float = 1.0):

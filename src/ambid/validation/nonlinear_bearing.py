@@ -14,8 +14,8 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
-from ambid.validate.residuals import P_LEAST, fit_of, joint_triangle, score_of
-from ambid.validate.second_record import conclude, consistency_check
+from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
+from ambid.validation.second_record import conclude, consistency_check
 
 _ROLES = ("position", "current")
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others

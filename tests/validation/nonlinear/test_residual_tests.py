@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.fits import judge, nonlinear_residuals, run
-from ambid.validate.residuals import correlations
-from tests.validate.nonlinear.plants import io, levitated, output_error, squared
+from ambid.validation.fits import judge, nonlinear_residuals, run
+from ambid.validation.residuals import correlations
+from tests.validation.nonlinear.plants import io, levitated, output_error, squared
 
 TRUE = {"ny": 1, "nu": 1, "ne": 0, "constant": 0, "selection": "frols"}
 TESTS = ("residuals_white", "residuals_uncorrelated", "residuals_nonlinear", "residual_variance", "feedback")

@@ -26,7 +26,7 @@ from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import criteria, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.validate.residuals import (
+from ambid.validation.residuals import (
     LEAST,
     MOST,
     Residuals,

@@ -8,8 +8,8 @@ import pytest
 from ambid.blackbox.prediction import run_states
 from ambid.errors import EstimationError
 from ambid.report.response_figures import stabilisation_figure
-from ambid.validate.stabilisation import assurance, stabilisation
-from tests.validate.blackbox.fits import DT, io
+from ambid.validation.stabilisation import assurance, stabilisation
+from tests.validation.blackbox.fits import DT, io
 
 MODES_HZ, DAMPING = np.array([6.0, 15.0]), np.array([0.03, 0.02])
 REAL = 4.0  # rad/s, unstable

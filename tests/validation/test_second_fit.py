@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validate.fits import judge, objections, validation
+from ambid.validation.fits import judge, objections, validation
 from tests.nonlinear.systems import smooth
 
 

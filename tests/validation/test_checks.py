@@ -10,7 +10,7 @@ from ambid.estimation.likelihood import search, sparse_gain
 from ambid.estimation.sensitivity import innovations
 from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
-from ambid.validate.physical import (
+from ambid.validation.physical import (
     agreement,
     implausible,
     innovation_checks,
@@ -18,9 +18,9 @@ from ambid.validate.physical import (
     lowest_power_hz,
     physical_checks,
 )
-from ambid.validate.residuals import ResidualTest, residual_check
+from ambid.validation.residuals import ResidualTest, residual_check
 from tests.bearing.benches import BEARING, problem_of, run
-from tests.validate.wrong import WithoutMotionalVoltage
+from tests.validation.wrong import WithoutMotionalVoltage
 
 AXIS = ("m", "k_x", "k_i", "R", "L")
 
@@ -152,5 +152,5 @@ def test_agreement_does_without_a_refit_whose_gain_is_not_found(monkeypatch):
             raise np.linalg.LinAlgError("the Riccati equation has no stabilising solution")
         return sparse_gain(fit, stride)
 
-    monkeypatch.setattr("ambid.validate.physical.sparse_gain", none)
+    monkeypatch.setattr("ambid.validation.physical.sparse_gain", none)
     assert agreement(fitted(60, n=3000)).strides == (2,)

@@ -1,7 +1,7 @@
 """All checks of a physical estimate on its own record, in the order of the report.
 
-The residual tests are score tests (`ambid.validate.residuals`): lagged signals beside the weighted Jacobian as further
-regressors of all innovations together, from the scalar products of one pass of sensitivities.
+The residual tests are score tests (`ambid.validation.residuals`): lagged signals beside the weighted Jacobian as
+further regressors of all innovations together, from the scalar products of one pass of sensitivities.
 
 Under the right model the estimate does not depend on how far ahead the predictor has to look. So the same record is
 fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor
@@ -30,7 +30,7 @@ from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
-from ambid.validate.residuals import P_LEAST, ResidualTest, residual_check
+from ambid.validation.residuals import P_LEAST, ResidualTest, residual_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
