@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -10,7 +12,7 @@ from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import structure
-from ambid.report.fit_figures import fit_overview
+from ambid.report.fit_figures import fit_overview, traces_of
 from ambid.validation.fits import judge
 
 POLES, ZEROS = 0.9 * np.exp(0.4j), 0.8 * np.exp(1.2j)
@@ -38,3 +40,11 @@ def test_poles_and_zeros_are_drawn_with_their_regions(data: IOData) -> None:
     assert np.max(np.min(np.abs(truth[:, None] - centres), axis=1)) < 0.02
     assert all(0 < p.width < 0.1 for p in regions)
     assert "95 % regions" in axes.get_title()
+
+
+def test_time_is_that_of_the_record_after_a_cut(data: IOData) -> None:
+    part = replace(data, start_s=3.0).part(500, 1500)
+    fit = structure("oe").estimator(part, {"nb": 1, "nf": 1, "nk": 1})
+    t = traces_of(fit, part).time_s
+    assert part.start_s == t[0] == 3.0 + 500 * data.dt
+    assert t[-1] == pytest.approx(3.0 + 1499 * data.dt)

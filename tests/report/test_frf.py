@@ -120,3 +120,17 @@ def test_many_pairs_are_counted_and_a_single_line_is_drawn():
     )  # fmt: skip
     page = frf_figure(Measured(response=wide))
     assert "6 of 8 pairs" in page.get_suptitle()
+
+
+def test_a_phase_that_noise_hides_does_not_walk_out_of_its_axis():
+    rng = np.random.default_rng(5)
+    f = np.linspace(5.0, 2000.0, 400)
+    G = 1.0 / (1 + 1j * f / 50) ** 3
+    noise = 1e-3 * (rng.standard_normal(400) + 1j * rng.standard_normal(400))
+    frame = drawn(400, frequency_hz=f, G=(G + noise)[:, None, None], covariance=np.full((400, 1, 1), 2e-6 + 0j))
+    (phase,) = (a for a in frf_figure(Measured(response=frame)).axes if a.get_ylabel().startswith("phase"))
+    (points,) = (np.asarray(x.get_ydata()) for x in phase.lines if x.get_marker() == ".")
+    low, high = phase.get_ylim()
+    assert low <= points.min() <= points.max() <= high
+    assert high - low < 800
+    np.testing.assert_allclose(points[:40], -3 * np.rad2deg(np.arctan(f[:40] / 50)), atol=5.0)

@@ -150,3 +150,12 @@ def test_runs_and_words():
     assert list(runs(np.array([True, False, True, True, False, True]))) == [(0, 0), (2, 3), (5, 5)]
     assert list(runs(np.zeros(3, dtype=bool))) == []
     assert event_words(Event(kind="disturbed", t=12.3456, why="")) == "disturbed at 12.35 s"
+
+
+def test_the_change_of_a_negative_parameter_is_told_as_the_table_tells_it():
+    track = track_of(seconds=5.0, every_s=0.1, names=("k_x",))
+    axes = panel(track_figure(track), "k_x")
+    start, last = track.header.start["k_x"].value, track.lines[-1].parameters["k_x"].value
+    assert start < 0
+    assert axes.get_title(loc="left") == f"{100 * (last / start - 1):+.3g} % from start"
+    assert not axes.child_axes  # a second axis in per cent would run downward

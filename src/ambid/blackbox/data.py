@@ -37,6 +37,8 @@ class IOData:
     references : tuple of str
     record : Mapping[str, object]
         ``samples``, ``rate_hz``, ``sha256``, ``file`` of the record.
+    start_s : float, s
+        Time of the first sample in its record.
     """
 
     u: Array
@@ -49,6 +51,7 @@ class IOData:
     reference: Array = field(default_factory=lambda: np.empty((0, 0)))
     references: tuple[str, ...] = ()
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    start_s: float = 0.0
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.dt) and self.dt > 0):
@@ -107,7 +110,7 @@ class IOData:
         if not 0 <= first < last <= self.n_samples:
             raise EstimationError(f"samples {first} to {last} of a record of {self.n_samples}; give a part inside it")
         cut = {name: getattr(self, name)[first:last] for name in ("u", "y", "reference")}
-        return replace(self, **cut)
+        return replace(self, start_s=self.start_s + first * self.dt, **cut)
 
 
 def io_data(
@@ -147,6 +150,7 @@ def io_data(
             "file": record.provenance.get("file"),
             "history": [str(step) for step in record.history],
         },
+        start_s=record.start_s,
     )
 
 

@@ -347,10 +347,16 @@ def magnitude_axis(
     axes.set_ylim(0.5 * size.min(), 2 * size.max())
 
 
-def unwrapped(value: Complex, near: float = 0.0) -> Array:
-    """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`."""
-    angle = np.unwrap(np.angle(value))
-    return np.asarray(angle - 2 * np.pi * np.round((angle[0] - near) / (2 * np.pi)))
+def unwrapped(value: Complex, near: float = 0.0, known: NDArray[np.bool_] | None = None) -> Array:
+    """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`.
+
+    `known`: where noise leaves the phase known; elsewhere it stands within half a turn of its neighbours, since noise
+    that is unwrapped walks away.
+    """
+    at = np.arange(value.size) if known is None or not known.any() else np.flatnonzero(known)
+    line = np.unwrap(np.angle(value[at]))
+    guide = np.interp(np.arange(value.size), at, line - 2 * np.pi * np.round((line[0] - near) / (2 * np.pi)))
+    return np.asarray(guide + np.angle(value * np.exp(-1j * guide)))
 
 
 def phase_axis(

@@ -153,7 +153,7 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
     return Traces(
         title=title,
         second=second,
-        time_s=np.arange(first, data.n_samples, dtype=np.float64) * data.dt,
+        time_s=data.start_s + np.arange(first, data.n_samples, dtype=np.float64) * data.dt,
         names=data.outputs,
         units=tuple(fit.units[o] for o in data.outputs),
         measured=data.y[first:],
@@ -356,7 +356,7 @@ def _draw_band(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, wher
     variance = np.maximum(np.einsum("tok,kl,tol->to", slopes, fit.covariance, slopes, optimize=True), 0.0)
     noise = np.maximum(np.diag(fit.noise_covariance), 0.0)
     outside = beyond(model.novelty(data.u, data.y)[first:last])
-    t = np.arange(first, last) * data.dt
+    t = data.start_s + np.arange(first, last) * data.dt
     axes = figure.subplots(data.n_outputs, 2, squeeze=False, sharex="col", width_ratios=(3, 2))
     for j, name in enumerate(data.outputs):
         y, p = data.y[first:last, j], predicted[first:last, j]

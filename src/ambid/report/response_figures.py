@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import Measured, ModelResponse, model_responses
@@ -36,6 +37,7 @@ _MODELS: tuple[tuple[str, str, str], ...] = (
     (PREDICTED, BAND, "-"),
     (BOUND, "#f1c4be", "--"),
 )  # line and band of the black-box fit and of the physical parameters
+_PHASE_KNOWN = 0.5  # radius of the 95 % region over the magnitude up to which the phase is
 _GRID = 800  # frequencies at which a model is drawn
 _STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
 _KINDS = (
@@ -100,8 +102,8 @@ def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair
     """Phase, unwrapped beginning near zero; where |G| is lost in its sd the band is all angles."""
     frf = measured.response
     f, size, radius = frf.frequency_hz, frf.magnitude[:, *pair], frf.confidence_radius()[:, *pair]
-    angle = np.rad2deg(_angle(frf.G[:, *pair], f, models, pair))
     ratio = np.minimum(radius / np.maximum(size, 1e-300), 1.0)
+    angle = np.rad2deg(_angle(frf.G[:, *pair], f, ratio < _PHASE_KNOWN, models, pair))
     spread = np.where(ratio < 1, np.rad2deg(np.arcsin(ratio)), 180.0)
     near = float(unwrapped(models[0].G[:, *pair])[0]) if models else 0.0  # a phase near ±180° begins on one side
     for m, (line, band, style) in zip(models, _MODELS, strict=False):
@@ -110,13 +112,13 @@ def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair
     axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
     axes.set_xscale("log")
     lines = [np.rad2deg(unwrapped(m.G[:, *pair], near)) for m in models]
-    angle_ticks(axes, np.concatenate([angle[ratio < 0.5] if np.any(ratio < 0.5) else angle, *lines]))
+    angle_ticks(axes, np.concatenate([angle, *lines]))
 
 
-def _angle(G: Complex, f: Array, models: Sequence[ModelResponse], pair: Pair) -> Array:
+def _angle(G: Complex, f: Array, known: NDArray[np.bool_], models: Sequence[ModelResponse], pair: Pair) -> Array:
     """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
     if not models:
-        return unwrapped(G)
+        return unwrapped(G, known=known)
     near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].G[:, *pair]))
     return np.asarray(near + np.angle(G * np.exp(-1j * near)))
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,7 +163,7 @@ def _parameter_panel(axes: Axes, history: TrackHistory, name: str, truth: tuple[
     axes.ticklabel_format(axis="y", style="plain", useOffset=False)
     axes.set_axisbelow(True)
     grid(axes)
-    _relative_axis(axes, history, name, scale)
+    _say_change(axes, history, name, float(value[-1]))
 
 
 def _limits(value: Array, sd: Array, truth: tuple[Array, Array] | None, history: TrackHistory) -> tuple[float, float]:
@@ -186,22 +186,11 @@ def _limits(value: Array, sd: Array, truth: tuple[Array, Array] | None, history:
     return low - 0.06 * (high - low), high + 0.22 * (high - low)  # names of events stand at the top
 
 
-def _relative_axis(axes: Axes, history: TrackHistory, name: str, scale: float) -> None:
-    """A second axis at the right: change since the start in per cent."""
+def _say_change(axes: Axes, history: TrackHistory, name: str, last: float) -> None:
+    """Write the change since the start above the panel, as the table says it: in per cent of a start of either sign."""
     begin = history.header.start.get(name)
-    if begin is None or not np.isfinite(begin.value) or begin.value == 0:
-        return
-    zero, one = begin.value / scale, begin.value / scale / 100
-
-    def percent(y: Any) -> Any:
-        return (y - zero) / one
-
-    def own_unit(p: Any) -> Any:
-        return zero + p * one
-
-    beside = axes.secondary_yaxis("right", functions=(percent, own_unit))
-    beside.tick_params(labelsize=8, colors="#555555")
-    beside.set_ylabel("% from start", fontsize=8, color="#555555")
+    if begin is not None and begin.value and np.isfinite(last / begin.value):
+        _say(axes, f"{100 * (last / begin.value - 1):+.3g} % from start", "left")
 
 
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
@@ -221,9 +210,9 @@ def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], tru
     return f"truth inside the band in {inside:.0f} % of the lines{away}"
 
 
-def _say(axes: Axes, text: str) -> None:
+def _say(axes: Axes, text: str, where: Literal["left", "right"] = "right") -> None:
     """Write above the panel, where nothing is hidden."""
-    axes.set_title(text, fontsize=8, loc="right", color="#333333", pad=2)
+    axes.set_title(text, fontsize=8, loc=where, color="#333333", pad=2)
 
 
 def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: TrackHistory) -> None:
