@@ -156,6 +156,12 @@ def known_units() -> tuple[str, ...]:
     return (*_SUGGESTED, *_KNOWN_COMPOUNDS)
 
 
+def counted(n: float, noun: str) -> str:
+    """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``."""
+    text = f"{n:.3g}" if isinstance(n, float) else str(n)
+    return f"{text} {noun}{'' if text == '1' else 's'}"
+
+
 def _plain(text: str) -> str:
     """Write µ, Ω, ², · in plain letters and single spaces."""
     for fancy, letters in (("µ", "u"), ("μ", "u"), ("Ω", "ohm"), ("Ω", "ohm"), ("²", "^2"), ("·", " "), ("*", " ")):

@@ -82,7 +82,7 @@ def test_what_no_unit_explains_is_refused_only_where_it_is_impossible():
     values, _, seen = slipped_free("pump", "voltage", 1.0)
     odd = check_units({**values, "L": 50.0}, (), seen)
     assert odd.passed
-    assert "no single unit explains it" in odd.detail
+    assert "no wrong unit of one channel explains it" in odd.detail
     assert not check_units({**values, "L": 5e4}, (), seen).passed
 
 
@@ -109,7 +109,7 @@ def test_the_presets_lie_inside_the_usual_ranges(name):
     largest = signals(bench.limits.voltage[1], bench.limits.current[1], bench.limits.position[1])
     check = check_units(bench.parameters, (), largest)
     assert check.passed
-    assert "every size" in check.detail
+    assert "all sizes" in check.detail
 
 
 def reversed_voltage(s):
@@ -145,12 +145,12 @@ def twice(s):
 
 MISTAKEN = [
     (reversed_voltage, "channel 'voltage' is reversed"),
-    (reversed_current, "reversed (or else 'current')"),
+    (reversed_current, "reversed (or 'current' is)"),
     (twice, "channels 'position' and 'current' hold the same signal"),
     (swapped, "channels 'voltage' and 'current' are swapped"),
     (swapped_outputs, "channels 'position' and 'current' are swapped"),
-    (silent("current"), "channel 'current' holds no signal that belongs to voltage and position"),
-    (silent("position"), "channel 'position' holds no signal that belongs to voltage and current"),
+    (silent("current"), "channel 'current' is unrelated to voltage and position"),
+    (silent("position"), "channel 'position' is unrelated to voltage and current"),
 ]
 
 
@@ -170,7 +170,7 @@ def test_a_weak_or_spoiled_signal_is_still_a_signal():
     spoiled[rng.integers(0, len(i), 6)] += 100.0 * i.std()
     for changed in (noisy, replace(bench.signals, y=np.column_stack([x, spoiled]))):
         refuse_silent(bench.model, changed)
-    with pytest.raises(EstimationError, match="'position' holds no signal"):
+    with pytest.raises(EstimationError, match="'position' is unrelated"):
         refuse_silent(bench.model, replace(noisy, y=np.column_stack([rng.standard_normal(len(x)), i])))
 
 
@@ -181,7 +181,7 @@ def test_a_value_of_the_rig_in_another_unit_is_named(name, factor, power):
     check = check_units(values, (known,), seen)
     assert not check.passed
     assert f"{name} = " in check.detail
-    assert f"in the rig is about 10^{power} times what the record shows" in check.detail
+    assert f"in the rig is about 10^{power} times the value from the data" in check.detail
 
 
 def test_a_sign_is_named_in_a_long_record_too(monkeypatch):

@@ -51,7 +51,7 @@ def refused(found, folder, *words):
     [
         (("--validate", "units.csv"), "'u' is in A in the second record, in V in the first"),
         (("--validate", "slow.csv"), "the second record is sampled at 500 Hz, the first at 1000 Hz"),
-        (("--validate", "still.csv"), "'y' is constant over the second record"),
+        (("--validate", "still.csv"), "'y' is constant in the second record"),
         (("--validate-from", "0.1"), "none is given. Give --validate"),
         (("--criterion", "bicc"), "Did you mean 'bic'?"),
         (("--criterion", "aic"), "orders are given"),

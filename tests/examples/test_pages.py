@@ -136,7 +136,7 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
             else:
                 assert words[0] in (".", "cd"), f"unforeseen command: {line}"
     assert re.search(r"^m    60 g .* fixed$", said["identify mine.csv"], re.MULTILINE)  # the edit took
-    assert "NOT SHOWN" not in "".join(said.values())
+    assert "not identifiable" not in "".join(said.values())
     left = {"mine.json", "mine.png", "mine.html", "track.jsonl", "track.png", "first", "run.h5"}
     assert left <= {p.name for p in tmp_path.iterdir()}
     page = (ROOT / "README.md").read_text(encoding="utf-8")

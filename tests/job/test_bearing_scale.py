@@ -30,4 +30,4 @@ def test_a_wrong_gain_of_the_position_is_not_seen_while_the_mass_is_free_and_tha
     assert found.checks["residuals_white"].passed
     assert found.checks["residuals_uncorrelated"].passed
     assert m.value == pytest.approx(bench.plant.m / 1.05**2, rel=0.02)
-    assert any("gain of the position sensor cannot be seen" in w for w in found.warnings)
+    assert any("gain error of the position sensor cannot be detected" in w for w in found.warnings)

@@ -290,7 +290,7 @@ def test_a_line_that_is_lost_stops_it_with_that_reason_and_keeps_the_record(tmp_
 def test_a_fixed_value_that_is_wrong_stops_it(tmp_path):
     rig = prototype(('R   = { value = 6.0, unit = "ohm" }', 'R = { value = 9.0, unit = "ohm", role = "fixed" }'))
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig, wishes=replace(SHORT, amplitude_v=1.4))
-    stopped_at("identify", done, "speaks against R = 9 ohm", "Check that value, or free it")
+    stopped_at("identify", done, "contradict the fixed R = 9 ohm", "Check it, or free it")
     assert "estimate.json" in files(tmp_path)
 
 

@@ -20,14 +20,14 @@ def test_a_parameter_that_is_not_shown_is_never_called_identified(unstable):
     e = unstable.estimate
     parameters = tuple(replace(p, identifiable=p.name != "k_x") for p in e.parameters)
     text = estimate_text(replace(e, parameters=parameters))
-    assert line_of(text, "k_x").endswith("NOT SHOWN")
+    assert line_of(text, "k_x").endswith("not identifiable")
     assert line_of(text, "R").endswith("identified")
 
 
 def test_priors_say_how_much_came_from_the_data(unstable):
     p = replace(unstable.estimate.parameter("R"), role="prior", data_share=0.873)
     assert verdict(p) == "prior, 87 % data"
-    assert verdict(replace(p, identifiable=False)) == "prior, NOT SHOWN, 87 % data"
+    assert verdict(replace(p, identifiable=False)) == "prior, not identifiable, 87 % data"
 
 
 def test_too_wide_a_table_loses_its_si_column_only(unstable):
@@ -71,7 +71,7 @@ def test_a_failed_check_leaves_no_parameter_identified(unstable):
     )
     text = estimate_text(unseen)
     assert text.splitlines()[0] == "verdict: use with caution"
-    assert line_of(text, unseen.parameters[0].name).endswith("NOT SHOWN")
+    assert line_of(text, unseen.parameters[0].name).endswith("not identifiable")
     assert "identified" in text  # what the record does show
 
 

@@ -18,7 +18,7 @@ from ambid.validation.physical import (
     lowest_power_hz,
     physical_checks,
 )
-from ambid.validation.residuals import ResidualTest, residual_check
+from ambid.validation.residuals import ResidualTest, white_check
 from tests.bearing.benches import BEARING, problem_of, run
 from tests.validation.wrong import WithoutMotionalVoltage
 
@@ -57,7 +57,7 @@ def test_the_right_model_passes_every_check(name):
 def test_a_wrong_model_fails_by_name():
     checks = all_checks(fitted(change=lambda p: replace(p, delay=0)))
     assert not checks["residuals_uncorrelated"].passed
-    assert "something is left" in checks["residuals_uncorrelated"].detail
+    assert "residuals are correlated with past inputs" in checks["residuals_uncorrelated"].detail
 
 
 def test_refits_agree_on_the_right_model_and_say_how_well():
@@ -124,7 +124,7 @@ def test_physics_forbids_what_it_forbids():
         assert len(wrong) == 1
         assert wrong[0].startswith(f"{name} = -0.1")
     assert implausible(of, {**BEARING, "c": -0.02}, sd) == []  # within 3.3 sd of none
-    assert "gain energy" in implausible(of, {**BEARING, "c": -0.05}, sd)[0]
+    assert "generate energy" in implausible(of, {**BEARING, "c": -0.05}, sd)[0]
     # a spring may have either sign, and so may the force
     assert implausible(of, {**BEARING, "k_x": 1.0, "k_i": -5.0}, sd) == []
 
@@ -132,9 +132,12 @@ def test_physics_forbids_what_it_forbids():
 def test_words_of_a_residual_check():
     good = ResidualTest(p=0.4, statistic=10.0, degrees=11, largest=0.012, largest_lag=3)
     bad = replace(good, p=1e-9)
-    assert residual_check(good, "innovations").passed
-    assert not residual_check(bad, "innovations").passed
-    assert residual_check(bad, "innovations").values["degrees_of_freedom"] == 11
+    assert white_check(good).passed
+    assert white_check(good).detail == "residuals are white (largest autocorrelation 0.012 at lag 3, p = 0.4)"
+    assert not white_check(bad).passed
+    assert white_check(bad).detail.startswith("residuals are not white (")
+    assert white_check(replace(good, p=0.0)).detail.endswith("p < 1e-16)")
+    assert white_check(bad).values["degrees_of_freedom"] == 11
     assert replace(good, p=1e-3).passed
     assert not replace(good, p=0.99e-3).passed
 

@@ -51,7 +51,7 @@ def test_a_delay_that_hides_in_the_inductance_is_named():
             assert failed == {"delay_shown"}  # no other check sees it
             assert 0.15 < check.values["unseen_samples"] <= 1.0
             assert abs(off) < check.values["shift_sd"]
-            assert "cannot tell L" in check.detail
+            assert "could bias L" in check.detail
     assert wrong >= 5
 
 

@@ -38,6 +38,4 @@ def test_a_record_outside_the_training_data_is_told(fit):
 
 
 def test_a_prediction_that_runs_away_is_told(fit):
-    assert objections(fit, {"y": {"one_step": None, "simulation": None}}) == (
-        "no one-step prediction of y that stays finite",
-    )
+    assert objections(fit, {"y": {"one_step": None, "simulation": None}}) == ("the one-step prediction of y diverges",)

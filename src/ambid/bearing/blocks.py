@@ -26,6 +26,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.instruments import solve, span
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
+from ambid.estimation.uncertainty import p_text
 
 LIMIT = (
     "limit of the three blocks: the mass is normalised to 1, so that only ratios to the mass are found (N/A, N/m per "
@@ -243,26 +244,26 @@ def _warnings(
 ) -> tuple[str, ...]:
     out = []
     if not settled:
-        out.append("the search did not converge: treat the numbers as a first guess")
+        out.append("the search did not converge: treat the values as a first guess")
     if not safe:
         out.append(
-            "three blocks: biased where a controller was at work, and nothing says that this record is open loop: name "
-            "the loop's reference (--reference), or say --open-loop if there was no feedback"
+            "three blocks: biased by feedback. Name the loop's reference (--reference), or give --open-loop if the "
+            "record is open loop"
         )
-    what = {"current": "TFa and TFb do not make the current", "position": "TFc does not make the position"}
+    what = {"current": "TFa and TFb do not explain the current", "position": "TFc does not explain the position"}
     for name, p in doubt.items():
         if p < _DOUBT:
             out.append(
-                f"{what[name]} (p = {p:.2g}): the blocks are of first order, the bench is not. Take the numbers as a "
-                "rough guide, and the grey-box model for the parameters"
+                f"{what[name]} ({p_text(p)}): the blocks are of first order, the bench is not. Use the values as a "
+                "rough guide only, and the grey-box model for the parameters"
             )
     sd = np.sqrt(np.maximum(np.diag(covariance), 0))
     for k, name in enumerate(("K_a", "a", "K_b", "b", "K_c", "c")):
         if sd[k] > abs(coefficients[k]):
-            out.append(f"{name} = {coefficients[k]:.3g} ± {sd[k]:.2g}: the record does not tell it from zero")
+            out.append(f"{name} = {coefficients[k]:.3g} ± {sd[k]:.2g} does not differ significantly from zero")
     for k, name in ((1, "a"), (3, "b")):
         if coefficients[k] * dt > np.pi:
-            out.append(f"the pole {name} lies beyond half the sampling rate; the record does not show it")
+            out.append(f"the pole {name} lies beyond the Nyquist frequency and is not identifiable")
     return tuple(out)
 
 

@@ -48,8 +48,8 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
     if chance[most] > _CHANCE:
         role, others = roles[most], " and ".join(r for j, r in enumerate(roles) if j != most)
         raise EstimationError(
-            f"channel {role!r} holds no signal that belongs to {others}: they explain nothing of it. Check "
-            f"channels.{role}.column in the rig, and the wiring"
+            f"channel {role!r} is unrelated to {others}: they explain none of it. Check channels.{role}.column in the "
+            "rig, and the wiring"
         )
 
 
@@ -113,8 +113,8 @@ def refuse_mistaken(
         fit = _try(follow, found)
         if fit is not None and fit.problem.parameters(fit.vector)["R"] > 0:
             raise EstimationError(
-                f"{text}: as it is no bearing explains the record, and with that changed one explains it "
-                f"({_numbers(fit)}). {remedy}"
+                f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
+                f"{remedy}"
             )
 
 
@@ -166,8 +166,8 @@ def _changes(signals: Signals) -> list[tuple[str, str, Signals]]:
     first, second = ("current", "voltage") if bias else ("voltage", "current")
     return [
         (
-            f"channel {first!r} is reversed (or else {second!r})",
-            f"Turn the sensor's leads, or give channels.{first}.gain the other sign",
+            f"channel {first!r} is reversed (or {second!r} is)",
+            f"Swap the sensor's leads, or reverse the sign of channels.{first}.gain",
             replace(signals, u=-signals.u) if first == "voltage" else replace(signals, y=signals.y * [1.0, -1.0]),
         ),
         (

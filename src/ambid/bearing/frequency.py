@@ -234,14 +234,14 @@ def frequency_estimate(
         "cost": check,
         "identifiable": Check(
             passed=not unseen,
-            detail=f"not shown by these lines: {', '.join(unseen)}. Excite another band, or give a prior"
+            detail=f"not identifiable from these lines: {', '.join(unseen)}. Excite another band, or give a prior"
             if unseen
             else "every estimated parameter has a relative standard deviation under 25 %",
         ),
     }
     warnings = [*frf.warnings, *(f"{k}: {c.detail}" for k, c in checks.items() if not c.passed)]
     if not converged:
-        warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+        warnings.insert(0, "the search did not converge: treat the values as a first guess")
     total = problem.delay_at(v)
     space = problem.model.matrices(theta)
     return FrequencyEstimate(

@@ -183,7 +183,7 @@ def _gain_promise(fit: Fit) -> float:
 def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay) -> None:
     n_estimated = sum(p.role != "fixed" for p in parameters)
     if n_estimated == 0:
-        raise EstimationError("every parameter of the rig is fixed; nothing is left to identify. Free at least one")
+        raise EstimationError("every parameter of the rig is fixed, and none is left to identify. Free at least one")
     least = 10 * (n_estimated + 3 * len(model.states)) + MAX_DELAY
     if signals.y.shape[0] < least:
         raise EstimationError(

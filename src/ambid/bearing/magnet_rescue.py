@@ -10,7 +10,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
-from ambid.bearing.rescue import FAR, PAST, look_elsewhere
+from ambid.bearing.rescue import NOT_CONVERGED, PAST, look_elsewhere, predictable
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.predictor import noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -98,9 +98,8 @@ def failure(fit: BearingFit) -> str:
     Returns empty where it did not: it converged, or a linear regression on the past explains little of what it leaves.
     """
     if fit.status == "converged":
-        part = max(_unexplained(fit, r) for r in range(len(fit.problem.records)))
-        return f"a linear regression on the past explains {100 * part:.0f} % of the errors' variance" * (part > FAR)
-    return "no search converged"
+        return predictable(max(_unexplained(fit, r) for r in range(len(fit.problem.records))))
+    return NOT_CONVERGED
 
 
 def _unexplained(fit: BearingFit, r: int) -> float:

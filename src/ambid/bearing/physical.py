@@ -26,7 +26,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, Parametric
 from ambid.estimation.linear import one_thread
-from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
+from ambid.estimation.uncertainty import WEAK, natural_sizes, p_text, weakest_direction
 from ambid.physics.linear_model import LinearModel, Parameter
 
 _MISFIT = 1e-3  # probability of the misfit below which a black box does not agree with this physics
@@ -92,9 +92,9 @@ def physical_parameters(
     free = [p for p in parameters if p.role != "fixed"]
     missing = [p.name for p in model.parameters if p.name not in {q.name for q in parameters}]
     if missing:
-        raise EstimationError(f"nothing is said of parameter {missing[0]!r} of {model.name!r}. Give it, free or fixed")
+        raise EstimationError(f"parameter {missing[0]!r} of {model.name!r} is missing. Give it, free or fixed")
     if not free:
-        raise EstimationError("every parameter is fixed; nothing is left to find. Free at least one")
+        raise EstimationError("every parameter is fixed, and none is left to estimate. Free at least one")
     with one_thread():
         return _find(fit, model, parameters, free, delay, roles or {})
 
@@ -128,7 +128,7 @@ def _result(
     *,
     delay_how: Literal["estimated", "given"],
 ) -> PhysicalFit:
-    """Covariance, misfit and identifiability of a finished match."""
+    """Covariance, goodness of fit and identifiability of a finished match."""
     names, theta, n = found.names, found.theta, len(found.names)
     own = spread(target, found)
     check, factor = _misfit(fit, model, target, found, own)
@@ -140,10 +140,12 @@ def _result(
     near = factor**2 < _GROSS
     seen = {k: near and bool(r < WEAK**2) for k, r in zip(names, relative, strict=True)}
     warnings = [] if check.passed else [check.detail]
-    warnings += [f"the black box fails its own check: {c.detail}" for c in fit.checks.values() if not c.passed]
+    warnings += [
+        f"a check of the {fit.structure} model failed: {c.detail}" for c in fit.checks.values() if not c.passed
+    ]
     hidden = [k for k, r in zip(names, relative, strict=True) if not r < WEAK**2]
     if hidden:
-        warnings.append(f"the black box does not show {', '.join(hidden)}: relative sd above {WEAK:.0%}")
+        warnings.append(f"not identifiable from the {fit.structure} model (sd above {WEAK:.0%}): {', '.join(hidden)}")
     samples = found.delay / fit.dt
     steps = int(np.floor(samples + 1e-9))
     return PhysicalFit(
@@ -181,7 +183,7 @@ def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match, 
     from scipy.stats import chi2, f
 
     if target.rank - len(found.names) - found.delay_free + found.n_priors <= 0:
-        return Check(passed=True, detail="the black box has no number left to test the physics by", p=None), 1.0
+        return Check(passed=True, detail="no degrees of freedom are left to test the physical model", p=None), 1.0
     mean = float(np.sum(own.left))
     freedom = mean**2 / float(np.sum(own.left**2))
     left = found.criterion / mean * freedom
@@ -189,19 +191,19 @@ def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match, 
         p = float(chi2.sf(left, freedom))
     else:
         p = float(f.sf(left / freedom, freedom, freedom * (target.groups - 1)))
-    text = f"chi-square {left:.4g} for {freedom:.3g} degrees of freedom (p = {p:.2g})"
+    text = f"chi-square {left:.4g} with {freedom:.3g} degrees of freedom, {p_text(p)}"
     passed, factor = p > _MISFIT, max(1.0, float(np.sqrt(left / freedom)))
     if passed:
-        detail = f"the {fit.structure} model agrees with {model.name!r}: {text}"
+        detail = f"the {fit.structure} model agrees with {model.name!r} ({text})"
     elif factor**2 < _GROSS:
         detail = (
-            f"the {fit.structure} model agrees with {model.name!r} only roughly: {text}. Standard deviations are "
-            f"widened by {factor:.2g}; other orders or the grey-box method may do better"
+            f"the {fit.structure} model agrees only roughly with {model.name!r} ({text}): standard deviations are "
+            f"multiplied by {factor:.2g}. Try other orders, or the grey-box method"
         )
     else:
         detail = (
-            f"the {fit.structure} model is not a {model.name!r} plant: {text}. Other orders (a delay takes poles too), "
-            "a structure that stands feedback, or the grey-box method"
+            f"the {fit.structure} model contradicts {model.name!r} ({text}). Try other orders (a delay needs poles "
+            "too), a structure that is consistent in closed loop, or the grey-box method"
         )
     values = {"statistic": left, "freedom": freedom}
     return Check(passed=passed, detail=detail, p=p, values=values), factor
@@ -300,7 +302,7 @@ def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], d
     if not scored:
         raise EstimationError(
             f"no plant of {model.name!r} with positive {', '.join(p.name for p in model.parameters if p.positive)} "
-            "comes near this black box. Check channels and signs, or give start values"
+            f"resembles this black-box model. Check channels and signs, or give start values"
         )
     scored.sort(key=lambda s: s[0])
     found: list[Match] = []
@@ -327,8 +329,9 @@ def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], d
     physical = [m for m in found if all(m.theta[p.name] > 0 for p in model.parameters if p.positive)]
     if not physical or not np.isfinite(min(m.criterion for m in physical)):
         raise EstimationError(
-            f"the black box leads to a negative {' or '.join(p.name for p in model.parameters if p.positive)}: it is "
-            f"no {model.name!r} plant. Check channels and signs, and use a structure that stands feedback"
+            f"the match to {model.name!r} gives a negative "
+            f"{' or '.join(p.name for p in model.parameters if p.positive)}. Check channels and signs, and use a "
+            "structure that is consistent in closed loop"
         )
     best = min(physical, key=lambda m: m.criterion + _FRACTION * m.delay_free)
     if not best.delay_free:

@@ -18,6 +18,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, TransferModel, response_covariance
 from ambid.errors import EstimationError
 from ambid.physics.linear_model import DiscreteSpace, LinearModel, discretise
+from ambid.units import counted
 
 Complex = NDArray[np.complex128]
 
@@ -69,17 +70,17 @@ class Target:
 
 
 def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) -> Target:
-    """Take out of a black box what a physical model has to meet.
+    """Extract from a black box what a physical model has to match.
 
-    `roles`: role -> channel, where names do not tell.
+    `roles`: role -> channel, where names differ.
     """
     rows = [_place(role, fit.outputs, fit, model, roles, "output") for role in model.outputs]
     columns = [_place(role, fit.inputs, fit, model, roles, "input") for role in model.inputs]
     _check_poles(fit, model, rows, columns)
     if fit.covariance is None:
         raise EstimationError(
-            f"the {fit.structure} model has no covariance, so no uncertainty follows from it. Use a method that gives "
-            "one (arx, armax, oe, bj, sspem, pbsid)"
+            f"the {fit.structure} model has no covariance. Use a method that gives one (arx, armax, oe, bj, sspem, "
+            "pbsid)"
         )
     if isinstance(fit.model, TransferModel) and fit.model.delay_estimated:
         # the match holds the delay where it was found: what is open about it stands in the coefficients' own spread
@@ -94,7 +95,8 @@ def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) ->
     response, known = _known(fit, omega, rows, columns)
     if not np.any(known):
         raise EstimationError(
-            f"the {fit.structure} model knows its response nowhere to {_KNOWN:.0%}. Excite more, or record longer"
+            f"the response of the {fit.structure} model has a relative sd above {_KNOWN:.0%} at every frequency. "
+            "Excite more, or record longer"
         )
     grids = (np.linspace(0.0, high, _LINES), np.geomspace(low, high, _LINES // 2))
     everywhere = np.all(known, axis=(1, 2)).astype(np.float64)
@@ -119,7 +121,7 @@ def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) ->
 def _place(
     role: str, names: tuple[str, ...], fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str], what: str
 ) -> int:
-    """Find the channel of a role: as told, by name, or by unit."""
+    """Find the channel of a role: as given, by name, or by unit."""
     name = roles.get(role, role)
     if name in names:
         return names.index(name)
@@ -145,7 +147,8 @@ def _check_poles(fit: BlackBoxFit, model: LinearModel, rows: list[int], columns:
                 poles = fit.model.state_space().order
             if poles < least:
                 raise EstimationError(
-                    f"the {fit.structure} model has {poles} pole(s) from {fit.inputs[i]!r} to {fit.outputs[o]!r}; "
+                    f"the {fit.structure} model has {counted(poles, 'pole')} from {fit.inputs[i]!r} to "
+                    f"{fit.outputs[o]!r}; "
                     f"{model.name!r} has {least}. Identify it with an order of at least {least}"
                 )
 

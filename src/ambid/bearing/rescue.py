@@ -60,9 +60,18 @@ def reason(fit: Fit) -> str:
     Returns empty where it did not.
     """
     if fit.status != "converged":
-        return "no search converged"
-    part = unexplained(fit)
-    return f"a linear regression on the past explains {100 * part:.0f} % of the errors' variance" if part > FAR else ""
+        return NOT_CONVERGED
+    return predictable(unexplained(fit))
+
+
+NOT_CONVERGED = "no search converged"
+
+
+def predictable(part: float) -> str:
+    """Return why a fit counts as failed whose residuals a linear regression on the past predicts; empty if not."""
+    return (
+        f"a linear regression on past data predicts {100 * part:.0f} % of the residual variance" if part > FAR else ""
+    )
 
 
 def unexplained(fit: Fit) -> float:
@@ -163,22 +172,22 @@ def rescue(
 
 
 def describe_search(report: Mapping[str, object]) -> str:
-    """Return what a global search did, in one sentence for people.
+    """Return what a global search did, in one sentence.
 
     `report`: `global_search` of a fit.
     """
     before, after = report["criterion_before"], report["criterion_after"]
     out = f"the ordinary start values failed ({report['why']}): "
     if report["interrupted"]:
-        out += "a global search was interrupted, and the best so far is kept; "
+        out += "a global search was interrupted and "
     else:
-        out += f"a global search by differential evolution was made ({report['evaluations']} evaluations); "
+        out += f"a global search (differential evolution, {report['evaluations']} evaluations) "
     if not report["taken"]:
-        return out + "it found nothing better. Check columns, signs and units, delay and excitation"
+        return out + "found nothing better. Check columns, signs, units, delay and excitation"
     if before is None:
-        return out + "the fit comes from there"
+        return out + "found this fit"
     fall = float(str(before)) - float(str(after))
-    return out + f"the fit comes from there, its likelihood criterion lies {fall:.2g} per sample lower"
+    return out + f"found this fit, whose likelihood criterion is {fall:.2g} per sample lower"
 
 
 def _better(after: Fit, before: Fit) -> bool:

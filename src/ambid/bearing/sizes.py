@@ -120,7 +120,7 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     far = (logs - (low + high) / 2) / ((high - low) / 2)
     odd = [j for j in np.flatnonzero(~(np.abs(far) <= 1.0)) if np.isfinite(far[j])]
     if not odd:
-        return Check(passed=True, values={"unusual": 0.0}, detail="every size is usual for a magnetic bearing")
+        return Check(passed=True, values={"unusual": 0.0}, detail="all sizes are typical of magnetic bearings")
     if all(sizes[j].source == "rig" for j in odd):
         wrong = _mistaken_values(parameters, values)
         if wrong:
@@ -133,7 +133,7 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
     slips = _slips(far, symmetry / ((high - low) / 2)[:, None])
     worst = max(odd, key=lambda j: abs(far[j]))
     what = f"{sizes[worst].name} = {10 ** logs[worst]:.3g} {sizes[worst].unit}"
-    what += f" is unusual (usual {sizes[worst].usual[0]:.3g} to {sizes[worst].usual[1]:.3g})"
+    what += f" is unusual (usually {sizes[worst].usual[0]:.3g} to {sizes[worst].usual[1]:.3g})"
     if slips:
         factors: dict[str, float] = {}
         for slip in slips:
@@ -142,14 +142,14 @@ def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], si
         return Check(
             passed=False,
             values={**factors, "unusual": float(len(odd))},
-            detail=f"{what}. Every size is usual if {words}. Correct the unit in the record's header, or give "
+            detail=f"{what}. All sizes are typical if {words}. Correct the unit in the record's header, or give "
             f"channels.{slips[0].channel}.gain",
         )
     possible = all(s.possible[0] <= 10**x <= s.possible[1] for s, x in zip(sizes, logs, strict=True) if np.isfinite(x))
     return Check(
         passed=possible,
         values={"unusual": float(len(odd))},
-        detail=f"{what}, and no single unit explains it. Check units, calibration and sampling rate",
+        detail=f"{what}, and no wrong unit of one channel explains it. Check units, calibration and sampling rate",
     )
 
 
@@ -164,8 +164,8 @@ def _mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) ->
         thousands = round(decades / 3.0)
         if thousands and abs(decades - 3.0 * thousands) < _EXACT:
             found.append(
-                f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times what the record shows "
-                f"({alone:.4g} {p.unit}). Correct its unit there"
+                f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times the value from the "
+                f"data ({alone:.4g} {p.unit}). Correct its unit in the rig"
             )
     return found
 

@@ -28,12 +28,12 @@ _LONG = 75.0  # memories of the predictor from which noise levels are known well
 _FELT = 1.1  # factor on standard deviations below which rough noise levels do not matter
 STRETCHES = 30  # stretches of the record for the robust covariance
 _ADVICE = {
-    "k_x": "k_x shows where the displacement force counts: excite more at low frequency (from {low:.2g} Hz), or larger",
-    "k_i": "k_i shows in the motional voltage and in the force: excite larger motion near {mid:.3g} Hz",
-    "m": "m shows in the acceleration: excite up to {mid:.3g} Hz and beyond, larger",
-    "R": "R shows in slow currents: add steps of the voltage that are held for {settle:.2g} s or longer",
-    "L": "L shows in fast changes of the current: excite around {corner:.3g} Hz and above",
-    "c": "c shows near the mechanical resonance: excite around {low:.3g} Hz",
+    "k_x": "for k_x, excite more at low frequency (from {low:.2g} Hz) or with a larger amplitude",
+    "k_i": "for k_i, excite larger motion near {mid:.3g} Hz",
+    "m": "for m, excite larger motion at {mid:.3g} Hz and above",
+    "R": "for R, add voltage steps held for {settle:.2g} s or longer",
+    "L": "for L, excite at {corner:.3g} Hz and above",
+    "c": "for c, excite near the mechanical resonance, around {low:.3g} Hz",
 }
 
 
@@ -216,7 +216,7 @@ def _scatter(scores: Array) -> Array:
 def experiment_hint(
     u: Uncertainty, values: Mapping[str, float], band_hz: tuple[float, float, float], *, robust: bool
 ) -> str | None:
-    """Say which experiment would show the weakest direction.
+    """Return the experiment that would make the weakest direction identifiable.
 
     `values`: all parameters, SI; `robust`: which standard deviations count. Returns none where everything is
     identifiable.
@@ -229,19 +229,20 @@ def experiment_hint(
         "R" not in values and {"k_x", "k_i", "m"} & in_direction and len(in_direction) > 1
     ):
         return (
-            "m, k_x and k_i can only be told up to a common factor: the motional voltage k_i x' is lost in the noise. "
-            "Weigh the rotor and fix m (or give a prior), or excite faster and larger motion"
+            "Only the ratios of m, k_x and k_i are identifiable: the back-EMF k_i dx/dt is lost in the noise. Weigh "
+            "the rotor and fix m (or give a prior), or excite faster and larger motion"
         )
     frequencies = _frequencies(values, band_hz)
     advice = [_ADVICE[name].format(**frequencies) for name in unseen if name in _ADVICE]
     worst = float(max(u.relative_sd(robust=robust)))
     factor = worst / WEAK
     more = (
-        f"with the same band, {factor:.2g} times the amplitude or {factor**2:.2g} times the length would do"
+        f"in the same band, {factor:.2g} times the amplitude or {factor**2:.2g} times the length suffices"
         if factor < 1e3
         else ""
     )
-    return "; ".join([*advice, *([more] if more else [])])
+    hint = "; ".join([*advice, *([more] if more else [])])
+    return hint[:1].upper() + hint[1:]
 
 
 def _frequencies(values: Mapping[str, float], band_hz: tuple[float, float, float]) -> dict[str, float]:

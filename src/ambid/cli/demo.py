@@ -27,7 +27,7 @@ _INSIDE = 3.29  # standard deviations of a 99.9 % interval
 def command() -> None:
     """Identify the embedded record and print the estimate beside the truth.
 
-    The record: 0.4 s of an unstable bearing, levitated by a PID, simulated with noise. Nothing is known beforehand.
+    The record: 0.4 s of an unstable bearing levitated by a PID controller, simulated with noise. No parameter is given.
     """
     from ambid.job import identify
     from ambid.physics.presets import preset
@@ -42,12 +42,12 @@ def command() -> None:
         estimate = identify(record, rig, tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
-    typer.echo(f"{header_lines(estimate, paint=paint)[0]}\nsimulated in closed loop; nothing was known beforehand\n")
+    typer.echo(f"{header_lines(estimate, paint=paint)[0]}\nsimulated in closed loop; no parameter was given\n")
     typer.echo("\n".join(truth_lines(estimate.parameters, truth, paint)))
     typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(output_rows(estimate))]))
     typer.echo("\n" + "\n".join(check_lines(estimate.checks, paint=paint)))
     whole = sum(estimate.timing_s.values())
-    typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate; the thesis needed about 5 s")
+    typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate (the thesis* reports about 5 s)")
 
 
 def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float], paint: Paint) -> list[str]:
@@ -69,12 +69,13 @@ def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float
         scale, decimals = p.value / float(q.value), len(q.value.partition(".")[2])
         shown = f"{true / scale:.{decimals}f} {q.unit}"
         errors = (_percent(p.value - true, true, 2), f"{z:+.1f}", _percent(got - was, was, 1))
-        rows.append((p.name, q.text, shown, *errors, "identified" if p.identifiable else "NOT SHOWN"))
+        rows.append((p.name, q.text, shown, *errors, "identified" if p.identifiable else "not identifiable"))
     mark = paint("✓", "good") if all(inside) else paint("✗", "bad")
     return [
         *columns(rows, right=(3, 4, 5)),
-        "* what the thesis's own method was off by, on its simulation rig (4.10 → 4.11)",
-        f"{mark} {sum(inside)} of {len(inside)} truths lie inside their 99.9 % intervals",
+        "* error in eq. 4.11 of the thesis that ambid builds on, 'Physical parameters",
+        "  identification for a prototype of Active Magnetic Bearing system', simulated",
+        f"{mark} {sum(inside)} of {len(inside)} true values lie in their 99.9 % intervals",
     ]
 
 

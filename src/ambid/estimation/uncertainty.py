@@ -127,6 +127,11 @@ def chi_squared_tail(degrees: int, x: float) -> float:
     return min(1.0, sum(terms, erfc(sqrt(half)) if shift else 0.0))
 
 
+def p_text(p: float) -> str:
+    """Return a probability as it is printed: one that has underflowed to zero is given as a bound."""
+    return "p < 1e-16" if p < 1e-16 else f"p = {p:.2g}"
+
+
 def explained_by_past(
     parts: Sequence[tuple[Array, Sequence[tuple[Array, int]]]], *, least: float = 4.0
 ) -> tuple[float, float, int]:

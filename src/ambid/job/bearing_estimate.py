@@ -19,9 +19,8 @@ from ambid.bearing.rescue import describe_search
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
-from ambid.validation.nonlinear_bearing import WhitenessTest, whiteness
+from ambid.validation.nonlinear_bearing import WhitenessTest, whiteness, whiteness_checks
 
-_P_LEAST = 1e-3  # as for the linear model
 _INFLATION = 1.5  # robust over information standard deviation from which the model, not the noise, sets the error
 _ROLES = ("position", "current")
 
@@ -37,7 +36,7 @@ def judge_bearing(
     problem, names = fit.problem, _names(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
         tests = list(threads.map(lambda r: whiteness(fit, r), range(len(problem.records))))
-    residuals = _residuals(tests, names)
+    residuals = whiteness_checks(tests, names)
     robust = not all(c.passed for c in residuals.values()) or known.inflation > _INFLATION or fit.status != "converged"
     parameters = _parameters(fit, known, robust=robust)
     checks = {**residuals, "identifiable": _shown(parameters)} | _gravity(fit)
@@ -60,25 +59,6 @@ def judge_bearing(
         bic=fit.criterion + problem.size * float(np.log(problem.n_used)), checks=checks,
         warnings=_warnings(fit, checks, robust=robust) + changed,
     )  # fmt: skip
-
-
-def _residuals(tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, Check]:
-    """One-step errors against their own past and against past voltages: a check passes where every record does."""
-    against = {
-        "residuals_white": ("their past", [t.p_own for t in tests]),
-        "residuals_uncorrelated": ("past voltages", [t.p_input for t in tests]),
-    }
-    found = {}
-    for check, (what, p) in against.items():
-        worst = min(range(len(p)), key=lambda r: p[r])
-        more = f", largest correlation {max(t.largest for t in tests):.3f}" if check == "residuals_white" else ""
-        found[check] = Check(
-            passed=p[worst] >= _P_LEAST,
-            p=p[worst],
-            detail=f"one-step errors against {what}: p = {p[worst]:.2g} on {names[worst]}{more}",
-            values=dict(zip(names, p, strict=True)),
-        )
-    return found
 
 
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
@@ -119,7 +99,7 @@ def _names(fit: BearingFit) -> list[str]:
 
 
 def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
-    """Every number that acts, as it came out."""
+    """Return every number that acts."""
     law, values, found = fit.problem.law, fit.problem.values(fit.vector), []
     sds = np.sqrt(np.diag(known.covariance(robust=robust)))
     acts = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair, "a": fit.problem.eddy}
@@ -148,15 +128,15 @@ def _parameters(fit: BearingFit, known: BearingUncertainty, *, robust: bool) -> 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
 
     hidden = [p.name for p in parameters if not p.identifiable]
-    detail = "the records show every number" if not hidden else (
-        f"the records do not show {', '.join(hidden)} (relative standard deviation above 25 %): fix them, "
+    detail = "every estimated parameter is identifiable" if not hidden else (
+        f"not identifiable from these records: {', '.join(hidden)} (relative standard deviation above 25 %). Fix them, "
         "give a prior, or record with more motion"
     )  # fmt: skip
     return Check(passed=not hidden, detail=detail)
 
 
 def _gravity(fit: BearingFit) -> dict[str, Check]:
-    """For one magnet: does the law carry the weight where the rotor stood, whatever the dynamics say?"""
+    """Check, for one magnet, that the force law carries the weight at the mean position of every record."""
     law, values = fit.problem.law, fit.problem.values(fit.vector)
     weight = values["m"] * values["g"]
     if law.pair or weight == 0.0:
@@ -177,33 +157,33 @@ def _hull(points: Array) -> Array:
 
 
 def _unseen(fit: BearingFit) -> list[str]:
-    """What no record can show, however well it is explained: the scale of the position, and whose an offset is."""
+    """What no record can identify, however good the fit: a gain of the position sensor, the source of an offset."""
     free, values = {n.name for n in fit.problem.estimated if n.prior_sd == float("inf")}, fit.problem.values(fit.vector)
     found = []
     scaled = ("k", "s") if fit.problem.law.gap == "hyperbolic" else ("zeta",)
     if "m" in free and values["g"] == 0.0 and set(scaled) <= free:
         found.append(
-            "a wrong gain of the position sensor cannot be seen while m is free: 1 % too much makes m 2 %, k_x 2 % and "
-            "k_i 1 % too small, and s and k 1 % too large. Fix m where it is weighed: the residuals then show it"
+            "a gain error of the position sensor cannot be detected while m is free: 1 % too much makes m and k_x 2 % "
+            "and k_i 1 % too small, and s and k 1 % too large. Weigh the rotor and fix m: the residuals then reveal it"
         )
     if "i0_asym" in free and "i_offset" not in free:
-        found.append("i0_asym may as well be an offset of the current sensor: the records do not tell them apart")
+        found.append("i0_asym cannot be distinguished from an offset of the current sensor")
     return found
 
 
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
+    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
 
     if fit.global_search is not None:
         found.append(describe_search(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
-            "the model explains the records only in part: standard deviations are robust ones (scatter over the "
-            "records), and cannot cover a bias that is the same everywhere"
+            "the model does not fully fit; standard errors are inflated (scatter over the records) but cannot cover a "
+            "systematic bias"
         )
     found += _unseen(fit)
     if fit.problem.drift:
-        found.append("a slowly walking force takes up what the law leaves over; forces at rest count for less then")
+        found.append("a random-walk force absorbs what the force law does not explain; static forces count for less")
     return tuple(found)

@@ -30,7 +30,7 @@ class Quantity:
     def text(self) -> str:
         """Value ± sd and unit on one line."""
         spread = f" ± {self.sd}" if self.sd else ""
-        return f"{self.value}{spread} {self.unit}".rstrip()
+        return _with_unit(f"{self.value}{spread}", self.unit)
 
 
 def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | None = None) -> Quantity:
@@ -43,7 +43,9 @@ def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | 
     if sd == 0 or lost:  # known exactly, or not at all: digits of the value alone
         scale, shown = prefixed(value, unit)
         spread = "" if sd == 0 else f"{sd / scale:.0e}" if math.isfinite(sd) else "inf"
-        return Quantity(value=f"{value / scale:.6g}", sd=spread, low="", high="", unit=shown, si=f"{value:.6g} {unit}")
+        return Quantity(
+            value=f"{value / scale:.6g}", sd=spread, low="", high="", unit=shown, si=_with_unit(f"{value:.6g}", unit)
+        )
     scale, shown = prefixed(max(abs(value), sd), unit)
     decimals = 1 - math.floor(math.log10(sd / scale))
     if float(f"{sd / scale:.{max(decimals, 0)}f}") >= 10.0 ** (2 - decimals):
@@ -87,9 +89,9 @@ def si_text(value: float, digits: int, unit: str) -> str:
     size = math.floor(math.log10(abs(value))) if value else 0
     if -3 <= size <= 5:
         decimals = max(digits - 1 - size, 0)
-        return f"{value:.{decimals}f} {unit}"
+        return _with_unit(f"{value:.{decimals}f}", unit)
     mantissa, exponent = f"{value:.{max(digits - 1, 0)}e}".split("e")
-    return f"{mantissa}e{int(exponent)} {unit}"
+    return _with_unit(f"{mantissa}e{int(exponent)}", unit)
 
 
 def sized(value: float, unit: str, digits: int = 3) -> str:
@@ -98,7 +100,7 @@ def sized(value: float, unit: str, digits: int = 3) -> str:
     `value`: in `unit`; `unit`: SI unit; `digits`: significant digits. Returns such as ``"104 nm"``.
     """
     scale, shown = prefixed(float(f"{value:.{digits}g}"), unit)
-    return f"{value / scale:.{digits}g} {shown}"
+    return _with_unit(f"{value / scale:.{digits}g}", shown)
 
 
 def response_unit(units: Mapping[str, str], output: str, source: str) -> str:
@@ -109,6 +111,11 @@ def response_unit(units: Mapping[str, str], output: str, source: str) -> str:
     if below == "1":
         return above
     return f"{above}/({below})" if set(below) & set(" /") else f"{above}/{below}"
+
+
+def _with_unit(text: str, unit: str) -> str:
+    """Put the unit behind a number; a plain number has none to show."""
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def _fixed(x: float, decimals: int) -> str:

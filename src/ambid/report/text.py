@@ -142,8 +142,8 @@ def verdict(p: EstimatedParameter, found: Verdict = _USABLE) -> str:
         return WORDS[word][0]
     if p.role == "prior":
         share = "" if p.data_share is None else f", {100 * p.data_share:.0f} % data"
-        return f"prior{share}" if p.identifiable else f"prior, NOT SHOWN{share}"
-    return "identified" if p.identifiable else "NOT SHOWN"
+        return f"prior{share}" if p.identifiable else f"prior, not identifiable{share}"
+    return "identified" if p.identifiable else "not identifiable"
 
 
 def _word_for_all(found: Verdict) -> str:
@@ -156,14 +156,13 @@ def delay_line(what: str, d: Delay, rate_hz: float) -> str:
     """Say by how much an input is delayed."""
     total = d.samples + d.fraction
     count = f"{total:.3g}" if d.sd is None else pure(total, d.sd)
-    plural = "" if count == "1" else "s"
     time = f" ({sized(total / rate_hz, 's')})" if total else ""
-    return f"delay of {what}: {count} sample{plural}{time}, {d.how}"
+    return f"delay of {what}: {count} sample{'' if count == '1' else 's'}{time}, {d.how}"
 
 
 def pure(value: float, sd: float) -> str:
     """Write a number without unit ± its standard deviation."""
-    return quantity(value, sd, "1").text.removesuffix(" 1")
+    return quantity(value, sd, "1").text
 
 
 def coefficient_text(value: float, sd: float | None) -> str:

@@ -150,12 +150,12 @@ def _summary(entries: Sequence[Entry]) -> str:
     """Say in one line what the differences of BIC mean: twice the log of the odds (Kass and Raftery 1995)."""
     scored = sorted((x for x in entries if x.fit is not None and "bic" in x.fit.criteria), key=_bic)
     if len(scored) < 2:
-        return "one structure: nothing to compare"
+        return "only one structure was fitted"
     gap = _bic(scored[1]) - _bic(scored[0])
-    strength = "hardly any" if gap < 2 else "some" if gap < 6 else "strong" if gap < 10 else "very strong"
+    strength = "negligible" if gap < 2 else "positive" if gap < 6 else "strong" if gap < 10 else "very strong"
     return (
         f"BIC of {scored[0].structure} is {gap:.3g} below that of {scored[1].structure}: {strength} evidence for it "
-        "(under 2 is chance, above 10 is clear)"
+        "(Kass and Raftery: below 2 negligible, above 10 very strong)"
     )
 
 

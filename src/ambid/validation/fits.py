@@ -23,9 +23,10 @@ from ambid.blackbox.prediction import Errors, Gradient, errors, errors_elsewhere
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
-from ambid.estimation.uncertainty import criteria, skipped
+from ambid.estimation.uncertainty import criteria, p_text, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
+from ambid.units import counted
 from ambid.validation.residuals import (
     LEAST,
     MOST,
@@ -65,7 +66,7 @@ def judge(fit: AnyFit, records: IOData | Sequence[IOData], *, second: IOData | N
     """
     own = [records] if isinstance(records, IOData) else list(records)
     if not own:
-        raise EstimationError("there is no record to judge on. Pass those that the fit was estimated from")
+        raise EstimationError("no record was given. Pass those that the fit was estimated from")
     if isinstance(fit, BlackBoxFit):
         return _judge_linear(fit, own[0], second)
     return fit if fit.model is None else _judge_nonlinear(fit, own, second)
@@ -174,16 +175,16 @@ def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tup
     for name, sizes in found.items():
         one, usual = sizes["one_step"], fit.fit[name].innovation_sd
         if one is None or not math.isfinite(one["rmse"]):
-            said.append(f"no one-step prediction of {name} that stays finite")
+            said.append(f"the one-step prediction of {name} diverges")
         elif one["rmse"] > _GROWN * usual:
             said.append(
                 f"one-step errors of {name} are {one['rmse'] / usual:.3g} times as large as at identification"
                 if usual > 0
-                else f"one-step errors of {name} are not zero as they were at identification"
+                else f"one-step errors of {name} are not zero, as they were at identification"
             )
     share = max((float(sizes.get("extrapolated", 0.0)) for sizes in found.values()), default=0.0)
     if share > _OUTSIDE:
-        said.append(f"{100 * share:.2g} % of it lies outside the training data, where standard deviations say nothing")
+        said.append(f"{100 * share:.2g} % of it lies outside the training data, where the model extrapolates")
     return tuple(said)
 
 
@@ -254,7 +255,7 @@ def run(fit: NonlinearFit, data: IOData) -> Run:
 def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
     """Return the model of a fit if it can be run on a record."""
     if fit.model is None:
-        raise EstimationError(f"the fit has failed and holds no model: {fit.reason or 'no reason is given'}. Fit again")
+        raise EstimationError(f"the fit failed and has no model: {fit.reason or 'unknown reason'}. Fit again")
     if (data.inputs, data.outputs) != (fit.inputs, fit.outputs):
         raise EstimationError(
             f"the record has inputs {', '.join(data.inputs) or '(none)'} and outputs {', '.join(data.outputs)}, the "
@@ -266,7 +267,8 @@ def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
         )
     if data.n_samples <= fit.model.lag:
         raise EstimationError(
-            f"the record has {data.n_samples} samples; the model looks back over {fit.model.lag}. Give a longer record"
+            f"the record has {counted(data.n_samples, 'sample')}; the model needs more than {fit.model.lag}. Give a "
+            "longer record"
         )
     return fit.model
 
@@ -338,13 +340,13 @@ def _feedback_warnings(
         return []
     open_loop = all(x.open_loop for x in records)
     if open_loop and tests is not None and tests.feedback_seen and not tests.explained_by_inputs:
-        return ["the records are said to be open loop, but inputs depend on past residuals: leave --open-loop out"]
+        return ["--open-loop was given, but inputs depend on past residuals: there is feedback. Omit --open-loop"]
     said = any("biased" in x and "open loop" in x for x in fit.warnings)
     if open_loop or said or not subject.biased:
         return []
     return [
-        f"{subject.name} has no noise model and is biased where a controller was at work, and nothing says that "
-        "these records are open loop: use narmax with ne > 0, or say --open-loop if there was no feedback"
+        f"{subject.name} has no noise model and is biased by feedback. Use narmax with ne > 0, or give --open-loop "
+        "if the records are open loop"
     ]
 
 
@@ -352,9 +354,7 @@ def _check_finite(runs: Sequence[Run]) -> Check:
     """Check that the one-step errors are finite on all records."""
     bad = [k + 1 for k, r in enumerate(runs) if not r.finite]
     where = f"record {bad[0]}" if bad else ""
-    detail = (
-        f"one-step errors grow beyond all numbers on {where}" if bad else "one-step errors are finite on all records"
-    )
+    detail = f"one-step predictions diverge on {where}" if bad else "one-step predictions are finite on all records"
     return Check(passed=not bad, detail=detail, values={"diverged": float(len(bad))})
 
 
@@ -378,21 +378,19 @@ def _check_simulation(records: Sequence[IOData], runs: Sequence[Run], tests: Res
     values = {"diverged": float(len(gone)), "reach": reach}
     loop = tests is not None and tests.feedback_seen
     excuse = (
-        "; there is feedback, and the plant may be unstable: judge by predictions"
+        "; with feedback the plant may be unstable: judge by predictions"
         if loop
-        else ": the model predicts, but does not simulate"
+        else ": the model is fit for prediction, not for simulation"
     )
     if gone:
         k, at = gone[0]
         assert at is not None
-        detail = f"the free run of record {k + 1} diverges {at * records[k].dt:.3g} s after its start{excuse}"
+        detail = f"the simulation of record {k + 1} diverges after {at * records[k].dt:.3g} s{excuse}"
         return Check(passed=loop, detail=detail, values=values)
     if reach > _REACH:
-        detail = f"the free run reaches {reach:.3g} times the span of what was measured{excuse}"
+        detail = f"the simulated output spans {reach:.3g} times the measured range{excuse}"
         return Check(passed=loop, detail=detail, values=values)
-    return Check(
-        passed=True, detail=f"the free run stays finite, at {reach:.3g} times the measured span", values=values
-    )
+    return Check(passed=True, detail=f"the simulated output spans {reach:.3g} times the measured range", values=values)
 
 
 def _extrapolation_warnings(share: float) -> list[str]:
@@ -400,16 +398,16 @@ def _extrapolation_warnings(share: float) -> list[str]:
     if share <= _SHARE:
         return []
     return [
-        f"{100 * share:.2g} % of the second record lies outside what the model was trained on: there it extrapolates, "
-        "and its standard deviations say nothing"
+        f"{100 * share:.2g} % of the second record lies outside the training data: the model extrapolates there, and "
+        "its standard deviations do not apply"
     ]
 
 
 def _unconverged_warnings(fit: NonlinearFit) -> list[str]:
-    """Say that a search did not converge, where the estimator has not."""
+    """Warn that a search did not converge, where the estimator has not."""
     if fit.status != "stalled" or any("converge" in x or "interrupted" in x for x in fit.warnings):
         return []
-    return ["the training did not converge: the best of its steps is given; more iterations may go on from there"]
+    return ["training did not converge; the best iterate is kept. Allow more iterations"]
 
 
 def leaves_colour_open(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run]) -> bool:
@@ -462,8 +460,8 @@ def _check_predictor(found: Errors) -> Check:
     return Check(
         passed=ok,
         values={"radius": radius},
-        detail=f"the predictor's poles are within {radius:.4g} of zero"
-        + ("" if ok else ": its errors grow without bound. Take a structure with a noise model, or other orders"),
+        detail=f"the predictor is {'stable' if ok else 'unstable'} (largest pole magnitude {radius:.4g})"
+        + ("" if ok else ". Use a structure with a noise model, or other orders"),
     )
 
 
@@ -471,13 +469,13 @@ def _feedback_warning(subject: Subject, tests: ResidualTests, *, open_loop: bool
     """Warn where the data show feedback that the user or the structure excludes."""
     if tests.feedback is None or tests.feedback.passed:
         return []
-    evidence = f"{describe_feedback(tests.feedback)} (p = {tests.feedback.p:.2g})"
+    evidence = f"{describe_feedback(tests.feedback)} ({p_text(tests.feedback.p)})"
     if subject.biased:
         if tests.explained_by_inputs:
-            return [f"{evidence}: feedback, by which {subject.name} is biased, or what the model misses"]
-        return [f"there is feedback in this record: {evidence}; {subject.name} is biased by it. Use bj, armax or pbsid"]
+            return [f"{evidence}: feedback, which biases {subject.name}, or an incomplete model"]
+        return [f"there is feedback: {evidence}. It biases {subject.name}; use bj, armax or pbsid"]
     if open_loop and not tests.explained_by_inputs:
-        return [f"the record is said to be open loop, but {evidence}: leave --open-loop out"]
+        return [f"--open-loop was given, but {evidence}: there is feedback. Omit --open-loop"]
     return []
 
 
@@ -485,14 +483,14 @@ def _coloured_warning(fit: BlackBoxFit, *, adjusted: bool) -> list[str]:
     """Say how far the standard deviations of an output-error model hold under coloured noise."""
     if adjusted:
         return [
-            f"the noise is coloured, which {fit.structure} does not describe: standard deviations allow for it; "
-            "a noise model (bj) would make them smaller"
+            f"the noise is coloured, and {fit.structure} has no noise model: standard deviations allow for it; a noise "
+            "model (bj) would reduce them"
         ]
     if fit.covariance is None:
         return []
     return [
-        f"the noise is coloured, which {fit.structure} does not describe; its standard deviations are those of "
-        "white noise: they may be too small. Use a structure with a noise model"
+        f"the noise is coloured, and {fit.structure} has no noise model: standard deviations assume white noise and "
+        "may be too small. Use a structure with a noise model"
     ]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +14,8 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
+from ambid.estimation.uncertainty import p_text
+from ambid.units import counted
 from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validation.second_record import conclude, consistency_check
 
@@ -108,7 +110,7 @@ def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_o
         of_kind = [r for r in estimate.records if bool(r["held"]) == record.held]
         rates = ", ".join(dict.fromkeys(f"{float(str(r['rate_hz'])):g} Hz" for r in of_kind))
         raise EstimationError(
-            f"{record.name} is sampled at {record.rate_hz:g} Hz, the estimate's predictor at {rates}; they have to "
+            f"{record.name} is sampled at {record.rate_hz:g} Hz, the estimate's predictor at {rates}; the rates must "
             "agree. Resample the record, or identify with it"
         )
     best, found = np.inf, None
@@ -118,7 +120,7 @@ def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_o
             best, found = fit.criterion, (name, fit)
     if found is None:
         raise EstimationError(
-            f"the estimate makes no predictor for {record.name}. Check that both are of the same bench"
+            f"the estimate gives no stable predictor for {record.name}. Check that both come from the same bench"
         )
     name, fit = found
     return _replayed(fit, name)
@@ -155,7 +157,7 @@ def _fit(
     )
     if record.u.size < problem.skip + 60:
         raise EstimationError(
-            f"{record.name} has {record.u.size} samples; too few to judge an estimate. Give a longer one"
+            f"{record.name} has {counted(record.u.size, 'sample')}, too few to test an estimate. Give a longer one"
         )
     vector = problem.start()
     value = criterion(problem, vector)
@@ -194,20 +196,10 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
     before = [estimate.fit[found.noise_of][role].innovation_sd for role in _ROLES]
     one_step, ratio = fit_of(errors, measured), rms / np.array(before)
     outside = 1.0 - float(np.mean(estimate.covers(record.kept)))
-    test = whiteness(found.fit, 0)
     checks = {
-        "residuals_white": Check(
-            passed=test.p_own >= P_LEAST,
-            p=test.p_own,
-            detail=f"one-step errors against their past: p = {test.p_own:.2g}, largest correlation {test.largest:.3f}",
-        ),
-        "residuals_uncorrelated": Check(
-            passed=test.p_input >= P_LEAST,
-            p=test.p_input,
-            detail=f"one-step errors against past voltages: p = {test.p_input:.2g}",
-        ),
+        **whiteness_checks([whiteness(found.fit, 0)]),
         "innovations_consistent": consistency_check(
-            dict(zip(_ROLES, ratio.tolist(), strict=True)), "one-step errors", f"on {found.noise_of} "
+            dict(zip(_ROLES, ratio.tolist(), strict=True)), f"on {found.noise_of} at identification"
         ),
         "inside_range": _inside(estimate, record, outside),
         **_carries(estimate, record),
@@ -228,15 +220,41 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
     }
 
 
+def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) -> dict[str, Check]:
+    """Check residuals against their own past and against past voltages; each passes where every record does.
+
+    `names`: of the records, where there are several.
+    """
+    found = {}
+    for check, what, p in (
+        ("residuals_white", ("not white", "white"), [t.p_own for t in tests]),
+        (
+            "residuals_uncorrelated",
+            tuple(f"{x}correlated with past voltages" for x in ("", "un")),
+            [t.p_input for t in tests],
+        ),
+    ):
+        worst = min(range(len(p)), key=lambda r: p[r])
+        passed = p[worst] >= P_LEAST
+        words = [p_text(p[worst]) + (f" on {names[worst]}" if names else "")]
+        if check == "residuals_white":
+            words.insert(0, f"largest autocorrelation {max(t.largest for t in tests):.3f}")
+        detail = f"residuals are {what[passed]} ({', '.join(words)})"
+        found[check] = Check(
+            passed=passed, p=p[worst], detail=detail, values=dict(zip(names, p, strict=True)) if names else {}
+        )
+    return found
+
+
 def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:
     low, high = record.kept.min(axis=0), record.kept.max(axis=0)
     seen = estimate.range
-    detail = f"{100 * outside:.2g} % of the record lies outside the positions and currents that the estimate has seen"
+    detail = f"{100 * outside:.2g} % of the record lies outside the positions and currents used for identification"
     if outside > _OUTSIDE:
         detail += (
-            f" (here {1e3 * low[0]:.4g} to {1e3 * high[0]:.4g} mm, {low[1]:.3g} to {high[1]:.3g} A; seen "
+            f" (here {1e3 * low[0]:.4g} to {1e3 * high[0]:.4g} mm, {low[1]:.3g} to {high[1]:.3g} A; there "
             f"{1e3 * seen['position'][0]:.4g} to {1e3 * seen['position'][1]:.4g} mm, "
-            f"{seen['current'][0]:.3g} to {seen['current'][1]:.3g} A): the law extrapolates there"
+            f"{seen['current'][0]:.3g} to {seen['current'][1]:.3g} A): the force law extrapolates"
         )
     return Check(passed=outside <= _OUTSIDE, detail=detail, values={"outside": outside})
 

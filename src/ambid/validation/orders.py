@@ -204,12 +204,12 @@ def _why(ranked: list[Candidate], by: Criterion) -> str:
     gap = ranked[1].scores[by] - best.scores[by]
     if by in ("holdout", "kfold"):
         share = 100 * gap / max(ranked[1].scores[by], 1e-300)
-        return f"{name}: least error on data not used in the fit ({by}), {share:.2g} % below the next of {len(ranked)}"
+        return f"{name}: smallest error on held-out data ({by}), {share:.2g} % below the next of {len(ranked)}"
     if by in ("mdl", "fpe"):
         share = 100 * gap / max(abs(ranked[1].scores[by]), 1e-300)
-        return f"{name}: least {by.upper()}, {share:.2g} % below the next of {len(ranked)}"
-    how = "clearly ahead of" if gap > 6 else "ahead of" if gap > 2 else "hardly better than"
-    return f"{name}: least {by.upper()}, {how} the next of {len(ranked)} (difference {gap:.3g}; under 2 is chance)"
+        return f"{name}: smallest {by.upper()}, {share:.2g} % below the next of {len(ranked)}"
+    how = "clearly better than" if gap > 6 else "better than" if gap > 2 else "about as good as"
+    return f"{name}: smallest {by.upper()}, {how} the next of {len(ranked)} (difference {gap:.3g})"
 
 
 Point = tuple[int, ...]

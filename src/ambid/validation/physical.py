@@ -26,11 +26,12 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, extend, free_one, search, sparse_gain, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.sensitivity import Products, products
-from ambid.estimation.uncertainty import chi_squared_tail
+from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
-from ambid.validation.residuals import P_LEAST, ResidualTest, residual_check
+from ambid.units import counted
+from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
@@ -107,13 +108,13 @@ def innovation_checks(fit: Fit, found: Products, known: Uncertainty, moved: Agre
     """
     own, inputs = innovation_tests(fit, found)
     return {
-        "residuals_white": residual_check(own, "innovations against their own past"),
-        "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
+        "residuals_white": white_check(own),
+        "residuals_uncorrelated": uncorrelated_check(inputs),
         "uncertainty_consistent": Check(
             passed=known.inflation < _INFLATION,
             values={"inflation": known.inflation},
-            detail=f"standard deviations from the scatter over the record are {known.inflation:.2f} times those from "
-            f"the information matrix (at most {_INFLATION:g})",
+            detail=f"robust standard deviations are up to {known.inflation:.2f} times those from the information "
+            f"matrix (limit {_INFLATION:g})",
         ),
         "estimates_agree": _estimates_agree(moved),
     }
@@ -172,14 +173,14 @@ def _explain_columns(fit: Fit, found: Products, cross: Array, inner: Array) -> t
 def _estimates_agree(moved: Agreement) -> Check:
     every = " and ".join(f"{s}{'nd' if s == 2 else 'th'}" for s in moved.strides)
     if not moved.strides:
-        detail = "the record could not be fitted with every 2nd or 4th output alone: one step ahead is all that fits"
+        detail = "refits to every 2nd or 4th output sample failed: the model fits one step ahead only"
     elif moved.passed:
-        detail = f"refits with every {every} output give the same parameters (largest shift {moved.largest:.1f} sd)"
+        detail = f"refits to every {every} output sample agree (largest parameter shift {moved.largest:.1f} sd)"
     else:
         far = ", ".join(f"{k} by {s:.3g}" for k, s in zip(moved.names, moved.disagreement(), strict=True))
         detail = (
-            f"refits with every {every} output move the parameters by up to {moved.largest:.1f} sd ({far} in SI): "
-            "the model does not fit this record; excite more, work in a smaller range, or look for what is missing"
+            f"refits to every {every} output sample shift the parameters by up to {moved.largest:.1f} sd ({far} in "
+            "SI): the model does not fit this record. Excite more, reduce the range of motion, or extend the model"
         )
     return Check(
         passed=moved.passed,
@@ -236,14 +237,14 @@ def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimate
 def _fixed_agree(fit: Fit) -> Check:
     """Score test of each fixed value: would the record, if asked, put it elsewhere?"""
     units = {p.name: p.unit for p in fit.problem.model.parameters}
-    worst, detail = 1.0, "the record does not speak against any fixed value"
+    worst, detail = 1.0, "the data agree with every fixed value"
     for name, value in fit.problem.known.items():
         statistic, there = free_one(fit, name)
         p = chi_squared_tail(1, statistic)
         if p < min(worst, P_LEAST):
             detail = (
-                f"the record speaks against {name} = {value:.4g} {units[name]}, which was fixed, and wants a "
-                f"{'larger' if there > value else 'smaller'} value (p = {p:.2g}). Check that value, or free it"
+                f"the data contradict the fixed {name} = {value:.4g} {units[name]}; a "
+                f"{'larger' if there > value else 'smaller'} value fits better ({p_text(p)}). Check it, or free it"
             )
         worst = min(worst, p)
     return Check(passed=worst >= P_LEAST, p=worst, detail=detail)
@@ -268,17 +269,18 @@ def _priors_agree(fit: Fit) -> Check:
         if not name or far > worst:
             worst, name = far, problem.estimated[j]
     if worst > _FAR:
-        detail = f"the record puts {name} {worst:.1f} sd away from its prior: one of them is wrong. Check the prior"
+        detail = f"the data place {name} {worst:.1f} sd from its prior: one of them is wrong. Check the prior"
     else:
-        detail = "priors and record agree" if name else "there are no priors"
+        detail = "the data agree with every prior" if name else "no priors were given"
     return Check(passed=worst <= _FAR, values={"largest_sd": worst}, detail=detail)
 
 
 def _delay_in_range(fit: Fit, how: Literal["estimated", "given"]) -> Check:
     total = fit.problem.delay_samples(fit.vector)
     inside = how == "given" or total < 2 * MAX_DELAY
-    doubt = "" if inside else ". That is long for a bench: check the columns, or give channels.<input>.delay"
-    return Check(passed=inside, values={"samples": total}, detail=f"the input acts {total:.3g} samples late{doubt}")
+    doubt = "" if inside else ", unusually long. Check the columns, or give channels.<input>.delay"
+    detail = f"the input delay is {counted(total, 'sample')}{doubt}"
+    return Check(passed=inside, values={"samples": total}, detail=detail)
 
 
 def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
@@ -290,15 +292,15 @@ def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
     """
     problem, n = fit.problem, fit.problem.n_physical
     if how == "given":
-        return Check(passed=True, detail="the delay was given: the other numbers are right if it is")
+        return Check(passed=True, detail="the delay was given; the estimates assume that it is right")
     if problem.fractional:
-        return Check(passed=True, detail="the delay was estimated as a real number and counts in the intervals")
+        return Check(passed=True, detail="a fractional delay was estimated; the intervals allow for it")
     freed = fit.freed
     if freed is None:
         rows = extend(fit, *free_delay(fit))
         freed = None if rows is None else rows[0]
     if freed is None:
-        return Check(passed=False, detail="the delay could not be freed at the estimate: give channels.<input>.delay")
+        return Check(passed=False, detail="a fractional delay could not be tested. Give channels.<input>.delay")
     found = directions(freed).inverse()
     s, own = float(np.sqrt(found[n, n])), np.diag(found)[:n]
     along = found[:n, n] / s
@@ -311,26 +313,26 @@ def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
     return Check(
         passed=passed,
         values={"unseen_samples": unseen, "shift_sd": shift, "missed": missed},
-        detail="a delay by a fraction of a sample would show before it moves a parameter out of its interval"
+        detail="a fractional delay large enough to bias a parameter beyond its interval would be detected"
         if passed
-        else f"the record cannot tell {name} from a delay of up to {unseen:.2g} samples more, which would move it by "
-        f"up to {shift:.2g} sd. Sample faster, excite more at high frequencies, or give channels.<input>.delay",
+        else f"an undetected further delay of up to {counted(unseen, 'sample')} could bias {name} by up to "
+        f"{shift:.2g} sd. Sample faster, excite more at high frequencies, or give channels.<input>.delay",
     )
 
 
 def _long_enough(known: Uncertainty) -> Check:
     enough = known.widening == 1.0
     detail = (
-        "the record is long enough to tell the noise levels"
+        "the record is long enough to estimate the noise levels"
         if enough
-        else "the record is too short to tell the noise levels: standard deviations are widened by up to "
+        else "the record is too short to estimate the noise levels: standard deviations are multiplied by up to "
         f"{known.widening:.2g}. Record longer"
     )
     return Check(passed=enough, values={"widening": known.widening}, detail=detail)
 
 
 def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
-    """Check whether the parameters are shown by the data, can exist, and come from signals within their limits.
+    """Check that the parameters are identifiable and possible, and come from signals within their limits.
 
     `record`: channels named by role; `robust`: which standard deviations count. Returns ``identifiable``,
     ``plausible``, ``within_limits``, ``signals_sound``.
@@ -341,7 +343,7 @@ def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: boo
     limits = {c.name: find_saturation(record, c.name) for c in record.channels}
     return {
         "identifiable": _identifiable(fit, known, theta, robust=robust),
-        "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical and the coil is passive"),
+        "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical; the coil is passive"),
         "within_limits": _within_limits(limits),
         "signals_sound": _signals_sound(record, fit.problem.model.outputs, limits),
     }
@@ -356,14 +358,15 @@ def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, r
     ]
     values = {"condition": float(known.singular_values[0] / known.singular_values[-1])}
     if not unseen:
-        return Check(passed=True, values=values, detail="the record shows every estimated parameter")
+        return Check(passed=True, values=values, detail="every estimated parameter is identifiable")
+    what = f"not identifiable from this record: {', '.join(unseen)}"
     if np.any(np.abs(known.disagreement) > 0.5 * known.standard_deviations(robust=robust)):
-        hint = "Not noise but disagreement of the refits makes it so: repeat it away from limits, with more excitation"
-        return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
+        hint = "The cause is not noise but disagreement of the refits: stay away from limits, and excite more"
+        return Check(passed=False, values=values, detail=f"{what}. {hint}")
     rate, length = fit.problem.rate_hz, fit.problem.u.shape[0]
     band = (rate / length, lowest_power_hz(fit.problem.u, rate), rate / 2)
     hint = experiment_hint(known, theta, band, robust=robust) or ""
-    return Check(passed=False, values=values, detail=f"the record does not show {', '.join(unseen)}. {hint}")
+    return Check(passed=False, values=values, detail=f"{what}. {hint}")
 
 
 def lowest_power_hz(u: Array, rate_hz: float) -> float:
@@ -389,15 +392,15 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
     for spec in model.parameters:
         value, spread = values[spec.name], sd.get(spec.name, 0.0)
         if spec.positive and value <= 0:
-            found.append(f"{spec.name} = {value:.4g} {spec.unit} is not positive ({spec.meaning})")
+            found.append(f"{spec.name} = {value:.4g} {spec.unit} ({spec.meaning}) must be positive")
         low, high = _SIZES.get(spec.name, (0.0, float("inf")))
         if not low <= abs(value) <= high:
             found.append(
-                f"{spec.name} = {value:.4g} {spec.unit} is of a size that no bearing has: check the units of the "
-                "columns, their calibration and the sampling rate"
+                f"{spec.name} = {value:.4g} {spec.unit} is impossible for a bearing: check the units and calibration "
+                "of the columns and the sampling rate"
             )
         if spec.name == "c" and value < -3.3 * spread:
-            found.append(f"c = {value:.4g} {spec.unit} is negative: the rotor would gain energy by moving")
+            found.append(f"c = {value:.4g} {spec.unit} is negative: motion would generate energy")
     return found
 
 
@@ -407,7 +410,7 @@ def _within_limits(found: Mapping[str, Saturation]) -> Check:
     return Check(
         passed=not bad,
         values={f"{name}_fraction": s.fraction for name, s in found.items()},
-        detail=f"{detail}. Lower the excitation, or cut those parts out" if bad else "no channel dwells at its limits",
+        detail=f"{detail}. Reduce the excitation, or cut those parts out" if bad else "no saturation",
     )
 
 
@@ -423,7 +426,7 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
     return Check(
         passed=few,
         values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in found},
-        detail=f"{'; '.join(some)}. They are used as they are; replace them (signals.replace_samples) or cut them out"
+        detail=f"{'; '.join(some)}. They were used unchanged; replace them (signals.replace_samples) or cut them out"
         if some
-        else "no outliers and no drop-outs in the measured outputs",
+        else "no outliers or drop-outs in the measured outputs",
     )

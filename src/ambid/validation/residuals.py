@@ -27,7 +27,7 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.linear import column_sizes, directions, triangle_of
-from ambid.estimation.uncertainty import chi_squared_tail
+from ambid.estimation.uncertainty import chi_squared_tail, p_text
 
 P_LEAST = 1e-3  # 99.9 % bounds
 _SEEN = 1e-3  # part of a regressor that J must leave for it to be tested
@@ -86,7 +86,7 @@ def refuse_constant(second: IOData) -> None:
     for name, y in zip(second.outputs, second.y.T, strict=True):
         if not np.any(y != y[0]):
             raise EstimationError(
-                f"output {name!r} is constant over the second record; nothing can be judged on it. Give another record"
+                f"output {name!r} is constant in the second record, which cannot test a model. Give another record"
             )
 
 
@@ -472,9 +472,21 @@ class Subject:
     biased: bool  # whether feedback biases it
 
 
-def residual_check(test: ResidualTest, what: str) -> Check:
-    """Put a residual test into words: what was tested against what, and what that means."""
-    verdict = "nothing is left" if test.passed else "something is left that the model does not explain"
+def white_check(test: ResidualTest) -> Check:
+    """Return the check that residuals are white, from their test against their own past."""
+    return _residual_check(test)
+
+
+def uncorrelated_check(test: ResidualTest) -> Check:
+    """Return the check that residuals are uncorrelated with past inputs."""
+    return _residual_check(test, "past inputs")
+
+
+def _residual_check(test: ResidualTest, against: str = "", *, of: str = "residuals") -> Check:
+    """State whether residuals are white or, with `against`, uncorrelated with another signal."""
+    whose = f" of {test.channel}" if test.channel else ""
+    words = ("white", "not white") if not against else (f"uncorrelated with {against}", f"correlated with {against}")
+    measure = "cross-correlation" if against else "autocorrelation"
     return Check(
         passed=test.passed,
         p=test.p,
@@ -484,26 +496,24 @@ def residual_check(test: ResidualTest, what: str) -> Check:
             "largest_correlation": test.largest,
             "largest_lag": float(test.largest_lag),
         },
-        detail=f"{what}: {verdict} "
-        f"(largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})",
+        detail=f"{of}{whose} are {words[not test.passed]} "
+        f"(largest {measure} {test.largest:.3f} at lag {test.largest_lag}, {p_text(test.p)})",
     )
 
 
 def residual_checks(tests: ResidualTests, subject: Subject) -> dict[str, Check]:
-    """Put residual tests into words.
+    """Return residual tests as checks.
 
     Returns ``residuals_white``, with inputs ``residuals_uncorrelated`` and ``feedback``, and of a nonlinear model
     ``residuals_nonlinear`` and ``residual_variance``.
     """
-    e = _name_residuals(tests.white)
-    white = residual_check(tests.white, f"{e} against past residuals")
+    white = white_check(tests.white)
     if not white.passed and subject.coloured:
-        detail = f"{e} are coloured; {subject.name} does not describe noise, and need not"
+        detail = f"residuals are coloured, which is no fault: {subject.name} has no noise model"
         white = Check(passed=True, p=white.p, values=white.values, detail=detail)
     checks = {"residuals_white": white}
     if tests.uncorrelated is not None:
-        what = f"{_name_residuals(tests.uncorrelated)} against past inputs"
-        checks["residuals_uncorrelated"] = residual_check(tests.uncorrelated, what)
+        checks["residuals_uncorrelated"] = uncorrelated_check(tests.uncorrelated)
     if tests.squares is not None:
         checks["residuals_nonlinear"] = _check_nonlinear(tests.squares, tests.products)
     if tests.variance is not None:
@@ -513,17 +523,13 @@ def residual_checks(tests: ResidualTests, subject: Subject) -> dict[str, Check]:
     return checks
 
 
-def _name_residuals(test: ResidualTest) -> str:
-    return f"residuals of {test.channel}" if test.channel else "residuals"
-
-
 def _check_nonlinear(squares: ResidualTest, products: ResidualTest | None) -> Check:
     """One verdict of both; p by Bonferroni's rule."""
-    both = [(squares, "residuals against squares of past inputs")]
+    both = [(squares, "squares of past inputs")]
     if products is not None:
-        both.append((products, "residuals against past residuals times inputs"))
+        both.append((products, "products of past residuals and inputs"))
     worst, what = min(both, key=lambda x: x[0].p)
-    check = residual_check(replace(worst, p=min(1.0, len(both) * worst.p)), what)
+    check = _residual_check(replace(worst, p=min(1.0, len(both) * worst.p)), what)
     values = {**check.values, "p_squares": squares.p}
     if products is not None:
         values["p_products"] = products.p
@@ -531,14 +537,11 @@ def _check_nonlinear(squares: ResidualTest, products: ResidualTest | None) -> Ch
 
 
 def _check_variance(test: ResidualTest) -> Check:
-    check = residual_check(test, "squared residuals against squares of past inputs")
+    check = _residual_check(test, "squares of past inputs", of="squared residuals")
     if check.passed:
         return check
-    detail = (
-        "the size of the residuals depends on past inputs: standard deviations take it as constant, or a nonlinearity "
-        f"is missing (largest correlation {test.largest:.3f} at lag {test.largest_lag}, p = {test.p:.2g})"
-    )
-    return Check(passed=False, p=check.p, detail=detail, values=check.values)
+    detail = f"{check.detail}: the noise level varies, or a nonlinearity is missing; standard deviations assume neither"
+    return replace(check, detail=detail)
 
 
 def describe_feedback(test: ResidualTest) -> str:
@@ -549,16 +552,16 @@ def describe_feedback(test: ResidualTest) -> str:
 def _check_feedback(tests: ResidualTests, test: ResidualTest, subject: Subject) -> Check:
     seen, evidence = tests.feedback_seen, describe_feedback(test)
     if not seen:
-        detail = "no sign of feedback, which is no proof that there is none: inputs do not depend on past residuals"
+        detail = "no sign of feedback (no proof of an open loop): inputs do not depend on past residuals"
     elif tests.explained_by_inputs:
-        detail = f"{evidence}, which hold what inputs explain: feedback, or what the model misses"
+        detail = f"{evidence}, but residuals also on past inputs: feedback, or an incomplete model"
     elif subject.biased:
-        detail = f"{evidence}: there is feedback, and {subject.name} is biased by it"
+        detail = f"{evidence}: there is feedback, which biases {subject.name}"
     else:
-        detail = f"{evidence}: there is feedback, which {subject.name} allows for"
+        detail = f"{evidence}: there is feedback; {subject.name} is consistent in closed loop"
     return Check(
         passed=not (seen and subject.biased),
         p=test.p,
         values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
-        detail=f"{detail} (p = {test.p:.2g})",
+        detail=f"{detail} ({p_text(test.p)})",
     )

@@ -23,11 +23,13 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.linear_model import model
+from ambid.units import counted
 from ambid.validation.physical import innovation_products, innovation_tests
-from ambid.validation.residuals import fit_of, residual_check
+from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 
 _RATIO = 1.5  # innovation standard deviation against the one at identification that a check lets pass
 _HORIZONS = (1, 10, 100)  # samples ahead
+_NO_PREDICTOR = "the estimate gives no stable predictor for this record. Check that both come from the same bench"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -55,7 +57,7 @@ def replay(estimate: Estimate, signals: Signals) -> Replay:
     problem = fit.problem
     e = innovations(problem, fit.vector)
     if e is None:
-        raise EstimationError("the estimate makes no predictor for this record. Check that both are of the same bench")
+        raise EstimationError(_NO_PREDICTOR)
     e = e * problem.scales.output
     mean = signals.y.mean(axis=0)
     measured, error = problem.y[problem.skip :] + mean, simulation_error(fit)
@@ -74,20 +76,20 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
     rate = float(str(estimate.record["rate_hz"]))
     if abs(signals.rate_hz / rate - 1) > 1e-6:
         raise EstimationError(
-            f"the record is sampled at {signals.rate_hz:g} Hz, the estimate's predictor at {rate:g} Hz; they have to "
-            "agree. Resample the record, or identify from it"
+            f"the record is sampled at {signals.rate_hz:g} Hz, the estimate's predictor at {rate:g} Hz; the rates "
+            "must agree. Resample the record, or identify from it"
         )
     delay = estimate.delay[plant.inputs[0]]
     skip = delay.samples + 2
     if signals.y.shape[0] < skip + 20 * len(plant.states):
         raise EstimationError(
-            f"the record has {signals.y.shape[0]} samples; too few to judge an estimate. Give a longer one"
+            f"the record has {counted(signals.y.shape[0], 'sample')}, too few to test an estimate. Give a longer one"
         )
     u, y = signals.u - signals.u.mean(axis=0), signals.y - signals.y.mean(axis=0)
     for role, column in zip((*plant.inputs, *plant.outputs), np.hstack([u, y]).T, strict=True):
         if not np.any(column):
             raise EstimationError(
-                f"channel {role!r} is constant over the whole record; nothing can be judged on it. Check it"
+                f"channel {role!r} is constant in the whole record, which cannot test an estimate. Check it"
             )
     scales = scales_for(plant, estimate.values, np.std(u, axis=0), noise_floor(y), signals.rate_hz)
     kept = PredictorProblem(
@@ -109,7 +111,7 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
     )
     fit = search(kept, np.zeros(kept.size))
     if fit.status == "failed":
-        raise EstimationError("the estimate makes no predictor for this record. Check that both are of the same bench")
+        raise EstimationError(_NO_PREDICTOR)
     return _with_covariance(fit, estimate)
 
 
@@ -185,14 +187,13 @@ def conclude(checks: Mapping[str, Check], samples: int) -> dict[str, object]:
     }
 
 
-def consistency_check(ratios: Mapping[str, float], whose: str, where: str) -> Check:
-    """Check that innovations are as large as at identification, within a factor; `ratios` are given by output."""
+def consistency_check(ratios: Mapping[str, float], where: str) -> Check:
+    """Check that residuals are as large as at identification, within a factor; `ratios` are given by output."""
     worst = max(ratios, key=lambda role: abs(np.log(ratios[role])))
     return Check(
         passed=all(1 / _RATIO < r < _RATIO for r in ratios.values()),
         values={f"{role}_ratio": r for role, r in ratios.items()},
-        detail=f"{whose} of {worst} are {ratios[worst]:.2f} times as large as {where}at identification "
-        f"(within a factor {_RATIO:g})",
+        detail=f"residuals of {worst} are {ratios[worst]:.2f} times as large as {where} (limit: a factor {_RATIO:g})",
     )
 
 
@@ -207,7 +208,7 @@ def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
     e = run.innovations / run.fit.problem.scales.output
     own, inputs = innovation_tests(run.fit, innovation_products(run.fit, e))
     return {
-        "residuals_white": residual_check(own, "innovations against their own past"),
-        "residuals_uncorrelated": residual_check(inputs, "innovations against past inputs"),
-        "innovations_consistent": consistency_check(ratios, "innovations", ""),
+        "residuals_white": white_check(own),
+        "residuals_uncorrelated": uncorrelated_check(inputs),
+        "innovations_consistent": consistency_check(ratios, "at identification"),
     }

@@ -65,7 +65,7 @@ def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
     """
     if fit.covariance is None or not np.any(np.diag(fit.covariance) > 0):
         raise EstimationError(
-            f"{fit.structure} gave no covariance for these data; without one no sensitivity can be told. Lower orders"
+            f"{fit.structure} gave no covariance for these data, and sensitivities need one. Lower the orders"
         )
     model = fit.model
     free = np.nonzero(np.diag(fit.covariance) > 0)[0]
