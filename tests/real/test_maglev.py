@@ -37,6 +37,8 @@ k_x = {{ unit = "N/m" }}
 k_i = {{ unit = "N/A" }}
 R = {{ unit = "ohm" }}
 L = {{ unit = "H" }}
+[magnet]
+kind = "single"
 """
 COIL_RIG = """schema = "ambid.rig/1"
 name = "maglev, upper coil, ball at rest"
@@ -98,6 +100,16 @@ def test_resistance_and_inductance_on_every_record(levitation, name):
     value = levitation[name].estimate.values
     assert value["R"] == pytest.approx(RESISTANCE, rel=0.07)
     assert value["L"] == pytest.approx(INDUCTANCE, rel=0.07)
+
+
+@pytest.mark.parametrize(("name", "least", "most"), [("stairs_a", 9, 12), ("stairs_b", 15, 18), ("sine_d", 8, 11)])
+def test_the_verdict_shows_by_how_much_gravity_asks_for_more(levitation, name, least, most):
+    run = levitation[name]
+    check = run.estimate.checks["gravity_balance"]
+    assert check.values["expected"] == pytest.approx(run.balance / MASS, rel=1e-3)
+    assert least < -100.0 * check.values["relative"] < most
+    assert not check.passed
+    assert "gravity_balance" in [r.check for r in run.estimate.verdict.reasons]
 
 
 def plain_least_squares(name, cutoff_hz):

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ambid.cli.options import Gaps, Rate, argument, option, switch
 from ambid.cli.output import Outputs
 from ambid.errors import AmbidError, nearest
+
+if TYPE_CHECKING:
+    from ambid.rig.roles import Candidate
 
 _WIRED = ("prototype",)  # presets with a controller, whose rig is among the package's data
 
@@ -24,6 +29,10 @@ def command(
             "Instead of a record: the rig of a bench that 'ambid models' lists; prototype has a controller.",
         ),
     ] = None,
+    plot: Annotated[
+        Path | None, option("--plot FILE.png", "Draw the columns that may be a role: signals, coherences, scores.")
+    ] = None,
+    yes: Annotated[bool, switch("--yes", "Take the most likely columns, and ask nothing.")] = False,
     rate: Rate = None,
     gaps: Gaps = None,
     force: Annotated[bool, switch("--force", "Write over a rig file that exists.")] = False,
@@ -34,9 +43,11 @@ def command(
         raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_WIRED[0]}")
     if preset is not None and (rate is not None or gaps is not None):
         raise AmbidError("--rate and --gaps are for reading a record; with --preset none is read. Leave them out")
-    with Outputs(record) as outputs:
+    if preset is not None and plot is not None:
+        raise AmbidError("--plot draws the columns of a record; with --preset there are none. Leave it out")
+    with Outputs(record, plot=plot) as outputs:
         outputs.claim(rig, "-o", force=force)
-        text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps)
+        text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps, outputs, plot, ask=not yes)
         if rig is not None:
             outputs.stage_text(rig, text)
     if rig is None:
@@ -55,12 +66,38 @@ def command(
         )
 
 
-def _of_record(record: Path | None, rate: Rate, gaps: Gaps) -> str:
+def _of_record(record: Path | None, rate: Rate, gaps: Gaps, outputs: Outputs, plot: Path | None, *, ask: bool) -> str:
     from ambid.record import read_record
     from ambid.rig import draft_rig
+    from ambid.rig.roles import rank_roles
 
     assert record is not None
-    return draft_rig(read_record(record, rate_hz=rate, gaps=gaps or "error"))
+    read = read_record(record, rate_hz=rate, gaps=gaps or "error")
+    ranked = rank_roles(read)
+    if ask and sys.stdin.isatty() and sys.stderr.isatty():
+        ranked = {role: _chosen(role, found) for role, found in ranked.items()}
+    for role, found in ranked.items():
+        typer.echo(f"{role}: {f'{found[0].channel.name}, because {found[0].why}' if found else 'none found'}", err=True)
+    if plot is not None:
+        from ambid.report.role_figures import roles_figure  # much is loaded for it
+
+        outputs.draw(plot, lambda: roles_figure(read, ranked), lambda _: None)
+    return draft_rig(read, ranked)
+
+
+def _chosen(role: str, found: Sequence[Candidate]) -> Sequence[Candidate]:
+    """Ask which column is a role where two are nearly as likely."""
+    from ambid.rig.roles import close
+
+    if not close(found):
+        return found
+    for x in found:
+        typer.echo(f"  {x.channel.name}: score {x.score:.2f}; {x.why}", err=True)
+    names = [x.channel.name for x in found]
+    answer = ""
+    while answer not in names:
+        answer = typer.prompt(f"Which column is the {role} ({', '.join(names)})?", default=names[0], err=True)
+    return sorted(found, key=lambda x: x.channel.name != answer)
 
 
 def _of_preset(name: str) -> str:

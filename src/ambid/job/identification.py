@@ -115,6 +115,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validation import physical
+    from ambid.validation.gravity import carries_weight, gravity_balance
     from ambid.validation.residuals import fit_of
 
     problem = fit.problem
@@ -130,6 +131,9 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
     if problem.model.name == "one-axis":
         checks["units"] = _units(fit, rig, signals_of(bench, problem.model), doubt=not checks["fixed_agree"].passed)
+        if rig.magnet is not None and carries_weight(rig.magnet, bench["current"]):
+            theta = problem.parameters(fit.vector)
+            checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
     y, error = problem.y[problem.skip :], simulation_error(fit)
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,

@@ -12,6 +12,7 @@ from ambid.errors import AmbidError
 from ambid.record import Channel, Record
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WIDTH, Paint, columns, fraction, joined, plain, pure, wrapped
+from ambid.rig.roles import rank_roles
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
 from ambid.units import UNKNOWN
 
@@ -34,10 +35,21 @@ def record_text(record: Record, *, inputs: Sequence[str] = (), paint: Paint = pl
     rows: list[tuple[str, ...]] = [("channel", "unit", "min", "max", "mean", "sd", "step", "SNR")]
     rows += [_row(record, c, inputs) for c in record.channels]
     blocks = [[head], columns(rows, right=(2, 3, 4, 5, 6, 7)), _findings(record, inputs, paint)]
+    blocks += [] if inputs else [_roles(record, paint)]
     blocks.append(["history: " + "; ".join(str(step) for step in record.history)] if record.history else [])
     return joined(
         [[x for line in b for x in (wrapped([line], WIDTH, "  ") if len(line) > WIDTH else [line])] for b in blocks]
     )
+
+
+def _roles(record: Record, paint: Paint) -> list[str]:
+    """For each role the column that is likely it, with its score and the reason, and the others."""
+    lines = []
+    for role, found in rank_roles(record).items():
+        for x in found:
+            head = f"{role}: likely {x.channel.name}" if x is found[0] else f"  or {x.channel.name}"
+            lines.append(f"{paint(head, 'strong' if x is found[0] else 'dim')} (score {x.score:.2f}), because {x.why}")
+    return lines
 
 
 def _row(record: Record, c: Channel, inputs: Sequence[str]) -> tuple[str, ...]:

@@ -1,0 +1,260 @@
+"""Which column is which role: by unit and name, by whether it holds a signal, and by what a bearing does to it.
+
+Voltage and current are those of a coil. Over windows of some samples, int V = R int i + L [i] + k [x] (the weak form of
+thesis eq. 4.4, Shinbrot 1957): no measured signal is differentiated, and no controller biases it much. The position is
+a second-order response to the force: coherent with current and voltage where it has its power, and smoother than they.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import AmbidError
+from ambid.record.record import Channel, Record
+from ambid.signals.noise_ratio import snr
+from ambid.signals.spectra import cross_spectra
+from ambid.units import UNKNOWN
+
+ROLES = {"voltage": "V", "current": "A", "position": "m"}
+NAMES = {
+    "voltage": r"volt|^u|^v\b|^v_|duty|pwm|command|input|drive",
+    "current": r"curr|^i\b|^i_|amp",
+    "position": r"pos|disp|gap|^x|^y|^z|eddy|hall|sensor|output",
+    "speed": r"speed|omega|rpm|rotat|spin",
+    "angle": r"angle|phi|theta|encoder",
+}
+SET_POINT = r"ref|set|target|desired|goal"
+_UNNAMED = 0.3  # what unit and name say of a column without either
+_CLOSE = 0.15  # scores that differ by less are left to the user
+_LOOKED = 16384  # samples
+_LEAST = 200  # samples from which a coil can be told
+_WINDOWS = (1, 4, 16, 64)  # samples that the coil's equation is integrated over
+_DELAYS = (0, 1, 2, 4)  # samples by which the voltage may act later
+_CANDIDATES = 4  # of a role that are looked at, the best by name
+_SHOWN = 0.2  # part of what the other terms leave that a term has to explain before its sign counts
+_LIKE = 0.8  # how much a column that neither unit nor name gives away has to do what its role does
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Coil:
+    """The coil between two columns: V = R i + L i' + k x'."""
+
+    voltage: str
+    current: str
+    share: float  # part of the variance of the integrated voltage that is explained, 0 to 1
+    R: float  # in units of the columns, without a sign; 0 where the record does not show it
+    L: float
+    reversed: bool = False  # fits with both R and L negative: one of the two has the wrong sign
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidate:
+    """A column that may be a role, with what speaks for and against it."""
+
+    role: str
+    channel: Channel
+    named: float  # by unit and name, 0 to 1
+    signal: float  # part of its power that is no noise, 0 to 1; 0: constant or noise alone
+    fits: float  # how much it does what its role does in a bearing, 0 to 1
+    why: str
+
+    @property
+    def score(self) -> float:
+        """From 0 to 1; half of it is what the column does."""
+        return self.named * (1.0 + self.signal + 2.0 * self.fits) / 4.0
+
+
+def rank_roles(record: Record) -> Mapping[str, Sequence[Candidate]]:
+    """Rank the columns for each role of a bearing, the best first; those chosen for different roles differ.
+
+    `record`: as read from its file, columns under their own names. Returns voltage, current and position; empty where
+    no column looks like one.
+    """
+    found = {
+        role: sorted((_named(c, role, record) for c in record.channels if _name(c, role)), key=lambda c: -c.score)
+        for role in ROLES
+    }
+    shown = {role: [c for c in cs if c.signal > 0][:_CANDIDATES] for role, cs in found.items()}
+    coils = _coils(record, shown)
+    coherent = _coherences(record, {c.channel.name for cs in shown.values() for c in cs})
+    judged = {role: [_judged(c, coils, coherent, shown, record) for c in cs] for role, cs in found.items()}
+    return _distinct({
+        role: sorted((c for c in cs if c.named > _UNNAMED or c.fits >= _LIKE), key=lambda c: -c.score)
+        for role, cs in judged.items()
+    })  # fmt: skip
+
+
+def close(ranked: Sequence[Candidate]) -> bool:
+    """Whether the second is nearly as likely as the first."""
+    return len(ranked) > 1 and ranked[0].score - ranked[1].score < _CLOSE
+
+
+def at_rest(ranked: Mapping[str, Sequence[Candidate]]) -> bool:
+    """Whether there is a coil, and a position that has nothing to do with it: the rotor is held."""
+    first = [ranked[role][0].fits for role in ROLES if ranked[role]]
+    return len(first) == len(ROLES) and min(first[:2]) >= _LIKE and first[2] < _SHOWN
+
+
+def _name(c: Channel, role: str) -> float:
+    """Rate a column by unit and name; 0: not of this role."""
+    if re.search(SET_POINT, c.name.lower()):
+        return 0.0
+    named = re.search(NAMES[role], c.name.lower()) is not None
+    if c.unit == ROLES[role]:
+        return 1.0 if named else 0.8
+    if c.unit not in ("1", UNKNOWN, *(["V"] if named else [])):
+        return 0.0
+    return 0.6 if named else 0.0 if any(re.search(other, c.name.lower()) for other in NAMES.values()) else _UNNAMED
+
+
+def _named(c: Channel, role: str, record: Record) -> Candidate:
+    part = 0.0
+    if np.ptp(c.values) > 0:
+        try:
+            ratio = snr(record, c.name)
+            part = ratio.signal_sd**2 / (ratio.signal_sd**2 + ratio.noise_sd**2)
+        except AmbidError:
+            part = 0.5  # too short to tell
+    return Candidate(role=role, channel=c, named=_name(c, role), signal=part, fits=0.0, why="")
+
+
+def _coils(record: Record, shown: Mapping[str, Sequence[Candidate]]) -> list[Coil]:
+    """Coils between candidates for voltage and current, with the motion that suits them best."""
+    if record.n_samples < _LEAST:
+        return []
+    columns = {c.channel.name: c.channel.values[:_LOOKED] for cs in shown.values() for c in cs}
+    motions: list[str | None] = [c.channel.name for c in shown["position"]]
+    found = []
+    for v, i in itertools.product(shown["voltage"], shown["current"]):
+        names = v.channel.name, i.channel.name
+        if names[0] != names[1]:
+            fits = [
+                _coil(names, columns, None if x is None else columns[x], record.rate_hz)
+                for x in (motions or [None])
+                if x not in names
+            ]
+            found += sorted(fits, key=lambda c: -c.share)[:1]
+    return found
+
+
+def _coil(names: tuple[str, str], columns: Mapping[str, Array], x: Array | None, rate_hz: float) -> Coil:
+    """Least squares over windows; the window and delay at which the inductance explains most."""
+    v, i = (columns[name] for name in names)
+    best, found = -1.0, Coil(voltage=names[0], current=names[1], share=0.0, R=0.0, L=0.0)
+    for late, length in itertools.product(_DELAYS, _WINDOWS):
+        n = v.size - late - 1
+        starts = np.arange(0, n - length + 1, max(1, length // 2))
+        ends, after = starts + length, i[late : late + n + 1]
+        total = [np.concatenate([[0.0], np.cumsum(s)]) for s in (v[:n], (after[1:] + after[:-1]) / 2.0)]
+        target, area = (s[ends] - s[starts] for s in total)
+        moved = [s[ends] - s[starts] for s in ([after] if x is None else [after, x[late : late + n + 1]])]
+        terms = np.column_stack([area, *moved])
+        terms, target = terms - terms.mean(axis=0), target - target.mean()
+        size, power = np.linalg.norm(terms, axis=0), float(target @ target)
+        if not (np.all(size > 0) and power > 0):
+            continue
+        values = np.linalg.lstsq(terms / size, target, rcond=None)[0]
+        left = target - terms / size @ values
+        share = 1.0 - float(left @ left) / power
+        # what R and L explain that the other terms do not, from the inverse of their scalar products
+        alone = values**2 / np.diag(np.linalg.pinv(terms.T @ terms / np.outer(size, size))) / power
+        alone /= alone + max(1.0 - share, 1e-12)
+        if alone[1] > best:
+            best = float(alone[1])
+            signs = {bool(value > 0) for value, part in zip(values[:2], alone[:2], strict=True) if part > _SHOWN}
+            R = abs(float(values[0] / size[0])) if alone[0] > _SHOWN else 0.0
+            found = replace(
+                found, share=share if len(signs) == 1 else 0.0, reversed=signs == {False},
+                R=R, L=abs(float(values[1] / size[1])) / rate_hz,
+            )  # fmt: skip
+    return found
+
+
+def _coherences(record: Record, names: set[str]) -> dict[tuple[str, str], float]:
+    """For each pair (a, b) the part of a's power that is a linear response to b, or the other way round."""
+    own = sorted(names)
+    if record.n_samples < _LEAST or len(own) < 2:
+        return {}
+    found = cross_spectra(np.column_stack([record[name][:_LOOKED] for name in own]), record.rate_hz)
+    power = np.einsum("fii->fi", found.density).real
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = np.abs(found.density) ** 2 / (power[:, :, None] * power[:, None, :])
+    chance = 1.0 / max(found.n_effective, 1.0 + 1e-9)  # of two signals that have nothing to do with each other
+    share = np.clip((np.nan_to_num(share) - chance) / (1.0 - chance), 0.0, 1.0)
+    part = np.einsum("fij,fi->ij", share[1:], power[1:]) / np.maximum(power[1:].sum(axis=0), 1e-300)[:, None]
+    return {(a, b): float(part[j, k]) for j, a in enumerate(own) for k, b in enumerate(own) if j != k}
+
+
+def _judged(
+    c: Candidate,
+    coils: Sequence[Coil],
+    coherent: Mapping[tuple[str, str], float],
+    shown: Mapping[str, Sequence[Candidate]],
+    record: Record,
+) -> Candidate:
+    """A candidate with what it does in a bearing."""
+    name = c.channel.name
+    if c.signal == 0.0:
+        what = "never changes" if not np.ptp(c.channel.values) > 0 else "no signal, noise alone"
+        return replace(c, why=f"{_unit_words(c)}; {what}")
+    words, fits = [_unit_words(c)], 0.0
+    if c.role == "position":
+        sources = [x.channel.name for role in ("current", "voltage") for x in shown[role] if x.channel.name != name]
+        pairs = [(coherent[name, s], s) for s in sources if (name, s) in coherent]
+        if pairs:
+            fits, source = max(pairs)
+            words.append(f"{100.0 * fits:.0f} % of its power is coherent with {source}")
+    else:
+        own = [x for x in coils if name == (x.voltage if c.role == "voltage" else x.current)]
+        best = max(own, key=lambda x: x.share, default=None)
+        if best is not None and best.share > 0:
+            fits, other = best.share, best.current if c.role == "voltage" else best.voltage
+            words.append(f"with {other} a coil explains {100.0 * fits:.1f} % ({_coil_words(best, record)})")
+        elif best is not None:
+            words.append("no coil (R, L > 0) between it and any other column")
+    return replace(c, fits=fits, why="; ".join([*words, *_weak(c)]))
+
+
+def _weak(c: Candidate) -> list[str]:
+    return [f"only {100.0 * c.signal:.0f} % of its power is signal"] if c.signal < 0.5 else []
+
+
+def _unit_words(c: Candidate) -> str:
+    words = f"unit [{c.channel.source_unit}]"
+    if c.channel.unit == ROLES[c.role]:
+        return f"{words} and name fit" if c.named == 1.0 else f"{words} fits"
+    return f"{words} instead of [{ROLES[c.role]}]" + ("" if c.named == _UNNAMED else ", but the name fits")
+
+
+def _coil_words(coil: Coil, record: Record) -> str:
+    R, L = coil.R, coil.L
+    if record.channel(coil.voltage).unit == "V" and record.channel(coil.current).unit == "A":
+        words = f"R about {R:.2g} ohm, L about {L:.2g} H" if R else f"L about {L:.2g} H"
+    else:
+        words = f"L/R about {L / R:.2g} s" if R else "L > 0"
+    return words + (", one of the two reversed" if coil.reversed else "")
+
+
+def _distinct(ranked: Mapping[str, Sequence[Candidate]]) -> Mapping[str, Sequence[Candidate]]:
+    """Give a column that two roles want to the one for which all scores together are best."""
+    first = [[*cs[:_CANDIDATES], None] for cs in ranked.values()]
+    best = max(
+        (
+            choice
+            for choice in itertools.product(*first)
+            if len({c.channel.name for c in choice if c}) == sum(c is not None for c in choice)
+        ),
+        key=lambda choice: sum(c.score for c in choice if c),
+    )
+    found = {}
+    for (role, cs), top in zip(ranked.items(), best, strict=True):
+        taken = {c.channel.name for c in best if c and c is not top}
+        rest = [c for c in cs if c is not top and c.channel.name not in taken]
+        found[role] = (top, *rest) if top else ()
+    return found

@@ -1,0 +1,80 @@
+"""The balance of gravity: a fact on force per current and mass that no fit has a part in.
+
+The force of one magnet grows with the square of its current, f = i^2 h(x), and at rest it carries the weight, f = -m g
+(x grows away from the magnet). So k_i = df/di = 2 f/i0, and k_i/m = -2 g/i0 (theory.md sec. 1; thesis eq. 1.9).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.estimate import Check
+from ambid.record import Record
+from ambid.rig.rig import RigMagnet
+from ambid.signals.faults import resolution
+
+GRAVITY = 9.81
+_FAR = 3.3  # standard deviations, as for other facts
+_MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
+_REVERSED = 0.02  # of a current's largest value that an offset may put on the other side of zero
+
+
+def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:
+    """Whether a rig says that one magnet carries the weight, with a force that grows as the square of `current`."""
+    if magnet is None or magnet.kind == "pair" or magnet.saturation:
+        return False
+    low, high = sorted((float(current.min()), float(current.max())), key=abs)
+    one_sided = low * high > 0 or abs(low) <= _REVERSED * abs(high)
+    known = magnet.known("g")
+    return (magnet.kind == "single" or one_sided) and (known is None or known.value != 0.0)
+
+
+def gravity_balance(
+    magnet: RigMagnet, record: Record, theta: Mapping[str, float], names: tuple[str, ...], covariance: Array
+) -> Check:
+    """Check k_i/m against -2 g/i0.
+
+    `record`: channels named by role; `theta`: parameters; `names`, `covariance`: the estimated ones, under the model.
+    The limit is what is not known: of the estimate, of gravity and of the current's zero (both from the rig; else the
+    current's resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
+    """
+    x, i = record["position"], record["current"]
+    known = {name: magnet.known(name) for name in ("g", "i_offset")}
+    g, g_sd = _value(known["g"], GRAVITY, 0.0)
+    zero, zero_sd = _value(known["i_offset"], 0.0, resolution(record, "current").step / np.sqrt(12.0))
+    i0, (spread, along) = float(i.mean()) - zero, np.cov(x, i)
+    found, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
+    slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
+    sd = abs(found) * float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    rise = theta["k_x"] / (theta["m"] * g)  # -f_x/f
+    ripple = float(along[1]) / i0**2
+    bend = ripple + 2.0 * rise * float(along[0]) / i0 + 0.75 * rise**2 * float(spread[0])
+    doubt = abs(expected) * float(np.sqrt((g_sd / g) ** 2 + (zero_sd / i0) ** 2 + bend**2 + ripple**2))
+    total = float(np.hypot(sd, doubt))
+    off = found / expected - 1.0
+    passed = abs(found - expected) <= _FAR * total
+    detail = f"k_i/m = {found:.4g} N/(A kg), sd {sd:.2g} if the model is right; the weight at {i0:.4g} A asks for "
+    detail += f"-2 g/i0 = {expected:.4g}, sd {doubt:.2g}"
+    if abs(found + expected) < _MIRROR * abs(expected):
+        detail += (
+            ": position is reversed. It has to grow away from the magnet: give channels.position.gain the other sign "
+            "(k_i changes its sign with it, no other parameter does), or magnet.parameters.g"
+        )
+    else:
+        detail += f": {100.0 * abs(off):.3g} % {'more' if off > 0 else 'less'}"
+    if not passed and abs(off) < 1.0:
+        detail += (
+            ". Force, mass or current are off by as much: check calibration and mass, and that one magnet alone "
+            "carries the rotor; else record away from limits, with more excitation"
+        )
+    values = {"k_i_over_m": found, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
+    return Check(passed=passed, values=values, detail=detail)
+
+
+def _value(p: object, value: float, sd: float) -> tuple[float, float]:
+    """A number of the rig and its standard deviation, or what stands where it says nothing."""
+    given = getattr(p, "value", None)
+    return (value, sd) if given is None else (float(given), float(getattr(p, "sd", None) or 0.0))
