@@ -73,7 +73,7 @@ bench: setup peers  ## measure speed and accuracy beside SciPy and peers; writes
 	@$(BIN)/python bench/run.py $(BENCH)
 
 docs: $(VENV)/.docs  ## build the documentation into docs/_site
-	@$(BIN)/python -m sphinx --quiet -b html docs docs/_site
+	@$(BIN)/python -m sphinx --quiet -W -b html docs docs/_site
 	@echo "docs/_site/index.html"
 
 $(VENV)/.docs: $(VENV)/.setup requirements/docs.txt
@@ -91,7 +91,7 @@ lock: setup  ## pin the newest allowed versions again (needs the package index)
 	@sh tools/lock.sh $(BIN)/python
 
 clean:  ## remove caches and builds
-	@rm -rf build dist firmware/build docs/_site docs/api .pytest_cache .mypy_cache .ruff_cache
+	@rm -rf build dist firmware/build docs/_site docs/made .pytest_cache .mypy_cache .ruff_cache
 	@find src tests bench tools docs -type d -name __pycache__ -prune -exec rm -rf {} + 2>/dev/null || true
 
 distclean: clean  ## clean, and remove .venv

@@ -1,74 +1,94 @@
-"""Sphinx settings: pages in Markdown (MyST), API pages from numpydoc docstrings."""
+"""Sphinx settings. Pages are in Markdown, examples are run, commands and Python names describe themselves.
+
+Nothing is loaded from elsewhere when a page is read: formulas become MathML, and the theme brings no font from outside.
+"""
 
 import re
+import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
+from typing import Any
 
+from latex2mathml.converter import convert
 from sphinx.application import Sphinx
+from sphinx.util import logging
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE))
+from reference import write_reference  # noqa: E402
 
 project = "ambid"
 author = "the ambid contributors"
 copyright = author  # noqa: A001
 release = version = installed_version("ambid")
 
-extensions = [
-    "myst_parser",
-    "numpydoc",
-    "sphinx.ext.autodoc",
-    "sphinx.ext.autosummary",
-    "sphinx.ext.mathjax",
-    "sphinx.ext.viewcode",
-]
+extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
+exclude_patterns = ["_site", "_templates", "examples", "notebooks", "**/*.ipynb"]
 myst_enable_extensions = ["amsmath", "dollarmath", "deflist"]
-myst_heading_anchors = 3
+myst_heading_anchors = 4
+suppress_warnings = ["config.cache"]  # the scraper below is a function, which Sphinx cannot compare
 
-autosummary_generate = True
-# Each name is described once, on the page of the module that defines it.
-autodoc_default_options = {"ignore-module-all": True}
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
-numpydoc_class_members_toctree = False
 
-templates_path = ["_templates"]
-exclude_patterns = ["_site", "_templates"]
-html_theme = "alabaster"
-html_title = f"ambid {release}"
-html_theme_options = {
-    "description": "Active magnetic bearings, identified",
-    "page_width": "72em",
-    "fixed_sidebar": True,
-}
-html_sidebars = {"**": ["about.html", "navigation.html", "searchbox.html"]}
+html_theme = "furo"
+html_title = "ambid"
 html_show_sourcelink = False
-
-_PACKAGE = Path(__file__).resolve().parent.parent / "src" / "ambid"
-
-
-def _public_modules() -> list[str]:
-    """Name the public modules of the package, rooms before their files; private ones begin with an underscore."""
-    names = []
-    for path in sorted(_PACKAGE.rglob("*.py")):
-        parts = path.relative_to(_PACKAGE.parent).with_suffix("").parts
-        parts = parts[:-1] if parts[-1] == "__init__" else parts
-        if len(parts) > 1 and not any(part.startswith("_") for part in parts):
-            names.append(".".join(parts))
-    return sorted(names)
+html_copy_source = False
+html_static_path = ["static"]
+html_css_files = ["pages.css"]
+html_math_renderer = "mathml"
+html_theme_options = {"footer_icons": []}
+pygments_style = "friendly"
 
 
-def _write_api_index() -> None:
-    """List every public module, so that a new file has its page without an entry by hand."""
-    lines = ["# API reference", "", "From the docstrings; one page per module.", ""]
-    lines += ["```{eval-rst}", ".. autosummary::", "   :toctree: generated", "   :template: module.rst", ""]
-    lines += [*(f"   {name}" for name in _public_modules()), "```", ""]
-    target = Path(__file__).resolve().parent / "api" / "index.md"
-    target.parent.mkdir(exist_ok=True)
-    text = "\n".join(lines)
-    if not target.is_file() or target.read_text(encoding="utf-8") != text:
-        target.write_text(text, encoding="utf-8")
+def _last_figure(block: tuple[Any, ...], names: dict[str, Any], settings: dict[str, Any]) -> str:
+    """Save the figure that a block of an example ends with, as a notebook would show it, or calls `figure`."""
+    from matplotlib.figure import Figure
+    from sphinx_gallery.scrapers import figure_rst
+
+    del block
+    found = names["example_globals"].get("___") or names["example_globals"].pop("figure", None)
+    if not isinstance(found, Figure):
+        return ""
+    path = next(names["image_path_iterator"])
+    found.savefig(path, dpi=110)
+    return str(figure_rst([path], settings["src_dir"]))
 
 
-_write_api_index()
+sphinx_gallery_conf = {
+    "examples_dirs": ["notebooks", "examples"],
+    "gallery_dirs": ["made/notebooks", "made/gallery"],
+    "filename_pattern": r"\.py$",
+    "ignore_pattern": "real_maglev",  # its records are not part of the repository
+    "image_scrapers": (_last_figure,),
+    "capture_repr": ("_repr_html_", "__repr__"),
+    "ignore_repr_types": r"matplotlib\.figure",
+    "within_subsection_order": "FileNameSortKey",
+    "download_all_examples": False,
+    "write_computation_times": False,
+    "show_signature": False,
+    "reset_modules": (),
+    "abort_on_example_error": True,
+}
+
+
+def _formula(self: Any, node: Any) -> None:
+    """Write a formula as MathML, which browsers draw by themselves."""
+    block = node.tagname == "math_block"
+    text = node.astext()
+    if block and "\\begin{" not in text and ("\\\\" in text or "&" in text):
+        text = rf"\begin{{aligned}}{text}\end{{aligned}}"
+    try:
+        drawn = convert(text, display="block" if block else "inline")
+    except Exception as why:  # whatever the converter dislikes names the page
+        logging.getLogger(__name__).warning("formula %r: %s", text, why, location=node)
+        drawn = ""
+    self.body.append(f'<div class="formula">{drawn}</div>' if block else drawn)
+    from docutils.nodes import SkipNode
+
+    raise SkipNode
 
 
 def _formulas_are_text(_app: object, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
@@ -79,6 +99,10 @@ def _formulas_are_text(_app: object, _what: str, _name: str, _obj: object, _opti
         lines[k] = "``".join(parts)
 
 
+write_reference(HERE / "made" / "reference")
+
+
 def setup(app: Sphinx) -> None:
     """Connect what is above; first, so that numpydoc's own markup comes after it."""
+    app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _formulas_are_text, priority=1)

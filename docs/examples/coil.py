@@ -1,12 +1,17 @@
-"""The thesis's coil, I/V = 550/(s + 860) (eq. 4.2), rotor at rest, from voltage and noisy current by three methods.
+"""The thesis's coil by three methods
+==================================
+
+The thesis's coil, I/V = 550/(s + 860) (eq. 4.2), rotor at rest, from voltage and noisy current by three methods.
 
 The thesis gets 519.8/(s + 812.5) (eq. 4.3) by least squares. Noise on the current makes least squares biased, because
 the current is its regressor; the instrumental variable and the likelihood are not.
 
-Run: python docs/examples/coil.py
+Run: ``python docs/examples/coil.py``
 """
 
 from __future__ import annotations
+
+from matplotlib.figure import Figure
 
 from ambid import identify
 from ambid.bearing.coil import coil_instrumental, coil_least_squares
@@ -49,5 +54,20 @@ def main(seed: int = 1) -> dict[str, dict[str, float]]:
     return found
 
 
+def draw(found: dict[str, dict[str, float]]) -> Figure:
+    """Draw the errors of gain and pole, method by method."""
+    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    axes = figure.subplots()
+    methods = [name for name in found if not name.startswith("truth")]
+    for shift, (key, true) in zip((-0.2, 0.2), {"gain": GAIN, "pole": POLE}.items(), strict=True):
+        errors = [100.0 * (found[name][key] / true - 1.0) for name in methods]
+        axes.barh([k + shift for k in range(len(methods))], errors, height=0.35, label=key)
+    axes.set_yticks(range(len(methods)), methods)
+    axes.axvline(0.0, color="0.3", linewidth=0.8)
+    axes.set_xlabel("error in %")
+    axes.legend()
+    return figure
+
+
 if __name__ == "__main__":
-    main()
+    figure = draw(main())

@@ -1,18 +1,20 @@
-"""What the Laguerre operator does: condition numbers with and without it, order 2 to 20 (thesis eq. 1.7-1.8).
+"""Powers of s and of the Laguerre operator
+========================================
+
+What the Laguerre operator does: condition numbers with and without it, order 2 to 20 (thesis eq. 1.7-1.8).
 
 A subspace method in continuous time works on rows of powers of s = j omega, which grow like omega^k and are nearly
 parallel. Powers of w = (s - p)/(s + p) stay on the unit circle; here p is the one that conditions them best.
 
-Run: python docs/examples/laguerre_condition.py [FIGURE.png]
+Run: ``python docs/examples/laguerre_condition.py``
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from ambid.blackbox.frequency_subspace import best_conditioned, block_rows_condition
@@ -30,8 +32,8 @@ class Result:
     p_hz: Array
 
 
-def main(figure: Path | None = None) -> Result:
-    """Compute, print a table, draw where a file is named; return the numbers."""
+def main() -> Result:
+    """Compute and print a table; return the numbers."""
     frequency_hz = np.linspace(5.0, 2000.0, 400)
     omega = 2 * np.pi * frequency_hz
     orders = np.arange(2, 21)
@@ -46,15 +48,11 @@ def main(figure: Path | None = None) -> Result:
     print("order   powers of s   powers of w   p (Hz)")
     for n, a, b, q in zip(result.orders, result.without, result.with_operator, result.p_hz, strict=True):
         print(f"{n:5d} {a:13.3g} {b:13.3g} {q:8.0f}")
-    if figure is not None:
-        _draw(result, figure)
-        print(f"figure: {figure}")
     return result
 
 
-def _draw(result: Result, path: Path) -> None:
-    from matplotlib.figure import Figure
-
+def draw(result: Result) -> Figure:
+    """Draw both condition numbers over the order."""
     figure = Figure(figsize=(6.4, 4.0), layout="constrained")
     axes = figure.subplots()
     axes.semilogy(result.orders, result.without, "o-", label="powers of s = jω (over the median ω)")
@@ -66,8 +64,8 @@ def _draw(result: Result, path: Path) -> None:
     axes.set_xticks(result.orders[::2])
     axes.grid(visible=True, alpha=0.3)
     axes.legend(loc="upper left", bbox_to_anchor=(0.0, 0.8))
-    figure.savefig(path, dpi=120)
+    return figure
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    figure = draw(main())

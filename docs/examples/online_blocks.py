@@ -1,10 +1,13 @@
-"""The thesis's three blocks on-line (fig. 5.8): a coil warms by 20 % while its block is followed.
+"""Three blocks while a coil warms
+===============================
+
+The thesis's three blocks on-line (fig. 5.8): a coil warms by 20 % while its block is followed.
 
 The bench is built of three first-order blocks as in three_blocks.py, excited in open loop; the pole of the coil, R/L,
 rises linearly. Voltage, current and position go through one Kalman-Bucy filter each, then into the recursions. The
 blocks have a limit, which the result prints: the mass is taken as 1.
 
-Run: python docs/examples/online_blocks.py
+Run: ``python docs/examples/online_blocks.py``
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.linalg import expm
 
 from ambid.recursive.blocks import OnlineThreeBlocks
@@ -67,5 +71,18 @@ def main(seed: int = 1) -> Result:
     return Result(t=t, R=found, sd=sd, truth=truth)
 
 
+def draw(result: Result) -> Figure:
+    """Draw the resistance with its 95 % band beside the truth."""
+    figure = Figure(figsize=(7.0, 3.0), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(result.t, result.truth, color="0.4", linestyle="--", label="truth")
+    axes.plot(result.t, result.R, label="estimate")
+    axes.fill_between(result.t, result.R - 1.96 * result.sd, result.R + 1.96 * result.sd, alpha=0.3, label="95 %")
+    axes.set_xlabel("time in s")
+    axes.set_ylabel("R in ohm")
+    axes.legend()
+    return figure
+
+
 if __name__ == "__main__":
-    main()
+    figure = draw(main())

@@ -1,23 +1,26 @@
-"""A magnet loses 15 % of its force while the rotor levitates: detected, named, found anew, accepted, on-line.
+"""A magnet that loses force
+=========================
+
+A magnet loses 15 % of its force while the rotor levitates: detected, named, found anew, accepted, on-line.
 
 The unstable bearing is simulated in closed loop, excited throughout, with its truth. The first second identifies the
 bench; from there on the record is tracked block by block, without looking ahead.
 
-Run: python docs/examples/online_change.py [FIGURE.png]
+Run: ``python docs/examples/online_change.py``
 """
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ambid import track
 from ambid.physics.presets import preset
 from ambid.recursive.lines import Event, Track
-from ambid.simulation import simulate_scenario, truth_columns
+from ambid.report import track_figure
+from ambid.simulation import Simulation, simulate_scenario, truth_columns
 
 START_S, CHANGE_S, LENGTH_S = 1.0, 2.0, 4.0
 CLOSE = 0.02  # what counts as found again
@@ -27,6 +30,7 @@ CLOSE = 0.02  # what counts as found again
 class Result:
     """What was said of the change, and how soon; s after it."""
 
+    simulation: Simulation
     track: Track
     change: Event
     detected_s: float
@@ -34,7 +38,7 @@ class Result:
     k_i: float  # true, at the end
 
 
-def main(figure: str | None = None, seed: int = 1) -> Result:
+def main(seed: int = 1) -> Result:
     """Simulate, track, print the decisions and the last values beside the truth."""
     simulation = simulate_scenario(
         "change", preset("unstable-bearing"), duration_s=LENGTH_S, at_s=CHANGE_S, size=-0.15, seed=seed
@@ -57,6 +61,7 @@ def main(figure: str | None = None, seed: int = 1) -> Result:
     value = np.array([line.parameters["k_i"].value for line in followed.lines])
     off = t[(t > CHANGE_S) & (np.abs(value / k_i - 1) > CLOSE)].max(initial=CHANGE_S)
     result = Result(
+        simulation=simulation,
         track=followed,
         change=change,
         detected_s=change.values["detected"] - CHANGE_S,
@@ -64,17 +69,14 @@ def main(figure: str | None = None, seed: int = 1) -> Result:
         k_i=float(k_i),
     )
     print(f"detected after {1e3 * result.detected_s:.1f} ms, within 2 % after {1e3 * result.found_s:.0f} ms")
-    if figure is not None:
-        _draw(followed, simulation.record.time_s, truth_columns(simulation.record)["k_i"].values, Path(figure))
     return result
 
 
-def _draw(followed: Track, time_s: np.ndarray, k_i: np.ndarray, path: Path) -> None:
-    from ambid.report.drawing import save
-    from ambid.report.track_figures import track_figure
-
-    save(track_figure(followed, truth={"k_i": (time_s, k_i)}), path)
+def draw(result: Result) -> Figure:
+    """Draw the parameters with their bands, k_i beside its truth."""
+    record = result.simulation.record
+    return track_figure(result.track, truth={"k_i": (record.time_s, truth_columns(record)["k_i"].values)})
 
 
 if __name__ == "__main__":
-    main(*sys.argv[1:2])
+    figure = draw(main())

@@ -1,11 +1,14 @@
-"""Real records: a steel ball (60.54 g) under one magnet, closed loop, 1 kHz; least squares beside the likelihood.
+"""A real levitated ball
+=====================
+
+Real records: a steel ball (60.54 g) under one magnet, closed loop, 1 kHz; least squares beside the likelihood.
 
 The records are public, from the student laboratory repository 062020-Lab-Mechatronics, and not part of this one; the
 example takes their folder, or ``maglev`` in the folder that AMBID_RECORDS names. The check that uses no fit at all is
 gravity: the magnet's force is proportional to the current squared and carries the ball, so k_i = df/di = -2 m g/i0 and
 k_i/m = -2 g/i0 at the mean current i0 (the position is the gap: it grows away from the magnet).
 
-Run: python docs/examples/real_maglev.py [FOLDER]
+Run: ``python docs/examples/real_maglev.py [FOLDER]``
 """
 
 from __future__ import annotations

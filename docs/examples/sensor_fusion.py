@@ -1,14 +1,18 @@
-"""Three eddy-current sensors on one axis: fused, one of them slips, is found, left out and mended.
+"""Several position sensors
+========================
+
+Three eddy-current sensors on one axis: fused, one of them slips, is found, left out and mended.
 
 And a pair on opposite sides of the rotor whose zeros a warming housing moves by 20 um: the sum of both shows the
 temperature, the position does not.
 
-Run: python docs/examples/sensor_fusion.py
+Run: ``python docs/examples/sensor_fusion.py``
 """
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ambid.recursive.fusion import FusedSensor, SensorFusion
 
@@ -83,5 +87,16 @@ def main(seed: int = 1) -> tuple[SensorFusion, dict[str, float], dict[str, float
     return fusion, errors, pair(seed)
 
 
+def draw(done: tuple[SensorFusion, dict[str, float], dict[str, float]]) -> Figure:
+    """Draw the rms error of one sensor, of the mean of three, and of the fusion."""
+    errors = {name: 1e6 * value for name, value in done[1].items() if "sd" not in name}
+    figure = Figure(figsize=(7.0, 2.2), layout="constrained")
+    axes = figure.subplots()
+    axes.barh(list(errors), list(errors.values()), height=0.5)
+    axes.invert_yaxis()
+    axes.set_xlabel("rms error of the position in um")
+    return figure
+
+
 if __name__ == "__main__":
-    main()
+    figure = draw(main())

@@ -1,15 +1,19 @@
-"""The thesis's identification repeated: table 4.1 -> matrices (4.10) -> noisy record -> parameters, beside its (4.11).
+"""The thesis, repeated
+====================
+
+The thesis's identification repeated: table 4.1 -> matrices (4.10) -> noisy record -> parameters, beside its (4.11).
 
 The thesis simulates a rig of known parameters, adds white noise, and trains a network whose weights are the state
 matrices. Here the same rig is simulated (open loop, 10 kHz, 2 s, multisine 1 to 2000 Hz, noise 40 dB under both
 outputs) and its record goes through the main job.
 
-Run: python docs/examples/thesis_reproduction.py
+Run: ``python docs/examples/thesis_reproduction.py``
 """
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from ambid import identify
 from ambid.estimation.estimate import Estimate
@@ -78,5 +82,20 @@ def main(seed: int = 1) -> dict[str, dict[str, float]]:
     return {"truth": truth, "thesis": thesis, "ambid": found, "sd": sd, "entries": entries}
 
 
+def draw(found: dict[str, dict[str, float]]) -> Figure:
+    """Draw the errors of the parameters, those of the thesis beside those found here."""
+    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    axes = figure.subplots()
+    names = list(found["thesis"])
+    for shift, who in ((-0.2, "thesis"), (0.2, "ambid")):
+        errors = [100.0 * abs(found[who][name] / found["truth"][name] - 1.0) for name in names]
+        axes.bar([k + shift for k in range(len(names))], errors, width=0.35, label=who)
+    axes.set_xticks(range(len(names)), names)
+    axes.set_yscale("log")
+    axes.set_ylabel("error in %")
+    axes.legend()
+    return figure
+
+
 if __name__ == "__main__":
-    main()
+    figure = draw(main())

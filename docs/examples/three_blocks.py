@@ -1,14 +1,18 @@
-"""The three first-order blocks of the thesis (eq. 2.8-2.15): table 5.1 corrected, and the blocks found from a record.
+"""The thesis's three blocks
+=========================
+
+The three first-order blocks of the thesis (eq. 2.8-2.15): table 5.1 corrected, and the blocks found from a record.
 
 The blocks are a fast form with a limit, which the result prints: the mass is taken as 1, so only ratios to it come out.
 The simulated bench is built of such blocks, V -> i through the coil, i -> x, and x back to i.
 
-Run: python docs/examples/three_blocks.py
+Run: ``python docs/examples/three_blocks.py``
 """
 
 from __future__ import annotations
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.linalg import expm
 
 from ambid.bearing.blocks import ThreeBlocks, block_parameters, three_blocks
@@ -50,5 +54,18 @@ def main(seed: int = 1) -> tuple[dict[str, float], ThreeBlocks]:
     return corrected, found
 
 
+def draw(done: tuple[dict[str, float], ThreeBlocks]) -> Figure:
+    """Draw how far each parameter of the simulated bench is from the truth, with its 95 % interval."""
+    figure = Figure(figsize=(7.0, 2.8), layout="constrained")
+    axes = figure.subplots()
+    found, truth = done[1].parameters, block_parameters(BENCH)[0].tolist()
+    off = [100.0 * (p.value / true - 1.0) for p, true in zip(found.values(), truth, strict=True)]
+    bars = [196.0 * p.sd / abs(true) for p, true in zip(found.values(), truth, strict=True)]
+    axes.errorbar(list(found), off, yerr=bars, fmt="o", capsize=4)
+    axes.axhline(0.0, color="0.3", linewidth=0.8)
+    axes.set_ylabel("error in %, with 95 % interval")
+    return figure
+
+
 if __name__ == "__main__":
-    main()
+    figure = draw(main())

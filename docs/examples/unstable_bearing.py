@@ -1,10 +1,13 @@
-"""An unstable bearing in closed loop: five parameters and the delay from 1 s of record, without start values.
+"""An unstable bearing in closed loop
+==================================
+
+An unstable bearing in closed loop: five parameters and the delay from 1 s of record, without start values.
 
 A differential bearing (138 turns, 470.3 mm2, bias 1 A, gap 0.432 mm) levitates under a PID with current feedback; the
 voltage reaches the coils one sample late; disturbances act on rotor and amplifier, both sensors are noisy. A multisine
 is added to the controller's output, as large as 60 % of all limits allow.
 
-Run: python docs/examples/unstable_bearing.py
+Run: ``python docs/examples/unstable_bearing.py``
 """
 
 from __future__ import annotations

@@ -87,19 +87,16 @@ def test_sensor_fusion_finds_the_slip_and_the_temperature():
     assert abs(pair["temperature"] - 20.0) < IN_99_9 * pair["temperature_sd"]
 
 
-def test_the_laguerre_operator_keeps_the_condition(tmp_path):
-    picture = tmp_path / "condition.png"
-    result = example("laguerre_condition").main(picture)
+def test_the_laguerre_operator_keeps_the_condition():
+    result = example("laguerre_condition").main()
     assert result.orders.tolist() == list(range(2, 21))
     assert result.with_operator.max() < 10.0
     assert result.without[-1] > 1e8
     assert np.all(result.without[1:] / result.without[:-1] > 2.0)
-    assert picture.stat().st_size > 10_000
 
 
-def test_a_change_is_found_while_the_rotor_levitates(tmp_path):
-    figure = tmp_path / "change.png"
-    result = example("online_change").main(str(figure))
+def test_a_change_is_found_while_the_rotor_levitates():
+    result = example("online_change").main()
     assert [change.parameter for change in result.track.summary.changes] == ["k_i"]
     assert 0.0 < result.detected_s < 0.02
     assert result.detected_s < result.found_s < 0.25
@@ -107,7 +104,6 @@ def test_a_change_is_found_while_the_rotor_levitates(tmp_path):
     assert last.state == "tracking"
     assert abs(last.parameters["k_i"].value - result.k_i) < IN_99_9 * last.parameters["k_i"].sd
     assert last.parameters["k_i"].value == pytest.approx(result.k_i, rel=0.01)
-    assert figure.stat().st_size > 10_000
 
 
 def test_the_blocks_follow_a_coil_that_warms():

@@ -1,0 +1,112 @@
+"""The pages of the reference that describe themselves: commands from their own help, Python names from the packages."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterator
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+# Every public name stands once, with the job that it serves; rooms follow one another as a record goes through them.
+GROUPS: dict[str, dict[str, str]] = {
+    "The jobs": {"ambid": "what the commands call: one function each, and the nouns that they take and give"},
+    "Records and rigs": {
+        "ambid.record": "records and their files",
+        "ambid.rig": "what is known of a bench",
+        "ambid.signals": "excitation, conditioning, spectra, frequency responses, diagnostics",
+    },
+    "Physics": {
+        "ambid.physics": "models, magnets, loops and noise",
+        "ambid.simulation": "simulated benches and scenarios",
+    },
+    "Estimators": {
+        "ambid.estimation": "the estimate",
+        "ambid.bearing": "physical parameters of one axis",
+        "ambid.blackbox": "linear black boxes",
+        "ambid.nonlinear": "nonlinear black boxes",
+        "ambid.recursive": "recursive estimators and filters",
+        "ambid.tracking": "the supervised tracker",
+    },
+    "Jobs and hardware": {
+        "ambid.job": "whole jobs and their parts",
+        "ambid.report": "figures",
+        "ambid.acquisition": "records from a controller",
+    },
+}
+
+
+def public_names(room: str) -> list[str]:
+    """Return what a room exports, in alphabetical order."""
+    return sorted(getattr(import_module(room), "__all__", ()), key=str.lower)
+
+
+def write_reference(folder: Path) -> None:
+    """Write `commands.md`, `python.md` and a page for each room into the folder; equal files are left alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / "commands.md", "\n".join(_commands()))
+    lines = [
+        "# Python interface",
+        "",
+        "Public names only, from their docstrings. `import ambid` alone gives the jobs.",
+        "",
+    ]
+    for group, rooms in GROUPS.items():
+        lines += [f"## {group}", "", "| package | what is in it |", "|---|---|"]
+        lines += [f"| [`{room}`]({room}.md) | {what} |" for room, what in rooms.items()] + [""]
+    rooms = [(room, what) for group in GROUPS.values() for room, what in group.items()]
+    lines += ["```{toctree}", ":hidden:", "", *(room for room, _ in rooms), "```", ""]
+    _write(folder / "python.md", "\n".join(lines))
+    for room, what in rooms:
+        _write(folder / f"{room}.md", "\n".join(_room(room, what)))
+
+
+def _room(room: str, what: str) -> Iterator[str]:
+    yield from (f"# {room}", "", f"{what[0].upper()}{what[1:]}.", "")
+    yield from ("```{eval-rst}", f".. currentmodule:: {room}", "")
+    jobs = import_module("ambid")
+    for name in public_names(room):
+        thing = getattr(import_module(room), name)
+        if room != "ambid" and name in jobs.__all__ and getattr(jobs, name) is thing:
+            yield from (f"``{name}`` is :py:obj:`ambid.{name}`.", "")
+            continue
+        kind = "class" if inspect.isclass(thing) else "function" if callable(thing) else "data"
+        yield f".. auto{kind}:: {name}"
+        if kind == "class":
+            yield "   :members:"
+        yield ""
+    yield "```"
+
+
+def _commands() -> Iterator[str]:
+    import typer
+
+    from ambid.cli.app import app
+
+    top: Any = typer.main.get_command(app)
+    yield from ("# Commands", "", "What `ambid COMMAND --help` says, made from the program itself.", "")
+    for name, command in top.commands.items():
+        yield from _command(name, command)
+
+
+def _command(name: str, command: Any) -> Iterator[str]:
+    import typer
+
+    context = typer.Context(command, info_name=f"ambid {name}")
+    usage = " ".join(command.collect_usage_pieces(context))
+    yield from (f"## ambid {name}", "", "```text", f"ambid {name} {usage}", "```", "")
+    yield from (_text(command.help or command.short_help or ""), "")
+    rows = [row for p in command.params if (row := p.get_help_record(context))]
+    for words, said in rows:
+        yield from (f"`{words}`", f": {' '.join(_text(said).split())}", "")
+
+
+def _text(said: str) -> str:
+    """Help as Markdown: what would be read as markup is not."""
+    return re.sub(r"([*_<>|\[\]$\\])", r"\\\1", inspect.cleandoc(said).replace("\b", ""))
+
+
+def _write(path: Path, text: str) -> None:
+    if not path.is_file() or path.read_text(encoding="utf-8") != text:
+        path.write_text(text, encoding="utf-8")
