@@ -156,8 +156,8 @@ def known_units() -> tuple[str, ...]:
     return (*_SUGGESTED, *_KNOWN_COMPOUNDS)
 
 
-def counted(n: float, noun: str) -> str:
-    """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``."""
+def counted(n: float | str, noun: str) -> str:
+    """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``; a number may be text already."""
     text = f"{n:.3g}" if isinstance(n, float) else str(n)
     return f"{text} {noun}{'' if text == '1' else 's'}"
 

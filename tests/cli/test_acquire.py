@@ -64,7 +64,7 @@ def test_a_record_and_what_is_to_be_said_of_it(acquire, place):
     done = acquire("--seconds", "2", *PLAYED)
     assert done.code == 0
     assert "o.h5: 4000 samples at 2000 Hz (2 s) from simulated prototype" in done.out
-    for word in ("SNR", "range used", "saturated", "0 samples lost", "noise is what does not repeat"):
+    for word in ("SNR", "range used", "saturated", "0 samples lost", "noise: what does not repeat"):
         assert word in done.out
     rows = {line.split()[0]: line for line in done.out.splitlines() if line.startswith(("position", "duty"))}
     assert "dB" in rows["position"]

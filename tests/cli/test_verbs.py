@@ -184,9 +184,9 @@ def test_info_shows_levels_noise_and_excitation(bench, ambid):
     assert max(map(len, plain.out.splitlines())) <= 80
     for name in ("voltage", "current", "position"):
         assert any(line.startswith(f"{name} ") for line in plain.out.splitlines())
-    assert "✓ no saturation, no drop-outs, no outliers" in plain.out
+    assert "✓ no saturation, drop-outs or outliers" in plain.out
     by_role = ambid("info", "record.csv", "--rig", "rig.toml")
-    assert "noise is what 20 lags of the channel and of voltage do not predict" in by_role.out
+    assert "noise is the part that 20 lags of the channel and of voltage do not predict" in by_role.out
     assert "voltage: persistently exciting of order at least" in by_role.out
 
 

@@ -48,7 +48,7 @@ def test_without_an_excitation_there_is_no_ratio():
     still = replace(QUALITY, excited=False, columns=(replace(COLUMN, noise_by="differences"),))
     text = said(quality=still)
     assert "dB" not in text
-    assert "at most" in text
+    assert "upper bound" in text
     assert "dB" not in progress_line(still, NOTHING)
 
 
@@ -65,7 +65,7 @@ def test_what_is_poor_is_said_at_the_end():
 def test_the_clock_of_the_controller_is_told_with_its_uncertainty():
     counters = Counters(drift=12e-6, drift_sd=3e-6, controller={"busy_us": 231.0})
     text = said(counters=counters)
-    assert "231 us in its longest tick" in text
+    assert "longest controller tick 231 us" in text
     assert "+12.0 ± 3.0 ppm" in text
 
 

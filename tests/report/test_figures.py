@@ -24,7 +24,7 @@ def test_the_overview_has_all_parts(unstable):
     titles = [axes.get_title() for axes in page.axes]
     for words in (
         "measured and predicted",
-        "innovations",
+        "residuals",
         "autocorrelation",
         "voltage → position",
         "poles of the identified",

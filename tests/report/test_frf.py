@@ -37,7 +37,7 @@ def test_pairs_are_told_by_their_medians():
     assert line.split()[:3] == ["voltage", "→", "position"]
     assert "2 %" in line
     assert "um/V" in line
-    assert "not told apart" in " ".join(about)
+    assert "not separated" in " ".join(about)
     split = drawn(noise=(0.01 * np.abs(frame.G)) ** 2 + 0j, coherence=np.full((40, 1), 0.9876))
     (_, line, *_) = pair_lines(Measured(response=split))
     assert [x for x in line.split() if x[0].isdigit()][2:] == ["2", "1", "1.7", "0.9876"]

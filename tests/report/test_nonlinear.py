@@ -63,7 +63,7 @@ def test_weights_beside_terms_are_counted_and_ratios_shown_where_there_are_any(f
     lines = term_lines(hybrid)
     assert lines[0].split() == ["term", "coefficient", "±", "sd"]
     assert [x.split()[0] for x in lines[1:5]] == names[:4]
-    assert lines[5:] == [f"beside them a network of {len(names) - 4} weights; --json has them"]
+    assert lines[5:] == [f"and a network of {len(names) - 4} weights; --json has them"]
 
 
 def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit) -> None:

@@ -57,6 +57,6 @@ def test_excitation_is_told_with_its_band():
 
 def test_constant_short_and_unknown_channels_are_named_not_crashed_on():
     text = record_text(record_of(voltage=np.zeros(30), current=np.arange(30.0) % 7, other=np.arange(30.0)))
-    assert "voltage: constant, it excites nothing" in text
+    assert "voltage: constant, no excitation" in text
     assert row(text, "current")[-1] == "short"
-    assert "other: no known unit [?]" in text
+    assert "other: unknown unit [?]" in text

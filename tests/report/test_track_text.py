@@ -62,10 +62,10 @@ def test_many_events_are_not_all_listed(track):
 
 TROUBLES = {
     "none": (1.0, "tracking", (), ()),
-    "frozen": (1.0, "frozen", (), ("without information",)),
-    "error": (1.6, "tracking", (), ("1.6 at the end, beyond the limit 1.5",)),
-    "unknown error": (math.nan, "tracking", (), ("not known",)),
-    "open change": (1.0, "tracking", ("k_i", None), ("of k_i at 3 s was not answered", "the change at 3 s")),
+    "frozen": (1.0, "frozen", (), ("without excitation",)),
+    "error": (1.6, "tracking", (), ("at the end is 1.6, above the limit 1.5",)),
+    "unknown error": (math.nan, "tracking", (), ("unknown",)),
+    "open change": (1.0, "tracking", ("k_i", None), ("of k_i at 3 s was not followed", "the change at 3 s")),
     "contradicted": (1.0, "changed", (), ("contradict",)),
     "held": (1.0, "hold", (), ()),
 }

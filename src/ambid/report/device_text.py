@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain, wrapped
+from ambid.units import counted
 
 if TYPE_CHECKING:
     from pathlib import Path
@@ -19,21 +20,21 @@ if TYPE_CHECKING:
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
 _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
 _NEXT = {
-    "self-test": "put right what the self-test names; nothing was switched on",
-    "rest": "put sensors, wiring or calibrations right; nothing was switched on",
-    "levitate": "put the bench right, or [loop], [daq.trip] and the calibrations of the rig",
-    "excite": "give a smaller --amplitude or another --band, or put the bench right",
-    "record": "see to what spoilt the record; {folder}/record.h5 holds what came",
+    "self-test": "correct what the self-test names; the output was never switched on",
+    "rest": "correct sensors, wiring or calibrations; the output was never switched on",
+    "levitate": "correct the bench, or [loop], [daq.trip] and the calibrations of the rig",
+    "excite": "give a smaller --amplitude or another --band, or correct the bench",
+    "record": "remove what disturbed the record; {folder}/record.h5 holds what was recorded",
     "identify": (
         "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig;"
         " 'ambid identify {folder}/record.h5 --rig RIG' tries a corrected rig without the bench"
     ),
     "validate": (
-        "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for what"
-        " changed between the two"
+        "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
+        "what changed between the two"
     ),
-    "report": "see to the folder and its disk",
-    "track": "look for what changed since the record: load, temperature, supply; {folder}/track.jsonl shows when",
+    "report": "check the folder and its disk",
+    "track": "look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when",
 }
 """What to do after a step that was not good enough."""
 
@@ -75,7 +76,8 @@ def acquired_text(
     stored = run.samples - not_stored - q.repeated
     whole = "" if stored == run.wanted else f" of {run.wanted} wanted"
     head = (
-        f"{path}: {stored} samples{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from {info.kind} {info.port}"
+        f"{path}: {counted(stored, 'sample')}{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from "
+        f"{info.kind} {info.port}"
     )
     words = [paint(line, "dim") for line in textwrap.wrap(_noise_words(q), width)]
     words += textwrap.wrap(_line_words(run, counters), width)
@@ -84,14 +86,17 @@ def acquired_text(
 
 
 def _line_words(run: RunReport, counters: Counters) -> str:
-    words = f"{run.lost} samples lost, {counters.damaged} frames damaged, {counters.overruns} blocks overrun"
+    words = (
+        f"{counted(run.lost, 'sample')} lost, {counted(counters.damaged, 'frame')} damaged, "
+        f"{counted(counters.overruns, 'block')} overrun"
+    )
     if run.lost:
         words += "; read it with --gaps"
     busy = counters.controller.get("busy_us")
     if busy is not None:
-        words += f"; the controller worked {busy:.0f} us in its longest tick"
+        words += f"; longest controller tick {busy:.0f} us"
     if math.isfinite(counters.drift):
-        words += f"; its clock is {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm off"
+        words += f"; controller clock off by {1e6 * counters.drift:+.1f} ± {1e6 * counters.drift_sd:.1f} ppm"
     return words
 
 
@@ -99,10 +104,10 @@ def _noise_words(q: QualityReport) -> str:
     """Say what the column of noise is: neither way of telling it knows what the sensor's own noise is."""
     if q.columns and q.columns[0].noise_by == "periods":
         return (
-            "noise is what does not repeat with the excitation: the sensor's, and how the bench and its loop answer to"
-            " disturbance; SNR is what repeats over it"
+            "noise: what does not repeat with the excitation (sensor noise and the response to disturbances); SNR: "
+            "the repeating part over it"
         )
-    return "noise is what changes from sample to sample, at most: fast motion counts as noise too"
+    return "noise: upper bound from sample-to-sample changes; fast motion counts as noise"
 
 
 def _table(q: QualityReport, paint: Paint) -> list[str]:

@@ -173,7 +173,7 @@ def residuals_panel(figure: Figure | SubFigure, traces: Traces) -> None:
         over_lag.set_ylim(-reach, reach)
         grid(over_time, over_lag)
     heads = (
-        "innovations (measured - predicted) with 99 % bounds",
+        "residuals (measured - predicted) with 99 % bounds",
         "their autocorrelation with 99 % bounds of white noise",
     )
     _heads(axes, heads, ("time [s]", "lag [samples]"))

@@ -33,6 +33,7 @@ from ambid.report.text import (
     verdict_lines,
     warning_lines,
 )
+from ambid.units import counted
 
 if TYPE_CHECKING:
     from ambid.bearing.frequency import FrequencyEstimate
@@ -105,7 +106,7 @@ def curve_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH) -> li
     for table in tables:
         lines += ["", *columns(table)] if lines else columns(table)
     if any("*" in cell for table in tables for row in table for cell in row):
-        lines += ["* no record came there: the law extrapolates, which its deviation does not know"]
+        lines += ["* outside the recorded range: the law extrapolates, and its sd does not cover that"]
     return lines
 
 
@@ -166,7 +167,7 @@ def output_rows(estimate: AnyEstimate) -> list[tuple[str, ...]]:
 def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Write how an estimate does on a second record: the fit of each output, then the checks."""
     return [
-        paint(f"on the second record ({validation['samples']} samples)", "strong"),
+        paint(f"on the second record ({counted(int(validation['samples']), 'sample')})", "strong"),
         *columns(validation_rows(validation)),
         *check_lines(checks_of(validation), width=width, paint=paint),
     ]
@@ -183,7 +184,7 @@ def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
             free = "unstable in open loop" if f["simulation"] is None else fraction(f["simulation"])
             rows.append((role, *(fraction(f["k_step"][k]) for k in horizons), free))
         return rows
-    rows = [("fit", "one step", "innovations", "of those at identification")]
+    rows = [("fit", "one step", "innovations", "relative to identification")]
     for role, f in fits.items():
         rms = f"{sized(float(f['innovation_rms']), _UNITS[role])} rms"
         rows.append((role, f"{f['one_step']:.4f}", rms, f"{100 * float(f['ratio']):.3g} %"))
@@ -194,10 +195,10 @@ def physics_text(found: PhysicalFit | FrequencyEstimate, *, width: int = WIDTH, 
     """Write the physical parameters that follow from a black-box fit or a measured response, and their checks."""
     d = found.delay
     spread = "" if d.sd is None else f" ± {d.sd:.2g}"
-    delay = f"delay {d.samples + d.fraction:.4g}{spread} samples, {d.how}"
+    delay = f"delay {counted(f'{d.samples + d.fraction:.4g}{spread}', 'sample')}, {d.how}"
     if not isinstance(found, Judged):
         low, high = found.band_hz
-        about, checks = f", from {found.structure}", {"misfit": found.misfit}
+        about, checks = f", from {found.structure}", {"agreement": found.misfit}
         delay += f"; from {sized(low, 'Hz')} to {sized(high, 'Hz')}"
         warnings = other_warnings(checks, found.warnings)
     else:  # its warnings stand with those of the response

@@ -208,7 +208,7 @@ def _curves(figure: Figure | SubFigure, e: NonlinearBearingEstimate) -> None:
     axes = figure.subplots(1, 3)
     found = [e.curves(x, level) for level in levels.tolist()]
     for a, name, meaning in zip(
-        axes, ("k_i", "k_x", "L"), ("force per current", "stiffness", "inductance"), strict=True
+        axes, ("k_i", "k_x", "L"), ("force–current factor", "stiffness", "inductance"), strict=True
     ):
         size, shown = _unit_of(found, name)
         for k, (level, at) in enumerate(zip(levels, found, strict=True)):
@@ -219,7 +219,9 @@ def _curves(figure: Figure | SubFigure, e: NonlinearBearingEstimate) -> None:
         a.set_title(f"{meaning} {name}", fontsize=10)
         grid(a)
     axes[0].legend(loc="best", fontsize=8, framealpha=0.85)
-    figure.suptitle("curves with 95 % bands; dotted where the free rotor did not come (L: no record)", fontsize=10)
+    figure.suptitle(
+        "curves with 95 % bands; dotted outside the range of the free rotor (L: of all records)", fontsize=10
+    )
 
 
 def _unit_of(found: Sequence[Curves], name: str) -> tuple[float, str]:
@@ -251,7 +253,7 @@ def _map(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
     _balance(where, e, scale)
     where.set_xlabel(f"position [{unit}]")
     where.set_ylabel("current [A]")
-    where.set_title("where the records were; hulls of the free rotor and of all", fontsize=10)
+    where.set_title("positions and currents of the records; hulls of the free rotor and of all records", fontsize=10)
     where.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, framealpha=0.85)
     low, high = e.coil_hull[:, 1].min(), e.coil_hull[:, 1].max()
     currents, levels = np.linspace(low, high, _POINTS), np.linspace(*e.usual["position"], _LEVELS)

@@ -41,6 +41,7 @@ from ambid.report.drawing import (
 from ambid.report.fit_text import is_weight, pole_lines, term_ratios
 from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
+from ambid.units import counted
 from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
 from ambid.validation.residuals import Correlation, correlations
 
@@ -75,7 +76,7 @@ def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], sec
     `second`: a further record that a nonlinear fit was judged on.
     """
     if not records:
-        raise EstimationError("there is no record to draw. Pass those that the fit was estimated from")
+        raise EstimationError("no record was given. Pass those that the fit was estimated from")
     parts, n_y = _signals(fit, records, second), len(fit.outputs)
     width = max(11.0, 4.5 * n_y) if len(records) > 1 or second is not None else 11.0
     if isinstance(fit, BlackBoxFit):
@@ -111,7 +112,7 @@ def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IODat
 
 def _title(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None) -> str:
     what = _name(records[0], 0) if len(records) == 1 else f"{len(records)} records"
-    more = f", judged on {_name(second, 0)} too" if second is not None else ""
+    more = f", validated on {_name(second, 0)}" if second is not None else ""
     left = len(records) - _RECORDS
     hidden = f" (the first {_RECORDS} are drawn, {left} more are not)" if left > 0 else ""
     return f"{what}: {fit.structure}{more}{hidden}"
@@ -188,8 +189,8 @@ def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
     if known is not None:
         of_poles, of_zeros = pole_covariance(fit.model, known), zero_covariance(fit.model, known)[near]
     far = int(zeros.size - np.count_nonzero(near))
-    hidden = f"; {far} zero(s) farther out" if far else ""
-    delayed = ", delay apart" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
+    hidden = f"; {counted(far, 'zero')} farther out" if far else ""
+    delayed = ", without the delay" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
     poles_panel(
         figure,
         roots(poles, of_poles, 1e3),

@@ -186,12 +186,12 @@ def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
     if fit.sd is not None:
         known = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
     elif "uncertainty" in fit.settings:
-        known += " (--settings uncertainty=... asks for them)"
+        known += " (--settings uncertainty=... gives them)"
     size = fit.model.theta.size
     lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{'' if shown else '; --json has them all'}"]
     effective = fit.details.get("effective_parameters")
     if isinstance(effective, (int, float)) and math.isfinite(effective) and round(effective, 1) < fit.n_estimated:
-        lines.append(f"as many as {effective:.3g} parameters would be without the prior")
+        lines.append(f"regularised to {effective:.3g} effective parameters")
     return lines
 
 
@@ -221,7 +221,7 @@ def term_lines(fit: NonlinearFit) -> list[str]:
         shares = ["ERR", *(_percent(ratio.get(fit.model.names[k])) for k in named[:_TERMS])]
         rows = [(*r, x) for r, x in zip(rows, shares, strict=True)]
     more = [f"… and {rest} more; --json has them all"] if rest else []
-    beside = [f"beside them a network of {weights} weights; --json has them"] if weights else []
+    beside = [f"and a network of {weights} weights; --json has them"] if weights else []
     return [*columns(rows, right=(2,)), *more, *beside]
 
 
@@ -339,7 +339,7 @@ def _response_header(measured: Measured, width: int, paint: Paint) -> list[str]:
     if samples:
         first = title_line(name, "frequency response", samples, frf.rate_hz, "converged", paint)
     reference = f", reference {', '.join(measured.references)}" if measured.references else ""
-    loop = ", said to be open loop" if measured.open_loop else ""
+    loop = ", declared open loop" if measured.open_loop else ""
     signals = f"from {', '.join(frf.inputs)} to {', '.join(frf.outputs)}{reference}{loop}"
     f = frf.frequency_hz
     method = f"{frf.method}{_periods(frf.details)}; {f.size} lines, {sized(f[0], 'Hz')} to {sized(f[-1], 'Hz')}"
@@ -373,7 +373,7 @@ def pair_lines(measured: Measured, *, width: int = WIDTH) -> list[str]:
         named = [[*textwrap.wrap(row[0], width), line] for row, line in zip(rows[1:], values, strict=True)]
         lines = [head, *(line for pair in named for line in pair)]
     about = "medians over the lines, of |G|"
-    about += "; noise and distortion were not told apart" if distortion is None else ""
+    about += "; noise and distortion were not separated" if distortion is None else ""
     return [*lines, *textwrap.wrap(f"({about})", width)]
 
 
@@ -400,7 +400,10 @@ def _distortion_lines(measured: Measured, width: int) -> list[str]:
         signal = _rms(found.signal, k)
         cells = [found.even, found.even_noise, found.odd, found.odd_noise]
         rows.append((output, *("–" if x is None or not x.size else _decibel(_rms(x, k), signal) for x in cells)))
-    return [*columns(rows, right=(1, 2, 3, 4)), *textwrap.wrap("(rms of a line beside that of an excited one)", width)]
+    return [
+        *columns(rows, right=(1, 2, 3, 4)),
+        *textwrap.wrap("(rms of a line relative to that of an excited one)", width),
+    ]
 
 
 def _rms(levels: Array, k: int) -> float:

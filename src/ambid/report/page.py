@@ -37,26 +37,32 @@ _CAPTIONS = {
     ),
     "residuals": (
         "Innovations",
-        "What is left of the measurement. For a right model they are white: about 1 % outside the bounds, no pattern.",
+        "Measured minus predicted. The residuals of a correct model are white: about 1 % outside the bounds, no "
+        "pattern.",
     ),
     "bode": (
         "Frequency response of the identified plant",
-        "From the physical parameters, with the 95 % band that their covariance gives, up to half the sampling rate.",
+        "Computed from the physical parameters up to half the sampling rate, with the 95 % band that follows from "
+        "their covariance.",
     ),
-    "poles": ("Poles", "Of the identified plant in open loop, with the 95 % regions that the covariance gives."),
+    "poles": (
+        "Poles",
+        "Poles of the identified plant in open loop, with the 95 % regions that follow from the covariance.",
+    ),
     "curves": (
         "Curves",
-        "From one co-energy, so that force and motional voltage agree, with the bands that the covariance gives. "
-        "Dotted where no record came: there the law extrapolates, and the band does not know it.",
+        "From one co-energy, so that force and back-EMF agree, with the bands that follow from the covariance. "
+        "Dotted outside the recorded range: there the law extrapolates, which the band does not cover.",
     ),
     "map": (
-        "Where the records were",
-        "Each point a sample. For one magnet, the line on which its force is the weight: a rotor at rest stands on it.",
+        "Range of the records",
+        "Each point is a sample. For one magnet, the line shows where its force equals the weight; a rotor at rest "
+        "lies on it.",
     ),
     "records": (
         "Records",
-        "Each sample predicted from all samples before it; errors over the standard deviation that the predictor "
-        "expects of them. For a right model they are white: about 1 % outside the bounds, no pattern.",
+        "Each sample predicted from all samples before it; errors relative to the standard deviation expected by "
+        "the predictor. The errors of a correct model are white: about 1 % outside the bounds, no pattern.",
     ),
 }
 _LIBRARIES = ("ambid", "numpy", "scipy", "numba")

@@ -14,7 +14,7 @@ from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WIDTH, Paint, columns, fraction, joined, plain, pure, wrapped
 from ambid.rig.roles import rank_roles
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
-from ambid.units import UNKNOWN
+from ambid.units import UNKNOWN, counted
 
 if TYPE_CHECKING:
     from ambid.validation.comparison import Comparison, Entry
@@ -29,8 +29,8 @@ def record_text(record: Record, *, inputs: Sequence[str] = (), paint: Paint = pl
     """Describe a record: its channels, a sentence for each thing found, and its history."""
     name = record.provenance.get("file", "record")
     head = (
-        f"{paint(name, 'strong')}: {record.n_samples} samples at {record.rate_hz:.6g} Hz, {record.duration_s:.6g} s"
-        f" from {record.start_s:g} s"
+        f"{paint(name, 'strong')}: {counted(record.n_samples, 'sample')} at {record.rate_hz:.6g} Hz, "
+        f"{record.duration_s:.6g} s from {record.start_s:g} s"
     )
     rows: list[tuple[str, ...]] = [("channel", "unit", "min", "max", "mean", "sd", "step", "SNR")]
     rows += [_row(record, c, inputs) for c in record.channels]
@@ -78,7 +78,7 @@ def _findings(record: Record, inputs: Sequence[str], paint: Paint) -> list[str]:
     lines: list[str] = []
     for c in record.channels:
         if c.unit == UNKNOWN:
-            lines.append(f"{paint('✗', 'bad')} {c.name}: no known unit [{c.source_unit}]; a rig can declare it")
+            lines.append(f"{paint('✗', 'bad')} {c.name}: unknown unit [{c.source_unit}]; a rig can declare it")
         looks: tuple[Callable[[Record, str], object], ...] = (find_saturation, find_dropouts, find_outliers)
         for look in looks:
             try:
@@ -88,8 +88,8 @@ def _findings(record: Record, inputs: Sequence[str], paint: Paint) -> list[str]:
             if found.count:  # type: ignore[attr-defined]
                 lines.append(f"{paint('✗', 'bad')} {found}")
     if not lines:
-        lines.append(f"{paint('✓', 'good')} no saturation, no drop-outs, no outliers")
-    method = f"what 20 lags of the channel{' and of ' + ', '.join(inputs) if inputs else ''} do not predict"
+        lines.append(f"{paint('✓', 'good')} no saturation, drop-outs or outliers")
+    method = f"the part that 20 lags of the channel{' and of ' + ', '.join(inputs) if inputs else ''} do not predict"
     lines.append(f"SNR: noise is {method}{'' if inputs else '; without a rig a lower bound'}")
     lines += [_excitation(record, name) for name in inputs or record.names]
     return lines
@@ -101,7 +101,7 @@ def _excitation(record: Record, name: str) -> str:
     centred = u - u.mean()
     power = np.cumsum(np.abs(np.fft.rfft(centred)) ** 2)
     if not power[-1] > 0:
-        return f"{name}: constant, it excites nothing"
+        return f"{name}: constant, no excitation"
     low, high = (np.searchsorted(power, part * power[-1]) * record.rate_hz / u.size for part in (0.005, 0.995))
     band = f"99 % of its power between {sized(float(low), 'Hz')} and {sized(float(high), 'Hz')}"
     try:
@@ -118,8 +118,8 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint 
     n, where = comparison.judged_samples, comparison.judged_on
     on = f"the {n} of a second record" if where == "second record" else f"{n} of the {where}"
     header = (
-        f"{paint(str(name), 'strong')}: {signals}{', '.join(comparison.outputs)}; {comparison.fitted_samples} samples "
-        f"fitted, judged on {on}"
+        f"{paint(str(name), 'strong')}: {signals}{', '.join(comparison.outputs)}; "
+        f"{counted(comparison.fitted_samples, 'sample')} fitted, validated on {on}"
     )
     least = min((x.fit.criteria["bic"] for x in comparison.entries if x.fit and "bic" in x.fit.criteria), default=0.0)
     head = ("structure", "orders", "d", "BIC", "one-step", "simulation", "s", "checks")
@@ -135,8 +135,8 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint 
         if x.fit is None or x.failed
     ]
     meaning = (
-        "d: numbers estimated; BIC: above the least, on the data fitted; one-step, simulation: fit on data not used, "
-        f"1 - |e|/|y - mean|; s: seconds with the choice of orders. {comparison.summary}."
+        "d: estimated parameters; BIC: above the smallest, on the data fitted; one-step, simulation: fit on data "
+        f"not used, 1 - |e|/|y - mean|; s: seconds, choice of orders included. {comparison.summary}."
     )
     first = wrapped([header], width) if paint is plain else [header]
     return joined([first, painted, wrapped(remarks, width, "  "), wrapped([meaning], width)])
@@ -178,15 +178,15 @@ def sensitivity_text(found: SensitivityAnalysis, *, width: int = WIDTH, paint: P
         for x in found.influences[:_SHOWN]
     ]
     rest = len(found.influences) - _SHOWN
-    more = [f"… and {rest} more, which matter less; --json has them all"] if rest > 0 else []
+    more = [f"… and {rest} more of less effect; --json has them all"] if rest > 0 else []
     index = "infinite" if not np.isfinite(found.collinearity) else f"{found.collinearity:.3g}"
     pairs = "; ".join(f"{a} with {b} ({r:+.3f})" for a, b, r in found.pairs[:6]) or "none above 0.9"
     weakest = ", ".join(f"{name} {100 * part:+.3g} %" for name, part in found.weakest)
     notes = [
-        "if a number moves by 1 %: rise of -2 log L alone, and with all others fitted again (under 4: within 2 sd); "
-        "largest move of a pole; move of the frequency response",
-        f"collinearity of all together {index} (under 10 is good); correlated: {pairs}",
-        *([f"seen least, relative to each other: {weakest}"] if weakest else []),
+        "for a change of one coefficient by 1 %: rise of -2 log L with the others kept, and with the others "
+        "refitted (below 4: within 2 sd); largest move of a pole; change of the frequency response",
+        f"collinearity of all coefficients {index} (below 10 is good); correlated: {pairs}",
+        *([f"least identifiable, relative to each other: {weakest}"] if weakest else []),
     ]
     text = [line for note in notes for line in textwrap.wrap(note, width)]
     return "\n".join([paint("sensitivity", "strong"), *columns(rows), *more, *text])

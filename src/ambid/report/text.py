@@ -13,6 +13,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, Verdict
 from ambid.report.numbers import Quantity, quantity, sized
+from ambid.units import counted
 
 Style = Literal["good", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
@@ -50,8 +51,8 @@ def columns(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list
 def title_line(name: object, what: str, samples: int, rate_hz: float, status: str, paint: Paint = plain) -> str:
     """Say what came of how long a record, and whether the search converged."""
     return (
-        f"{paint(str(name or 'record'), 'strong')}: {what}, {samples} samples at {rate_hz:g} Hz"
-        f" ({samples / rate_hz:.4g} s){status_words(status, paint)}"
+        f"{paint(str(name or 'record'), 'strong')}: {what}, {counted(samples, 'sample')} at {rate_hz:g} Hz "
+        f"({samples / rate_hz:.4g} s){status_words(status, paint)}"
     )
 
 
@@ -157,7 +158,7 @@ def delay_line(what: str, d: Delay, rate_hz: float) -> str:
     total = d.samples + d.fraction
     count = f"{total:.3g}" if d.sd is None else pure(total, d.sd)
     time = f" ({sized(total / rate_hz, 's')})" if total else ""
-    return f"delay of {what}: {count} sample{'' if count == '1' else 's'}{time}, {d.how}"
+    return f"delay of {what}: {counted(count, 'sample')}{time}, {d.how}"
 
 
 def pure(value: float, sd: float) -> str:
@@ -225,7 +226,7 @@ def criteria_lines(criteria: Mapping[str, float], n_estimated: int, width: int) 
     if not criteria:
         return []
     text = ", ".join(f"{name} {value:.6g}" for name, value in criteria.items())
-    return textwrap.wrap(f"criteria: {text}; {n_estimated} numbers estimated", width)
+    return textwrap.wrap(f"criteria: {text}; {n_estimated} parameters estimated", width)
 
 
 def check_lines(

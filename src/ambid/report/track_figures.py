@@ -316,7 +316,7 @@ def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequenc
         Line2D([], [], color=_MARK, linestyle=_MARKED[kind], linewidth=1.0, label=kind)
         for kind in dict.fromkeys(e.kind for e in marks)
     ]
-    entries.append(Line2D([], [], color=_OVER, linestyle="--", linewidth=1.2, label="limit of the error"))
+    entries.append(Line2D([], [], color=_OVER, linestyle="--", linewidth=1.2, label="model error limit"))
     for code, name in enumerate(STATES):
         if (history.state == code).any():
             entries.append(

@@ -22,6 +22,7 @@ from ambid.report.text import (
     warning_lines,
 )
 from ambid.tracking.lines_file import NORMAL_95
+from ambid.units import counted
 
 if TYPE_CHECKING:
     from rich.console import Group
@@ -135,18 +136,18 @@ def troubles_of(header: TrackHeader, last: TrackLine, open_changes: Sequence[Eve
     found = []
     for e in open_changes:
         who = f"of {e.parameter} " if e.parameter else ""
-        found.append(f"the change {who}at {e.t:.4g} s was not answered by new values that passed their validation")
+        found.append(f"the change {who}at {e.t:.4g} s was not followed by new values that passed validation")
     if last.state == "frozen":
-        found.append("the record ends without information: parameters are frozen, and older than its end")
+        found.append("the record ends without excitation: the parameters are frozen at an earlier time")
     if last.state == "changed" and not open_changes:
         found.append("the record ends while the data contradict the published values")
     if last.error > header.limit:
-        found.append(f"the model error is {last.error:.3g} at the end, beyond the limit {header.limit:g}")
+        found.append(f"the model error at the end is {last.error:.3g}, above the limit {header.limit:g}")
     elif math.isnan(last.error):
-        found.append("the model error at the end is not known")
+        found.append("the model error at the end is unknown")
     if header.warnings:
-        n = _counted(len(header.warnings), "warning")
-        found.append(f"the start is to be mistrusted: {n}, see below")
+        n = counted(len(header.warnings), "warning")
+        found.append(f"the starting estimate failed its checks: {n}, see below")
     return tuple(found)
 
 
@@ -162,7 +163,7 @@ def state_lines(
 
     `width`: columns of the terminal; `paint`: adds colour.
     """
-    error = "not known" if math.isnan(last.error) else f"{last.error:.3g}"
+    error = "unknown" if math.isnan(last.error) else f"{last.error:.3g}"
     lines = [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"]
     return [*lines, *(x for trouble in troubles for x in hanging(f"{paint('✗', 'bad')} ", trouble, width, 2))]
 
@@ -190,10 +191,10 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
     `paint`: adds colour.
     """
     places = summary.counts.get("rejected", 0)
-    rejected = _counted(summary.rejected_samples, "sample") + " rejected"
+    rejected = counted(summary.rejected_samples, "sample") + " rejected"
     if places:
-        rejected += f" in {_counted(places, 'place')}"
-    lines = [f"{_counted(summary.updates, 'update')}, {_counted(len(summary.changes), 'change')}, {rejected}"]
+        rejected += f" in {counted(places, 'place')}"
+    lines = [f"{counted(summary.updates, 'update')}, {counted(len(summary.changes), 'change')}, {rejected}"]
     if summary.counts:
         lines.append(f"events: {', '.join(f'{n} {kind}' for kind, n in summary.counts.items())}")
     speed = speed_words(summary.samples, summary.seconds_of_record, summary.computing_s)
@@ -201,7 +202,7 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
         lines.append(paint(f"{summary.computing_s:.2g} s of computing: {speed}", "dim"))
     latency = summary.latency
     if latency is not None and math.isfinite(latency.median):
-        lost = f"; {_counted(latency.overruns, 'block')} LOST" if latency.overruns else ""
+        lost = f"; {counted(latency.overruns, 'block')} LOST" if latency.overruns else ""
         median, p99, largest = (sized(x, "s", 3) for x in (latency.median, latency.p99, latency.largest))
         words = f"latency of a block: median {median}, 99 % {p99}, largest {largest}; {latency.late} late{lost}"
         lines.append(paint(words, "bad" if lost else "dim"))
@@ -220,10 +221,6 @@ def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> s
         f"{rate / 1e6:.3g} million" if rate >= 1e6 else f"{rate / 1e3:.3g} thousand" if rate >= 1e3 else f"{rate:.3g}"
     )
     return f"{pace} samples/s, {seconds_of_record / computing_s:.3g} times real time"
-
-
-def _counted(n: int, noun: str) -> str:
-    return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -376,7 +373,7 @@ def _counts(view: TrackView) -> Parts:
     done = view.line.t - view.begin_s
     parts: Parts = [f"{view.updates} updates, {view.rejected} samples rejected"]
     if view.open_changes:
-        parts.append((f", {_counted(view.open_changes, 'open change')}", "bold red"))
+        parts.append((f", {counted(view.open_changes, 'open change')}", "bold red"))
     speed = speed_words(round(done * view.header.rate_hz), done, view.wall_s)
     return [*parts, (f"\n{speed}", "dim")] if speed else parts
 
