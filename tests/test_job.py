@@ -188,11 +188,11 @@ def damaged(kind):
         return renamed(record(n=1500), voltage="current", current="voltage", position="position")
     rec = record()
     if kind == "position upside down in the second half":
-        x = rec["position"].copy()
+        x = rec["position"].values.copy()
         x[2000:] *= -1
         return replace(rec, channels=(*rec.channels[:2], Channel(name="position", unit="m", values=x)))
     if kind == "stuck for a while":
-        x = rec["position"].copy()
+        x = rec["position"].values.copy()
         x[1000:1800] = x[1000]
         return replace(rec, channels=(*rec.channels[:2], Channel(name="position", unit="m", values=x)))
     raise AssertionError(kind)

@@ -58,7 +58,5 @@ def test_the_functions_are_not_hidden_by_rooms(estimate, record):
 
     assert callable(ambid.simulate)
     assert callable(ambid.track)
-    fit = ambid.fit(
-        record, structure_name="arx", orders={"na": 2, "nb": 2, "nk": 1}, inputs=["voltage"], outputs=["current"]
-    )
+    fit = ambid.fit(record, structure="arx", orders={"na": 2, "nb": 2, "nk": 1}, input="voltage", output="current")
     assert fit.verdict.word in ("usable", "caution", "unusable")

@@ -70,7 +70,7 @@ class Result:
 
 def gravity_balance(record: Record) -> float:
     """Return k_i/m = -2 g/i0, i0 the mean current."""
-    return -2.0 * GRAVITY / float(record["current"].mean())
+    return -2.0 * GRAVITY / float(record["current"].values.mean())
 
 
 def plain_least_squares(record: Record, cutoff_hz: float) -> float:

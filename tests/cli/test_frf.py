@@ -229,7 +229,7 @@ def test_simulate_repeats_and_logs_the_excitation(tmp_path, monkeypatch, ambid):
         "10:1000",
     )
     assert ambid(*words, "--periods", "4", "--log-excitation").code == 0
-    excitation = read_record(tmp_path / "a.csv")["excitation"].reshape(4, -1)
+    excitation = read_record(tmp_path / "a.csv")["excitation"].values.reshape(4, -1)
     assert np.array_equal(excitation, np.broadcast_to(excitation[0], excitation.shape))
     assert np.abs(excitation).max() == pytest.approx(5.0)
     refused = ambid(*words, "--periods", "7", "-o", "b.csv")

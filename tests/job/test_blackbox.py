@@ -19,12 +19,12 @@ def test_a_choice_of_orders_says_what_share_is_over(tmp_path) -> None:
     def listen(stage: str, done: float | None = None) -> None:
         told.append((stage, done))
 
-    fit(tmp_path / "r.csv", inputs=["u"], outputs=["y"], structure_name="armax", open_loop=True, tick=listen)
+    fit(tmp_path / "r.csv", input="u", output="y", structure="armax", open_loop=True, tick=listen)
     shares = [x for stage, x in told if stage in ("orders", "fit") and x is not None]
     assert len(shares) > 5
     assert shares == sorted(shares)
     assert (shares[0], shares[-1]) == (0.0, 0.95)
     assert [x for k, (x, _) in enumerate(told) if k == 0 or x != told[k - 1][0]] == ["orders", "fit", "check"]
     told.clear()
-    fit(tmp_path / "r.csv", inputs=["u"], outputs=["y"], structure_name="arx", orders={"na": 2, "nb": 1}, tick=listen)
+    fit(tmp_path / "r.csv", input="u", output="y", structure="arx", orders={"na": 2, "nb": 1}, tick=listen)
     assert told == [("fit", None), ("check", None)]

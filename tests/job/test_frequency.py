@@ -16,7 +16,7 @@ from tests.job.loops import loop_record, odd_record
 
 BEARING = preset("unstable-bearing")
 FREE = ("m", "k_x", "k_i", "R", "L")
-BOTH = {"inputs": ["voltage"], "outputs": ["position", "current"], "references": ["excitation"]}
+BOTH = {"input": "voltage", "output": ["position", "current"], "reference": "excitation"}
 LATE = 1.0 / BEARING.rate_hz
 
 
@@ -27,7 +27,7 @@ def record():
 
 @pytest.fixture(scope="module")
 def physical(record):
-    return frf(record, references=["excitation"], rig=default_rig())
+    return frf(record, reference="excitation", rig=default_rig())
 
 
 def test_physical_parameters_of_a_levitated_bearing_lie_in_their_intervals(physical):
@@ -92,7 +92,7 @@ def test_distortion_is_told_from_noise_where_lines_are_left_free():
 
 def test_a_file_and_its_record_give_the_same(record, physical, tmp_path):
     write_record(record, tmp_path / "loop.csv")
-    found = frf(tmp_path / "loop.csv", references=["excitation"], rig=default_rig())
+    found = frf(tmp_path / "loop.csv", reference="excitation", rig=default_rig())
     np.testing.assert_allclose(found.response.G, physical.response.G, rtol=1e-9)
     assert found.record["file"] == "loop.csv"
 
@@ -103,7 +103,7 @@ def test_the_rig_s_delay_and_fixed_values_are_obeyed(record):
         replace(p, role="fixed", value=BEARING.parameters["m"]) if p.name == "m" else p for p in rig.parameters
     )
     given = tuple(replace(c, delay=1) if c.role == "voltage" else c for c in rig.channels)
-    found = frf(record, references=["excitation"], rig=replace(rig, parameters=known, channels=given)).estimate
+    found = frf(record, reference="excitation", rig=replace(rig, parameters=known, channels=given)).estimate
     assert found.delay.how == "given"
     assert found.parameter("m").value == BEARING.parameters["m"]
     assert found.parameter("m").sd == 0.0
@@ -112,7 +112,7 @@ def test_the_rig_s_delay_and_fixed_values_are_obeyed(record):
 
 def test_an_operating_point_is_the_records_and_a_response_does_not_claim_it(record):
     found = frf(record, **BOTH, orders={"nf": 4})
-    assert found.fit.offsets.y == pytest.approx([record["position"].mean(), record["current"].mean()])
+    assert found.fit.offsets.y == pytest.approx([record["position"].values.mean(), record["current"].values.mean()])
     assert "do not" in found.fit.details["offsets"] or "does not" in found.fit.details["offsets"]
 
 
@@ -124,7 +124,7 @@ def test_several_inputs_and_a_direct_path_in_open_loop():
     y += 0.05 * rng.normal(size=(n, 2))
     columns = {"u1": u[:, 0], "u2": u[:, 1], "y1": y[:, 0], "y2": y[:, 1]}
     made = Record(rate_hz=1000.0, channels=tuple(Channel(name=k, unit="V", values=v) for k, v in columns.items()))
-    found = frf(made, inputs=["u1", "u2"], outputs=["y1", "y2"], open_loop=True, method="random",
+    found = frf(made, input=["u1", "u2"], output=["y1", "y2"], open_loop=True, method="random",
                 state_space=4, feedthrough=True, domain="z")  # fmt: skip
     assert found.response.method.startswith("H1")
     assert pytest.approx(np.array([[0.0, 0.0], [0.3, 0.0]]), abs=0.01) == found.fit.model.D

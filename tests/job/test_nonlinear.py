@@ -11,7 +11,7 @@ from ambid.job.results import load
 from ambid.nonlinear.fit_file import nonlinear_fit_text
 from ambid.record import read_record
 
-CHANNELS = {"inputs": ("u",), "outputs": ("y",)}
+CHANNELS = {"input": "u", "output": "y"}
 
 
 @pytest.fixture(scope="module")
@@ -33,7 +33,7 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
     found = fit(
         [folder / "r0.csv", read_record(folder / "r1.csv")],
         **CHANNELS,
-        structure_name="narmax",
+        structure="narmax",
         settings={"ne": 0},
         open_loop=True,
         from_s=0.5,
@@ -61,7 +61,7 @@ def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> No
             calls.append("stopped")
             raise KeyboardInterrupt
 
-    found = fit([folder / "r0.csv"], **CHANNELS, structure_name="narx", open_loop=True, tick=tick)
+    found = fit([folder / "r0.csv"], **CHANNELS, structure="narx", open_loop=True, tick=tick)
     assert found.status == "stalled"
     assert any("interrupted" in x for x in found.warnings)
     assert found.fit["y"].one_step > 0.1
@@ -71,7 +71,7 @@ def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> No
 def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -> None:
     settings = {"ny": 1, "nu": 2, "neurons": 3, "starts": 2, "iterations": 8}
     fits = [
-        fit([folder / "r0.csv"], **CHANNELS, structure_name="narx", settings=settings, open_loop=True, seed=seed)
+        fit([folder / "r0.csv"], **CHANNELS, structure="narx", settings=settings, open_loop=True, seed=seed)
         for seed in (4, 4, 5)
     ]
     thetas = [f.model.theta for f in fits if f.model is not None]
@@ -86,23 +86,23 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"structure_name": "narmx"}, "Did you mean 'narmax'"),
+        ({"structure": "narmx"}, "Did you mean 'narmax'"),
         ({"settings": {"degre": 2}}, "Did you mean 'degree'"),
         ({"seed": -1}, "seed"),
         ({"validate_from_s": 1.0}, "--validate"),
-        ({"outputs": ("z",)}, "z"),
+        ({"output": "z"}, "z"),
         ({"from_s": 100.0}, "100"),
     ],
 )
 def test_what_makes_no_sense_is_refused(folder, changes, said) -> None:
     with pytest.raises(AmbidError, match=said):
-        fit([folder / "r0.csv"], **{**CHANNELS, "structure_name": "narmax", **changes})
+        fit([folder / "r0.csv"], **{**CHANNELS, "structure": "narmax", **changes})
 
 
 def test_records_of_another_rate_are_refused(folder) -> None:
     for words in ({"records": [folder / "r0.csv", folder / "r3.csv"]},
                   {"records": [folder / "r0.csv"], "validate": folder / "r3.csv"}):  # fmt: skip
         with pytest.raises(EstimationError, match="50 Hz"):
-            fit(**words, **CHANNELS, structure_name="narmax")
+            fit(**words, **CHANNELS, structure="narmax")
     with pytest.raises(EstimationError, match="no record"):
-        fit([], **CHANNELS, structure_name="narmax")
+        fit([], **CHANNELS, structure="narmax")

@@ -50,7 +50,7 @@ def last(found: Track) -> tuple[dict[str, float], dict[str, float]]:
     ],
 )
 def test_coefficients_come_in_si_with_their_deviations(method: str, more: dict[str, object]) -> None:
-    settings = {"inputs": ("u",), "outputs": ("y",), "orders": ARX} | more
+    settings = {"input": "u", "output": "y", "orders": ARX} | more
     found = track(first_order(), method=method, every_s=0.1, **settings)  # type: ignore[arg-type]
     value, sd = last(found)
     assert abs(value["a1"] - A1) < 4 * sd["a1"] < 0.4
@@ -64,9 +64,9 @@ def test_coefficients_come_in_si_with_their_deviations(method: str, more: dict[s
 
 
 def test_feedback_biases_and_is_told_unless_a_reference_is_the_instrument() -> None:
-    record, settings = first_order(loop=True), {"inputs": ("u",), "outputs": ("y",), "orders": ARX}
+    record, settings = first_order(loop=True), {"input": "u", "output": "y", "orders": ARX}
     rls = track(record, method="rls", **settings)  # type: ignore[arg-type]
-    iv = track(record, method="iv", references=("r",), **settings)  # type: ignore[arg-type]
+    iv = track(record, method="iv", reference="r", **settings)  # type: ignore[arg-type]
     value, sd = last(rls)
     assert abs(value["a1"] - A1) > 5 * sd["a1"]
     assert "biased" in rls.header.warnings[0]
@@ -101,11 +101,11 @@ def test_joint_filters_follow_physical_parameters_from_an_identified_start(metho
         ("rls", {"start_s": 1.0}, "no --start-seconds"),
         ("ekf", {}, "no --input"),
         ("rls", {"pace": "real-time"}, "no supervisor"),
-        ("rls", {"outputs": ("y", "r")}, "one output"),
+        ("rls", {"output": ("y", "r")}, "one output"),
     ],
 )
 def test_what_a_method_would_ignore_or_lacks_is_refused(method: str, more: dict[str, object], match: str) -> None:
-    settings = {"inputs": ("u",), "outputs": ("y",), "orders": ARX} | more
+    settings = {"input": "u", "output": "y", "orders": ARX} | more
     with pytest.raises(EstimationError, match=match):
         track(first_order(), method=method, **settings)  # type: ignore[arg-type]
 

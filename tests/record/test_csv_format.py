@@ -96,7 +96,7 @@ def test_round_trip_keeps_every_bit(tmp_path):
         assert back.rate_hz == 10000.0
         assert back.start_s == 2.5
         assert [c.unit for c in back.channels] == ["m", "?"]
-        assert back["position"].tobytes() == values.tobytes()
+        assert back["position"].values.tobytes() == values.tobytes()
         assert back.provenance["comment"] == "made by a test"
 
 

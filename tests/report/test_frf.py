@@ -28,7 +28,7 @@ def drawn(n=40, noise=None, **changes):
 
 @pytest.fixture(scope="module")
 def both():
-    return frf(loop_record(), references=["excitation"], rig=default_rig(), orders={"nf": 4})
+    return frf(loop_record(), reference="excitation", rig=default_rig(), orders={"nf": 4})
 
 
 def test_pairs_are_told_by_their_medians():
@@ -78,8 +78,8 @@ def test_a_warning_stands_once(both):
 
 
 def test_distortion_levels_are_shown_beside_their_noise():
-    text = frf_text(frf(odd_record(nonlinear=True, rms=3.0), inputs=["voltage"], outputs=["current"],
-                        references=["excitation"]))  # fmt: skip
+    text = frf_text(frf(odd_record(nonlinear=True, rms=3.0), input="voltage", output="current",
+                        reference="excitation"))  # fmt: skip
     assert "at lines without excitation" in text
     (line,) = [x for x in text.splitlines() if x.startswith("current ")]
     even, of_even, odd, of_odd = (float(x) for x in line.replace("dB", "").split()[1:])

@@ -153,5 +153,5 @@ def test_measured_bench_with_its_table(rig_file, name):
     text = 'schema = "ambid.rig/1"\nmodel = "one-axis"\n'
     text += "".join(f'[channels.{role}]\ncolumn = "{column}"\n' for role, column in channels)
     r = read_bench(DATA / f"levitate_{name}.csv", load_rig(rig_file(text)))
-    assert r["voltage"].min() >= 0.043
-    assert r["voltage"].max() <= 11.06
+    assert r["voltage"].values.min() >= 0.043
+    assert r["voltage"].values.max() <= 11.06

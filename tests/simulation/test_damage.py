@@ -63,7 +63,7 @@ def test_rows_that_are_missing_make_time_jump(steady: Simulation, tmp_path: Path
 
 
 def test_damage_leaves_the_record_alone_and_refuses_what_it_cannot_do(steady: Simulation, tmp_path: Path) -> None:
-    before = steady.record["position"].copy()
+    before = steady.record["position"].values.copy()
     damage(steady.record, tmp_path / "lost.csv", share=0.01, seed=0)
     assert np.array_equal(steady.record["position"], before)
     write_record(steady.record, tmp_path / "whole.csv")

@@ -63,7 +63,7 @@ def test_record_is_read_back_through_the_rig(rig: Rig, tmp_path: Path) -> None:
     u = np.random.default_rng(0).standard_normal(500)
     done = simulate_rig(rig, u, rate_hz=2000.0, seed=1)
     assert set(done.record.names) == {"duty", "shunt", "z", "z_wanted"}
-    assert 0.0 <= done.record["duty"].min() < done.record["duty"].max() <= 1.0
+    assert 0.0 <= done.record["duty"].values.min() < done.record["duty"].values.max() <= 1.0
     write_csv(done.record, tmp_path / "record.csv")
     read = read_bench(tmp_path / "record.csv", rig)
     # the preset has the same plant, loop and operating point; only its noise differs

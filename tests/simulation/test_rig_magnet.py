@@ -135,7 +135,7 @@ def test_noise_resolutions_and_limits_are_the_rigs() -> None:
         counts = done.record[role] / step
         assert counts == pytest.approx(np.round(counts), abs=1e-6)
     hard = simulated(replace(ball(), limits=Limits(voltage=(3.5, 4.5), position=(0.002, 0.02))), volts=0.6)
-    assert (hard.record["voltage"].min(), hard.record["voltage"].max()) == (3.5, 4.5)
+    assert (hard.record["voltage"].values.min(), hard.record["voltage"].values.max()) == (3.5, 4.5)
     assert hard.n_saturated > 0
 
 

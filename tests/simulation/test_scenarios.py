@@ -247,7 +247,7 @@ def test_a_rig_is_simulated_in_its_own_columns(rig: Rig) -> None:
     assert done.record["i"] == pytest.approx(same.record["current"] / 0.5, rel=1e-12)
     assert np.array_equal(done.record["turns"], same.record["speed"])
     still = simulate_scenario("change", rig, duration_s=0.1, seed=1)
-    assert not still.record["turns"].any()
+    assert not still.record["turns"].values.any()
     assert still.record["true_k_i"][-1] == pytest.approx(0.85 * BEARING.parameters["k_i"])
 
 

@@ -74,7 +74,7 @@ def test_a_jump_is_two_stationary_simulations_joined() -> None:
     second = simulate(after, u[k:], rate_hz=RATE, seed=0, start=first.states[-1])
     assert np.array_equal(joined.states[: k + 1], first.states)
     assert np.array_equal(joined.states[k:], second.states)
-    assert joined.record["true_m"].tolist() == [0.1] * k + [0.12] * (800 - k)
+    assert joined.record["true_m"].values.tolist() == [0.1] * k + [0.12] * (800 - k)
 
 
 @pytest.mark.parametrize("delay", [1.0, 0.4])

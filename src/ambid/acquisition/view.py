@@ -45,7 +45,7 @@ class BenchView:
         `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
         """
         seen = self.record(raw.values)
-        values = np.column_stack([seen[role] for role in self.units])
+        values = np.column_stack([seen[role].values for role in self.units])
         return Block(first=raw.first, time_s=raw.time_s, values=values)
 
     def record(self, values: Array, *, start_s: float = 0.0) -> Record:

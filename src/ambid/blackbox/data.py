@@ -131,7 +131,7 @@ def io_data(
     n = record.n_samples
 
     def columns(names: Sequence[str]) -> Array:
-        return np.stack([record[x] for x in names], axis=1) if names else np.empty((n, 0))
+        return np.stack([record[x].values for x in names], axis=1) if names else np.empty((n, 0))
 
     return IOData(
         u=columns(inputs),

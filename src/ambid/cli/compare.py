@@ -42,11 +42,9 @@ def command(
     from ambid.report.tables import comparison_text
 
     with Outputs(record, second, json=json) as outputs:
-        named = (c.partition(":") for c in candidates)
-        wanted = [(name.strip(), opt.orders_of(orders or "auto")) for name, _, orders in named]
         with progress("compare") as tick:
             found = compare(
-                record, wanted, inputs=inputs or (), outputs=output or (), references=reference or (),
+                record, candidates, input=inputs, output=output, reference=reference,
                 open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, validate=second,
                 holdout=holdout, tick=tick,
             )  # fmt: skip

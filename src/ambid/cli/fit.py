@@ -106,17 +106,11 @@ def command(
     from ambid.rig import load_rig
 
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)
-    said: dict[str, Any] = {"settings": None if settings is None else opt.settings_of(settings)}
     if nonlinear:
         refuse_given(
             {"--stabilisation": stabilisation, "--sensitivity": sensitivity},
             f"{{}} is for linear structures; {structure} has no use for it. Leave it out",
         )
-        if settings is not None and orders != "auto":
-            raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
-        said["settings"] = opt.settings_of(orders if settings is None else settings)
-    else:
-        said["orders"] = opt.orders_of(orders)
     stop, extras = Stop(), list[tuple[str, Any, Callable[..., str]]]()
     with Outputs(*records, second, rig, json=json, plot=plot) as outputs:
         outputs.claim(stabilisation, "--stabilisation", FIGURE_ENDINGS)
@@ -124,14 +118,14 @@ def command(
         if nonlinear:
             _check_second(records, part, second, second_part)
         bench = None if rig is None else load_rig(rig)
-        columns: dict[str, Any] = {"inputs": inputs or (), "outputs": output or (), "rig": bench}
+        columns: dict[str, Any] = {"input": inputs, "output": output, "rig": bench}
         columns |= {"rate_hz": rate, "gaps": gaps}
         with signals(stop.take) if nonlinear else nullcontext(), progress("fit") as show:
             found: Any = fit(
-                records, structure_name=structure, criterion=criterion, fixed=opt.fixed_of(fix) or None,
-                at_rest=at_rest, seed=seed, open_loop=open_loop, references=reference or (), from_s=from_s, to_s=to_s,
+                records, structure=structure, orders=orders, settings=settings, criterion=criterion, fix=fix,
+                at_rest=at_rest, seed=seed, open_loop=open_loop, reference=reference, from_s=from_s, to_s=to_s,
                 validate=second, validate_from_s=validate_from, validate_to_s=validate_to,
-                tick=interruptible(show, stop) if nonlinear else show, **columns, **said,
+                tick=interruptible(show, stop) if nonlinear else show, **columns,
             )  # fmt: skip
             stop.torn()
             if bench is not None and not nonlinear:

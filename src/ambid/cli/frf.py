@@ -3,16 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import Annotated, Literal
 
 from ambid.cli import options as opt
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
-
-if TYPE_CHECKING:
-    from ambid.blackbox.data import Orders
 
 
 def command(
@@ -71,24 +68,17 @@ def command(
     from ambid.report.response_figures import frf_figure
 
     with Outputs(record, rig, json=json, plot=plot) as outputs:
-        between, wanted, n, late = opt.band_of(band), _orders(orders), _order(state_space), _delay(delay)
+        between, n, late = opt.band_of(band), _order(state_space), _delay(delay)
         with progress("measure") as tick:
             found = frf(
-                record, inputs=inputs or (), outputs=output or (), references=reference or (), open_loop=open_loop,
-                method=method, hold=hold, band=between, orders=wanted, state_space=n, feedthrough=feedthrough,
+                record, input=inputs, output=output, reference=reference, open_loop=open_loop,
+                method=method, hold=hold, band=between, orders=orders, state_space=n, feedthrough=feedthrough,
                 domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
             )  # fmt: skip
             outputs.draw(plot, lambda: frf_figure(found), tick)
         outputs.keep(measured_text(found))
     outputs.show(lambda paint: frf_text(found, paint=paint))
     end(failed=strict and not found.passed)
-
-
-def _orders(text: str | None) -> Orders | None:
-    found = None if text is None else opt.orders_of(text)
-    if text is not None and found is None:
-        raise AmbidError("--orders auto: a transfer function wants its degree. Give nf=2, or use --state-space auto")
-    return found
 
 
 def _order(text: str | None) -> int | Literal["auto"] | None:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.blackbox.data import Orders
-    from ambid.nonlinear.fit import Settings
     from ambid.physics.presets import Preset
 
 LARGEST = 1e9
@@ -130,65 +127,3 @@ def refuse_twice(records: Sequence[Path]) -> None:
         if path.resolve() in seen:
             raise AmbidError(f"record {path} is given twice; it would count twice. Leave one out")
         seen.add(path.resolve())
-
-
-def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str, str]:
-    """Read NAME=VALUE, each name once; ``{}`` in `said` stands for a part that is not of that form."""
-    found: dict[str, str] = {}
-    for part in parts:
-        name, _, value = (x.strip() for x in part.partition("="))
-        if not (name and value):
-            raise EstimationError(f"{said.format(repr(part.strip()))}. {remedy}")
-        if name in found:
-            raise EstimationError(f"{where}: {name} stands twice. Leave one out")
-        found[name] = value
-    return found
-
-
-def _read_first(text: str, *kinds: Callable[[str], Any]) -> Any:
-    """Read a text as the first kind that takes it; as it is where none does."""
-    for kind in kinds:
-        with suppress(ValueError):
-            return kind(text)
-    return text
-
-
-def _whole_numbers(text: str) -> tuple[int, ...]:
-    parts = [x.strip() for x in text.split("/")]
-    if len(parts) < 2 or not all(x.isdecimal() for x in parts):
-        raise ValueError(text)
-    return tuple(map(int, parts))
-
-
-def orders_of(text: str) -> Orders | None:
-    """Read orders as they are written on the command line; None where all are to be chosen."""
-    if text.strip() == "auto":
-        return None
-    where, remedy = f"--orders {text!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
-    given = _pairs(text.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
-    found: dict[str, int | str | tuple[int, ...]] = {}
-    for name, value in given.items():
-        if value != "auto" and not all(n.strip().isdecimal() and len(n) < 7 for n in value.split("/")):
-            raise EstimationError(f"{where}: {f'{name}={value}'!r} is not NAME=NUMBER. {remedy}")
-        found[name] = _read_first(value, int, _whole_numbers)
-    return found
-
-
-def settings_of(text: str) -> Settings:
-    """Read settings as they are written on the command line; what is ``auto`` is left to the method."""
-    if text.strip() in ("auto", ""):
-        return {}
-    where = f"--settings {text!r}"
-    given = _pairs(text.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
-    return {name: _read_first(x, _whole_numbers, int, float) for name, x in given.items() if x != "auto"}
-
-
-def fixed_of(parts: list[str] | None) -> dict[str, float]:
-    """Read known coefficients, ``a1=-1.5``."""
-    said, remedy = "--fix {} is not NAME=NUMBER", "Write, for example, --fix a1=-1"
-    given = _pairs(parts or [], "--fix", said, remedy)
-    found = {name: _read_first(value, float) for name, value in given.items()}
-    for name, number in found.items():
-        if isinstance(number, str):
-            raise EstimationError(f"{said.format(repr(f'{name}={number}'))}. {remedy}")
-    return found

@@ -96,10 +96,10 @@ def command(
         "start": start, "start_s": start_seconds, "every_s": every, "limit": limit, "memory": _memory(memory),
         "pace": pace, "flags": times, "rate_hz": rate,
     }  # fmt: skip
-    check_settings(record, how, _NAMES)
+    check_settings(how, _NAMES)
     settings: dict[str, Any] = {
-        "inputs": tuple(inputs or ()), "outputs": tuple(output or ()), "references": tuple(reference or ()),
-        "orders": None if orders is None else opt.orders_of(orders), "open_loop": open_loop, "step": step,
+        "input": inputs, "output": output, "reference": reference, "orders": orders, "open_loop": open_loop,
+        "step": step,
     }  # fmt: skip
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:

@@ -108,7 +108,7 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
         rig = replace(rig, record=replace(rig.record, from_s=None, to_s=None))
         how = {**how, "from_s": None, "to_s": None}
     bench = load_bench(record, rig, **how)
-    u, name = np.array(bench["voltage"]), str(bench.provenance.get("file") or "record")
+    u, name = np.array(bench["voltage"].values), str(bench.provenance.get("file") or "record")
     warnings, off = list[str](), None if rig.magnet is None else rig.magnet.off_below
     if rig.limits is not None:
         low, high = rig.limits.voltage
@@ -118,7 +118,7 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
             warnings.append(
                 f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
             )
-    y = np.column_stack([bench["position"], bench["current"]])
+    y = np.column_stack([bench["position"].values, bench["current"].values])
     loose = np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0)
     valid = np.ones(y.shape, dtype=np.bool_)
     taken = BearingRecord(name=name, rate_hz=bench.rate_hz, u=u, loose=loose, y=y, valid=valid, held=held)

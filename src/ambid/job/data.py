@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
-from ambid.errors import EstimationError, RecordError
+from ambid.errors import EstimationError
 from ambid.physics.linear_model import model
-from ambid.record import Record, read_record
-from ambid.rig import Rig, bench_record, default_rig, load_rig, mat_variables, read_bench, rig_text
-from ambid.signals.conditioning import cut
+from ambid.record import GapPolicy, Record, cut, read_record
+from ambid.record import Source as Source
+from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -24,9 +24,6 @@ Part = tuple[float | None, float | None]
 """From and to, in s; None: the record's own begin or end."""
 
 WHOLE: Part = (None, None)
-
-Source = Record | str | Path
-"""A record, or its file."""
 
 
 class Clock:
@@ -76,7 +73,8 @@ class Reading(TypedDict, total=False):
     from_s: float | None
     to_s: float | None
     rate_hz: float | None  # sampling rate of a file without a time column
-    gaps: str | None  # ``"error"``, ``"interpolate"`` or ``"cut"``
+    gaps: GapPolicy | None
+    units: Mapping[str, str] | None  # of the columns of a table in memory
 
 
 def load_bench(
@@ -86,19 +84,21 @@ def load_bench(
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
-    gaps: str | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record through a rig and cut it to the part that is to be used.
 
     Parameters
     ----------
-    record : Record, str or Path
-        A file, or a record whose channels are named by role.
+    record : file, Record, DataFrame, Dataset or dict of arrays
+        In the rig's columns, or through a rig already.
     rig : Rig
     from_s, to_s : float, optional
         Override the rig's ``record.from`` and ``record.to``; s.
     rate_hz : float, optional
     gaps : {"error", "interpolate", "cut"}, optional
+    units : Mapping of str to str, optional
 
     Returns
     -------
@@ -110,8 +110,7 @@ def load_bench(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    bench = record if isinstance(record, Record) else read_bench(record, rig, rate_hz=rate_hz, gaps=gaps)  # type: ignore[arg-type]
-    return _cut_by(rig, bench, (from_s, to_s))
+    return _cut_by(rig, read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units), (from_s, to_s))
 
 
 def signals_of(record: Record, plant: LinearModel) -> Signals:
@@ -133,43 +132,55 @@ def signals_of(record: Record, plant: LinearModel) -> Signals:
     from ambid.bearing.multistart import Signals
 
     return Signals(
-        u=np.stack([record[r] for r in plant.inputs], axis=1),
-        y=np.stack([record[r] for r in plant.outputs], axis=1),
+        u=np.stack([record[r].values for r in plant.inputs], axis=1),
+        y=np.stack([record[r].values for r in plant.outputs], axis=1),
         rate_hz=record.rate_hz,
     )
 
 
+Names = str | Sequence[str]
+"""The name of a channel, or several."""
+
+
 class Columns(TypedDict, total=False):
-    """Which columns of records are inputs, outputs and references, and how their files are read."""
+    """Which columns of records are inputs, outputs and references, and how they are read."""
 
     # names of channels; with a rig its roles or columns, by default all of its model
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-    references: Sequence[str]  # channels of the loop's outer excitation, for methods that want it
+    input: Names | None
+    output: Names | None
+    reference: Names | None  # channels of the loop's outer excitation, for methods that want it
     open_loop: bool  # whether no feedback was at work
-    rate_hz: float | None  # sampling rate of a file without a time column
-    gaps: str | None  # ``"error"``, ``"interpolate"`` or ``"cut"``
+    rate_hz: float | None  # sampling rate of a source without time
+    gaps: GapPolicy | None
+    units: Mapping[str, str] | None  # of the columns of a table in memory
     rig: Rig | str | Path | None  # names and calibrates the channels
+
+
+def names_of(said: Names | None) -> tuple[str, ...]:
+    """Return the names of one channel, several or none."""
+    return () if said is None else (said,) if isinstance(said, str) else tuple(said)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Channels:
-    """Inputs, outputs and references of records, and how their files are read: `Columns`, with the rig loaded."""
+    """Inputs, outputs and references of records, and how these are read: `Columns`, with the rig loaded."""
 
-    inputs: Sequence[str] = ()
-    outputs: Sequence[str] = ()
-    references: Sequence[str] = ()
+    inputs: tuple[str, ...] = ()
+    outputs: tuple[str, ...] = ()
+    references: tuple[str, ...] = ()
     open_loop: bool = False
     rate_hz: float | None = None
-    gaps: str | None = None
+    gaps: GapPolicy | None = None
+    units: Mapping[str, str] | None = None
     rig: Rig | None = None
 
     @classmethod
-    def of(cls, columns: Columns) -> Channels:
+    def of(cls, **columns: Unpack[Columns]) -> Channels:
         """Take them from what a caller says."""
         said: dict[str, Any] = dict(columns)
+        named: dict[str, Any] = {f"{x}s": names_of(said.pop(x, None)) for x in ("input", "output", "reference")}
         rig = said.pop("rig", None)
-        return cls(**said, rig=None if rig is None else known_rig(rig))
+        return cls(**named, **said, rig=None if rig is None else known_rig(rig))
 
     def read(self, record: Source, part: Part = WHOLE) -> IOData:
         """Read a record, cut it and take the columns out of it.
@@ -181,35 +192,17 @@ class Channels:
 
         if self.rig is not None:
             return self._through(self.rig, record, part)
-        if not isinstance(record, Record):
-            record = read_record(record, rate_hz=self.rate_hz, gaps=self.gaps or "error")  # type: ignore[arg-type]
+        found = read_record(record, rate_hz=self.rate_hz, gaps=self.gaps or "error", units=self.units)
         if part != WHOLE:
-            record = cut(record, *part)
-        return io_data(record, self.inputs, self.outputs, references=self.references, open_loop=self.open_loop)
+            found = cut(found, *part)
+        return io_data(found, self.inputs, self.outputs, references=self.references, open_loop=self.open_loop)
 
     def _through(self, rig: Rig, record: Source, part: Part) -> IOData:
         from ambid.blackbox.data import io_data
 
         plant = model(rig.model)
-        if isinstance(record, Record):
-            bench, raw = record, record
-        else:
-            mat = Path(record).suffix.lower() == ".mat"
-            raw = read_record(
-                record,
-                rate_hz=self.rate_hz if self.rate_hz is not None else rig.record.rate_hz,
-                gaps=self.gaps or rig.record.gaps or "error",  # type: ignore[arg-type]
-                variables={**{x: (x, UNKNOWN) for x in self.references}, **mat_variables(rig)} if mat else None,
-            )
-            bench = bench_record(raw, rig)
-        for name in self.references:
-            if name not in bench.names and name not in raw.names:
-                raise RecordError(
-                    f"the record has no column {name!r} for the reference; it has {', '.join(raw.names)}. Correct "
-                    "--reference"
-                )
-        beside = [raw.channel(name) for name in self.references if name not in bench.names]
-        bench = _cut_by(rig, replace(bench, channels=(*bench.channels, *beside)), part)
+        bench = read_bench(record, rig, rate_hz=self.rate_hz, gaps=self.gaps, units=self.units, beside=self.references)
+        bench = _cut_by(rig, bench, part)
         inputs = [_role(x, rig, plant.inputs, "input") for x in self.inputs] or list(plant.inputs)
         outputs = [_role(x, rig, plant.outputs, "output") for x in self.outputs] or list(plant.outputs)
         open_loop = self.open_loop or rig.open_loop
@@ -238,11 +231,12 @@ def read_data(record: Source, *, part: Part = WHOLE, **columns: Unpack[Columns])
 
     Parameters
     ----------
-    record : Record, str or Path
+    record : file, Record, DataFrame, Dataset or dict of arrays
     part : (float or None, float or None), optional
         From and to, in s.
     **columns
-        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see `Columns`.
+        ``input``, ``output``, ``reference``, ``open_loop``, ``rate_hz``, ``gaps``, ``units`` and ``rig``, see
+        `Columns`.
 
     Returns
     -------
@@ -253,7 +247,7 @@ def read_data(record: Source, *, part: Part = WHOLE, **columns: Unpack[Columns])
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    return Channels.of(columns).read(record, part)
+    return Channels.of(**columns).read(record, part)
 
 
 def check_same_bench(units: Mapping[str, str], dt: float, second: IOData) -> None:

@@ -9,16 +9,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import count
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Unpack, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
-from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure, structure
+from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure
+from ambid.blackbox.fit import structure as structure_named
+from ambid.blackbox.words import Candidate, candidates_of, fixed_of, orders_of, settings_of
 from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
-from ambid.job.data import Channels, Clock, Columns, Source, check_same_bench, known_rig
+from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model
-from ambid.record import Record
+from ambid.record import GapPolicy
 from ambid.rig import Rig
 
 if TYPE_CHECKING:
@@ -36,45 +38,66 @@ _SEARCH = 0.95  # of a nonlinear job's time, by experience; the rest are the che
 def fit(
     records: Source | Sequence[Source],
     *,
-    structure_name: str,
-    orders: Orders | None = None,
-    criterion: str = "bic",
-    fixed: Mapping[str, float] | None = None,
-    at_rest: bool = False,
-    settings: Settings | None = None,
+    structure: str,
+    input: Names | None = None,  # noqa: A002 - the words of the command
+    output: Names | None = None,
+    reference: Names | None = None,
+    orders: Orders | str | None = "auto",
+    settings: Settings | str | None = None,
     seed: int | None = None,
+    criterion: str = "bic",
+    fix: Mapping[str, float] | Sequence[str] | str | None = None,
+    rig: Rig | str | Path | None = None,
+    open_loop: bool = False,
+    at_rest: bool = False,
     from_s: float | None = None,
     to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
     validate: Source | None = None,
     validate_from_s: float | None = None,
     validate_to_s: float | None = None,
     tick: Tick | None = None,
-    **columns: Unpack[Columns],
 ) -> BlackBoxFit | NonlinearFit:
     """Fit a black-box model to one record, or a nonlinear one to one or several, and check it.
 
     Parameters
     ----------
-    records : Record, str or Path, or sequence of these
+    records : file, Record, DataFrame, Dataset or dict of arrays, or sequence of these
         Several: for nonlinear structures, of one bench, with the same channels and rate.
-    structure_name : str
+    structure : str
         As in `ambid.blackbox.fit` or `ambid.nonlinear.structures`.
-    orders : Mapping[str, int, "auto" or tuple of int], optional
-        Of a linear structure; a tuple has one number for each input. None: all are chosen by `criterion`.
-    criterion : str, optional
-        For the choice of orders, see `ambid.validation.orders`.
-    fixed : Mapping[str, float], optional
-        Coefficients that are known, for polynomial structures, by name (``a1``, ``b2``).
-    at_rest : bool, optional
-        Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
-        are estimated. For polynomial structures; a record that contradicts it is warned of.
-    settings : Mapping, optional
+    input, output, reference : str or sequence of str, optional
+        Names of channels; no input for a time series. With a rig its roles or columns, by default all of its model.
+        References are the loop's outer excitation, for methods that use it.
+    orders : str or Mapping[str, int, "auto" or tuple of int], optional
+        Of a linear structure: ``"na=2,nb=2,nk=1"`` as the command takes them, or by name, a tuple with a number for
+        each input. "auto": all are chosen by `criterion`.
+    settings : str or Mapping, optional
         Of a nonlinear structure, as the register describes them; what is left out the method chooses.
     seed : int, optional
         Of everything random in a nonlinear structure, 0 or more: equal seeds give equal results.
+    criterion : str, optional
+        For the choice of orders, see `ambid.validation.orders`.
+    fix : Mapping[str, float] or sequence of str, optional
+        Coefficients that are known, for polynomial structures, by name (``{"a1": -1.5}`` or ``["a1=-1.5"]``).
+    rig : Rig, str or Path, optional
+        Names and calibrates the channels.
+    open_loop : bool, optional
+        Say that no feedback was at work.
+    at_rest : bool, optional
+        Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
+        are estimated. For polynomial structures; a record that contradicts it is warned of.
     from_s, to_s : float, optional
         Part of every record to fit, in s.
-    validate : Record, str or Path, optional
+    rate_hz : float, optional
+        Sampling rate of records without time, Hz.
+    gaps : {"error", "interpolate", "cut"}, optional
+        What to do about missing values.
+    units : Mapping of str to str, optional
+        Unit by column, for tables in memory.
+    validate : as `records`, optional
         A further record to validate on; may be one of the first, with another part.
     validate_from_s, validate_to_s : float, optional
         Part of it to use, in s; default all of it.
@@ -82,9 +105,6 @@ def fit(
         Called with the name of the present stage and, where it is known, the share of the job that is over:
         ``tick(stage, done)``; may raise to interrupt. A KeyboardInterrupt during the search of a nonlinear structure
         ends that with the best model so far, status ``stalled``.
-    **columns
-        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see
-        `ambid.job.data.Columns`; no inputs for a time series.
 
     Returns
     -------
@@ -97,19 +117,27 @@ def fit(
     EstimationError
         If nothing can be estimated.
     """
-    say, channels = tick or silent, Channels.of(columns)
-    sources = [records] if isinstance(records, (Record, str, Path)) else list(records)
-    nonlinear = structure_name in NONLINEAR_STRUCTURES
+    say, channels = tick or silent, Channels.of(
+        input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
+        rig=rig,
+    )  # fmt: skip
+    sources: list[Source] = list(records) if isinstance(records, (list, tuple)) else [records]  # type: ignore[list-item]
+    nonlinear, wanted, fixed = structure in NONLINEAR_STRUCTURES, orders_of(orders), fixed_of(fix)
+    chosen = settings_of(settings)
     if nonlinear:
-        linear_only = {"--orders": orders, "--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
+        if orders is not None and orders != "auto":
+            if settings is not None:
+                raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
+            chosen = settings_of(orders)
+        linear_only = {"--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
                        "--criterion": criterion != "bic"}  # fmt: skip
-        refuse_given(linear_only, f"{{}} is for linear structures; {structure_name} has no use for it. Leave it out")
-        _check_settings(structure_name, sources, settings or {}, seed or 0)
+        refuse_given(linear_only, f"{{}} is for linear structures; {structure} has no use for it. Leave it out")
+        _check_settings(structure, sources, chosen, seed or 0)
     else:
-        _check_linear(structure_name, sources, {"--settings": settings, "--seed": seed is not None})
-        _check_criterion(criterion, orders)
+        _check_linear(structure, sources, {"--settings": settings, "--seed": seed is not None})
+        _check_criterion(criterion, wanted)
         taken = channels.inputs if channels.rig is None else channels.inputs or model(channels.rig.model).inputs
-        _check_use(structure(structure_name), taken, fixed, at_rest=at_rest)
+        _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
     if validate is None and (validate_from_s, validate_to_s) != (None, None):
         raise EstimationError(
             "--validate-from and --validate-to cut a second record; none is given. Give --validate, or leave them out"
@@ -122,13 +150,13 @@ def fit(
     for other in data[1:] if second is None else (*data[1:], second):
         check_same_bench(data[0].units, data[0].dt, other)
     clock.lap("read")
-    options: dict[str, Any] = {"fixed": dict(fixed)} if fixed else {}
+    options: dict[str, Any] = {"fixed": fixed} if fixed else {}
     options |= {"at_rest": True} if at_rest else {}
     with one_thread():
         found: Any = (
-            _estimate_nonlinear(structure_name, data, second, settings or {}, seed or 0, clock, say)
+            _estimate_nonlinear(structure, data, second, chosen, seed or 0, clock, say)
             if nonlinear
-            else _estimate_linear(structure(structure_name), data[0], second, orders, criterion, options, clock, say)
+            else _estimate_linear(structure_named(structure), data[0], second, wanted, criterion, options, clock, say)
         )
         clock.lap("checks")
     return replace(found, timing_s=clock.laps)  # type: ignore[no-any-return]
@@ -205,30 +233,36 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
 
 def compare(
     record: Source,
-    candidates: Sequence[tuple[str, Orders | None]],
+    candidates: Sequence[Candidate],
     *,
+    input: Names | None = None,  # noqa: A002 - the words of the command
+    output: Names | None = None,
+    reference: Names | None = None,
+    rig: Rig | str | Path | None = None,
+    open_loop: bool = False,
     from_s: float | None = None,
     to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
     validate: Source | None = None,
     holdout: float = 0.3,
     tick: Tick | None = None,
-    **columns: Unpack[Columns],
 ) -> Comparison:
     """Fit several structures to one record and compare them on data that none of them has seen.
 
     Parameters
     ----------
-    record : Record, str or Path
-    candidates : sequence of (str, Mapping or None)
-        Structures with their orders; None chooses.
-    from_s, to_s, tick : optional
+    record : file, Record, DataFrame, Dataset or dict of arrays
+    candidates : sequence of str or (str, orders)
+        Structures with their orders: ``"arx:na=2,nb=2,nk=1"``, ``"n4sid"`` (orders are chosen), or a name beside
+        orders as `fit` takes them.
+    input, output, reference, rig, open_loop, from_s, to_s, rate_hz, gaps, units, tick : optional
         As `fit`.
-    validate : Record, str or Path, optional
+    validate : as `record`, optional
         A second record to validate on; without one the last part of the record is held out.
     holdout : float, optional
         That part, 0 to 1.
-    **columns
-        As `fit`.
 
     Returns
     -------
@@ -241,15 +275,18 @@ def compare(
     """
     from ambid.validation.comparison import compare as compare_fits
 
-    channels = Channels.of(columns)
-    for name, _ in candidates:
-        _check_use(structure(name), channels.inputs, None)
+    wanted, channels = candidates_of(candidates), Channels.of(
+        input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
+        rig=rig,
+    )  # fmt: skip
+    for name, _ in wanted:
+        _check_use(structure_named(name), channels.inputs, None)
     data = channels.read(record, (from_s, to_s))
     second = None if validate is None else channels.read(validate)
     if second is not None:
         check_same_bench(data.units, data.dt, second)
     with one_thread():
-        return compare_fits(data, candidates, holdout=holdout, second=second, tick=tick or silent)
+        return compare_fits(data, wanted, holdout=holdout, second=second, tick=tick or silent)
 
 
 def _choose_orders(of: Structure, data: IOData, criterion: str, say: Tick) -> tuple[Any, dict[str, object]]:
@@ -298,13 +335,13 @@ def _check_use(
 def _check_linear(name: str, records: Sequence[object], given: Mapping[str, object]) -> None:
     """Refuse a structure that is none, and what a linear one has no use for."""
     if name in RESPONSE_STRUCTURES:
-        structure(name)  # says where those are fitted
+        structure_named(name)  # says where those are fitted
     every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
     if name not in STRUCTURES:
         raise EstimationError(f"structure {name!r} is not known; known: {', '.join(every)}.{nearest(name, every)}")
     if len(records) > 1:
         several = ", ".join(NONLINEAR_STRUCTURES)
-        raise EstimationError(f"structure {name} takes one record; {several} take several. Leave {records[1]} out")
+        raise EstimationError(f"structure {name} takes one record; {several} take several. Give one")
     refuse_given(given, f"{{}} is for nonlinear structures; {name} has --orders. Leave it out")
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, TypedDict
 
 from ambid.blackbox.data import Orders
 from ambid.errors import EstimationError, nearest
-from ambid.record import Record
+from ambid.job.data import Names
 from ambid.recursive.lines import TrackHeader, TrackLine
 
 Flag = Literal["track", "hold", "accept", "revert"]
@@ -64,10 +63,10 @@ class FollowingWords(TypedDict, total=False):
 class EstimatorWords(TypedDict, total=False):
     """What methods with coefficients are told, as `fit`; and the step of lms and nlms, for signals of size one."""
 
-    inputs: Sequence[str]
-    outputs: Sequence[str]
-    references: Sequence[str]
-    orders: Orders | None
+    input: Names | None
+    output: Names | None
+    reference: Names | None
+    orders: Orders | str | None
     open_loop: bool
     step: float | None
 
@@ -76,7 +75,7 @@ class TrackWords(FollowingWords, EstimatorWords, total=False):
     """What `track` is told."""
 
 
-def check_settings(record: object, said: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> None:
+def check_settings(said: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> None:
     """Refuse what `track` is told where it makes no sense or contradicts itself, in the `names` of the caller."""
     for name in ("every_s", "limit", "start_s", "rate_hz"):
         if name in said and not (said[name] is None and name in ("start_s", "rate_hz")):
@@ -97,17 +96,10 @@ def check_settings(record: object, said: Mapping[str, Any], names: Mapping[str, 
     pace = said.get("pace", _PACES[0])
     if pace not in _PACES:
         raise EstimationError(f"pace is {pace!r}; known: {', '.join(_PACES)}. Correct it")
-    if not isinstance(record, (Record, str, Path)):
-        raise EstimationError(f"record is {_short(record)}; it must be a Record or the path of a file. Give one")
     if said.get("start") is not None and said.get("start_s") is not None:
         raise EstimationError(
             f"{names.get('start_s', 'start_s')} is for a start identified from the record; "
             f"{names.get('start', 'start')} gives one. Leave one of them out"
-        )
-    if said.get("rate_hz") is not None and isinstance(record, Record):
-        raise EstimationError(
-            f"rate_hz = {said['rate_hz']} is for files without a time column; this record has {record.rate_hz:g} Hz."
-            " Leave it out, or replace the record's"
         )
     for flag in said.get("flags", ()):
         _check_flag(flag)

@@ -131,13 +131,13 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
     if problem.model.name == "one-axis":
         checks["units"] = _units(fit, rig, signals_of(bench, problem.model), doubt=not checks["fixed_agree"].passed)
-        if rig.magnet is not None and carries_weight(rig.magnet, bench["current"]):
+        if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
     y, error = problem.y[problem.skip :], simulation_error(fit)
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
-        means={role: float(bench[role].mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
+        means={role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
         one_step=fit_of(e * problem.scales.output, y), simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip

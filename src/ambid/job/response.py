@@ -5,8 +5,10 @@ Read -> cut -> measure -> fit -> Measured. With a rig, columns are its roles and
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Literal, Unpack
+from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -15,11 +17,13 @@ from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets
+from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Channels, Clock, Columns, Source
+from ambid.job.data import Channels, Clock, Names, Source
 from ambid.physics.linear_model import model
+from ambid.record import GapPolicy
 from ambid.rig import Rig
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
@@ -30,33 +34,46 @@ Delay = float | Literal["auto"]
 def frf(
     record: Source,
     *,
+    input: Names | None = None,  # noqa: A002 - the words of the command
+    output: Names | None = None,
+    reference: Names | None = None,
+    rig: Rig | str | Path | None = None,
+    open_loop: bool = False,
     method: Method = "auto",
     hold: Hold = "zoh",
     band: tuple[float, float] | None = None,
-    orders: Orders | None = None,
+    orders: Orders | str | None = None,
     state_space: int | Literal["auto"] | None = None,
     feedthrough: bool = False,
     domain: Literal["s", "z"] | None = None,
     delay: Delay | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-    **columns: Unpack[Columns],
 ) -> Measured:
     """Measure a frequency response from one record, and fit models to it.
 
     Parameters
     ----------
-    record : Record, str or Path
-        With a rig: a file in the rig's columns, or a record whose channels are named by role.
+    record : file, Record, DataFrame, Dataset or dict of arrays
+    input, output, reference : str or sequence of str, optional
+        Names of channels. With references (the loop's outer excitation) the joint method is used, which feedback does
+        not bias.
+    rig : Rig, str or Path, optional
+        Names and calibrates the channels; physical parameters of its model are estimated.
+    open_loop : bool, optional
+        Say that no feedback was at work.
     method : {"auto", "periodic", "random", "local"}, optional
         As in `ambid.signals.frequency_response`. Periodic: leading periods with a transient are left out, and said so.
     hold : {"zoh", "band-limited"}, optional
         What the inputs do between samples.
     band : (float, float), optional
         Lines that are kept, in Hz.
-    orders : Mapping[str, int, "auto" or tuple of int], optional
-        ``nf`` and ``nb`` of transfer functions, fitted by maximum likelihood.
+    orders : str or Mapping[str, int, "auto" or tuple of int], optional
+        ``nf`` and ``nb`` of transfer functions (``"nf=4,nb=3"``), fitted by maximum likelihood.
     state_space : int or "auto", optional
         Order of a state space, fitted by subspace with the Laguerre operator. Not together with `orders`.
     feedthrough : bool, optional
@@ -68,12 +85,10 @@ def frf(
         for a state space).
     from_s, to_s : float, optional
         Part of the record to use, in s.
+    rate_hz, gaps, units : optional
+        As `ambid.identify`.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
-    **columns
-        ``inputs``, ``outputs``, ``references``, ``open_loop``, ``rate_hz``, ``gaps`` and ``rig``, see
-        `ambid.job.data.Columns`. With references the joint method is used, which feedback does not bias; with a rig,
-        physical parameters of its model are estimated.
 
     Returns
     -------
@@ -86,9 +101,14 @@ def frf(
     EstimationError
         If the response cannot be measured, or a model not be fitted to it.
     """
-    say, clock, channels = tick or silent, Clock(), Channels.of(columns)
-    bench = channels.rig
-    _check(orders, state_space, feedthrough, domain, delay, bench)
+    say, clock, channels = tick or silent, Clock(), Channels.of(
+        input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
+        rig=rig,
+    )  # fmt: skip
+    bench, wanted = channels.rig, orders_of(orders)
+    if orders is not None and wanted is None:
+        raise EstimationError("--orders auto: a transfer function wants its degree. Give nf=2, or --state-space auto")
+    _check(wanted, state_space, feedthrough, domain, delay, bench)
     if bench is None and not channels.inputs:
         raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
     data = channels.read(record, (from_s, to_s))
@@ -98,9 +118,9 @@ def frf(
     clock.lap("measure")
     found: BlackBoxFit | None = None
     estimate: FrequencyEstimate | None = None
-    if orders is not None or state_space is not None:
+    if wanted is not None or state_space is not None:
         say("fit")
-        found = _fit_model(response, data, orders, state_space, feedthrough, domain, 0.0 if delay is None else delay)
+        found = _fit_model(response, data, wanted, state_space, feedthrough, domain, 0.0 if delay is None else delay)
         clock.lap("fit")
     if bench is not None:
         say("identify")

@@ -17,13 +17,14 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_order_names, io_data, order_per_input, single_order
+from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import WHOLE, Reading, Source
+from ambid.job.data import WHOLE, Reading, names_of
 from ambid.job.following import EstimatorWords, Following, Memory
 from ambid.job.track_start import rows_of, start_of
 from ambid.physics.linear_model import model
-from ambid.record import Record, read_record
+from ambid.record import Source, cut, read_record
 from ambid.recursive import (
     JointEkf,
     JointUkf,
@@ -37,7 +38,6 @@ from ambid.recursive import (
 )
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig
-from ambid.signals.conditioning import cut
 from ambid.tracking.lines_file import Tally
 
 REGRESSIONS = ("rls", "lms", "nlms", "iv")
@@ -78,8 +78,8 @@ def track_estimator(
     """Follow a record with one of `METHODS` other than ``rpem``; `start` and `start_s` are of a joint filter."""
     if method not in METHODS:
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
-    inputs, outputs = settings.get("inputs", ()), settings.get("outputs", ())
-    references, orders = settings.get("references", ()), settings.get("orders")
+    inputs, outputs, references = (names_of(settings.get(x)) for x in ("input", "output", "reference"))  # type: ignore[arg-type]
+    orders = orders_of(settings.get("orders"))
     refusal = f"--method {method} takes no {{}}. Leave it out"
     if method in JOINT:
         columns = {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders}
@@ -87,7 +87,7 @@ def track_estimator(
         made = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
         refuse_given({"--rig": rig, "--start": start, "--start-seconds": start_s}, refusal)
-        whole = record if isinstance(record, Record) else read_record(record, rate_hz=part.get("rate_hz"))
+        whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"))
         span = part.get("from_s"), part.get("to_s")
         used = whole if span == WHOLE else cut(whole, *span)
         data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
@@ -229,8 +229,8 @@ def _joint(
     bench, first = source.record, begin.first
     return _Run(
         estimator=made, rate_hz=rate, t0=source.t0 + first / rate, scale=np.ones(len(made.names)), model=of.name,
-        inputs=np.column_stack([bench[x] for x in of.inputs])[first:],
-        outputs=np.column_stack([bench[x] for x in of.outputs])[first:],
+        inputs=np.column_stack([bench[x].values for x in of.inputs])[first:],
+        outputs=np.column_stack([bench[x].values for x in of.outputs])[first:],
         units={k: known.get(k) or offsets[k] for k in made.names},
         origin={**source.origin, "samples": bench.n_samples - first},
         start={k: TrackedValue(value=estimate.values[k], sd=sd[k]) for k in free}, warnings=begin.warnings,

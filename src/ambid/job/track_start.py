@@ -13,11 +13,11 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import EstimationError, RecordError
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import Reading, Source, known_rig, load_bench
+from ambid.job.data import Reading, known_rig, load_bench
 from ambid.job.identification import identify
 from ambid.job.results import read_linear_estimate
 from ambid.physics.linear_model import LinearModel, Parameter, model
-from ambid.record import Channel, Record, read_rows
+from ambid.record import Channel, Record, Source, read_rows
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
 from ambid.tracking.guard import ABSURD
@@ -90,13 +90,14 @@ class BenchRows:
 def rows_of(record: Source, known: Rig | None, **reading: Unpack[Reading]) -> BenchRows:
     """Read the rows of a record through a rig; without one, columns are named like the roles, also of a turning rotor.
 
-    `record`: a file, or a record whose channels are named by role.
+    `record`: a table or file, or a record.
     """
     rig, rate_hz = known_rig(known), reading.get("rate_hz")
-    if isinstance(record, Record) or not str(record).lower().endswith(_ROWS):
+    if isinstance(record, Record) or (isinstance(record, (str, Path)) and not str(record).lower().endswith(_ROWS)):
         bench, stamps = load_bench(record, rig, **reading), None
     else:
-        rows = read_rows(record, rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz)
+        rate = rate_hz if rate_hz is not None else rig.record.rate_hz
+        rows = read_rows(record, rate_hz=rate, units=reading.get("units"))
         from_s, to_s = reading.get("from_s"), reading.get("to_s")
         bench, stamps = _part(
             bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig), rows.time_s,
@@ -223,7 +224,7 @@ def credible_limits(source: BenchRows, estimate: Estimate) -> list[float]:
     plant, point = model(estimate.model), estimate.operating_point
     found = []
     for role in plant.inputs:
-        known = np.abs(source.record[role])
+        known = np.abs(source.record[role].values)
         known = known[np.isfinite(known)]
         size = float(np.quantile(known, _MOST_OF)) if known.size else 0.0
         found.append(_INPUT_CREDIBLE * max(size, abs(point[role])) or ABSURD)

@@ -79,7 +79,7 @@ def track(
         If start or settings make no sense, or nothing can be identified to start from.
     """
     said = {"start": start, "start_s": start_s, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz}
-    check_settings(record, {**said, **words})
+    check_settings({**said, **words})
     say, following, settings = tick or silent, dict[str, Any](words), EstimatorWords()
     for name in EstimatorWords.__annotations__:
         if name in following:

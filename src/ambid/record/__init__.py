@@ -4,47 +4,84 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any, Protocol
 
 from ambid.errors import RecordError
-from ambid.record.csv_format import read_csv, write_csv
-from ambid.record.record import Channel, Record, Step
-from ambid.record.rows import Rows, read_rows
-from ambid.record.sampling import GapPolicy
+from ambid.record.csv_format import read_csv, read_csv_rows, write_csv
+from ambid.record.record import Channel, Record, Step, cut
+from ambid.record.rows import Rows
+from ambid.record.sampling import GapPolicy, checked
 
-__all__ = ["Channel", "GapPolicy", "Record", "Rows", "Step", "read_record", "read_rows", "write_record"]
+__all__ = [
+    "Channel",
+    "Frame",
+    "GapPolicy",
+    "Record",
+    "Rows",
+    "Source",
+    "Step",
+    "cut",
+    "read_record",
+    "read_rows",
+    "write_record",
+]
+
+
+class Frame(Protocol):
+    """A DataFrame, of pandas or polars."""
+
+    @property
+    def columns(self) -> Any:
+        """Its labels."""
+
+
+Source = Record | str | Path | Frame | Mapping[str, Any]
+"""A record, its file, or a table in memory: a DataFrame, a Dataset of xarray, or arrays by name."""
 
 
 def read_record(
-    path: str | Path,
+    source: Source,
     *,
     rate_hz: float | None = None,
     gaps: GapPolicy = "error",
+    units: Mapping[str, str] | None = None,
     variables: Mapping[str, tuple[str, str]] | None = None,
 ) -> Record:
-    """Read a record; the format is taken from the file's name.
+    """Read a record from a file, whose name tells its format, or take it from a table in memory.
 
     Parameters
     ----------
-    path : str or Path
-        ``.csv``, ``.csv.gz``, ``.h5``, ``.hdf5`` or ``.mat``.
+    source : str, Path, Record, DataFrame, Dataset or Mapping of str to array
+        ``.csv``, ``.csv.gz``, ``.h5``, ``.hdf5`` or ``.mat``; a table as `Record.from_dataframe` takes it; or a record,
+        which stays as it is unless gaps are to be treated.
     rate_hz : float, optional
-        Sampling rate in Hz, for a file that does not hold it.
+        Sampling rate in Hz, for a source that does not hold it.
     gaps : {"error", "interpolate", "cut"}
         What to do about missing or non-finite values.
+    units : Mapping of str to str, optional
+        For tables only: unit by column.
     variables : Mapping of channel name to (variable, unit), optional
         For ``.mat`` only: which variable is which channel, e.g. ``{"current": ("data.i", "mA")}``.
 
     Returns
     -------
     Record
-        In SI units, with the file's SHA-256 in its provenance.
+        In SI units, with the file's SHA-256 in its provenance; of a table that of its numbers.
 
     Raises
     ------
     RecordError
-        If the format is not known or the file breaks one of its rules.
+        If the format is not known or the source breaks one of its rules.
     """
-    path = Path(path)
+    if units and isinstance(source, (str, Path, Record)):
+        raise RecordError("units= is for tables in memory; a file says its units in the header row. Leave it out")
+    if isinstance(source, Record):
+        return source if rate_hz is None and gaps == "error" else checked(source, "the record", rate_hz, gaps)
+    if not isinstance(source, (str, Path)):
+        from ambid.record.frames import read_table
+
+        return read_table(source, rate_hz=rate_hz, units=units, gaps=gaps)
+    path = Path(source)
     kind = _format_of(path)
     if variables is not None and kind != "mat":
         raise RecordError(f"{path}: a mapping of variables is for .mat files. Leave it out")
@@ -54,9 +91,48 @@ def read_record(
         from ambid.record.mat_format import read_mat
 
         return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps)
-    from ambid.record.hdf5_format import read_hdf5_checked
+    from ambid.record.hdf5_format import read_hdf5
 
-    return read_hdf5_checked(path, rate_hz=rate_hz, gaps=gaps)
+    return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
+
+
+def read_rows(source: Source, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
+    """Read the rows of a record that may be damaged.
+
+    Parameters
+    ----------
+    source : str, Path, Record, DataFrame, Dataset or Mapping of str to array
+        ``.csv``, ``.csv.gz``, ``.h5`` or ``.hdf5``, or as `read_record`.
+    rate_hz : float, optional
+        Sampling rate in Hz, for a source that does not hold it.
+    units : Mapping of str to str, optional
+        For tables only: unit by column.
+
+    Returns
+    -------
+    Rows
+        In SI units.
+
+    Raises
+    ------
+    RecordError
+        If the format is another one, a row has too many or too few cells, or there is no rate.
+    """
+    if isinstance(source, Record):
+        return Rows(record=read_record(source, units=units), time_s=None)
+    if not isinstance(source, (str, Path)):
+        from ambid.record.frames import read_table_rows
+
+        return read_table_rows(source, rate_hz=rate_hz, units=units)
+    path = Path(source)
+    kind = _format_of(path)
+    if kind == "csv":
+        return read_csv_rows(path, rate_hz=rate_hz)
+    if kind == "hdf5":
+        from ambid.record.hdf5_format import read_hdf5
+
+        return Rows(record=read_hdf5(path), time_s=None)
+    raise RecordError(f"record {path}: rows are read from .csv, .csv.gz, .h5 and .hdf5 only. Write the record as one")
 
 
 def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:

@@ -11,17 +11,25 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError
-from ambid.record.record import Channel, Record, Step, file_bytes, gunzipped, sha256_of, utf8_text
-from ambid.record.sampling import MIN_SAMPLES, GapPolicy, Table, check_gap_policy, sample_uniformly, usual_rate
-from ambid.units import UNKNOWN, Unit, nearest_unit, parse_unit
+from ambid.errors import RecordError
+from ambid.record.record import Record, file_bytes, gunzipped, sha256_of, utf8_text
+from ambid.record.rows import Rows
+from ambid.record.sampling import (
+    MIN_SAMPLES,
+    TIME_NAMES,
+    GapPolicy,
+    Table,
+    check_gap_policy,
+    record_of_rows,
+    seconds,
+    uniform_record,
+)
+from ambid.units import UNKNOWN
 
-_TIME_NAMES = ("time", "t")
 _REFUSED_IN_NAMES = set(',;\t\n[]"#')
 
 
@@ -32,35 +40,18 @@ def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy 
     Returns all columns but time, in SI units. A column whose unit is missing or unknown has the unit ``"?"``.
     """
     check_gap_policy(gaps)
-    content = _content(Path(path), gaps)
-    sampled = sample_uniformly(content.table, rate_hz, gaps)
-    return _record(content, sampled.values, sampled.rate_hz, sampled.start_s, sampled.steps)
+    return uniform_record(_table(Path(path), gaps), rate_hz, gaps)
 
 
-def read_csv_rows(path: str | Path, *, rate_hz: float | None = None) -> tuple[Record, Array | None]:
+def read_csv_rows(path: str | Path, *, rate_hz: float | None = None) -> Rows:
     """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.rows`).
 
     `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
-    Returns `record`: naN where a value is missing; the rate is that of the usual interval; `time_s`: (n_rows,), or
-    None, the time column, s; None if there is none.
     """
-    content = _content(Path(path), "cut")
-    rate, start_s = usual_rate(content.table, rate_hz)
-    time = content.table.time
-    record = _record(content, content.table.values, rate, start_s, ())
-    return record, None if time is None else content.table.values[:, time].copy()
+    return record_of_rows(_table(Path(path), "cut"), rate_hz)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Content:
-    """A file taken apart: its numbers, its header, and where they come from."""
-
-    table: Table
-    header: Header
-    provenance: dict[str, str]
-
-
-def _content(path: Path, gaps: GapPolicy) -> _Content:
+def _table(path: Path, gaps: GapPolicy) -> Table:
     """Read the header and the numbers, time in s."""
     data = file_bytes(path)
     provenance = {"file": path.name, "sha256": sha256_of(data)}
@@ -80,68 +71,17 @@ def _content(path: Path, gaps: GapPolicy) -> _Content:
         header, values = plain
     if header.comments:
         provenance["comment"] = "\n".join(header.comments)
-    time, time_unit = _time_column(header, path)
-    if time is not None and time_unit is not None:
-        values[:, time] = time_unit.to_si(values[:, time])
-    table = Table(where=str(path), names=header.names, values=values, first_row=header.row + 1, time=time)
-    return _Content(table=table, header=header, provenance=provenance)
-
-
-def _record(content: _Content, values: Array, rate_hz: float, start_s: float, steps: tuple[Step, ...]) -> Record:
-    """Make the record of all columns but time."""
-    header, table = content.header, content.table
-    settings: dict[str, object] = {"format": "csv", "rows": table.values.shape[0]}
+    time = next((j for j, name in enumerate(header.names) if name.lower() in TIME_NAMES), None)
+    if time is not None:
+        place = f"{path}, row {header.row}"
+        values[:, time] = seconds(values[:, time], header.names[time], header.unit_texts[time], place)
+    settings: dict[str, object] = {"format": "csv", "rows": values.shape[0]}
     if header.delimiter != ",":
         settings["delimiter"] = header.delimiter
-    channels = tuple(
-        column_channel(name, unit_text, values[:, j])
-        for j, (name, unit_text) in enumerate(zip(header.names, header.unit_texts, strict=True))
-        if j != table.time
-    )
-    if not channels:
-        raise RecordError(f"{table.where} has a time column and nothing else; a record needs a channel. Add a column")
-    return Record(
-        rate_hz=rate_hz,
-        start_s=start_s,
-        channels=channels,
-        history=(Step(name="read", settings=MappingProxyType(settings)), *steps),
-        provenance=MappingProxyType(content.provenance),
-    )
-
-
-def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
-    """Make a channel in SI units from a column in file units.
-
-    `name`: column name; `unit_text`: unit as the file gives it; missing or unknown units give the unit ``"?"``; `raw`:
-    (n_samples,), values in that unit. Returns in SI units, or as it stands in the file where the unit is not known.
-    """
-    try:
-        unit = parse_unit(unit_text or "")
-    except UnitError:
-        return Channel(name=name, unit=UNKNOWN, values=raw, source_unit=unit_text or UNKNOWN)
-    return Channel(name=name, unit=unit.si, values=unit.to_si(raw), source_unit=unit.symbol)
-
-
-def _time_column(header: Header, path: Path) -> tuple[int | None, Unit | None]:
-    """Find the time column and its unit."""
-    for j, (name, text) in enumerate(zip(header.names, header.unit_texts, strict=True)):
-        if name.lower() not in _TIME_NAMES:
-            continue
-        if text is None:
-            raise RecordError(f"{path}, row {header.row}: column {name!r} has no unit. Write '{name} [s]' (or ms, us)")
-        try:
-            unit = parse_unit(text)
-        except UnitError:
-            raise RecordError(
-                f"{path}, row {header.row}: column {name!r} is in [{text}], which is no known unit"
-                f" (nearest: {nearest_unit(text)}). Time must be in [s], [ms] or [us]"
-            ) from None
-        if unit.si != "s":
-            raise RecordError(
-                f"{path}, row {header.row}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]"
-            )
-        return j, unit
-    return None, None
+    return Table(
+        where=str(path), names=header.names, unit_texts=header.unit_texts, values=values, first_row=header.row + 1,
+        time=time, provenance=provenance, settings=settings,
+    )  # fmt: skip
 
 
 def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:
@@ -174,7 +114,7 @@ def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
     the last one is the header row.
     """
     for c in record.channels:
-        if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in _TIME_NAMES:
+        if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in TIME_NAMES:
             raise RecordError(f"channel {c.name!r} cannot be a CSV column: its name would be misread. Rename it")
     units = [c.source_unit if c.unit == UNKNOWN else c.unit for c in record.channels]
     names = [c.name if u == UNKNOWN else f"{c.name} [{u}]" for c, u in zip(record.channels, units, strict=True)]

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -20,7 +19,6 @@ import numpy as np
 from ambid.errors import RecordError
 from ambid.record._hdf5_file import new_hdf5
 from ambid.record.record import Channel, Record, Step, file_bytes, sha256_of
-from ambid.record.sampling import JITTER, GapPolicy, Table, check_gap_policy, sample_uniformly
 
 SCHEMA = "ambid.record/1"
 
@@ -76,35 +74,6 @@ def _history_text(record: Record) -> str:
         raise RecordError(
             f"the record's history cannot be stored: {failure}. Keep JSON-able settings in each step"
         ) from None
-
-
-def read_hdf5_checked(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:
-    """Read a record under the rules that hold for every format: one rate, and finite values unless gaps are treated.
-
-    `path`: HDF5 file of layout ``ambid.record/1``; `rate_hz`: has to agree with the rate in the file, in Hz; `gaps`:
-    what to do about values that are not finite. Returns finite throughout.
-    """
-    record = read_hdf5(path)
-    check_gap_policy(gaps)
-    if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
-        raise RecordError(
-            f"record {path} was sampled at {record.rate_hz:g} Hz but --rate says {rate_hz:g} Hz. Leave --rate out"
-        )
-    values = np.column_stack([c.values for c in record.channels])
-    bad = ~np.isfinite(values)
-    if gaps == "error" and bad.any():
-        k, j = np.argwhere(bad)[0]
-        raise RecordError(
-            f"record {path}, sample {k} of channel {record.names[j]!r}: {values[k, j]} is not a finite number."
-            " Say how to treat gaps: --gaps interpolate or --gaps cut"
-        )
-    table = Table(where=str(path), names=record.names, values=values, first_row=0, time=None)
-    sampled = sample_uniformly(table, record.rate_hz, gaps)
-    if not sampled.steps:
-        return record
-    channels = tuple(replace(c, values=sampled.values[:, j]) for j, c in enumerate(record.channels))
-    start_s = record.start_s + sampled.start_s
-    return replace(record, channels=channels, start_s=start_s, history=(*record.history, *sampled.steps))
 
 
 def read_hdf5(path: str | Path) -> Record:

@@ -9,20 +9,17 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError
-from ambid.record.csv_format import column_channel
-from ambid.record.record import Record, Step, file_bytes, sha256_of
-from ambid.record.sampling import GapPolicy, Table, check_gap_policy, sample_uniformly
-from ambid.units import UNKNOWN, parse_unit
+from ambid.errors import RecordError
+from ambid.record.record import Record, file_bytes, sha256_of
+from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, check_gap_policy, refuse_gaps, seconds, uniform_record
+from ambid.units import UNKNOWN
 
 _EXPRESSION = re.compile(r"(?P<path>[A-Za-z]\w*(?:\.[A-Za-z]\w*)*)\s*(?:\(\s*:\s*,\s*(?P<column>\d+)\s*\))?")
-_TIME_NAMES = ("time", "t")
 
 
 def read_mat(
@@ -43,31 +40,24 @@ def read_mat(
     content = _content(path, data)
     mapping = dict(variables) if variables is not None else _every_vector(content, path)
     if "time" not in mapping:
-        found = next((name for name in _TIME_NAMES if name in content), None)
+        found = next((name for name in TIME_NAMES if name in content), None)
         mapping |= {"time": (found, "s")} if found and rate_hz is None else {}
     columns = {name: _vector(content, expression, path) for name, (expression, _) in mapping.items()}
     values = _side_by_side(columns, mapping, path)
     names = tuple(columns)
     time = names.index("time") if "time" in names else None
     if time is not None:
-        values[:, time] = _seconds(values[:, time], mapping["time"], path)
+        variable, unit = mapping["time"]
+        values[:, time] = seconds(values[:, time], variable, unit, f"record {path}")
+    table = Table(
+        where=str(path), names=names, values=values, first_row=1, time=time,
+        unit_texts=tuple(None if unit == UNKNOWN else unit for _, unit in mapping.values()),
+        provenance={"file": path.name, "sha256": sha256_of(data)},
+        settings={"format": "mat", "variables": {name: expression for name, (expression, _) in mapping.items()}},
+    )  # fmt: skip
     if gaps == "error":
-        _refuse_gaps(values, names, mapping, path)
-    table = Table(where=str(path), names=names, values=values, first_row=1, time=time)
-    sampled = sample_uniformly(table, rate_hz, gaps)
-    channels = tuple(
-        column_channel(name, None if mapping[name][1] == UNKNOWN else mapping[name][1], sampled.values[:, j])
-        for j, name in enumerate(names)
-        if j != time
-    )
-    settings = {"format": "mat", "variables": {name: expression for name, (expression, _) in mapping.items()}}
-    return Record(
-        rate_hz=sampled.rate_hz,
-        start_s=sampled.start_s,
-        channels=channels,
-        history=(Step(name="read", settings=MappingProxyType(settings)), *sampled.steps),
-        provenance=MappingProxyType({"file": path.name, "sha256": sha256_of(data)}),
-    )
+        refuse_gaps(table)
+    return uniform_record(table, rate_hz, gaps)
 
 
 def _content(path: Path, data: bytes) -> dict[str, Any]:
@@ -116,7 +106,7 @@ def _content_v73(path: Path) -> dict[str, Any]:
 
 def _every_vector(content: Mapping[str, Any], path: Path) -> dict[str, tuple[str, str]]:
     """Map every numeric vector of the file, of unknown unit."""
-    found = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in _TIME_NAMES}
+    found = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in TIME_NAMES}
     if not found:
         held = ", ".join(f"{name} {_shape(value)}" for name, value in list(content.items())[:8]) or "nothing"
         raise RecordError(
@@ -182,25 +172,3 @@ def _side_by_side(columns: Mapping[str, Array], mapping: Mapping[str, tuple[str,
             f"record {path}: variables differ in length ({listing}); all must have the same. Choose others"
         )
     return np.column_stack(list(columns.values()))
-
-
-def _seconds(time: Array, variable: tuple[str, str], path: Path) -> Array:
-    try:
-        unit = parse_unit(variable[1])
-    except UnitError as error:
-        raise RecordError(f"record {path}: time variable {variable[0]!r}: {error}") from None
-    if unit.si != "s":
-        raise RecordError(
-            f"record {path}: time variable {variable[0]!r} is in [{variable[1]}]; it must be in s, ms or us"
-        )
-    return unit.to_si(time)
-
-
-def _refuse_gaps(values: Array, names: tuple[str, ...], mapping: Mapping[str, tuple[str, str]], path: Path) -> None:
-    bad = ~np.isfinite(values)
-    if bad.any():
-        row, j = np.argwhere(bad)[0]
-        raise RecordError(
-            f"{path}, row {row + 1} of variable {mapping[names[j]][0]!r}: {values[row, j]} is not a finite number;"
-            " every value must be one. Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
-        )

@@ -8,16 +8,25 @@ from __future__ import annotations
 import difflib
 import gzip
 import hashlib
+import math
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
+from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, RecordError
+from ambid.errors import AmbidError, RecordError, nearest
+from ambid.lazy import later
+
+if TYPE_CHECKING:
+    import pandas
+    import xarray
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,9 +49,9 @@ class Step:
         return f"{self.name}({inside})"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Channel:
-    """One measured or simulated quantity.
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Channel(NDArrayOperatorsMixin):
+    """One measured or simulated quantity; in NumPy's functions and arithmetic it stands for its values.
 
     Attributes
     ----------
@@ -79,10 +88,29 @@ class Channel:
         if not self.source_unit:
             object.__setattr__(self, "source_unit", self.unit)
 
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> Array:
+        return np.array(self.values, dtype=dtype, copy=copy)
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+    def __array_ufunc__(self, function: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
+        plain = [x.values if isinstance(x, Channel) else x for x in inputs]
+        return getattr(function, method)(*plain, **options)
+
+    def __len__(self) -> int:
+        return int(self.values.size)
+
+    def __getitem__(self, at: Any) -> Any:
+        return self.values[at]
+
+    def __repr__(self) -> str:
+        return f"Channel {self.name} [{self.unit}], {self.values.size} samples"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Record:
     """Uniformly sampled channels in SI units. Never changed in place: each step returns a new record.
+
+    ``record["current"]`` is a channel, ``record[2.0:5.0]`` the record from 2 s to 5 s; iterating gives names, `len`
+    the number of samples.
 
     Attributes
     ----------
@@ -151,14 +179,155 @@ class Record:
         for c in self.channels:
             if c.name == name:
                 return c
-        raise RecordError(f"the record has no channel {name!r}; it has {', '.join(self.names)}. Check the name")
+        raise RecordError(
+            f"the record has no channel {name!r}; it has {', '.join(self.names)}.{nearest(name, self.names)} Check the"
+            " name"
+        )
 
-    def __getitem__(self, name: str) -> Array:
-        return self.channel(name).values
+    @overload
+    def __getitem__(self, key: str) -> Channel: ...
+    @overload
+    def __getitem__(self, key: slice) -> Record: ...
+    def __getitem__(self, key: str | slice) -> Channel | Record:
+        if isinstance(key, str):
+            return self.channel(key)
+        if isinstance(key, slice) and key.step is None:
+            ends = [key.start, key.stop]
+            if all(x is None or (isinstance(x, Real) and not isinstance(x, bool)) for x in ends):
+                return cut(self, *(None if x is None else float(x) for x in ends))
+        raise RecordError(
+            f"a record has no part {_shown(key)}; it has channels by name, and parts in seconds. Write "
+            f'record["{self.names[0]}"] or record[0.5:2.0], and record["{self.names[0]}"].values[7] for a sample'
+        )
+
+    def __contains__(self, name: object) -> bool:
+        return name in self.names
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def __len__(self) -> int:
+        return self.n_samples
+
+    @classmethod
+    def from_dataframe(
+        cls,
+        table: Any,
+        *,
+        rate_hz: float | None = None,
+        units: Mapping[str, str] | None = None,
+        gaps: str = "error",
+    ) -> Record:
+        """Take a record from a table in memory.
+
+        Parameters
+        ----------
+        table : pandas or polars DataFrame, xarray Dataset, or Mapping of str to array
+            Columns are called ``name [unit]``, or their units are given beside them. Time is a column ``time [s]``, an
+            index or coordinate of seconds, time differences or dates (then from 0 on), or is told by `rate_hz`.
+        rate_hz : float, optional
+            Sampling rate in Hz, for a table without time.
+        units : Mapping of str to str, optional
+            Unit by column.
+        gaps : {"error", "interpolate", "cut"}, optional
+            What to do about missing values.
+
+        Returns
+        -------
+        Record
+            In SI units, under the rules that hold for files.
+
+        Raises
+        ------
+        RecordError
+            If the table breaks a rule.
+
+        Examples
+        --------
+        >>> from ambid import Record
+        >>> Record.from_dataframe({"current [mA]": [0, 1, 2, 3, 4, 5, 6, 7]}, rate_hz=1000.0)
+        Record of 8 samples, 0.008 s at 1000 Hz: current [A]
+        """
+        return later("ambid.record.frames", "read_table")(table, rate_hz=rate_hz, units=units, gaps=gaps)  # type: ignore[no-any-return]
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return a pandas DataFrame: columns ``name [unit]``, time in s as its index; `from_dataframe` takes it back.
+
+        Returns
+        -------
+        pandas.DataFrame
+        """
+        return later("ambid.record.frames", "to_dataframe")(self)
+
+    def to_xarray(self) -> xarray.Dataset:
+        """Return an xarray Dataset: a variable a channel with its unit, over the coordinate time in s.
+
+        Returns
+        -------
+        xarray.Dataset
+            With rate, history and provenance as attributes.
+        """
+        return later("ambid.record.frames", "to_xarray")(self)
+
+    def __repr__(self) -> str:
+        listed = ", ".join(f"{c.name} [{c.unit}]" for c in self.channels)
+        return f"Record of {self.n_samples} samples, {self.duration_s:.4g} s at {self.rate_hz:.6g} Hz: {listed}"
 
     def with_step(self, step: Step, **changes: object) -> Record:
         """Return a copy with `changes` made and `step` added to its history."""
         return replace(self, history=(*self.history, step), **changes)  # type: ignore[arg-type]
+
+
+def _shown(key: object) -> str:
+    """Write a key as it stands between the brackets."""
+    if not isinstance(key, slice):
+        return f"[{key!r}]"
+    ends = ["" if x is None else repr(x) for x in (key.start, key.stop)]
+    return f"[{':'.join([*ends, repr(key.step)] if key.step is not None else ends)}]"
+
+
+# Sampling instants that are given as decimals (2.0 s at 1 kHz) miss the grid by round-off; a thousandth of a sample is
+# none.
+_GRID_TOLERANCE = 1e-3
+
+
+def cut(record: Record, from_s: float | None = None, to_s: float | None = None) -> Record:
+    """Keep the samples with from_s <= t < to_s, on the record's own time axis.
+
+    Parameters
+    ----------
+    record : Record
+        The record to cut.
+    from_s, to_s : float, optional
+        Ends in s; the record's own by default.
+
+    Returns
+    -------
+    Record
+        A new record, whose `start_s` is the time of its first sample, with the step in its history.
+
+    Raises
+    ------
+    RecordError
+        If an end lies outside the record, or nothing would be left.
+    """
+    begin, end = record.start_s, record.start_s + record.duration_s
+    first_s = begin if from_s is None else float(from_s)
+    last_s = end if to_s is None else float(to_s)
+    slack = _GRID_TOLERANCE / record.rate_hz
+    for label, t in (("from", first_s), ("to", last_s)):
+        if not begin - slack <= t <= end + slack:
+            raise RecordError(f"cut {label} {t:g} s; the record spans {begin:g} to {end:g} s. Give a time inside it")
+    first = math.ceil((first_s - begin) * record.rate_hz - _GRID_TOLERANCE)
+    last = math.ceil((last_s - begin) * record.rate_hz - _GRID_TOLERANCE)
+    if last <= first:
+        raise RecordError(
+            f"cut from {first_s:g} to {last_s:g} s keeps no sample; from must lie before to. Swap or widen them"
+        )
+    first, last = max(first, 0), min(last, record.n_samples)
+    channels = tuple(replace(c, values=c.values[first:last].copy()) for c in record.channels)
+    step = Step(name="cut", settings={"from_s": first_s, "to_s": last_s, "samples": last - first})
+    return record.with_step(step, channels=channels, start_s=begin + first / record.rate_hz)
 
 
 def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> bytes:

@@ -1,4 +1,4 @@
-"""From time stamps and columns to uniform samples: the rate, and what is done about gaps.
+"""From columns and time stamps to a record: units, the rate, and what is done about gaps.
 
 A time column is uniform if every interval is within 1 % of the sampling period, or lies between two stamps that are
 within 1 % of a period of a uniform grid (jitter of a stamp shows twice in the intervals beside it).
@@ -6,31 +6,39 @@ within 1 % of a period of a uniform grid (jitter of a stamp shows twice in the i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import RecordError
-from ambid.record.record import Step
+from ambid.errors import RecordError, UnitError
+from ambid.record.record import Channel, Record, Step
+from ambid.record.rows import Rows
+from ambid.units import UNKNOWN, nearest_unit, parse_unit
 
 GapPolicy = Literal["error", "interpolate", "cut"]
 GAP_POLICIES: tuple[GapPolicy, ...] = ("error", "interpolate", "cut")
 MIN_SAMPLES = 8
 JITTER = 0.01  # of a sampling period
+TIME_NAMES = ("time", "t")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Columns as read from a file, not yet known to be uniform."""
+    """Columns as read from a file or taken from memory, not yet known to be uniform."""
 
     where: str  # the file, for messages
     names: tuple[str, ...]  # column names
     values: Array  # (n_rows, n_columns), in file units; NaN where a value is missing
     first_row: int  # line of the file in which the first row stands, counted from 1
     time: int | None  # which column is time (in seconds); None if there is none
+    unit_texts: tuple[str | None, ...] = ()  # units as the columns give them
+    provenance: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+    settings: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))  # of the reading, for history
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,6 +49,100 @@ class Sampled:
     rate_hz: float  # sampling rate in Hz and time of the first sample in s
     start_s: float
     steps: tuple[Step, ...]  # what was done about gaps
+
+
+def uniform_record(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Record:
+    """Return the columns on a uniform grid; all values are finite if `gaps` is ``"error"``."""
+    sampled = sample_uniformly(table, rate_hz, gaps)
+    return _record(table, sampled.values, sampled.rate_hz, sampled.start_s, sampled.steps)
+
+
+def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) -> Record:
+    """Return a record under the rules that hold for every source: one rate, and finite values unless gaps are treated.
+
+    `rate_hz`: has to agree with the record's, in Hz.
+    """
+    check_gap_policy(gaps)
+    if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
+        raise RecordError(
+            f"{where} was sampled at {record.rate_hz:g} Hz but --rate says {rate_hz:g} Hz. Leave --rate out"
+        )
+    values = np.column_stack([c.values for c in record.channels])
+    table = Table(where=where, names=record.names, values=values, first_row=0, time=None)
+    if gaps == "error":
+        refuse_gaps(table)
+    sampled = sample_uniformly(table, record.rate_hz, gaps)
+    if not sampled.steps:
+        return record
+    channels = tuple(replace(c, values=sampled.values[:, j]) for j, c in enumerate(record.channels))
+    start_s = record.start_s + sampled.start_s
+    return replace(record, channels=channels, start_s=start_s, history=(*record.history, *sampled.steps))
+
+
+def record_of_rows(table: Table, rate_hz: float | None) -> Rows:
+    """Return the rows as they stand; the rate is that of the usual interval."""
+    rate, start_s = usual_rate(table, rate_hz)
+    time = None if table.time is None else table.values[:, table.time].copy()
+    return Rows(record=_record(table, table.values, rate, start_s, ()), time_s=time)
+
+
+def _record(table: Table, values: Array, rate_hz: float, start_s: float, steps: tuple[Step, ...]) -> Record:
+    """Make the record of all columns but time."""
+    channels = tuple(
+        column_channel(name, text, values[:, j])
+        for j, (name, text) in enumerate(zip(table.names, table.unit_texts, strict=True))
+        if j != table.time
+    )
+    if not channels:
+        raise RecordError(f"{table.where} has a time column and nothing else; a record needs a channel. Add a column")
+    return Record(
+        rate_hz=rate_hz,
+        start_s=start_s,
+        channels=channels,
+        history=(Step(name="read", settings=MappingProxyType(dict(table.settings))), *steps),
+        provenance=MappingProxyType(dict(table.provenance)),
+    )
+
+
+def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
+    """Make a channel in SI units from a column in file units.
+
+    `unit_text`: unit as the file gives it; missing or unknown units give the unit ``"?"``; `raw`: (n_samples,), values
+    in that unit, which stay as they are where it is not known.
+    """
+    try:
+        unit = parse_unit(unit_text or "")
+    except UnitError:
+        return Channel(name=name, unit=UNKNOWN, values=raw, source_unit=unit_text or UNKNOWN)
+    return Channel(name=name, unit=unit.si, values=unit.to_si(raw), source_unit=unit.symbol)
+
+
+def seconds(time: Array, name: str, text: str | None, where: str) -> Array:
+    """Return time stamps in s; `text`: their unit, as the column gives it."""
+    if text is None:
+        raise RecordError(f"{where}: column {name!r} has no unit. Write '{name} [s]' (or ms, us)")
+    try:
+        unit = parse_unit(text)
+    except UnitError:
+        raise RecordError(
+            f"{where}: column {name!r} is in [{text}], which is no known unit (nearest: {nearest_unit(text)})."
+            " Time must be in [s], [ms] or [us]"
+        ) from None
+    if unit.si != "s":
+        raise RecordError(f"{where}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]")
+    return unit.to_si(time)
+
+
+def refuse_gaps(table: Table) -> None:
+    """Refuse values that are not finite, naming the first."""
+    bad = ~np.isfinite(table.values)
+    if bad.any():
+        row, j = np.argwhere(bad)[0]
+        raise RecordError(
+            f"{table.where}, row {table.first_row + row}, column {table.names[j]!r}: {table.values[row, j]} is not a"
+            " finite number; every value must be one. Correct it, or say how to treat gaps: --gaps interpolate or"
+            " --gaps cut"
+        )
 
 
 def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sampled:

@@ -65,7 +65,7 @@ def _row(record: Record, c: Channel, inputs: Sequence[str]) -> tuple[str, ...]:
 def _ratio(record: Record, c: Channel, inputs: Sequence[str]) -> str:
     if not np.ptp(c.values) > 0:
         return "–"
-    driving = [] if c.name in inputs else [name for name in inputs if np.ptp(record[name]) > 0]
+    driving = [] if c.name in inputs else [name for name in inputs if np.ptp(record[name].values) > 0]
     try:
         found = snr(record, c.name, inputs=driving)
     except AmbidError:
@@ -97,7 +97,7 @@ def _findings(record: Record, inputs: Sequence[str], paint: Paint) -> list[str]:
 
 def _excitation(record: Record, name: str) -> str:
     """Order of persistent excitation above the channel's own noise, and the band that holds its power."""
-    u = record[name][:_LONGEST]
+    u = record[name].values[:_LONGEST]
     centred = u - u.mean()
     power = np.cumsum(np.abs(np.fft.rfft(centred)) ** 2)
     if not power[-1] > 0:

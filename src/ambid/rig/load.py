@@ -17,13 +17,16 @@ from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitErro
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
-from ambid.record import Channel, GapPolicy, Record, Step, read_record
+from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
 from ambid.rig.rig import DAQ_RATE_HZ, OPTIONAL_ROLES, Daq, RecordSettings, Rig, RigChannel, RigMagnet, role_units
 from ambid.units import UNKNOWN, Unit, parse_unit
 
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
+
+
+_SELECT = "select"  # step in the history of a record that went through a rig
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -477,13 +480,21 @@ def unit_of(text: str, place: str) -> Unit:
         raise RigError(f"{place}: {error}") from None
 
 
-def read_bench(path: str | Path, rig: Rig, *, rate_hz: float | None = None, gaps: GapPolicy | None = None) -> Record:
-    """Read a record file as the rig says, and name its columns by their roles.
+def read_bench(
+    source: Source,
+    rig: Rig,
+    *,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
+    beside: Sequence[str] = (),
+) -> Record:
+    """Read a record as the rig says, and name its columns by their roles.
 
     Parameters
     ----------
-    path : str or Path
-        The record.
+    source : str, Path, Record, DataFrame, Dataset or Mapping of str to array
+        As :func:`ambid.record.read_record` takes it. A record that went through a rig already stays as it is.
     rig : Rig
         Its `record` settings are used where the arguments do not override them; ``record.from`` and ``to`` are left to
         the caller, who knows of other ones.
@@ -491,6 +502,10 @@ def read_bench(path: str | Path, rig: Rig, *, rate_hz: float | None = None, gaps
         Sampling rate in Hz.
     gaps : {"error", "interpolate", "cut"}, optional
         What to do about gaps.
+    units : Mapping of str to str, optional
+        Unit by column, for a table in memory.
+    beside : sequence of str, optional
+        As :func:`bench_record`.
 
     Returns
     -------
@@ -502,13 +517,14 @@ def read_bench(path: str | Path, rig: Rig, *, rate_hz: float | None = None, gaps
     AmbidError
         If the file or its columns break a rule.
     """
+    mat = isinstance(source, (str, Path)) and Path(source).suffix.lower() == ".mat"
+    if rate_hz is None and not isinstance(source, Record):  # a record may have been resampled since
+        rate_hz = rig.record.rate_hz
     record = read_record(
-        path,
-        rate_hz=rate_hz if rate_hz is not None else rig.record.rate_hz,
-        gaps=gaps or rig.record.gaps or "error",
-        variables=mat_variables(rig) if Path(path).suffix.lower() == ".mat" else None,
-    )
-    return bench_record(record, rig)
+        source, rate_hz=rate_hz, gaps=gaps or rig.record.gaps or "error", units=units,
+        variables={**{x: (x, UNKNOWN) for x in beside}, **mat_variables(rig)} if mat else None,
+    )  # fmt: skip
+    return bench_record(record, rig, beside=beside)
 
 
 def mat_variables(rig: Rig) -> dict[str, tuple[str, str]]:
@@ -531,15 +547,18 @@ def mat_variables(rig: Rig) -> dict[str, tuple[str, str]]:
     return variables
 
 
-def bench_record(record: Record, rig: Rig) -> Record:
+def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Record:
     """Select the rig's columns, check their units, calibrate them and name them by their roles.
 
     Parameters
     ----------
     record : Record
-        As read from a file: columns by name, SI units.
+        As read from a file: columns by name, SI units. One whose history says that it went through a rig already is
+        not calibrated again.
     rig : Rig
         Which column is which role, and its calibration.
+    beside : sequence of str, optional
+        Further columns that are kept as they are.
 
     Returns
     -------
@@ -554,6 +573,8 @@ def bench_record(record: Record, rig: Rig) -> Record:
         If a column's unit is missing or unknown, or is not the role's and no gain or table turns it into that.
     """
     wanted = role_units(model(rig.model))
+    if any(step.name == _SELECT for step in record.history):
+        return _through_a_rig(record, rig, wanted)
     for c in rig.channels:
         if c.column not in record.names:
             raise RecordError(
@@ -569,8 +590,22 @@ def bench_record(record: Record, rig: Rig) -> Record:
         channels.append(replace(channel, name=c.role))
         steps += [step] if step else []
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
-    history = (*record.history, *steps, Step(name="select", settings=columns))
-    return replace(record, channels=tuple(channels), history=history)
+    history = (*record.history, *steps, Step(name=_SELECT, settings=columns))
+    others = (record.channel(name) for name in beside if name not in found)
+    return replace(record, channels=(*channels, *others), history=history)
+
+
+def _through_a_rig(record: Record, rig: Rig, wanted: Mapping[str, str]) -> Record:
+    """Check a record whose channels are named by role already."""
+    for c in rig.channels:
+        unit = record.channel(c.role).unit if c.role in record else None
+        if unit != wanted[c.role] and not (unit is None and c.role in OPTIONAL_ROLES):
+            has = "is not there" if unit is None else f"is in [{unit}]"
+            raise RecordError(
+                f"the record went through a rig already (columns became {', '.join(record)}); its channel {c.role!r} "
+                f"{has}, this rig wants it in [{wanted[c.role]}]. Read the record again, through this rig"
+            )
+    return record
 
 
 def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.signals.conditioning import cut as cut
+    from ambid.record import cut as cut
     from ambid.signals.conditioning import lowpass as lowpass
     from ambid.signals.conditioning import remove_offset as remove_offset
     from ambid.signals.conditioning import remove_trend as remove_trend

@@ -27,7 +27,7 @@ def chosen(record: Record, names: str | Sequence[str] | None) -> tuple[str, ...]
 
 def finite(record: Record, name: str) -> Array:
     """Return the channel's values, refusing NaN and infinity: every filter would spread them over the record."""
-    values = record[name]
+    values = record[name].values
     bad = ~np.isfinite(values)
     if bad.any():
         first = int(np.argmax(bad))
@@ -56,50 +56,6 @@ def equal_runs(values: Array) -> tuple[np.ndarray, np.ndarray]:
     """Return starts and lengths of the runs of exactly equal samples that make up `values`."""
     starts = np.concatenate(([0], np.flatnonzero(np.diff(values)) + 1))
     return starts, np.diff(np.concatenate((starts, [values.size])))
-
-
-# Sampling instants that are given as decimals (2.0 s at 1 kHz) miss the grid by round-off; a thousandth of a sample is
-# none.
-_GRID_TOLERANCE = 1e-3
-
-
-def cut(record: Record, from_s: float | None = None, to_s: float | None = None) -> Record:
-    """Keep the samples with from_s <= t < to_s, on the record's own time axis.
-
-    Parameters
-    ----------
-    record : Record
-        The record to cut.
-    from_s, to_s : float, optional
-        Ends in s; the record's own by default.
-
-    Returns
-    -------
-    Record
-        A new record, whose `start_s` is the time of its first sample, with the step in its history.
-
-    Raises
-    ------
-    RecordError
-        If an end lies outside the record, or nothing would be left.
-    """
-    begin, end = record.start_s, record.start_s + record.duration_s
-    first_s = begin if from_s is None else float(from_s)
-    last_s = end if to_s is None else float(to_s)
-    slack = _GRID_TOLERANCE / record.rate_hz
-    for label, t in (("from", first_s), ("to", last_s)):
-        if not begin - slack <= t <= end + slack:
-            raise RecordError(f"cut {label} {t:g} s; the record spans {begin:g} to {end:g} s. Give a time inside it")
-    first = math.ceil((first_s - begin) * record.rate_hz - _GRID_TOLERANCE)
-    last = math.ceil((last_s - begin) * record.rate_hz - _GRID_TOLERANCE)
-    if last <= first:
-        raise RecordError(
-            f"cut from {first_s:g} to {last_s:g} s keeps no sample; from must lie before to. Swap or widen them"
-        )
-    first, last = max(first, 0), min(last, record.n_samples)
-    channels = tuple(replace(c, values=c.values[first:last].copy()) for c in record.channels)
-    step = Step(name="cut", settings={"from_s": first_s, "to_s": last_s, "samples": last - first})
-    return record.with_step(step, channels=channels, start_s=begin + first / record.rate_hz)
 
 
 def scale(record: Record, name: str, gain: float, *, offset: float = 0.0, unit: str | None = None) -> Record:

@@ -504,7 +504,7 @@ def _within(done: Simulation, limits: Limits, point: OperatingPoint, fraction: f
     if not done.within_limits:
         return False
     signals = {name: done.states[:, j] for j, name in enumerate(done.state_names) if name != "velocity"}
-    signals |= {name: done.record[name] for name in done.record.names if name not in signals}
+    signals |= {name: done.record[name].values for name in done.record.names if name not in signals}
     for name, values in signals.items():
         (low, high), rest = getattr(limits, name), getattr(point, name)
         if values.min() < rest + fraction * (low - rest) or values.max() > rest + fraction * (high - rest):

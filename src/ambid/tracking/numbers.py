@@ -139,10 +139,10 @@ def forcing_of(record: Record) -> Forcing | None:
         return None
     period = 1.0 / record.rate_hz
     if "speed" in record.names:
-        speed = record["speed"]
-        angle = record["angle"] if "angle" in record.names else _integrated(speed, period)
+        speed = record["speed"].values
+        angle = record["angle"].values if "angle" in record else _integrated(speed, period)
     else:
-        angle = record["angle"]
+        angle = record["angle"].values
         speed = np.gradient(np.unwrap(angle), period)
     top = float(np.nanmax(np.abs(speed), initial=0.0))
     if top == 0.0:

@@ -75,7 +75,7 @@ def blocks_of(
     if block_samples < 1:
         raise RecordError(f"a block of {block_samples} samples holds nothing; it must have at least one. Correct it")
     names = record.names if channels is None else tuple(channels)
-    values = np.column_stack([record[name] for name in names])
+    values = np.column_stack([record[name].values for name in names])
     if time_s is None:
         numbers, stamps, irregular = np.arange(record.n_samples, dtype=np.int64), record.time_s, 0
     else:

@@ -41,7 +41,7 @@ def gravity_balance(
     The limit is what is not known: of the estimate, of gravity and of the current's zero (both from the rig; else the
     current's resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
     """
-    x, i = record["position"], record["current"]
+    x, i = record["position"].values, record["current"].values
     known = {name: magnet.known(name) for name in ("g", "i_offset")}
     g, g_sd = _value(known["g"], GRAVITY, 0.0)
     zero, zero_sd = _value(known["i_offset"], 0.0, resolution(record, "current").step / np.sqrt(12.0))

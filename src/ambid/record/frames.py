@@ -1,0 +1,300 @@
+"""Records from tables in memory and back: pandas, polars, xarray, dicts of arrays.
+
+None of those packages is imported unless a record is to become such a table: what is handed in is known by the module
+that its class comes from. The rules are those of files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import RecordError, nearest
+from ambid.record.record import Channel, Record
+from ambid.record.rows import Rows
+from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, record_of_rows, refuse_gaps, seconds, uniform_record
+from ambid.units import UNKNOWN
+
+_LABEL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
+_EXACT = 2.0**53  # beyond it a float64 does not hold every whole number
+_TABLES = (("pandas", "DataFrame"), ("polars", "DataFrame"), ("xarray", "Dataset"))
+_REMEDIES = {
+    ("pandas", "Series"): "Pass a DataFrame: series.to_frame()",
+    ("polars", "Series"): "Pass a DataFrame: series.to_frame()",
+    ("polars", "LazyFrame"): "Pass a DataFrame: frame.collect()",
+    ("xarray", "DataArray"): "Pass a Dataset: array.to_dataset()",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Column:
+    """A column of a table, or its index."""
+
+    label: object  # as the table has it
+    values: Any  # what NumPy makes an array of
+    unit: str | None = None  # where the table itself says one
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Parts:
+    """A table taken apart."""
+
+    what: str  # for messages
+    columns: tuple[_Column, ...]
+    index: _Column | None = None
+
+
+def is_table(source: object) -> bool:
+    """Return whether something is a table in memory: a DataFrame, a Dataset or a mapping."""
+    return isinstance(source, Mapping) or _class_of(source) in _TABLES
+
+
+def read_table(
+    table: object,
+    *,
+    rate_hz: float | None = None,
+    units: Mapping[str, str] | None = None,
+    gaps: GapPolicy = "error",
+) -> Record:
+    """Take a record from a table in memory.
+
+    `table`: a DataFrame of pandas or polars, a Dataset of xarray or a mapping; `rate_hz`: sampling rate in Hz, where it
+    holds no time; `units`: by column, beside or instead of ``name [unit]``. Returns SI units.
+    """
+    found = _table(_parts(table), units or {})
+    if gaps == "error":
+        refuse_gaps(found)
+    return uniform_record(found, rate_hz, gaps)
+
+
+def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
+    """Take the rows of a table as they stand, whatever is missing and however time runs (`ambid.record.rows`)."""
+    return record_of_rows(_table(_parts(table), units or {}), rate_hz)
+
+
+def to_dataframe(record: Record) -> Any:
+    """Return a record as a pandas DataFrame."""
+    import pandas
+
+    columns = {_label(c): c.values for c in record.channels}
+    return pandas.DataFrame(columns, index=pandas.Index(record.time_s, name="time [s]"))
+
+
+def to_xarray(record: Record) -> Any:
+    """Return a record as an xarray Dataset."""
+    import xarray
+
+    return xarray.Dataset(
+        {c.name: ("time", c.values, {} if c.unit == UNKNOWN else {"units": c.unit}) for c in record.channels},
+        coords={"time": ("time", record.time_s, {"units": "s"})},
+        attrs={
+            "rate_hz": record.rate_hz,
+            "history": "\n".join(map(str, record.history)),
+            **{f"source_{key}": text for key, text in record.provenance.items()},
+        },
+    )
+
+
+def _label(channel: Channel) -> str:
+    return channel.name if channel.unit == UNKNOWN else f"{channel.name} [{channel.unit}]"
+
+
+def _class_of(x: object) -> tuple[str, str]:
+    """Return the package and the name of the class of something, where the package is one that has tables."""
+    known = {*_TABLES, *_REMEDIES}
+    named = ((c.__module__.partition(".")[0], c.__name__) for c in type(x).__mro__)
+    return next((x for x in named if x in known), ("", ""))
+
+
+def _parts(table: Any) -> _Parts:
+    """Take a table apart; refuse what is none."""
+    kind = _class_of(table)
+    if kind == ("pandas", "DataFrame"):
+        return _of_pandas(table)
+    if kind == ("polars", "DataFrame"):
+        columns = tuple(_Column(label=name, values=table.get_column(name)) for name in table.columns)
+        return _Parts(what="the DataFrame", columns=columns)
+    if kind == ("xarray", "Dataset"):
+        return _of_xarray(table)
+    if isinstance(table, Mapping):
+        columns = tuple(_Column(label=name, values=x, unit=_own_unit(x)) for name, x in table.items())
+        return _Parts(what="the dict of arrays", columns=columns)
+    remedy = _REMEDIES.get(kind, 'Pass a file, or a dict of arrays such as {"voltage [V]": u} with rate_hz=')
+    raise RecordError(
+        f"a record cannot be taken from a {type(table).__name__}; a file, a Record, a DataFrame, a Dataset or a dict of"
+        f" arrays can. {remedy}"
+    )
+
+
+def _own_unit(x: Any) -> str | None:
+    """Return the unit that a channel or a labelled array has of itself."""
+    if isinstance(x, Channel):
+        return None if x.unit == UNKNOWN else x.unit
+    attributes = getattr(x, "attrs", None)
+    unit = attributes.get("units") if isinstance(attributes, Mapping) else None
+    return unit if isinstance(unit, str) else None
+
+
+def _of_pandas(table: Any) -> _Parts:
+    for what, labels in (("column", table.columns), ("row", table.index)):
+        if labels.nlevels > 1:
+            raise RecordError(
+                f"the DataFrame has a MultiIndex with {labels.nlevels} labels for each {what}; one is wanted. Select a"
+                " level first, or reset_index"
+            )
+    columns = tuple(_Column(label=x, values=_series(table.iloc[:, j])) for j, x in enumerate(table.columns))
+    return _Parts(what="the DataFrame", columns=columns, index=_Column(label=table.index.name, values=table.index))
+
+
+def _series(column: Any) -> Any:
+    """Return a pandas column as NumPy does not see it: its own missing values as NaN, dates without a time zone."""
+    kind = getattr(column.dtype, "kind", "O")
+    if kind in "iufb" and not isinstance(column.dtype, np.dtype):
+        return column.to_numpy(dtype=np.float64, na_value=np.nan)
+    return column.to_numpy(dtype=f"{'datetime' if kind == 'M' else 'timedelta'}64[ns]") if kind in "mM" else column
+
+
+def _of_xarray(table: Any) -> _Parts:
+    names = list(table.data_vars)
+    for name in names:
+        if table[name].dims != table[names[0]].dims or len(table[name].dims) != 1:
+            raise RecordError(
+                f"variable {name!r} of the Dataset has the dimensions {table[name].dims}; every channel has one,"
+                " the same for all. Select from the others, or drop the variable"
+            )
+    columns = tuple(_Column(label=x, values=table[x].values, unit=_own_unit(table[x])) for x in names)
+    dimension = table[names[0]].dims[0] if names else None
+    index = None
+    if dimension is not None and dimension in table.coords:
+        along = table.coords[dimension]
+        index = _Column(label=dimension, values=along.values, unit=_own_unit(along))
+    return _Parts(what="the Dataset", columns=columns, index=index)
+
+
+def _table(parts: _Parts, units: Mapping[str, str]) -> Table:
+    """Check names, units and numbers, and find time."""
+    names, texts, arrays = list[str](), list[str | None](), list[Array]()
+    left, time = dict(units), None
+    for column in parts.columns:
+        name, text = _named(parts.what, column, left)
+        if name in names:
+            raise RecordError(f"{parts.what} has column {name!r} twice; names must differ. Rename one")
+        values = np.asarray(_plain(column.values))
+        if name.lower() in TIME_NAMES:
+            time, text = len(names), _time_text(values, text)
+        names.append(name)
+        texts.append(text)
+        arrays.append(_numbers(parts.what, name, values, time=time == len(names) - 1))
+    index = None if parts.index is None else _index(parts, parts.index, left)
+    if index is not None and time is not None:
+        raise RecordError(
+            f"{parts.what} tells time twice, by its index and by column {names[time]!r}. Drop one of them"
+        )
+    if left:
+        unknown = next(iter(left))
+        raise RecordError(
+            f"units names {unknown!r}, which is no column; {parts.what} has {', '.join(names) or 'none'}."
+            f"{nearest(str(unknown), names)} Correct units"
+        )
+    if not names:
+        raise RecordError(f"{parts.what} has no columns; a record needs at least one. Check what was selected")
+    if index is not None:
+        names, texts, arrays, time = ["time", *names], [index[0], *texts], [index[1], *arrays], 0
+    sizes = {x.size for x in arrays}
+    if len(sizes) > 1:
+        listing = ", ".join(f"{name} {x.size}" for name, x in zip(names, arrays, strict=True))
+        raise RecordError(f"columns differ in length ({listing}); all must have the same. Cut them")
+    values = np.column_stack(arrays)
+    if time is not None:
+        values[:, time] = seconds(values[:, time], names[time], texts[time], parts.what)
+    digest = hashlib.sha256(repr((names, texts)).encode() + values.tobytes()).hexdigest()
+    return Table(
+        where=parts.what, names=tuple(names), unit_texts=tuple(texts), values=values, first_row=0, time=time,
+        provenance={"sha256": digest}, settings={"format": parts.what.removeprefix("the "), "rows": values.shape[0]},
+    )  # fmt: skip
+
+
+def _named(what: str, column: _Column, units: dict[str, str]) -> tuple[str, str | None]:
+    """Return name and unit of a column; what is taken from `units` is taken out of it."""
+    if not isinstance(column.label, str) or not column.label.strip():
+        raise RecordError(
+            f"{what} has a column called {column.label!r}; a name is a text. Rename it, as 'voltage [V]' and so on"
+        )
+    match = _LABEL.fullmatch(column.label.strip())
+    name, inside = (match["name"].strip(), match["unit"].strip()) if match else (column.label.strip(), None)
+    said = {text for text in (inside, column.unit) if text is not None}
+    said |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
+    if len(said) > 1:
+        one, other = sorted(said)[:2]
+        raise RecordError(f"column {name!r} of {what} is said to be in [{one}] and in [{other}]. Leave one of them out")
+    return name, next(iter(said), None)
+
+
+def _text_of(name: str, unit: object) -> str:
+    if not isinstance(unit, str):
+        raise RecordError(f"units gives {unit!r} for {name!r}; a unit is a text. Write units={{{name!r}: 'V'}}")
+    return unit
+
+
+def _plain(values: Any) -> Any:
+    """Return NaN where an array is masked: NumPy would take what lies under the mask."""
+    masked: Any = values
+    return masked.astype(np.float64).filled(np.nan) if isinstance(values, np.ma.MaskedArray) else values
+
+
+def _time_text(values: np.ndarray, text: str | None) -> str | None:
+    """Dates and time differences come in seconds, whatever unit they had."""
+    return "s" if values.dtype.kind in "mM" else text
+
+
+def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
+    """Return a column as real numbers, dates and time differences in s."""
+    place, kind = f"column {name!r} of {what}", values.dtype.kind
+    if values.ndim != 1:
+        raise RecordError(f"{place} has shape {values.shape}; a channel is one column (n_samples,). Pass one column")
+    if kind in "mM":
+        if not time:
+            raise RecordError(f"{place} holds times; a channel holds numbers. Call it 'time', or leave it out")
+        known = values[~np.isnat(values)]
+        begin = known[0] if kind == "M" and known.size else np.timedelta64(0, "s")
+        return np.asarray((values - begin) / np.timedelta64(1, "s"), dtype=np.float64)
+    if kind == "c":
+        raise RecordError(
+            f"{place} holds complex numbers; a measured channel is real. Pass real and imaginary part as two columns"
+        )
+    if kind not in "iufb":
+        example = next((x for x in values.ravel() if not isinstance(x, (int, float))), "")
+        raise RecordError(f"{place} holds no numbers (such as {str(example)[:20]!r}). Convert it, or leave it out")
+    found = np.asarray(values, dtype=np.float64)
+    if kind in "iu" and found.size and np.abs(found).max() > _EXACT:
+        raise RecordError(
+            f"{place} reaches {np.abs(found).max():.4g}; beyond 2^53 whole numbers lose digits. Subtract the first one"
+        )
+    return found
+
+
+def _index(parts: _Parts, index: _Column, units: dict[str, str]) -> tuple[str | None, Array] | None:
+    """Return unit and values of an index that is time; None for one that counts rows."""
+    values = np.asarray(index.values)
+    labelled = index.label is not None
+    name, text = _named(parts.what, index, units) if labelled else ("time", None)
+    if values.dtype.kind in "iu" and not (labelled and name.lower() in TIME_NAMES):
+        if values.size > 1 and np.ptp(np.diff(values)):
+            raise RecordError(
+                f"the index of {parts.what} jumps: rows are missing, or were put together. Treat them as a gap with a"
+                " column 'time [s]', or reset_index(drop=True) where none is missing"
+            )
+        return None
+    if values.dtype.kind not in "iufmM" or (labelled and name.lower() not in TIME_NAMES and values.dtype.kind in "f"):
+        called = f" {index.label!r}" if labelled else ""
+        raise RecordError(
+            f"the index{called} of {parts.what} is no time: it has to hold seconds, time differences or dates, and be"
+            " called 'time'. Convert or rename it, or reset_index"
+        )
+    return _time_text(values, text) or "s", _numbers(parts.what, "time", values, time=True)
