@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from typing import Annotated
@@ -27,7 +28,6 @@ from ambid.cli import (
 from ambid.cli.terminal import plain_where_needed
 
 app = typer.Typer(
-    add_completion=False,
     rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
     no_args_is_help=False,
     help="Physical parameters of active magnetic bearings, with honest uncertainty, from measured voltage, current and"
@@ -80,6 +80,8 @@ def run_verb(words: Sequence[str]) -> int:
     plain_where_needed(sys.stderr)
     compiled.announce = _say_compiling if sys.stderr.isatty() else None
     command = typer.main.get_command(app)
+    if "_AMBID_COMPLETE" in os.environ:  # the shell asks what may follow
+        command.main(list(words), prog_name="ambid")
     try:
         with command.make_context("ambid", list(words)) as context:
             command.invoke(context)

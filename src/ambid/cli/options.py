@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
+from ambid.cli.completion import values_of
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
@@ -21,6 +22,8 @@ def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> An
     """Declare an option: its usage, such as ``--band LO:HI``; its help; how its default reads."""
     names = [word for word in usage.split() if word.startswith("-")]
     metavar = usage.removeprefix(" ".join(names)).strip() or None
+    if metavar is not None:
+        more["autocompletion"] = values_of(usage)
     return typer.Option(*names, metavar=metavar, help=about, show_default=shown, **more)
 
 
@@ -31,7 +34,7 @@ def switch(names: str, about: str) -> Any:
 
 def argument(metavar: str, about: str) -> Any:
     """Declare an argument."""
-    return typer.Argument(metavar=metavar, help=about, show_default=False)
+    return typer.Argument(metavar=metavar, help=about, show_default=False, autocompletion=values_of(metavar))
 
 
 RecordFile = Annotated[Path, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")]
