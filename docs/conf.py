@@ -40,6 +40,7 @@ html_static_path = ["static"]
 html_css_files = ["pages.css"]
 html_math_renderer = "mathml"
 html_theme_options = {"footer_icons": []}
+smartquotes_action = "qe"  # two hyphens begin an option
 pygments_style = "friendly"
 
 

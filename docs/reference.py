@@ -11,7 +11,7 @@ from typing import Any
 
 # Every public name stands once, with the job that it serves; rooms follow one another as a record goes through them.
 GROUPS: dict[str, dict[str, str]] = {
-    "The jobs": {"ambid": "what the commands call: one function each, and the nouns that they take and give"},
+    "The whole job": {"ambid": "what the commands call: one function each, and the nouns that they take and give"},
     "Records and rigs": {
         "ambid.record": "records and their files",
         "ambid.rig": "what is known of a bench",
@@ -37,9 +37,15 @@ GROUPS: dict[str, dict[str, str]] = {
 }
 
 
+# The order of the first page, on which a reader begins; what is not named here follows.
+FIRST = ("identify", "identify_nonlinear", "fit", "frf", "compare", "track", "simulate", "acquire", "validate", "load")
+
+
 def public_names(room: str) -> list[str]:
-    """Return what a room exports, in alphabetical order."""
-    return sorted(getattr(import_module(room), "__all__", ()), key=str.lower)
+    """Return what a room exports: the jobs first, then by name, functions and classes alike."""
+    names = getattr(import_module(room), "__all__", ())
+    jobs = FIRST if room == "ambid" else ()
+    return sorted(names, key=lambda name: (jobs.index(name) if name in jobs else len(jobs), name.lower()))
 
 
 def write_reference(folder: Path) -> None:

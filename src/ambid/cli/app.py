@@ -66,7 +66,7 @@ def _global(
 
 
 def _say_compiling() -> None:
-    print("compiling the numerical kernels, once on this machine: some seconds", file=sys.stderr)
+    print("compiling the numerical kernels, once on this machine, some 5 s; later starts are faster", file=sys.stderr)
 
 
 def run_verb(words: Sequence[str]) -> int:
