@@ -52,13 +52,13 @@ def test_what_is_rough_is_said(sound, changed, words):
     assert any(words in line for line in found), found
 
 
-def test_the_plant_may_be_another_than_the_rigs():
+def test_what_the_rig_does_not_know_is_lent_by_the_bench():
     rig = bench(('L = { value = 80.3, unit = "mH" }\n', ""))
     plant = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 80.3e-3, "c": 0.0}
     s = controller_settings(rig)
     assert review(rig, s, parameters=plant) == ()
-    heavier = review(rig, s, parameters=plant | {"k_x": -20_000.0})
-    assert any("the loop is unstable" in line for line in heavier), heavier
+    slower = review(rig, s, parameters=plant | {"L": 0.8, "k_x": -20_000.0})
+    assert any("the loop is unstable on the rig's own plant with L of the bench" in line for line in slower), slower
 
 
 def test_tables_are_told_where_they_end_and_where_they_bend(tmp_path):

@@ -213,13 +213,17 @@ def test_a_plant_beyond_all_numbers_is_refused_or_played(ambid, folder, name, va
     outcome = ambid(*SHORT)
     assert outcome.code in (0, 2), outcome.err
     if outcome.code:
-        refused(outcome, "the controller went to its safe state" if name == "L" else "rig")
+        refused(outcome, "rig")
 
 
-def test_the_loop_is_checked_on_the_bench_that_is_named(ambid, folder):
+def test_an_unstable_loop_is_refused_by_the_rig_and_what_it_lacks_by_the_bench(ambid, folder):
     assert "stability" not in ambid(*SHORT).err
     (folder / "p.toml").write_text(PROTOTYPE.replace("kd = 92.57", "kd = 9.0"), encoding="utf-8")
-    assert "the loop is unstable on the bench's plant" in ambid(*SHORT, "--force").err
+    (folder / "a.h5").unlink()
+    refused(ambid(*SHORT), "unstable on the rig's own plant with k_x, k_i, L of the bench", "largest pole", "--force")
+    assert "note: the loop is unstable" in ambid(*SHORT, "--force").err
+    (folder / "a.h5").unlink()
+    assert ambid(*SHORT, "--mode", "sample").code == 0  # nothing is closed
 
 
 @pytest.mark.parametrize("role", ["voltage", "current", "position"])

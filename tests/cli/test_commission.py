@@ -54,9 +54,9 @@ def test_a_good_bench_ends_with_0_and_what_to_do_next(commission):
     done = commission(*QUICK)
     assert done.code == 0
     for number, name in enumerate(
-        ("self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"), 1
+        ("self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "report", "track"), 1
     ):
-        assert f"{number}/9 {name}" in done.out
+        assert f"{number}/10 {name}" in done.out
     assert "commissioned; out holds rig, records, estimate, report and track" in words_of(done.out)
     assert "--track out/estimate.json" in words_of(done.out)
     assert files() == set(FILES)
@@ -80,7 +80,7 @@ def test_one_that_is_not_good_enough_ends_with_3_where_why_and_what_next(commiss
     assert done.code == 3
     text = words_of(done.out)
     assert "stopped: m is" in text
-    assert "stopped at identify, step 6 of 9; the output is off, and out holds what was found." in text
+    assert "stopped at identify, step 7 of 10; the output is off, and out holds what was found." in text
     assert "Next: record longer (--seconds)" in text
     assert "Then commission again, into another folder." in text
     assert told()["passed"] is False
@@ -137,7 +137,7 @@ def test_a_folder_of_the_users_own_is_left_although_it_is_empty(commission, plac
 @pytest.mark.parametrize(("what", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_leaves_what_was_found_and_the_output_off(commission, monkeypatch, what, code):
     def press(values, device):
-        if device.starts == 4 and device.blocks == 250:
+        if device.lifts == 3 and device.blocks == 250:
             os.kill(os.getpid(), what)
 
     device = Spoiled(prototype(), spoil=press)
@@ -177,7 +177,7 @@ def test_an_operator_is_asked_before_a_real_bench_moves_and_may_decline(commissi
     assert done.code == 2
     assert len(asked) == 1
     assert "switch its output on" in asked[0]
-    assert "levitation was not agreed to; the output stayed off" in done.err
+    assert "not agreed to; the output stayed off" in done.err
     assert device.starts == 1
     assert [s["name"] for s in told()["steps"]] == ["self-test", "rest"]
 
@@ -194,5 +194,9 @@ def test_the_help_says_what_it_does_and_how_it_ends(ambid):
     done = ambid("commission", "--help")
     assert done.code == 0
     text = words_of(done.out)
-    for word in ("self-test, rest, levitate, excite, record, identify, validate, report", "exit code 3", "--yes"):
+    for word in (
+        "self-test, rest, polarity, levitate, excite, record, identify, validate, report",
+        "exit code 3",
+        "--yes",
+    ):
         assert word in text

@@ -103,13 +103,14 @@ class Spoiled(SimulatedDevice):
     """The simulated bench with something wrong: what it samples, tells, or is.
 
     ``spoil(values, device)`` changes the counts of a block in place; ``lose(device)`` says whether a block is lost;
-    ``before(device, mode)`` is called before each start.
+    ``before(device, mode)`` is called before each start. `starts` counts them, `lifts` those that levitate: hovering is
+    the first, with an amplitude that is given one trial the second, then record, second record and tracking.
     """
 
     def __init__(self, rig, *, spoil=None, lose=None, before=None, **options):
         super().__init__(rig, **options)
         self.spoil, self.lose, self.before = spoil, lose, before
-        self.starts, self.blocks, self.excited, self.failed = 0, 0, False, ()
+        self.starts, self.lifts, self.blocks, self.excited, self.failed = 0, 0, 0, False, ()
         self.missing = 0
 
     def self_test(self):
@@ -118,6 +119,7 @@ class Spoiled(SimulatedDevice):
 
     def start(self, mode):
         self.starts, self.blocks, self.excited = self.starts + 1, 0, False
+        self.lifts += mode == "levitate"
         if self.before is not None:
             self.before(self, mode)
         super().start(mode)
@@ -161,7 +163,7 @@ class Silent(SimulatedDevice):
         self.playing = False
 
     def excite(self, program):
-        self.playing = program is not None
+        self.playing = program is not None and self.state == "levitating"
         super().excite(program)
 
     def read(self, timeout_s):

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from ambid.acquisition.device import SelfTest
+from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import AmbidError, EstimationError, ModelError
 from ambid.job import commissioning as room
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning import FILES, Declined, check_folder, commission
@@ -19,7 +20,10 @@ from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
 from ambid.rig import load_rig
 from tests.acquisition.test_look import WHOLE
+from tests.firmware.conftest import avr_gcc, bench_program, firmware_elf, native_cc
 from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, prototype
+
+__all__ = ["avr_gcc", "bench_program", "firmware_elf", "native_cc"]
 
 SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
 TRUTH = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 0.0803}
@@ -209,14 +213,15 @@ def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
 @pytest.mark.parametrize(("column", "name"), [(POSITION, "position"), (CURRENT, "current")])
 def test_a_dead_sensor_stops_it_when_it_hovers(tmp_path, column, name):
     def dead(values, device):
-        values[:, column] = 512
+        if device.lifts:
+            values[:, column] = 512
 
     stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=dead)), f"{name} does not move", "no sensor there")
 
 
 def test_a_sensor_that_dies_on_the_way_stops_it_at_the_record(tmp_path):
     def dead(values, device):
-        if device.starts > 2 and device.excited and device._next > 18_000:
+        if device.lifts > 1 and device.excited and device._next > 18_000:
             values[:, CURRENT] = 512
 
     done = ran(tmp_path, Spoiled(prototype(), spoil=dead))
@@ -224,16 +229,62 @@ def test_a_sensor_that_dies_on_the_way_stops_it_at_the_record(tmp_path):
     assert not done.passed
 
 
+def test_a_loop_that_is_predicted_unstable_is_refused_with_its_pole_before_anything_moves(tmp_path):
+    rig = prototype(("kd = 92.57", "kd = 9.257"))
+    with Spoiled(rig) as device:
+        with pytest.raises(ModelError, match=r"largest pole 1\.00\d+; it is stable for [\d.]+ to \d+ times its gains"):
+            commission(device, rig, tmp_path, wishes=SHORT)
+        assert device.starts == 0
+    assert files(tmp_path) == set()
+
+
+# The bench does not follow what the rig claims of it.
+REVERSED = {
+    "position": (
+        (("gain   = 2.44140625e-6", "gain = -2.44140625e-6"), ("-1.248779296875e-3", "1.248779296875e-3")),
+        ("position falls when the current rises: the rig says it rises", "channels.position.gain"),
+    ),
+    "current": (
+        (("gain   = 2.44140625e-3", "gain = -2.44140625e-3"), ("-1.248779296875 ", "1.248779296875 ")),
+        ("the current is reversed", "channels.current.gain"),
+    ),
+    "voltage": (
+        (("gain   = 0.03", "gain = -0.03"), ("offset = -12.0", "offset = 12.0")),
+        ("the voltage is reversed", "channels.voltage.gain"),
+    ),
+    "k_i": (
+        (('k_i = { unit = "N/A" }', 'k_i = { value = -20.1, unit = "N/A" }'),),
+        ("position rises when the current rises: the rig says it falls", "parameters.k_i"),
+    ),
+}
+
+
+@pytest.mark.usefixtures("bench_program", "firmware_elf")
+@pytest.mark.parametrize("of", [SimulatedDevice, EmulatedDevice])
+@pytest.mark.parametrize("what", REVERSED)
+def test_a_reversed_sign_is_named_and_never_levitated(tmp_path, of, what):
+    changes, words = REVERSED[what]
+    rig = prototype(*changes)
+    device = of(rig)
+    if what == "k_i":  # it is seen in the loop already
+        with device, pytest.raises(ModelError, match="stable with the other sign of kp, ki and kd"):
+            commission(device, rig, tmp_path, wishes=SHORT)
+    modes, start = [], device.start
+    device.start = lambda mode: (modes.append(mode), start(mode))
+    stopped_at("polarity", ran(tmp_path, device, rig=rig, force=True), *words)
+    assert set(modes) == {"sample", "drive"}
+
+
 def test_bad_gains_stop_it_when_it_lifts(tmp_path):
     rig = prototype(("kd = 92.57", "kd = 0.0"))
-    done = ran(tmp_path, SimulatedDevice(rig), rig=rig)
+    done = ran(tmp_path, SimulatedDevice(rig), rig=rig, force=True)
     stopped_at("levitate", done, "safe state during levitation", "out_of_gap, position outside limits", "gains")
     assert files(tmp_path) == {"rig.toml", "commission.json"}
 
 
 def test_a_rotor_that_strays_stops_it(tmp_path):
     def stray(values, device):
-        if device.starts == 2:
+        if device.lifts == 1:
             values[:, POSITION] = 512 + 200 * np.sign(np.sin(device.blocks))
 
     stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=stray)), "strays", "badly damped")
@@ -241,7 +292,7 @@ def test_a_rotor_that_strays_stops_it(tmp_path):
 
 def test_a_voltage_that_is_nearly_used_up_stops_it(tmp_path):
     def high(values, device):
-        if device.starts == 2:
+        if device.lifts == 1:
             values[:, DUTY] = 770
 
     stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=high)), "nothing is left to excite with")
@@ -253,26 +304,26 @@ def test_an_amplitude_that_trips_stops_it(tmp_path):
     assert json.loads((tmp_path / "commission.json").read_text())["steps"][-1]["numbers"]["used"] is None
 
 
-def lost_in(start):
-    return lambda device: device.starts == start and device.blocks == 150
+def lost_in(lift):
+    return lambda device: device.lifts == lift and device.blocks == 150
 
 
 def test_lost_samples_stop_it_at_the_record(tmp_path):
-    wishes = replace(SHORT, amplitude_v=1.4)  # self-test, rest, hover, one trial: the record is the fourth start
-    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), wishes=wishes)
+    wishes = replace(SHORT, amplitude_v=1.4)  # hover, one trial: the record is the third time that it levitates
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(3)), wishes=wishes)
     stopped_at("record", done, "20 of 8000 samples were lost during the record")
     assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5"}
 
 
 def test_lost_samples_of_the_second_record_stop_it_too(tmp_path):
-    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(5)), wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("record", done, "20 of 4000 samples were lost during the second record")
     assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
 
 
 def test_a_sensor_at_its_end_stops_it_at_the_record(tmp_path):
     def clip(values, device):
-        if device.starts == 4:
+        if device.lifts == 3:
             values[::50, POSITION] = 1023
 
     done = ran(tmp_path, Spoiled(prototype(), spoil=clip), wishes=replace(SHORT, amplitude_v=1.4))
@@ -324,19 +375,19 @@ def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
     assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
 
 
-def change_before(start, *changes):
-    return lambda device, mode: device.starts == start and device.become(*changes)
+def change_before(lift, *changes):
+    return lambda device, mode: mode == "levitate" and device.lifts == lift and device.become(*changes)
 
 
 def test_another_bench_in_the_second_record_stops_it_at_validation(tmp_path):
-    device = Spoiled(prototype(), before=change_before(5, ("R", 2.0), ("m", 1.3)))
+    device = Spoiled(prototype(), before=change_before(4, ("R", 2.0), ("m", 1.3)))
     done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("validate", done, "innovations")
     assert "report.html" not in files(tmp_path)
 
 
 def test_another_bench_when_it_tracks_stops_it_there(tmp_path, plain_report):
-    device = Spoiled(prototype(), before=change_before(6, ("R", 1.4), ("m", 1.2)))
+    device = Spoiled(prototype(), before=change_before(5, ("R", 1.4), ("m", 1.2)))
     done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
     assert done.steps[-1].name == "track"
     assert done.steps[-1].reasons
@@ -378,7 +429,7 @@ def test_an_operator_who_declines_leaves_the_output_off(tmp_path):
             commission(device, prototype(), tmp_path, wishes=SHORT, confirm=lambda name: asked.append(name))
         assert device.starts == 1  # the look at rest, with the output off
         assert device.state == "idle"
-    assert asked == ["levitate"]
+    assert asked == ["polarity"]
     told = json.loads((tmp_path / "commission.json").read_text())
     assert [s["name"] for s in told["steps"]] == ["self-test", "rest"]
 

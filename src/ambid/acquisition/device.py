@@ -44,6 +44,8 @@ class DeviceInfo:
     columns: tuple[Column, ...]  # in the order of a block's values
     # what the controller says of itself (message ``identity``); empty where there is none
     identity: Mapping[str, int] = field(default_factory=lambda: MappingProxyType({}))
+    # of an emulated or simulated bench: its linear parameters, SI; empty where nobody knows them
+    plant: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -148,6 +150,15 @@ class Device(Protocol):
         ----------
         program : Program or None
             None ends it; harmless where none is played.
+        """
+        ...
+
+    def load(self, program: Program) -> None:
+        """Give the device an excitation beforehand, so that `excite` with the very same begins at once; none is played.
+
+        Parameters
+        ----------
+        program : Program
         """
         ...
 

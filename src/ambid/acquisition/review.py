@@ -4,27 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from types import MappingProxyType
 
 import numpy as np
 
-from ambid.acquisition.scales import output_rates, scale_of, who
-from ambid.acquisition.settings import ControllerSettings, exact_gains, has_position, realised
+from ambid.acquisition.default_daq import with_default_daq
+from ambid.acquisition.device import DeviceInfo
+from ambid.acquisition.scales import LAG_S, output_rates, scale_of, who
+from ambid.acquisition.settings import ControllerSettings, controller_settings, exact_gains, has_position, realised
 from ambid.errors import ModelError, RigError
 from ambid.physics.linear_model import model
 from ambid.rig.rig import Rig
+from ambid.simulation.margins import LoopMargins
 
 _ROUNDED = 0.01  # of a gain: more is worth a line
 _BENT = 1.5  # largest over least slope of a calibration between the trips
 _NEAR_TRIP = 8  # counts between rest and a trip, under which noise may trip it
 _COARSE = 64  # counts between the trips
 _SLOW_PERIODS = 2000.0  # ticks in which a mode of the loop should have settled
+_NOBODY: Mapping[str, float] = MappingProxyType({})
 
 
-def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] | None = None) -> tuple[str, ...]:
+def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] = _NOBODY) -> tuple[str, ...]:
     """Say what a rig's controller will do only roughly, or what speaks against closing its loop.
 
-    `rig`: the rig; `settings`: made from it by `ambid.acquisition.settings.controller_settings`. Returns one line each,
-    with its remedy; empty where nothing is to be said.
+    `rig`: the rig; `settings`: made from it by `ambid.acquisition.settings.controller_settings`; `parameters`: as
+    `predicted`. Returns one line each, with its remedy; empty where nothing is to be said.
     """
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:
@@ -117,31 +122,64 @@ def _slopes(rig: Rig, settings: ControllerSettings) -> list[str]:
     return lines
 
 
-def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float] | None) -> list[str]:
+def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float]) -> list[str]:
     """Say where the loop as the controller closes it does not hold the plant that the rig knows."""
-    from ambid.simulation import closed_loop_poles
-
-    known = {p.name: p.value for p in rig.parameters if p.value is not None}
-    values, whose = (known, "the rig's own") if parameters is None else (parameters, "the bench's")
-    missing = [p.name for p in rig.parameters if p.name not in values]
-    if missing:
+    found, whose = predicted(rig, settings, parameters)
+    if found is None:
+        return [whose]
+    if not found.stable:
+        try:
+            _refuse(found, whose, settings)
+        except ModelError as failure:
+            return [str(failure)]
+    if found.largest_pole > 1.0 - 1.0 / _SLOW_PERIODS:
+        seconds = math.inf if found.largest_pole >= 1.0 else -1.0 / math.log(found.largest_pole) / settings.rate_hz
         return [
-            f"the loop could not be checked for stability, as the rig has no value for {', '.join(missing)}. A rough"
-            " value of each is enough"
-        ]
-    loop = realised(settings, rig)
-    try:
-        largest = float(np.abs(closed_loop_poles(values, loop, settings.rate_hz, of=rig.model)[0]))
-    except ModelError as failure:
-        raise RigError(f"{who(rig)}: on {whose} plant {failure}") from None
-    if largest >= 1.0:
-        return [
-            f"the loop is unstable on {whose} plant at {settings.rate_hz:g} Hz with the controller's delay of"
-            f" {loop.delay:.2g} samples (largest pole {largest:.4f}). Design [loop] for that rate and delay"
-        ]
-    if largest > 1.0 - 1.0 / _SLOW_PERIODS:
-        return [
-            f"the loop hardly damps {whose} plant: a mode takes {-1.0 / math.log(largest) / settings.rate_hz:.2g} s"
-            f" to fall to a third (largest pole {largest:.5f}). Raise loop.kd or loop.ki"
+            f"the loop hardly damps {whose}: a mode takes {seconds:.2g} s to fall to a third (largest pole"
+            f" {found.largest_pole:.5f}). Raise loop.kd or loop.ki"
         ]
     return []
+
+
+def predicted(
+    rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float] = _NOBODY
+) -> tuple[LoopMargins | None, str]:
+    """Predict the loop that a controller will close.
+
+    `rig`: with a loop; `settings`: made from it; `parameters`: of the bench, SI, where the rig has no value of its own.
+    Returns the margins and whose plant it is; None and why where a value is missing.
+    """
+    from ambid.simulation import loop_margins
+
+    known = {p.name: p.value for p in rig.parameters if p.value is not None}
+    lent = [p.name for p in rig.parameters if p.name not in known and p.name in parameters]
+    missing = [p.name for p in rig.parameters if p.name not in known and p.name not in parameters]
+    if missing:
+        return None, (
+            f"the loop could not be checked for stability, as the rig has no value for {', '.join(missing)}. A rough"
+            " value of each is enough"
+        )
+    whose = "the rig's own plant" + (f" with {', '.join(lent)} of the bench" if lent else "")
+    try:
+        of, loop = {**known, **{name: parameters[name] for name in lent}}, realised(settings, rig)
+        return loop_margins(of, loop, settings.rate_hz, of=rig.model), whose
+    except ModelError as failure:
+        raise RigError(f"{who(rig)}: on {whose} {failure}") from None
+
+
+def refuse_unstable(rig: Rig, info: DeviceInfo) -> tuple[LoopMargins | None, str]:
+    """Refuse to let a device close a loop that is predicted unstable.
+
+    `rig`: with a loop; `info`: of the device. Returns as `predicted`.
+    """
+    invented = info.kind in ("emulated", "simulated")
+    settings = controller_settings(with_default_daq(rig) if invented else rig)
+    found, whose = predicted(with_default_daq(rig) if invented else rig, settings, info.plant)
+    if found is not None:
+        _refuse(found, whose, settings)
+    return found, whose
+
+
+def _refuse(found: LoopMargins, whose: str, settings: ControllerSettings) -> None:
+    where = f"{whose} at {settings.rate_hz:g} Hz with the controller's delay of {LAG_S * settings.rate_hz:.2g} samples"
+    found.refuse(where, remedy="Design [loop] for that rate and delay")

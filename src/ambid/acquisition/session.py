@@ -46,6 +46,8 @@ class Course:
     # excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
     # periodic from its first sample.
     program: Program | None = None
+    # pass on all of it, the settling too; `seconds` then count from the excitation's first sample on
+    transient: bool = False
 
 
 @dataclass(slots=True, kw_only=True)
@@ -84,11 +86,13 @@ def run(
     made = _Run(device, course, taps, on_event)
     try:
         made.forget()
+        if course.transient and course.program is not None:
+            device.load(course.program)
         device.start(course.mode)
-        made.settle(stopped)
+        made.settle(stopped, told=course.transient)
         if made.going and course.program is not None:
             device.excite(course.program)
-            made.lead_in(course.program)
+            made.lead_in(course.program, told=course.transient)
         made.listen(stopped)
     except BaseException:
         with suppress(DeviceError):  # a line that is lost cannot be told to stop; what went wrong first is raised
@@ -108,10 +112,12 @@ class _Run:
     ) -> None:
         self._rate_hz = rate_hz = device.info.rate_hz
         self._device, self._taps, self._on_event = device, taps, on_event
-        self.report = RunReport(wanted=max(1, round(course.seconds * rate_hz)))
+        self._wanted = max(1, round(course.seconds * rate_hz))
+        self.report = RunReport(wanted=self._wanted)
         self._settling = round(course.settle_s * rate_hz)
         self._excited = next((k for k, c in enumerate(device.info.columns) if c.role == "excitation"), None)
         self._lead: int | None = None  # ticks of excitation that are still to pass before samples are passed on
+        self._awaited = False  # whether the excitation is waited for, and what comes meanwhile is passed on
         self._unheard = 0
         self._from: int | None = None  # number from which samples are passed on, once that is known
 
@@ -125,12 +131,15 @@ class _Run:
         while self._device.read(0.0) is not None:
             pass
 
-    def settle(self, stopped: Callable[[], bool]) -> None:
-        """Let the first samples pass."""
+    def settle(self, stopped: Callable[[], bool], *, told: bool) -> None:
+        """Let the first samples pass, unseen unless `told`."""
         settled = None
         for frame in self._frames(stopped) if self._settling else ():
             block = frame.block
             settled = block.first + self._settling if settled is None else settled
+            if told:
+                self._extend(block, None)
+                self._pass_on(frame, block)
             if block.first + len(block.values) >= settled:
                 return
 
@@ -138,46 +147,47 @@ class _Run:
         """Pass blocks on until all wanted samples are there."""
         if not self.going:
             return
-        made = self.report
         for frame in self._frames(stopped):
             block = self._after_lead(frame.block)
-            if block is None:
-                continue
-            if not made.samples:
-                made.first = made.after = block.first
-            end = made.first + made.wanted
-            if block.first >= end:
-                return
-            kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
-            for tap in self._taps:
-                tap.take(replace(frame, block=kept))
-            made.samples += len(kept.values)
-            made.lost += max(0, kept.first - made.after)
-            made.after = max(made.after, kept.first + len(kept.values))
-            if made.after >= end:
+            if block is not None and self._pass_on(frame, block):
                 return
 
-    def lead_in(self, program: Program) -> None:
-        """Let the excitation settle before samples are passed on."""
-        if self._excited is not None:
+    def _pass_on(self, frame: Frame, block: Block) -> bool:
+        """Give the taps what of a block is wanted; whether that was the last."""
+        made = self.report
+        if not made.samples:
+            made.first = made.after = block.first
+        end = made.first + made.wanted
+        if block.first >= end:
+            return True
+        kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
+        for tap in self._taps:
+            tap.take(replace(frame, block=kept))
+        made.samples += len(kept.values)
+        made.lost += max(0, kept.first - made.after)
+        made.after = max(made.after, kept.first + len(kept.values))
+        return made.after >= end
+
+    def lead_in(self, program: Program, *, told: bool) -> None:
+        """Let the excitation settle before samples are passed on; `told`: it is waited for, but all is passed on."""
+        self._awaited = told and self._excited is not None
+        if self._excited is not None and not told:
             self._lead = min(period_ticks(program), round(_LONGEST_LEAD_S * self._rate_hz))
 
     def _after_lead(self, block: Block) -> Block | None:
         """Return what of a block comes after the lead; what was under way when the excitation was ordered does not."""
+        if self._awaited:
+            begins = self._begin(block)
+            self._awaited = begins is None
+            self._extend(block, begins)
+            return block
         if self._lead is None:
             return block
         if self._from is None:
-            assert self._excited is not None
-            plays = np.flatnonzero(block.values[:, self._excited])
-            if not plays.size:
-                self._unheard += len(block.values)
-                if self._unheard > _LONGEST_WAIT_S * self._rate_hz:
-                    raise DeviceError(
-                        f"{self._device.info.port}: the excitation was ordered and does not show in"
-                        f" {_LONGEST_WAIT_S:g} s of samples. Give a larger amplitude"
-                    )
+            begins = self._begin(block)
+            if begins is None:
                 return None
-            self._from = block.first + int(plays[0]) + self._lead
+            self._from = block.first + begins + self._lead
         passed = self._from - block.first
         if passed >= len(block.values):
             return None
@@ -185,6 +195,25 @@ class _Run:
             return block
         later = block.time_s + passed / self._rate_hz
         return Block(first=self._from, time_s=later, values=block.values[passed:])
+
+    def _begin(self, block: Block) -> int | None:
+        """Return at which sample of a block the excitation is seen first; None where it is not."""
+        assert self._excited is not None
+        plays = np.flatnonzero(block.values[:, self._excited])
+        if plays.size:
+            return int(plays[0])
+        self._unheard += len(block.values)
+        if self._unheard > _LONGEST_WAIT_S * self._rate_hz:
+            raise DeviceError(
+                f"{self._device.info.port}: the excitation was ordered and does not show in"
+                f" {_LONGEST_WAIT_S:g} s of samples. Give a larger amplitude"
+            )
+        return None
+
+    def _extend(self, block: Block, begins: int | None) -> None:
+        """Want all of a block before the excitation; from where it `begins` what was wanted of the course."""
+        before = block.first - (self.report.first if self.report.samples else block.first)
+        self.report.wanted = before + (len(block.values) + 1 if begins is None else begins + self._wanted)
 
     def hear(self) -> None:
         """Take what the device tells."""

@@ -76,7 +76,7 @@ def command(
         str | None, option("--json FILE", "With --track: the track as lines of JSON; - for standard output.")
     ] = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view of the track.")] = False,
-    force: opt.Force = False,
+    force: opt.ForceLoop = False,
     strict: Annotated[
         bool, switch("--strict", "End with exit code 3 if samples were lost or the quality is poor.")
     ] = False,
@@ -109,7 +109,8 @@ def command(
     job = Recording(known, port, record, trial, force=force)
     start, before = start_of_track(track), _changed(record)
     try:
-        opening = open_bench(port, known, bench=bench, pace=pace, seed=seed)
+        closes = chosen == "levitate" and not force
+        opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=closes)
         with watching() as watch, signals(job.stop.take), opening as device:
             course = job.course(device, watch, played=excitation is not None, amplitude=amplitude)
             if track is None:

@@ -40,9 +40,10 @@ def command(
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
     seed: opt.Seed = 0,
+    force: Annotated[bool, switch("--force", "Go on with a loop that is predicted unstable.")] = False,
     yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
-    """Commission a bench: self-test, rest, levitate, excite, record, identify, validate, report, then track.
+    """Commission a bench: self-test, rest, polarity, levitate, excite, record, identify, validate, report, then track.
 
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
@@ -71,7 +72,8 @@ def command(
     if folder.exists():
         check_folder(folder)
     last: list[Step] = []
-    with watching() as watch, signals(stop.take), open_bench(port, known, bench=bench, pace=pace, seed=seed) as device:
+    opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=False)
+    with watching() as watch, signals(stop.take), opening as device:
         new = _make(folder)
 
         def begin(name: StepName) -> None:
@@ -106,7 +108,7 @@ def command(
         try:
             passed = commission(
                 device, known, folder, wishes=wishes, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
-                stopped=stop.wished, tick=alive,
+                stopped=stop.wished, tick=alive, force=force,
             ).passed  # fmt: skip
         except AmbidError:
             with suppress(OSError):

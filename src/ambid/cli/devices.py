@@ -37,38 +37,33 @@ def course_mode(port: str, rig: Rig, mode: Mode | None, excitation: str | None) 
 
 @contextmanager
 def open_bench(
-    port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int
+    port: str, rig: Rig, *, bench: str | None, pace: Literal["fastest", "real-time"], seed: int, closes: bool
 ) -> Iterator[Device]:
     """Open a device and close it.
 
     `port`: see ``--port``; `rig`: of the device; `bench`: see ``--bench``; `pace`: of a device that is no hardware;
-    `seed`: of simulated noise. Returns idle.
+    `seed`: of simulated noise; `closes`: whether a loop is to be closed that has to be stable. Returns idle.
     """
-    from ambid.acquisition.devices.choose import open_device
-
-    behind = _bench(bench)
-    for line in _notes(port, rig, behind):
-        typer.echo(f"ambid: note: {line}", err=True)
-    with open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
-        for line in _replay_notes(device, rig):
-            typer.echo(f"ambid: note: {line}", err=True)
-        yield device
-
-
-def _notes(port: str, rig: Rig, bench: Preset | Rig | None) -> tuple[str, ...]:
-    """What is made up for a rig, and what its controller will do only roughly."""
     from ambid.acquisition.default_daq import default_daq_notes, with_default_daq
-    from ambid.acquisition.devices.benches import bench_parameters
-    from ambid.acquisition.review import review
+    from ambid.acquisition.devices.choose import open_device
+    from ambid.acquisition.review import refuse_unstable, review
     from ambid.acquisition.settings import controller_settings
 
-    if port.startswith("replay:"):
-        return ()
-    invented = port in ("emulated", "simulated")
+    behind, invented = _bench(bench), port in ("emulated", "simulated")
     complete = with_default_daq(rig) if invented else rig
-    made_up = default_daq_notes(rig) if invented else ()
-    plant = bench_parameters(rig, bench) if invented else None  # the truth, whatever the rig knows of it
-    return (*made_up, *review(complete, controller_settings(complete), parameters=plant))
+    for line in default_daq_notes(rig) if invented else ():
+        typer.echo(f"ambid: note: {line}", err=True)
+    with open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
+        if closes:
+            refuse_unstable(rig, device.info)
+        notes = (
+            _replay_notes(device, rig)
+            if port.startswith("replay:")
+            else review(complete, controller_settings(complete), parameters=device.info.plant)
+        )
+        for line in notes:
+            typer.echo(f"ambid: note: {line}", err=True)
+        yield device
 
 
 def _replay_notes(device: Device, rig: Rig) -> tuple[str, ...]:

@@ -63,6 +63,9 @@ References = Annotated[
 ]
 OpenLoop = Annotated[bool, switch("--open-loop", "Say that no feedback was at work in this record.")]
 Force = Annotated[bool, switch("--force", "Write over a record that exists.")]
+ForceLoop = Annotated[
+    bool, switch("--force", "Write over a record that exists; go on with a loop that is predicted unstable.")
+]
 SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Judge on this record too, all of it.")]
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.cli.options import Force, argument, band_of, option, preset_of, switch
+from ambid.cli.options import ForceLoop, argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import refuse_given
@@ -64,7 +64,7 @@ def command(
         float | None,
         option("--position M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
     ] = None,
-    force: Force = False,
+    force: ForceLoop = False,
 ) -> None:
     """Simulate a bench and write the record that it would log; equal seeds give equal records.
 
@@ -80,7 +80,7 @@ def command(
                          "--position": position, "--periods": periods != 1}  # fmt: skip
         refuse_given(of_excitation, "--scenario has no {}. Leave {} out")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
-                 "closed": closed, "log_excitation": log_excitation}  # fmt: skip
+                 "closed": closed, "log_excitation": log_excitation, "force": force}  # fmt: skip
         _run_scenario(scenario, preset, rig, record, seed, words, force=force)
         return
     refuse_given({"--at": at, "--size": size}, "a simulation without --scenario has no {}. Leave {} out")
@@ -92,6 +92,7 @@ def command(
             preset or Path(rig), duration=1.0 if duration is None else duration, rate_hz=rate,
             excitation=excitation or "multisine", amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
             closed=closed, nonlinear=nonlinear, position=position, log_excitation=log_excitation,
+            force=force,
         )  # fmt: skip
         comments: tuple[str, ...] = ()
         if record.suffix not in (".h5", ".hdf5"):

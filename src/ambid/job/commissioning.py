@@ -1,4 +1,4 @@
-"""Guided commissioning: self-test, rest, levitate, excite, record, identify, validate, report, then track.
+"""Guided commissioning: self-test, rest, polarity, levitate, excite, record, identify, validate, report, then track.
 
 Each step is judged before the next begins; one that is not good enough ends it, with the reasons. All that was found up
 to there stays in the folder.
@@ -17,6 +17,7 @@ from typing import Unpack
 from ambid.acquisition.amplitude import Room, make_look
 from ambid.acquisition.device import Device
 from ambid.acquisition.recording import Acquired, Listeners, acquire
+from ambid.acquisition.review import refuse_unstable
 from ambid.acquisition.session import Course
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Estimate
@@ -69,6 +70,7 @@ def commission(
     confirm: Callable[[StepName], bool] | None = None,
     stopped: Callable[[], bool] = lambda: False,
     tick: Tick | None = None,
+    force: bool = False,
     **listeners: Unpack[Listeners],
 ) -> Commissioned:
     """Bring a bench from a controller that answers to physical parameters that are tracked.
@@ -86,11 +88,13 @@ def commission(
     on_begin, on_step : callable, optional
         Called with the name of a step before it begins, and with what it found.
     confirm : callable, optional
-        Asked before the rotor is lifted; False ends it.
+        Asked before the output is switched on; False ends it.
     stopped : callable, optional
         Asked now and then; True ends it.
     tick : callable, optional
         Sign of life while computing.
+    force : bool
+        Go on with a loop that is predicted unstable.
     **listeners
         See `ambid.acquisition.recording.Listeners`.
 
@@ -102,12 +106,14 @@ def commission(
     Raises
     ------
     AmbidError
-        If the bench cannot be commissioned, or the folder holds an earlier one.
+        If the bench cannot be commissioned, its loop is predicted unstable, or the folder holds an earlier one.
     """
     place = Path(folder)
     check_folder(place)
     guide = _Guide(device, rig, place, wishes or Wishes(), listeners, stopped, tick or silent)
     guide.check()
+    if not force:
+        refuse_unstable(rig, device.info)
     write_text(place / "rig.toml", rig_text(rig, place))
     done: list[Step] = []
     for name, do in guide.steps(confirm or (lambda _: True)):
@@ -189,8 +195,9 @@ class _Guide:
 
         yield "self-test", lambda: judge.self_test(device)
         yield "rest", lambda: judge.rest(look, room, wishes)
-        if not confirm("levitate"):
-            raise Declined("levitation was not agreed to; the output stayed off. Begin again when the bench is clear")
+        if not confirm("polarity"):
+            raise Declined("pulses and levitation were not agreed to; the output stayed off. Clear the bench first")
+        yield "polarity", lambda: judge.polarity(look, room, self._rig, device)
         yield "levitate", lambda: keep(judge.levitate(look, room, wishes))
         yield "excite", lambda: keep(judge.excite(look, room, wishes, device.info.rate_hz, found["levitate"]))
         yield "record", lambda: self._record(amplitude())

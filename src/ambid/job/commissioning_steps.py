@@ -15,14 +15,18 @@ import numpy as np
 
 from ambid.acquisition.amplitude import Look, Room, Trial, find_amplitude, moving_band, why_incomplete
 from ambid.acquisition.device import Device
+from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
 from ambid.acquisition.recording import Acquired
 from ambid.acquisition.session import Course
 from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate, fields_json
 from ambid.job.track_live import LiveTrack
 from ambid.report.numbers import quantity, sized
+from ambid.rig import Rig
 
-StepName = Literal["self-test", "rest", "levitate", "excite", "record", "identify", "validate", "report", "track"]
+StepName = Literal[
+    "self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "report", "track"
+]
 
 STEPS: tuple[StepName, ...] = get_args(StepName)
 """In their order."""
@@ -150,6 +154,84 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
     return Step(
         name="rest", findings=findings, reasons=tuple(reasons), cautions=tuple(cautions), numbers=_numbers(shown)
     )
+
+
+def polarity(look: Look, room: Room, rig: Rig, device: Device) -> Step:
+    """Find by pulses which way the bench answers, and compare it with what the rig says and the controller assumes.
+
+    `look`: see `make_look`; `room`: limits; `rig`: of the device. Returns not passed where a sign is reversed, no
+    current flows, or the controller tripped; a rotor that did not move is a caution.
+    """
+    found = find_polarity(look, room, rig, device.info.rate_hz, clear=device.clear)
+    largest = max(found.pulses, key=lambda p: abs(p.volts) * p.hold_s)
+    told = [f"{len(found.pulses)} pulses of {sized(abs(found.pulses[0].volts), 'V')} to {_pulse_words(largest)}"]
+    numbers = {"current": float(found.current), "motion": float(found.motion)}
+    if found.current:
+        told.append(f"the current {_way(found.current)} when the voltage rises")
+    if found.motion:
+        farthest = max(abs(p.motion) for p in found.pulses)
+        told.append(f"the position {_way(found.motion)} when the current rises, by {sized(farthest, 'm')} at most")
+    reasons = [*found.troubles, *_reversed(found, rig)]
+    if not found.current and not reasons:
+        reasons.append(
+            f"no current is shown for {_pulse_words(largest)}: look at the coil's cable, the current sensor and the"
+            " power stage"
+        )
+    cautions = []
+    if found.current and not found.motion and not reasons:
+        cautions.append(
+            f"the rotor did not move for {_pulse_words(largest)}, {sized(abs(largest.current_change), 'A')}: the sign"
+            " of the position could not be checked. If it does not lift, look at that first"
+        )
+    return Step(
+        name="polarity", findings=tuple(told), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
+    )
+
+
+def _pulse_words(pulse: Pulse) -> str:
+    return f"{sized(abs(pulse.volts), 'V')} for {sized(pulse.hold_s, 's')}"
+
+
+def _way(sign: int) -> str:
+    return "rises" if sign > 0 else "falls"
+
+
+def _reversed(found: Polarity, rig: Rig) -> list[str]:
+    """Name the sign that is not as the rig says, where the pulses tell it."""
+    k_i = next((p.value for p in rig.parameters if p.name == "k_i"), None)
+    kp = 0.0 if rig.loop is None else rig.loop.kp
+    said = int(np.sign(k_i or kp))  # of the motion, by the rig; the loop pushes back where kp has the same sign
+    by = f"k_i = {k_i:g} N/A" if k_i else f"loop.kp = {kp:g} V/m"
+    if found.current < 0:
+        falls = "the current falls when the voltage rises"
+        if not found.motion or not said:
+            return [
+                f"{falls}: one of the two is reversed. Exchange the leads of the coil or the sign of channels.voltage,"
+                " or turn the current sensor or the sign of channels.current (gain and offset)"
+            ]
+        if found.motion == said:
+            return [
+                f"{falls}, and the position moves with the current as the rig says: the voltage is reversed. Exchange"
+                " the leads of the coil, or the sign of channels.voltage.gain and offset"
+            ]
+        return [
+            f"{falls}, and the position moves with the voltage as the rig says: the current is reversed. Turn the"
+            " current sensor, or the sign of channels.current.gain and offset"
+        ]
+    if not found.current or not found.motion or not said or (found.motion == said and k_i is None):
+        return []
+    seen = f"the position {_way(found.motion)} when the current rises"
+    if found.motion != said:
+        right = kp != 0.0 and k_i and np.sign(kp) == found.motion
+        remedy = (
+            "The controller's gains assume what was seen: correct the sign of parameters.k_i"
+            if right
+            else "Exchange the position sensor's sign, or that of channels.position.gain and offset"
+        )
+        return [f"{seen}: the rig says it {_way(said)} ({by}). {remedy}"]
+    if kp != 0.0 and np.sign(kp) != found.motion:
+        return [f"{seen}, as the rig says, and loop.kp = {kp:g} V/m pushes it away: correct the sign of [loop]"]
+    return []
 
 
 def levitate(look: Look, room: Room, wishes: Wishes) -> Step:

@@ -35,6 +35,7 @@ class Words(TypedDict, total=False):
     nonlinear: bool  # the nonlinear magnet instead of its linearisation
     position: float | None  # nonlinear: where the loop holds the rotor, m
     log_excitation: bool  # a channel of it too
+    force: bool  # a loop that is predicted unstable too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,7 +55,7 @@ def simulate(source: str | Path | Rig | Preset, **words: Unpack[Words]) -> Recor
         A preset by its name, or a rig or its file.
     **words
         ``duration``, ``rate_hz``, ``excitation``, ``amplitude``, ``band``, ``periods``, ``seed``, ``closed``,
-        ``nonlinear``, ``position`` and ``log_excitation``, see `Words`.
+        ``nonlinear``, ``position``, ``log_excitation`` and ``force``, see `Words`.
 
     Returns
     -------
@@ -64,7 +65,7 @@ def simulate(source: str | Path | Rig | Preset, **words: Unpack[Words]) -> Recor
     Raises
     ------
     AmbidError
-        If a word breaks a rule, or the rig lacks a value.
+        If a word breaks a rule, the rig lacks a value, or the loop is predicted unstable.
 
     Examples
     --------
@@ -90,10 +91,13 @@ def simulate_used(
     nonlinear: bool = False,
     position: float | None = None,
     log_excitation: bool = False,
+    force: bool = False,
 ) -> tuple[Simulation, Excited]:
     """Return what `simulate` does with what happened, and the excitation."""
     bench = _bench(source, rate_hz, closed, nonlinear, position)
     n = _samples(duration, bench.rate_hz)
+    if not force:
+        bench.refuse_unstable()
     shape = _repeat(
         lambda part: make_excitation(excitation, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods
     )

@@ -22,6 +22,7 @@ _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders 
 _NEXT = {
     "self-test": "correct what the self-test names; the output was never switched on",
     "rest": "correct sensors, wiring or calibrations; the output was never switched on",
+    "polarity": "correct what is reversed, at the bench or in the rig; the rotor was not lifted",
     "levitate": "correct the bench, or [loop], [daq.trip] and the calibrations of the rig",
     "excite": "give a smaller --amplitude or another --band, or correct the bench",
     "record": "remove what disturbed the record; {folder}/record.h5 holds what was recorded",

@@ -155,6 +155,16 @@ def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: flo
     ndarray, shape (n_states + n_delayed + 3, ...)
         The loop's matrix; limits and quantisation are left out.
     """
+    return excited_loop(parameters, loop, rate_hz, of=of)[0]
+
+
+def excited_loop(
+    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis"
+) -> tuple[Array, Array, Array]:
+    """Return the matrix of `closed_loop_matrix`, the row that gives the command, and what an excitation of it does.
+
+    The excitation is added to the command: the states become z x + excited e, what is ordered is command x + e.
+    """
     plant, period = model(of), 1.0 / rate_hz
     whole = math.floor(loop.delay)
     d, _ = discretise(plant.matrices(parameters), period, fraction=loop.delay - whole)
@@ -172,11 +182,15 @@ def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: flo
     z[:n] += np.outer(d.B[:, 0], history[whole])
     if line > whole:
         z[:n] += np.outer(d.B_late[:, 0], history[whole + 1])
+    excited = np.zeros(total)
+    if whole == 0:
+        excited[:n] = d.B[:, 0]
+    excited[n : n + min(line, 1)] = 1.0
     for j in range(line):
         z[n + j] = history[j]
     z[i] = unit[i] - loop.ki * period * position
     z[dd], z[last] = derivative, position
-    return z
+    return z, command, excited
 
 
 def closed_loop_poles(

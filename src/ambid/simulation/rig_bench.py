@@ -6,6 +6,7 @@ Magnet, gravity, eddy pole, stage and offsets are those that ``ambid identify --
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING
@@ -24,7 +25,8 @@ from ambid.physics.power_stage import IDEAL, PowerStage
 from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulation.bench import Simulation, largest_amplitude, simulate
-from ambid.simulation.plant import LinearPlant
+from ambid.simulation.margins import loop_margins
+from ambid.simulation.plant import LinearPlant, Standing
 from ambid.units import parse_unit
 
 if TYPE_CHECKING:
@@ -177,6 +179,7 @@ def simulate_rig(
     nonlinear: bool = False,
     substeps: int | None = None,
     columns: bool = True,
+    force: bool = False,
 ) -> Simulation:
     """Simulate the linear model of a rig about its operating point, or the nonlinear plant of its ``[magnet]``.
 
@@ -203,6 +206,8 @@ def simulate_rig(
         Runge-Kutta steps in each sample (nonlinear only); default what the plant's rates ask for.
     columns : bool
         Log in the rig's columns, uncalibrated, so that the rig reads the record back; else by role, in SI.
+    force : bool
+        Simulate a loop that is predicted unstable too.
 
     Returns
     -------
@@ -214,9 +219,11 @@ def simulate_rig(
     RigError
         If a parameter has no value, a closed loop is asked for and the rig has none, or a calibration cannot be undone.
     ModelError
-        As `ambid.simulation.simulate`.
+        As `ambid.simulation.simulate`, and for a loop that is predicted unstable.
     """
     bench = Bench.of(rig, rate_hz, closed, nonlinear=nonlinear)
+    if not force:
+        bench.refuse_unstable()
     return bench.simulate(excitation, seed=seed, setpoint=setpoint, substeps=substeps, columns=columns)
 
 
@@ -316,6 +323,19 @@ class Bench:
         """The plant of a linear bench."""
         assert isinstance(self.plant, LinearPlant)
         return self.plant
+
+    @property
+    def parameters(self) -> Mapping[str, float]:
+        """Those of the linear plant, or of what the nonlinear one linearises to at rest; SI."""
+        return Standing.of(self.plant, self.point).parameters()
+
+    def refuse_unstable(self) -> None:
+        """Refuse a closed loop that is predicted unstable."""
+        if self.loop.closed:
+            of = Standing.of(self.plant, self.point).model.name
+            found = loop_margins(self.parameters, self.loop, self.rate_hz, of=of)
+            where = f"{self.name!r} at {self.rate_hz:g} Hz with a delay of {self.loop.delay:.2g} samples"
+            found.refuse(where, remedy="Correct [loop] or the parameters")
 
     def simulate(
         self,

@@ -464,6 +464,7 @@ class Course(TypedDict, total=False):
     at_s: float | None  # when it begins, in s
     size: float | None  # how much, as `Scenario.size_is` says
     closed: bool | None  # closed or open loop; default closed, unless a rig says ``open_loop``
+    force: bool  # whether a loop that is predicted unstable is simulated too
 
 
 def simulate_scenario(
@@ -583,6 +584,7 @@ class _Run:
         at_s: float | None = None,
         size: float | None = None,
         closed: bool | None = None,
+        force: bool = False,
     ) -> None:
         self.scenario = scenario(name) if isinstance(name, str) else name
         always = closed is None and isinstance(bench, Preset)
@@ -596,6 +598,8 @@ class _Run:
                 f"{self.duration_s:g} s at {b.rate_hz:g} Hz is {count:g} samples; it must be at least one. Correct one"
             )
         self.n_samples = round(count)
+        if not force:
+            b.refuse_unstable()
         if at_s is not None and not self.scenario.size_is:
             raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Leave the time out")
         self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s

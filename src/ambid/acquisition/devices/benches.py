@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+
+import numpy as np
 
 from ambid.acquisition.scales import ADC_TOP, Scale, scale_of
 from ambid.acquisition.settings import has_position
@@ -17,6 +19,7 @@ from ambid.physics.power_stage import IDEAL
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.rig.load import load_rig
 from ambid.rig.rig import Rig
+from ambid.simulation.plant import LinearPlant
 from ambid.simulation.rig_bench import Bench
 
 _VOLT_PER_COUNT = 5.0 / (ADC_TOP + 1)
@@ -26,23 +29,46 @@ _THIRD = {"third_position_gain": 0.0, "third_current_gain": 0.0, "third_offset":
 
 
 def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
-    """Return the bench that stands behind a rig, nonlinear where a preset is; its loop and rate have no meaning."""
+    """Return the bench that stands behind a rig, nonlinear where a preset is; its loop and rate have no meaning.
+
+    Where it is the rig's own, its force grows with the current as the rig's controller assumes, whatever the sign of
+    its k_i: a bench does not follow what is believed of it.
+    """
     truth = _named(rig) if bench is None else bench
     if isinstance(truth, Preset) and model(truth.model).inputs != ("voltage",):
         raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
     found = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
+    plant = found.plant
+    if truth is rig and rig.loop is not None and rig.loop.kp and isinstance(plant, LinearPlant):
+        held = math.copysign(plant.parameters["k_i"], rig.loop.kp)
+        found = replace(found, plant=replace(plant, parameters={**plant.parameters, "k_i": held}))
     return replace(found, name=truth.name or "rig")
 
 
-def bench_parameters(rig: Rig, bench: Preset | Rig | None) -> Mapping[str, float]:
-    """Return what is known of the linear plant of the bench behind a rig.
+def instruments(rig: Rig, bench: Preset | Rig | None) -> dict[str, Scale]:
+    """Return what really stands between a bench and its controller, by role: the rig only claims it.
 
-    `rig`: of the device; `bench`: as `bench_of`. Returns SI, under the names of the model's parameters.
+    Those of the bench's own rig file, where it is calibrated; else the rig's, wired so that each rises with its counts.
+
+    `rig`: with calibrations; `bench`: as `bench_of`.
     """
     truth = _named(rig) if bench is None else bench
-    if isinstance(truth, Preset):
-        return truth.parameters
-    return {p.name: p.value for p in truth.parameters if p.value is not None}
+    found = {}
+    for c in rig.channels:
+        if c.role in ("voltage", "current", "position"):
+            own = truth if isinstance(truth, Rig) and truth is not rig else None
+            known = own is not None and any(t.role == c.role and t.calibration is not None for t in own.channels)
+            found[c.role] = scale_of(own, c.role) if own is not None and known else _rising(scale_of(rig, c.role))
+    return found
+
+
+def _rising(scale: Scale) -> Scale:
+    """Return a scale that falls over its counts as one that rises over the same values."""
+    if scale.si[-1] > scale.si[0]:
+        return scale
+    return replace(
+        scale, raw=np.ascontiguousarray(scale.top - scale.raw[::-1]), si=np.ascontiguousarray(scale.si[::-1])
+    )
 
 
 def _named(rig: Rig) -> Preset | Rig:
@@ -72,7 +98,8 @@ def plant_text(rig: Rig, *, bench: Preset | Rig | None = None) -> str:
     """
     truth = bench_of(rig, bench)
     body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name
-    current, voltage = scale_of(rig, "current"), scale_of(rig, "voltage")
+    found = instruments(rig, bench)
+    voltage = found["voltage"]
     if voltage.raw.size > 2:
         raise DeviceError(
             f"rig {rig.name!r}: channels.voltage is calibrated by a table; the emulated power stage is a straight line"
@@ -88,8 +115,8 @@ def plant_text(rig: Rig, *, bench: Preset | Rig | None = None) -> str:
         *_numbers(_THIRD),
     ]
     # A rig without position leaves that input alone: it shows half of the supply.
-    position = _sensor("position", scale_of(rig, "position")) if has_position(rig) else _numbers(_NO_POSITION)
-    lines += [*position, *_sensor("current", current)]
+    position = _sensor("position", found["position"]) if has_position(rig) else _numbers(_NO_POSITION)
+    lines += [*position, *_sensor("current", found["current"])]
     lines += _numbers({"start_position": _resting_place(truth)})
     # A single transistor with its diode: no current the other way, and a coil that is switched off runs out slowly.
     one_way = min(low, high) >= 0.0

@@ -17,11 +17,12 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 from ambid.acquisition.default_daq import is_made_up, with_default_daq
-from ambid.acquisition.devices.benches import plant_text
+from ambid.acquisition.devices.benches import bench_of, plant_text
 from ambid.acquisition.devices.line_device import LineDevice
 from ambid.acquisition.devices.played import Pace, check_pace
 from ambid.acquisition.devices.port import Port, PortEnded, open_port
@@ -372,6 +373,7 @@ class EmulatedDevice(LineDevice):
             full, kind="emulated", where="emulated", si=is_made_up(rig, full), real=pace == "real", answer_s=_ANSWER_S
         )
         self._bench, self._pace, self._seed, self._script = bench, pace, seed, script
+        self._info = replace(self._info, plant=bench_of(full, bench).parameters)
         self.emulator: Emulator | None = None
 
     def _open(self) -> Port:

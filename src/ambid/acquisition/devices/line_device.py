@@ -316,6 +316,7 @@ class LineDevice(ABC):
         self._info = DeviceInfo(kind=kind, port=where, rate_hz=rate, columns=columns(rig, self._settings, si=si))
         self._stream = self._new_stream()
         self._controller: Controller | None = None
+        self._loaded: Program | None = None
         self._status: dict[str, float] = {}
         self._before = (0, 0)
         self._damaged_told = 0
@@ -407,16 +408,23 @@ class LineDevice(ABC):
                 f"{self._where} refuses excite in state {self.state}; an excitation is played while driving or"
                 " levitating. Start one of these first"
             )
-        if on:
+        if on and (program is None or program is not self._loaded):
             self._ask("excite", {"on": 0})
         if program is None:
             return
+        if program is not self._loaded:
+            self.load(program)
+        self._loaded = None  # what was changed meanwhile is not known
+        if program.kind != "none":
+            self._ask("excite", {"on": 1})
+
+    def load(self, program: Program) -> None:
+        """As `Device.load`."""
         fields = counts_of(program, self._rig, self._settings)
         for at in range(0, len(program.table), _TABLE_PART):
             self._ask("table", {"offset": at}, values=program.table[at : at + _TABLE_PART])
         self._ask("excitation", fields)
-        if program.kind != "none":
-            self._ask("excite", {"on": 1})
+        self._loaded = program
 
     def read(self, timeout_s: float) -> Frame | None:
         """As `Device.read`."""
@@ -496,13 +504,8 @@ class LineDevice(ABC):
     def _prepare(self, controller: Controller, where: str) -> None:
         """Identify, bring to idle whatever was before, and tell it the settings."""
         who = controller.identify()
-        self._info = DeviceInfo(
-            kind=self._info.kind,
-            port=where,
-            rate_hz=self._info.rate_hz,
-            columns=self._info.columns,
-            identity=MappingProxyType({k: v for k, v in who.fields.items() if k != "id"}),
-        )
+        identity = MappingProxyType({k: v for k, v in who.fields.items() if k != "id"})
+        self._info = replace(self._info, port=where, identity=identity)
         controller.ask("stop")
         before = controller.ask("ask_status")
         if before["state"] == table().value("state", "fault"):

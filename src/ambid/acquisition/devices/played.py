@@ -143,6 +143,9 @@ class PlayedDevice(ABC):
                 self._refuse("excite", "an excitation is played while driving or levitating. Start one of these first")
             self._play(program)
 
+    def load(self, program: Program) -> None:  # noqa: B027 - there is no line on which it would take time
+        """As `Device.load`."""
+
     def read(self, timeout_s: float) -> Frame | None:
         """As `Device.read`."""
         end = time.perf_counter() + timeout_s

@@ -6,6 +6,7 @@ Nothing of the line is simulated: no frame is ever lost, and the host is never s
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,11 +14,11 @@ from numpy.typing import NDArray
 
 from ambid.acquisition.default_daq import is_made_up, with_default_daq
 from ambid.acquisition.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
-from ambid.acquisition.devices.benches import bench_of
+from ambid.acquisition.devices.benches import bench_of, instruments
 from ambid.acquisition.devices.played import Pace, PlayedDevice
 from ambid.acquisition.program import counts_of
 from ambid.acquisition.protocol.table import table
-from ambid.acquisition.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates, scale_of
+from ambid.acquisition.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates
 from ambid.acquisition.settings import ControllerSettings, carried, columns, controller_settings, in_si
 from ambid.arrays import Array
 from ambid.errors import DeviceError
@@ -71,12 +72,14 @@ class SimulatedDevice(PlayedDevice):
         self._rig = with_default_daq(rig)
         self._si = is_made_up(rig, self._rig)
         self._settings = controller_settings(self._rig)
+        self._instruments = instruments(self._rig, bench)
         super().__init__(self._settings.rate_hz, pace, block_samples)
         self._info = DeviceInfo(
             kind="simulated",
             port=self._bench.name,
             rate_hz=self._settings.rate_hz,
             columns=columns(self._rig, self._settings, si=self._si),
+            plant=self._bench.parameters,
         )
         self._seed = seed
 
@@ -85,7 +88,7 @@ class SimulatedDevice(PlayedDevice):
 
         self._rng = np.random.default_rng(self._seed)
         self._plant, whole = _plant_of(self._bench, self._settings)
-        self._maps = _maps_of(self._rig)
+        self._maps = _maps_of(self._instruments)
         self._numbers = _numbers_of(self._settings)
         self._table = np.zeros(TABLE_LENGTH, dtype=np.int64)
         self._memory = np.zeros(k.N_MEMORY, dtype=np.int64)
@@ -227,13 +230,12 @@ def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
     return plant, whole
 
 
-def _maps_of(rig: Rig) -> tuple[Array, Array, Array, Array, Array, Array]:
+def _maps_of(scales: Mapping[str, Scale]) -> tuple[Array, Array, Array, Array, Array, Array]:
     """Return x and y of position to counts, current to counts, and pulse width to volts."""
     flat = np.array([0.0, 1.0])
-    has = {c.role for c in rig.channels}
-    position = _inverse(scale_of(rig, "position")) if "position" in has else (flat, flat)
-    voltage = scale_of(rig, "voltage")
-    return (*position, *_inverse(scale_of(rig, "current")), voltage.raw, voltage.si)
+    position = _inverse(scales["position"]) if "position" in scales else (flat, flat)
+    voltage = scales["voltage"]
+    return (*position, *_inverse(scales["current"]), voltage.raw, voltage.si)
 
 
 def _inverse(scale: Scale) -> tuple[Array, Array]:

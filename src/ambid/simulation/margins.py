@@ -1,0 +1,218 @@
+"""Margins of a position loop as its plant and controller predict it: poles, gain, phase, sensitivity; and a refusal.
+
+The loop is opened at the controller's output, where everything that it orders passes: L = 1/S - 1, with the sensitivity
+S = 1/(1 + L) from an excitation to the command (ISO 14839-3). Limits and quantisation are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.errors import ModelError
+from ambid.physics.loop import Interval, Loop
+from ambid.simulation.plant import closed_loop_poles, excited_loop
+
+Complex = NDArray[np.complex128]
+
+ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"))
+"""Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio: 9.5, 12 and 14 dB; beyond is zone D."""
+
+_REACH = 20.0  # factor on the gains that is looked at, up and down
+_GAINS = 81  # of them, even in the logarithm
+_SLACK = 1e-9  # of a pole on the circle: an integrator that nothing holds
+_SPAN = 1e-4  # of the rate: the lowest frequency
+_FREQUENCIES = 400
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopMargins:
+    """What is predicted of a closed loop.
+
+    Attributes
+    ----------
+    poles : ndarray, shape (n_poles,), complex
+        In the z plane, by falling modulus.
+    rate_hz : float
+        Sampling rate in Hz.
+    gain : (float, float) or None
+        Factors on all gains between which the loop is stable: around 1 where it is; else those nearest to it. None:
+        there are none within a factor of 20.
+    reversed : str or None
+        Of an unstable loop: the gains that hold it with the other sign, ``"kp, ki and kd"`` or ``"kc"``.
+    frequency_hz : ndarray, shape (n_frequencies,)
+        Up to half the rate.
+    open_loop : ndarray, shape (n_frequencies,), complex
+        L, from the controller's output back to it, for negative feedback.
+    """
+
+    poles: Complex
+    rate_hz: float
+    gain: Interval | None
+    reversed: str | None
+    frequency_hz: Array
+    open_loop: Complex
+
+    @property
+    def largest_pole(self) -> float:
+        """Largest modulus of the poles; the loop is unstable above 1."""
+        return float(np.abs(self.poles[0]))
+
+    @property
+    def stable(self) -> bool:
+        """Whether no pole lies outside the unit circle."""
+        return self.largest_pole <= 1.0 + _SLACK
+
+    @property
+    def sensitivity(self) -> Array:
+        """Modulus of S, shape (n_frequencies,)."""
+        return np.asarray(1.0 / np.abs(1.0 + self.open_loop))
+
+    @property
+    def peak(self) -> tuple[float, float]:
+        """Largest modulus of S (its inverse is the modulus margin), and its frequency in Hz."""
+        k = int(np.argmax(self.sensitivity))
+        return float(self.sensitivity[k]), float(self.frequency_hz[k])
+
+    @property
+    def zone(self) -> str:
+        """Zone of ISO 14839-3, ``"A"`` to ``"D"``."""
+        return next((zone for most, zone in ZONES if self.peak[0] < most), "D")
+
+    @property
+    def phase_deg(self) -> float | None:
+        """Smallest phase margin in degrees; None where the modulus of L never passes 1."""
+        size, angle = np.abs(self.open_loop), np.angle(self.open_loop)
+        passes = np.flatnonzero(np.diff(np.sign(size - 1.0)))
+        return None if not passes.size else float(np.degrees(np.min(np.pi - np.abs(angle[passes]))))
+
+    def words(self) -> str:
+        """Say the margins of a stable loop on one line."""
+        assert self.gain is not None
+        low, high = (f"{g:.2g}" for g in self.gain)
+        low, high = (
+            f"less than {1 / _REACH:g}" if self.gain[0] <= 1 / _REACH else low,
+            f"more than {_REACH:g}" if self.gain[1] >= _REACH else high,
+        )
+        phase = "" if self.phase_deg is None else f", phase margin {self.phase_deg:.0f}°"
+        peak, hz = self.peak
+        return (
+            f"largest pole {self.largest_pole:.4f}; stable for {low} to {high} times the gains{phase}, sensitivity peak"
+            f" {20 * math.log10(peak):.1f} dB at {hz:.3g} Hz (ISO 14839-3 zone {self.zone})"
+        )
+
+    def refuse(self, where: str, *, remedy: str) -> None:
+        """Raise `ModelError` for an unstable loop: its largest pole, how far the gains are off, and what to do.
+
+        `where`: which plant, rate and delay; `remedy`: what to do unless a sign is reversed.
+        """
+        if self.stable:
+            return
+        if self.reversed is not None:
+            far = f"it is stable with the other sign of {self.reversed}"
+            remedy = "Correct the sign of these gains, or that of k_i"
+        elif self.gain is None:
+            far = f"no factor of {1 / _REACH:g} to {_REACH:g} on its gains makes it stable"
+        else:
+            far = f"it is stable for {self.gain[0]:.2g} to {self.gain[1]:.2g} times its gains"
+        raise ModelError(
+            f"the loop is unstable on {where}: largest pole {self.largest_pole:.4f}; {far}. {remedy}, or go on with"
+            " --force"
+        )
+
+
+def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> LoopMargins:
+    """Predict a loop's poles and margins.
+
+    Parameters
+    ----------
+    parameters : Mapping[str, float]
+        Parameters of the model in SI units.
+    loop : Loop
+        Controller and delay.
+    rate_hz : float
+        Sampling rate in Hz.
+    of : str
+        Name of the linear model.
+
+    Returns
+    -------
+    LoopMargins
+
+    Raises
+    ------
+    ModelError
+        If the parameters carry the loop beyond the finite numbers.
+
+    Examples
+    --------
+    >>> from ambid.physics.presets import preset
+    >>> bench = preset("prototype")
+    >>> loop_margins(bench.parameters, bench.loop, bench.rate_hz).zone
+    'A'
+    """
+
+    def largest(tried: Loop) -> float:
+        try:
+            return float(np.abs(closed_loop_poles(parameters, tried, rate_hz, of=of)[0]))
+        except ModelError:  # beyond all numbers
+            return math.inf
+
+    poles = closed_loop_poles(parameters, loop, rate_hz, of=of)
+    stable = float(np.abs(poles[0])) <= 1.0 + _SLACK
+    others = {
+        "kp, ki and kd": replace(loop, kp=-loop.kp, ki=-loop.ki, kd=-loop.kd),
+        "kc": replace(loop, kc=-loop.kc),
+    }
+    frequency = np.geomspace(_SPAN * rate_hz, 0.5 * rate_hz, _FREQUENCIES)
+    with np.errstate(all="ignore"):  # of a plant near the end of all numbers
+        z, command, excited = excited_loop(parameters, loop, rate_hz, of=of)
+        around = np.exp(2j * np.pi * frequency / rate_hz)[:, None, None] * np.eye(z.shape[0]) - z
+        answer = np.linalg.solve(around, np.broadcast_to(excited[:, None], (frequency.size, z.shape[0], 1)))
+        sensitivity = 1.0 + answer[:, :, 0] @ command
+        open_loop = np.asarray(1.0 / sensitivity - 1.0, dtype=np.complex128)
+    return LoopMargins(
+        poles=poles,
+        rate_hz=rate_hz,
+        gain=_stable_gains(lambda g: largest(_scaled(loop, g)), stable),
+        reversed=None if stable else next((name for name, other in others.items() if largest(other) < 1.0), None),
+        frequency_hz=frequency,
+        open_loop=open_loop,
+    )
+
+
+def _scaled(loop: Loop, factor: float) -> Loop:
+    return replace(loop, kp=factor * loop.kp, ki=factor * loop.ki, kd=factor * loop.kd, kc=factor * loop.kc)
+
+
+def _stable_gains(largest: Callable[[float], float], stable: bool) -> Interval | None:
+    """Return the factors on the gains between which the loop is stable, nearest to 1."""
+    factors = np.geomspace(1.0 / _REACH, _REACH, _GAINS)
+    holds = np.array([largest(float(g)) <= 1.0 + _SLACK for g in factors])
+    middle = _GAINS // 2
+    holds[middle] = stable
+    if not holds.any():
+        return None
+    found = np.flatnonzero(holds)
+    inside = int(found[np.argmin(np.abs(found - middle))])
+    low = high = inside
+    while low > 0 and holds[low - 1]:
+        low -= 1
+    while high < _GAINS - 1 and holds[high + 1]:
+        high += 1
+    first = factors[0] if low == 0 else _edge(largest, float(factors[low]), float(factors[low - 1]))
+    last = factors[-1] if high == _GAINS - 1 else _edge(largest, float(factors[high]), float(factors[high + 1]))
+    return float(first), float(last)
+
+
+def _edge(largest: Callable[[float], float], stable: float, unstable: float) -> float:
+    """Return the factor between a stable and an unstable one at which the loop becomes unstable."""
+    for _ in range(10):
+        middle = math.sqrt(stable * unstable)
+        stable, unstable = (middle, unstable) if largest(middle) <= 1.0 + _SLACK else (stable, middle)
+    return stable
