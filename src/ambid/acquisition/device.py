@@ -108,7 +108,7 @@ class Device(Protocol):
 
     @property
     def info(self) -> DeviceInfo:
-        """Who is there; after opening."""
+        """Who is there; what a controller says of itself after opening."""
         ...
 
     @property

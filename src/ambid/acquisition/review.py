@@ -15,7 +15,7 @@ from ambid.acquisition.settings import ControllerSettings, controller_settings, 
 from ambid.errors import ModelError, RigError
 from ambid.physics.linear_model import model
 from ambid.rig.rig import Rig
-from ambid.simulation.margins import LoopMargins
+from ambid.simulation.margins import LoopMargins, loop_margins
 
 _ROUNDED = 0.01  # of a gain: more is worth a line
 _BENT = 1.5  # largest over least slope of a calibration between the trips
@@ -149,8 +149,6 @@ def predicted(
     `rig`: with a loop; `settings`: made from it; `parameters`: of the bench, SI, where the rig has no value of its own.
     Returns the margins and whose plant it is; None and why where a value is missing.
     """
-    from ambid.simulation import loop_margins
-
     known = {p.name: p.value for p in rig.parameters if p.value is not None}
     lent = [p.name for p in rig.parameters if p.name not in known and p.name in parameters]
     missing = [p.name for p in rig.parameters if p.name not in known and p.name not in parameters]

@@ -72,7 +72,7 @@ def command(
     if folder.exists():
         check_folder(folder)
     last: list[Step] = []
-    opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=False)
+    opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=not force)
     with watching() as watch, signals(stop.take), opening as device:
         new = _make(folder)
 

@@ -53,9 +53,10 @@ def open_bench(
     complete = with_default_daq(rig) if invented else rig
     for line in default_daq_notes(rig) if invented else ():
         typer.echo(f"ambid: note: {line}", err=True)
-    with open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed) as device:
-        if closes:
-            refuse_unstable(rig, device.info)
+    made = open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed)
+    if closes:
+        refuse_unstable(rig, made.info)
+    with made as device:
         notes = (
             _replay_notes(device, rig)
             if port.startswith("replay:")

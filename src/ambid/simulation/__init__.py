@@ -11,8 +11,6 @@ if TYPE_CHECKING:
     from ambid.simulation.bench import largest_amplitude as largest_amplitude
     from ambid.simulation.bench import noise_at_snr as noise_at_snr
     from ambid.simulation.bench import simulate as simulate
-    from ambid.simulation.margins import LoopMargins as LoopMargins
-    from ambid.simulation.margins import loop_margins as loop_margins
     from ambid.simulation.plant import LinearPlant as LinearPlant
     from ambid.simulation.plant import closed_loop_matrix as closed_loop_matrix
     from ambid.simulation.plant import closed_loop_poles as closed_loop_poles

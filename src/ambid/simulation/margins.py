@@ -32,31 +32,17 @@ _FREQUENCIES = 400
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopMargins:
-    """What is predicted of a closed loop.
+    """What is predicted of a closed loop."""
 
-    Attributes
-    ----------
-    poles : ndarray, shape (n_poles,), complex
-        In the z plane, by falling modulus.
-    rate_hz : float
-        Sampling rate in Hz.
-    gain : (float, float) or None
-        Factors on all gains between which the loop is stable: around 1 where it is; else those nearest to it. None:
-        there are none within a factor of 20.
-    reversed : str or None
-        Of an unstable loop: the gains that hold it with the other sign, ``"kp, ki and kd"`` or ``"kc"``.
-    frequency_hz : ndarray, shape (n_frequencies,)
-        Up to half the rate.
-    open_loop : ndarray, shape (n_frequencies,), complex
-        L, from the controller's output back to it, for negative feedback.
-    """
-
-    poles: Complex
+    poles: Complex  # (n_poles,), in the z plane, by falling modulus
     rate_hz: float
+    # factors on all gains between which the loop is stable: around 1 where it is; else those nearest to it. None: there
+    # are none within a factor of 20
     gain: Interval | None
+    # of an unstable loop: the gains that hold it with the other sign, "kp, ki and kd" or "kc"
     reversed: str | None
-    frequency_hz: Array
-    open_loop: Complex
+    frequency_hz: Array  # (n_frequencies,), up to half the rate
+    open_loop: Complex  # (n_frequencies,), L, from the controller's output back to it, for negative feedback
 
     @property
     def largest_pole(self) -> float:
@@ -129,32 +115,7 @@ class LoopMargins:
 def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> LoopMargins:
     """Predict a loop's poles and margins.
 
-    Parameters
-    ----------
-    parameters : Mapping[str, float]
-        Parameters of the model in SI units.
-    loop : Loop
-        Controller and delay.
-    rate_hz : float
-        Sampling rate in Hz.
-    of : str
-        Name of the linear model.
-
-    Returns
-    -------
-    LoopMargins
-
-    Raises
-    ------
-    ModelError
-        If the parameters carry the loop beyond the finite numbers.
-
-    Examples
-    --------
-    >>> from ambid.physics.presets import preset
-    >>> bench = preset("prototype")
-    >>> loop_margins(bench.parameters, bench.loop, bench.rate_hz).zone
-    'A'
+    `parameters`: of the model called `of`, SI; `loop`: controller and delay.
     """
 
     def largest(tried: Loop) -> float:

@@ -219,10 +219,12 @@ def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
     low, high = bench.limits.position
     # Short of the pole faces, where the equations end.
     stops = (max(low, inside[0] + 1e-3 * abs(inside[0])), min(high, inside[1] - 1e-3 * abs(inside[1])))
+    with np.errstate(all="ignore"):  # of a plant beyond all numbers, which is told when it runs
+        equations = standing.equations(period, delay - whole, _SUBSTEPS)
     plant = _Plant(
         centre=standing.centre,
         centre_input=standing.centre_input,
-        equations=standing.equations(period, delay - whole, _SUBSTEPS),
+        equations=equations,
         stops=stops,
         noise_size=np.array([bench.noise.position, bench.noise.current, *(size[d] for d in of.disturbances)]),
         roles=(_place(of.states, "position"), _place(of.states, "current")),
