@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ambid.job import load as load
     from ambid.job import simulate as simulate
     from ambid.job import track as track
+    from ambid.job import validate as validate
     from ambid.physics.linear_model import model as model
     from ambid.physics.linear_model import model_names as model_names
     from ambid.physics.presets import preset as preset

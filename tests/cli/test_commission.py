@@ -19,7 +19,7 @@ QUICK = ("--seconds", "4", "--track-seconds", "2", "--amplitude", "1.4")
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ambid.report.page.report_html", lambda evidence, made: f"<html>{made}</html>")
+    monkeypatch.setattr("ambid.job.commissioning.page", lambda estimate: "<html>2001</html>")
     (tmp_path / "rig.toml").write_text(PROTOTYPE_FILE.read_text(encoding="utf-8"), encoding="utf-8")
     (tmp_path / "coil.toml").write_text(COIL, encoding="utf-8")
     return tmp_path

@@ -182,9 +182,8 @@ def test_a_second_ctrl_c_writes_nothing_even_if_the_search_took_it_for_the_first
                 tick("search")
             except KeyboardInterrupt:
                 pass  # as a search does, which then goes on with its best
-        return None, ()
 
-    monkeypatch.setattr("ambid.job.identification.identify_nonlinear_used", takes_all)
+    monkeypatch.setattr("ambid.job.identification.identify_nonlinear", takes_all)
     found = ambid("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear", "--json", at / "ball.json")
     assert found.code == 130, found.out + found.err
     assert found.err == "ambid: interrupted; nothing was written\n"

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.report.estimate_text import curve_rows, estimate_text
+from ambid.job.presentation import text as estimate_text
+from ambid.report.estimate_page import estimate_page
+from ambid.report.estimate_text import curve_rows
 from ambid.report.figures import bearing_evidence, figures, overview
-from ambid.report.page import report_html
+from ambid.report.page import page_html
 from tests.bearing.magnet.estimates import by_hand, seen
 
 
@@ -96,7 +98,7 @@ def test_the_page_holds_all_and_escapes_names(evidence, estimate):
     renamed = {bad if n == "one.csv" else n: levels for n, levels in estimate.noise.items()}
     fits = {bad if n == "one.csv" else n: f for n, f in estimate.fit.items()}
     e = replace(estimate, noise=renamed, fit=fits)
-    page = report_html(replace(evidence, estimate=e), made="2001-02-03")
+    page = page_html(estimate_page(replace(evidence, estimate=e)), e.verdict, made="2001-02-03")
     assert "&lt;b&gt;one.csv" in page
     assert bad not in page
     assert page.count("data:image/png") == 3

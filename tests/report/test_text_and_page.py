@@ -6,8 +6,9 @@ from dataclasses import replace
 import pytest
 
 from ambid.estimation.estimate import Check
-from ambid.report.estimate_text import estimate_text
-from ambid.report.page import report_html
+from ambid.job.presentation import text as estimate_text
+from ambid.report.estimate_page import estimate_page
+from ambid.report.page import page_html
 from ambid.report.text import check_lines, columns, verdict
 
 
@@ -63,7 +64,7 @@ def test_a_failed_check_leaves_no_parameter_identified(unstable):
     assert e.verdict.word == "caution"
     assert not e.passed
     text = estimate_text(e, paint=lambda text, style: f"<{style}>{text}</>")
-    assert "verdict: <bad>use with caution</>" in text
+    assert "verdict: <doubt>use with caution</>" in text
     assert "<good>identified</>" not in text
     assert '"verdict": {\n  "word": "caution"' in e.dumps()
     unseen = replace(
@@ -109,7 +110,7 @@ def judged(unstable):
 
 @pytest.fixture(scope="module")
 def page(judged):
-    return report_html(judged, made="2001-01-01")
+    return page_html(estimate_page(judged), judged.estimate.verdict, made="2001-01-01")
 
 
 def test_the_report_holds_everything_and_needs_nothing_else(page, judged):
@@ -117,7 +118,7 @@ def test_the_report_holds_everything_and_needs_nothing_else(page, judged):
     assert "http" not in page
     assert page.count("data:image/png;base64,") == 4
     for p in judged.estimate.parameters:
-        assert f"<b>{p.name}</b>" in page
+        assert f"<th>{p.name}</th>" in page
     for name in judged.estimate.checks:
         assert name in page
     for words in ("ambid 0.", "numpy ", "made", "2001-01-01", "Correlations", "k_x &lt; 0"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.narmax import narmax
-from ambid.validation.fits import judge, objections, validation
+from ambid.validation.fits import judge, second_check, validation
 from tests.nonlinear.systems import smooth
 
 
@@ -17,7 +17,7 @@ def fit():
 
 
 def test_a_record_of_the_same_plant_has_nothing_against_it(fit):
-    assert objections(fit, validation(fit, smooth(seed=1))) == ()
+    assert second_check(fit, validation(fit, smooth(seed=1))).passed
 
 
 def test_errors_that_have_grown_are_told_with_their_size(fit):
@@ -26,16 +26,20 @@ def test_errors_that_have_grown_are_told_with_their_size(fit):
     found = validation(fit, noisy)
     times = found["y"]["one_step"]["rmse"] / fit.fit["y"].innovation_sd
     assert times > 3
-    assert f"one-step errors of y are {times:.3g} times as large as at identification" in objections(fit, found)
+    assert (
+        f"one-step errors of y are {times:.3g} times as large as at identification" in second_check(fit, found).detail
+    )
 
 
 def test_a_record_outside_the_training_data_is_told(fit):
     found = validation(fit, smooth(seed=1))
     far = {"y": {**found["y"], "extrapolated": 0.2}}
-    assert any(x.startswith("20 % of it lies outside") for x in objections(fit, far))
+    assert "20 % of it lies outside" in second_check(fit, far).detail
     near = {"y": {**found["y"], "extrapolated": 0.1}}
-    assert objections(fit, near) == ()
+    assert second_check(fit, near).passed
 
 
 def test_a_prediction_that_runs_away_is_told(fit):
-    assert objections(fit, {"y": {"one_step": None, "simulation": None}}) == ("the one-step prediction of y diverges",)
+    found = second_check(fit, {"y": {"one_step": None, "simulation": None}})
+    assert not found.passed
+    assert found.detail.endswith("the one-step prediction of y diverges")

@@ -22,6 +22,7 @@ from ambid.blackbox.frequency import Lines, check_lines
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, Judged, Parametric
 from ambid.estimation.linear import directions, one_thread
+from ambid.estimation.result import Linear
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 from ambid.physics.linear_model import LinearModel, Parameter
 from ambid.signals.response import FrequencyResponse
@@ -178,8 +179,8 @@ class PhysicalProblem:
                          for p in self.estimated if p.role == "prior"])  # fmt: skip
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FrequencyEstimate(Parametric, Judged):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class FrequencyEstimate(Parametric, Judged, Linear):
     """Physical parameters from a frequency response."""
 
     status: Literal["converged", "stalled"]

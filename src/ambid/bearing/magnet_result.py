@@ -30,6 +30,7 @@ from ambid.estimation.estimate import (
     read_as,
     read_whole,
 )
+from ambid.estimation.result import Linear, Predicting
 from ambid.physics.coenergy_law import MagnetLaw
 
 
@@ -69,8 +70,8 @@ class Curves:
     coil_inside: NDArray[np.bool_]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class NonlinearBearingEstimate(Parametric, Judged):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
     """Result of the nonlinear grey box.
 
     Attributes

@@ -20,18 +20,22 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_to_json
 from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
-from ambid.estimation.estimate import covariance_together, fields_json, plain_json
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import EstimatedParameter, covariance_together, fields_json, plain_json
+from ambid.estimation.result import Reason, Result
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.linear_model import model as physical_model
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 
+_NOISY = 0.25  # standard deviation over magnitude, median of the lines, from which a response is noise
+_LINES = 10
 _STEP = 1e-3  # standard deviations of a coefficient over which a difference is taken
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Measured:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Measured(Result):
     """A frequency response of one record and the models that were fitted to it, file schema ``ambid.frf/1``.
 
     Attributes
@@ -60,9 +64,28 @@ class Measured:
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
     @property
-    def passed(self) -> bool:
-        """Whether every fit converged and passed its checks; a response alone has none to fail."""
-        return all(x is None or x.passed for x in (self.fit, self.estimate))
+    def reasons(self) -> tuple[Reason, ...]:
+        """A response that noise hides or that has few lines, and what stands against the models fitted to it."""
+        frf, found = self.response, list[Reason]()
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.nanmedian(frf.sd / np.abs(frf.G), axis=0)
+        worst = np.unravel_index(np.nanargmax(share), share.shape) if np.any(np.isfinite(share)) else None
+        if worst is not None and share[worst] > _NOISY:
+            pair = f"{frf.inputs[worst[1]]} → {frf.outputs[worst[0]]}"
+            text = f"the noise of {pair} is {share[worst]:.0%} of it at half of the lines. Excite more, or longer"
+            found.append(Reason(check="noise", text=text, grave=bool(share[worst] > 1.0)))
+        if frf.frequency_hz.size < _LINES:
+            text = f"{frf.frequency_hz.size} lines are few to see a response by. Take a longer record or a wider band"
+            found.append(Reason(check="lines", text=text))
+        for name, model in (("fit", self.fit), ("physical", self.estimate)):
+            found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
+        return tuple(found)
+
+    def __getitem__(self, name: str) -> EstimatedParameter:
+        model = self.estimate or self.fit
+        if model is None:
+            raise EstimationError("no model was fitted to this response. Give orders=, state_space= or rig=")
+        return model[name]
 
     @property
     def distortion_sd(self) -> Array | None:

@@ -26,6 +26,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, Parametric
 from ambid.estimation.linear import one_thread
+from ambid.estimation.result import Reason, Result
 from ambid.estimation.uncertainty import WEAK, natural_sizes, p_text, weakest_direction
 from ambid.physics.linear_model import LinearModel, Parameter
 
@@ -33,8 +34,8 @@ _MISFIT = 1e-3  # probability of the misfit below which a black box does not agr
 _GROSS = 25.0  # chi-square over degrees of freedom from which nothing of it is believed
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PhysicalFit(Parametric):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class PhysicalFit(Parametric, Result):
     """Physical parameters that follow from a black-box model."""
 
     model: str  # name of the physical model
@@ -51,9 +52,14 @@ class PhysicalFit(Parametric):
     warnings: tuple[str, ...] = ()
 
     @property
-    def passed(self) -> bool:
-        """Whether the black box can be this physics and shows every parameter."""
-        return self.misfit.passed and all(p.identifiable for p in self.parameters)
+    def reasons(self) -> tuple[Reason, ...]:
+        """A black box that cannot be this physics, and parameters that it does not show."""
+        found = [] if self.misfit.passed else [Reason(check="misfit", text=self.misfit.detail)]
+        unseen = ", ".join(p.name for p in self.parameters if not p.identifiable)
+        if unseen:
+            text = f"the fit does not show {unseen}. Excite more, or give a prior"
+            found.append(Reason(check="identifiable", text=text))
+        return tuple(found)
 
 
 def physical_parameters(

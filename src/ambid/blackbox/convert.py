@@ -78,6 +78,11 @@ def to_control(model: BlackBoxModel) -> Any:
     return control.tf([[n for n, _ in row] for row in pairs], [[d for _, d in row] for row in pairs], dt)
 
 
+def state_space_to_control(A: Array, B: Array, C: Array) -> Any:
+    """Return a continuous plant without direct path as a control.StateSpace."""
+    return _control().ss(A, B, C, [[0.0] * B.shape[1]] * C.shape[0])
+
+
 def _control() -> Any:
     try:
         import control

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from importlib import import_module
+from types import MappingProxyType
 from typing import Any, Literal
 
 import numpy as np
@@ -14,6 +15,7 @@ from ambid.blackbox.data import IOData, UsedOrders
 from ambid.blackbox.model import BlackBoxModel, Offsets
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import FittedModel
+from ambid.estimation.result import Linear, Reason
 
 Feedback = Literal["consistent", "biased", "with noise model"]
 Kind = Literal["polynomial", "state space", "transfer function"]
@@ -153,8 +155,8 @@ def any_structure(name: str) -> Structure:
     return RESPONSE_STRUCTURES[name] if name in RESPONSE_STRUCTURES else structure(name)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BlackBoxFit(FittedModel):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class BlackBoxFit(FittedModel, Linear):
     """An identified black-box model, file schema ``ambid.fit/1``.
 
     Attributes
@@ -189,6 +191,9 @@ class BlackBoxFit(FittedModel):
     timing_s : Mapping[str, float]
     details : Mapping[str, object]
         Further results of the method as JSON-able values (singular values, condition numbers, chosen horizons).
+    derived : Mapping[str, object]
+        What was worked out from it, by name: ``physical`` parameters of a rig, ``sensitivity`` of the coefficients.
+        Written, but not read back.
     """
 
     orders: UsedOrders
@@ -196,6 +201,13 @@ class BlackBoxFit(FittedModel):
     offsets: Offsets
     record: Mapping[str, object]
     status: Literal["converged", "stalled"] = "converged"
+    derived: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}), metadata={"written": False})
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Those of the fit, and of the physical parameters that were derived from it."""
+        physical = getattr(self.derived.get("physical"), "reasons", ())
+        return (*super(BlackBoxFit, self).reasons, *(replace(r, check=f"physical.{r.check}") for r in physical))
 
 
 def build_fit(

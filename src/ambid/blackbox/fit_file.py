@@ -19,7 +19,15 @@ from ambid.blackbox.model import (
     pole_covariance,
 )
 from ambid.errors import ModelError
-from ambid.estimation.estimate import fit_document, json_text, only_outputs, read_as, read_fit
+from ambid.estimation.estimate import (
+    covariance_together,
+    fields_json,
+    fit_document,
+    json_text,
+    only_outputs,
+    read_as,
+    read_fit,
+)
 
 _LARGEST = 1e100  # what a number in a file may be: beyond, its square is not finite any more
 NO_INNOVATIONS = (
@@ -28,8 +36,12 @@ NO_INNOVATIONS = (
 
 
 def fit_text(fit: BlackBoxFit) -> str:
-    """Return the JSON text of a fit."""
-    return json_text(fit_to_json(fit))
+    """Return the JSON text of a fit, with what was derived from it."""
+    document = fit_to_json(fit)
+    for name, x in fit.derived.items():
+        entries = fields_json(x, without=("structure", "singular_values", "weakest") if name == "physical" else ())
+        document[name] = covariance_together(entries) if name == "physical" else entries
+    return json_text(document)
 
 
 def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:

@@ -31,24 +31,23 @@ def command(
         float, opt.switch("--holdout", "Part of the record held back to judge on, where there is no second.")
     ] = 0.3,
     json: opt.JsonFile = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
     strict: opt.Strict = False,
 ) -> None:
     """Fit several structures to a record and compare them on data that none of them has seen.
 
     Without --validate, the last part of the record is held back. Best first.
     """
-    from ambid.estimation.estimate import json_text, plain_json
     from ambid.job import compare
-    from ambid.report.tables import comparison_text
 
-    with Outputs(record, second, json=json) as outputs:
+    with Outputs(record, second, json=json, plot=plot, report=report) as outputs:
         with progress("compare") as tick:
             found = compare(
                 record, candidates, input=inputs, output=output, reference=reference,
                 open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, validate=second,
                 holdout=holdout, tick=tick,
             )  # fmt: skip
-        document = {"schema": "ambid.comparison/1", "record": record.name, **plain_json(found.as_dict())}
-        outputs.keep(json_text(document))
-    outputs.show(lambda paint: comparison_text(found, paint=paint))
-    end(failed=strict and any(e.fit is None or not e.fit.passed for e in found.entries))
+            outputs.give(found, tick)
+    outputs.show(found)
+    end(failed=strict and not found.passed)

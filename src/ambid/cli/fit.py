@@ -4,22 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from math import inf
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from ambid.cli import options as opt
 from ambid.cli.interrupts import Stop, interruptible, signals
 from ambid.cli.options import option, switch
-from ambid.cli.output import FIGURE_ENDINGS, Outputs, end
+from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import EstimationError, refuse_given
-
-if TYPE_CHECKING:
-    from ambid.blackbox.fit import BlackBoxFit
-    from ambid.nonlinear.fit import NonlinearFit
+from ambid.job.files import FIGURE_ENDINGS
 
 Part = tuple[float | None, float | None]
 
@@ -82,6 +80,7 @@ def command(
             " learning curves.",
         ),
     ] = None,
+    report: opt.Report = None,
     stabilisation: Annotated[
         Path | None,
         option(
@@ -100,9 +99,8 @@ def command(
     With --rig, inputs and outputs are the rig's, and a linear fit is carried on to its physical parameters.
     Ctrl-C during a nonlinear fit keeps the best model so far (exit code 130).
     """
-    from ambid.job import fit, physics, read_data
+    from ambid.job import fit, physics
     from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
-    from ambid.report.fit_text import fit_text
     from ambid.rig import load_rig
 
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)
@@ -111,8 +109,8 @@ def command(
             {"--stabilisation": stabilisation, "--sensitivity": sensitivity},
             f"{{}} is for linear structures; {structure} has no use for it. Leave it out",
         )
-    stop, extras = Stop(), list[tuple[str, Any, Callable[..., str]]]()
-    with Outputs(*records, second, rig, json=json, plot=plot) as outputs:
+    stop = Stop()
+    with Outputs(*records, second, rig, json=json, plot=plot, report=report) as outputs:
         outputs.claim(stabilisation, "--stabilisation", FIGURE_ENDINGS)
         opt.refuse_twice(records)
         if nonlinear:
@@ -129,33 +127,18 @@ def command(
             )  # fmt: skip
             stop.torn()
             if bench is not None and not nonlinear:
-                from ambid.report.estimate_text import physics_text
+                found = replace(found, derived={"physical": physics(found, bench)})
+            data = found.used[0]
+            if sensitivity:
+                from ambid.validation.sensitivity import sensitivity_analysis
 
-                extras.append(("physical", physics(found, bench), physics_text))
-            drawn = plot if found.status != "failed" else None
-            if drawn is not None or stabilisation is not None or sensitivity:
-                from ambid.report.fit_figures import fit_overview
-
-                data = [read_data(x, part=part, **columns) for x in records]
-                other = None if second is None or not nonlinear else read_data(second, part=second_part, **columns)
-                if sensitivity:
-                    from ambid.report.tables import sensitivity_text
-                    from ambid.validation.sensitivity import sensitivity_analysis
-
-                    extras.append(("sensitivity", sensitivity_analysis(found, data[0]), sensitivity_text))
-                outputs.draw(drawn, lambda: fit_overview(found, data, other), show)
-                outputs.draw(stabilisation, lambda: _poles_by_order(found, data[0], show), show)
-        outputs.keep(_json_text(found, extras))
-    outputs.show(
-        lambda paint: "\n\n".join([fit_text(found, paint=paint), *(text(x, paint=paint) for _, x, text in extras)])
-    )
+                found = replace(found, derived={**found.derived, "sensitivity": sensitivity_analysis(found, data[0])})
+            outputs.draw(stabilisation, lambda: _poles_by_order(found, data[0], show), show)
+            outputs.give(found, show)
+    outputs.show(found)
     if stop.wished():
         raise typer.Exit(stop.code)
-    against = against_second(found)
-    if json != "-" and against:
-        typer.echo("\n".join(against))
-    sound = found.passed and all(x.passed for name, x, _ in extras if name == "physical")
-    end(failed=found.status == "failed" or (strict and (bool(against) or not sound)))
+    end(failed=found.status == "failed" or (strict and not found.passed))
 
 
 def _check_second(records: Sequence[Path], part: Part, second: Path | None, second_part: Part) -> None:
@@ -171,36 +154,9 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
         )
 
 
-def against_second(found: BlackBoxFit | NonlinearFit) -> list[str]:
-    """Say why a fit does not hold on the second record, a line for each reason; empty where it was not judged there."""
-    from ambid.validation.fits import objections
-
-    validation: Any = found.validation
-    against = () if validation is None else objections(found, validation)
-    return [f"it does not hold on the second record: {x}" for x in against]
-
-
 def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
     from ambid.report.response_figures import stabilisation_figure
     from ambid.validation.stabilisation import stabilisation
 
     method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
     return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))
-
-
-def _json_text(found: Any, extras: Sequence[tuple[str, Any, object]]) -> str:
-    """Put a fit into ``ambid.fit/1``, with ``physical`` of a rig and ``sensitivity`` where they were asked for."""
-    from ambid.blackbox.fit import BlackBoxFit
-    from ambid.estimation.estimate import covariance_together, fields_json, json_text
-
-    if not isinstance(found, BlackBoxFit):
-        from ambid.nonlinear.fit_file import nonlinear_fit_text
-
-        return nonlinear_fit_text(found)
-    from ambid.blackbox.fit_file import fit_to_json
-
-    document = fit_to_json(found)
-    for name, x, _ in extras:
-        entries = fields_json(x, without=("structure", "singular_values", "weakest") if name == "physical" else ())
-        document[name] = covariance_together(entries) if name == "physical" else entries
-    return json_text(document)

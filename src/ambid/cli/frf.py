@@ -55,6 +55,7 @@ def command(
     gaps: opt.Gaps = None,
     json: opt.JsonFile = None,
     plot: Annotated[Path | None, option("--plot FILE.png", "Draw response, levels and models.")] = None,
+    report: opt.Report = None,
     strict: opt.Strict = False,
 ) -> None:
     """Measure a frequency response with its noise and distortion, and fit models to it.
@@ -62,12 +63,9 @@ def command(
     With --reference (the loop's outer excitation) feedback does not bias it. With --rig, physical parameters come out,
     and inputs and outputs are the rig's.
     """
-    from ambid.bearing.measured import measured_text
     from ambid.job import frf
-    from ambid.report.fit_text import frf_text
-    from ambid.report.response_figures import frf_figure
 
-    with Outputs(record, rig, json=json, plot=plot) as outputs:
+    with Outputs(record, rig, json=json, plot=plot, report=report) as outputs:
         between, n, late = opt.band_of(band), _order(state_space), _delay(delay)
         with progress("measure") as tick:
             found = frf(
@@ -75,9 +73,8 @@ def command(
                 method=method, hold=hold, band=between, orders=orders, state_space=n, feedthrough=feedthrough,
                 domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
             )  # fmt: skip
-            outputs.draw(plot, lambda: frf_figure(found), tick)
-        outputs.keep(measured_text(found))
-    outputs.show(lambda paint: frf_text(found, paint=paint))
+            outputs.give(found, tick)
+    outputs.show(found)
     end(failed=strict and not found.passed)
 
 

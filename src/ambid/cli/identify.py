@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from math import isfinite
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -16,6 +16,10 @@ from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError, refuse_given
+
+if TYPE_CHECKING:
+    from ambid.bearing.magnet_result import NonlinearBearingEstimate
+    from ambid.estimation.estimate import Estimate
 
 
 def command(
@@ -66,7 +70,7 @@ def command(
             "Draw signals, residuals, Bode and poles; with --nonlinear curves with bands, and every record.",
         ),
     ] = None,
-    report: Annotated[Path | None, option("--report FILE.html", "Write a report, all in one file.")] = None,
+    report: opt.Report = None,
     strict: opt.Strict = False,
 ) -> None:
     """Identify the physical parameters of a bench from a record of voltage, current and position.
@@ -76,7 +80,6 @@ def command(
     of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
     from ambid.job import identification as job
-    from ambid.report.estimate_text import estimate_text
 
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
@@ -89,26 +92,18 @@ def command(
         else:
             _check_linear(records, {"held": kept, **own})
         with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
-            estimate, used = (
-                job.identify_nonlinear_used(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
+            estimate: Estimate | NonlinearBearingEstimate = (
+                job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
-                else job.identify_used(records[0], rig, tick=show, **how)
+                else job.identify(records[0], rig, tick=show, **how)
             )
             stop.torn()
-            if plot or report:
-                from ambid.report.figures import overview  # much is loaded for it
-
-                evidence = job.evidence_of(estimate, used)
-                outputs.draw(plot, lambda: overview(evidence), show)
-                if report:
-                    outputs.stage_text(report, job.report_of(evidence))
-        outputs.keep(estimate.dumps())
-    outputs.show(lambda paint: estimate_text(estimate, paint=paint))
+            outputs.give(estimate, show)
+    outputs.show(estimate)
     search = getattr(estimate, "global_search", None)
     if stop.wished() or (search is not None and search["interrupted"]):
         raise typer.Exit(stop.code or INTERRUPTED)
-    validated = estimate.validation is None or bool(estimate.validation["passed"])
-    end(failed=strict and not (estimate.passed and validated))
+    end(failed=strict and not estimate.passed)
 
 
 def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:

@@ -54,6 +54,8 @@ JsonFile = Annotated[str | None, option("--json FILE", "Write the result as JSON
 TrackFile = Annotated[
     str | None, option("--json FILE", "Write the track as lines of JSON while it comes; - for standard output.")
 ]
+Plot = Annotated[Path | None, option("--plot FILE.png", "Draw the result.")]
+Report = Annotated[Path | None, option("--report FILE.html", "Write a report, all in one file.")]
 Strict = Annotated[bool, switch("--strict", "End with exit code 3 if the search did not converge or a check failed.")]
 Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeat for several.")]
 OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeat for several.")]

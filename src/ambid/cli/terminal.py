@@ -22,7 +22,13 @@ if TYPE_CHECKING:
     from ambid.report.text import Paint, Style
 
 _PLAIN = {"±": "+-", "…": "..", "✓": "ok", "✗": "FAILED", "–": "-", "→": "->", "°": "deg", "µ": "u", "√": "sqrt"}
-_COLOURS = {"good": {"fg": "green"}, "bad": {"fg": "red", "bold": True}, "dim": {"dim": True}, "strong": {"bold": True}}
+_COLOURS = {
+    "good": {"fg": "green"},
+    "doubt": {"fg": "yellow", "bold": True},
+    "bad": {"fg": "red", "bold": True},
+    "dim": {"dim": True},
+    "strong": {"bold": True},
+}
 _QUIET_S = 1.0  # a job that is done sooner shows no progress
 _FEWEST = 3  # evaluations before anything is guessed from their number
 _EXPECTED = 30  # evaluations of a whole identification; its checks refit, which takes about as long

@@ -23,9 +23,11 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.estimation.result import Linear, Predicting, Reason, Result, Simulating
 from ambid.physics.linear_model import Parameter, model
 
 _NORMAL_95 = 1.959963984540054
+_SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,30 +102,16 @@ class OutputFit:
     innovation_sd: float  # SI
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Reason:
-    """Why a result is not simply usable."""
+_GRAVE = frozenset({"units", "plausible", "delay_in_range", "finite_prediction", "stable_predictor"})
+"""Checks after whose failure no number is to be used."""
 
-    check: str  # its name; ``"status"`` for the search itself
-    text: str  # what was found, and what to do
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Verdict:
-    """Whether a result may be used, and what stands against it."""
-
-    word: Literal["usable", "caution", "unusable"]
-    reasons: tuple[Reason, ...]
-
-
-_GRAVE = frozenset({"units", "plausible", "delay_in_range"})  # checks after whose failure no number is to be used
 _UNFINISHED = {
     "stalled": "the search did not converge: its numbers are a first guess. Excite more, or give start values",
     "failed": "the search found no model of this record. Check columns, signs and fixed values",
 }
 
 
-class Judged:
+class Judged(Result):
     """A result with a status and checks."""
 
     __slots__ = ()
@@ -131,24 +119,15 @@ class Judged:
     checks: Mapping[str, Check]
 
     @property
-    def passed(self) -> bool:
-        """Whether the search converged and every check passed."""
-        return self.verdict.word == "usable"
-
-    @property
-    def verdict(self) -> Verdict:
-        """Whether the result may be used, with each check that failed as a reason."""
-        failed = {name: c.detail for name, c in self.checks.items() if not c.passed}
-        failed = {name: failed[name] for name in sorted(failed, key=lambda name: name not in _GRAVE)}
-        second = (getattr(self, "validation", None) or {}).get("checks", {})
-        failed |= {f"validation.{name}": str(c["detail"]) for name, c in second.items() if not c["passed"]}
-        grave = self.status != "converged" or not _GRAVE.isdisjoint(failed)
-        if self.status != "converged":
-            failed = {"status": _UNFINISHED[self.status], **failed}
-        return Verdict(
-            word="unusable" if grave else "caution" if failed else "usable",
-            reasons=tuple(Reason(check=name, text=text) for name, text in failed.items()),
+    def reasons(self) -> tuple[Reason, ...]:
+        """A search that did not end well, and each check that failed, on a second record too."""
+        failed = (
+            [] if self.status == "converged" else [Reason(check="status", text=_UNFINISHED[self.status], grave=True)]
         )
+        failed += [Reason(check=k, text=c.detail, grave=k in _GRAVE) for k, c in self.checks.items() if not c.passed]
+        second = (getattr(self, "validation", None) or {}).get("checks", {})
+        failed += [Reason(check=f"validation.{k}", text=c["detail"]) for k, c in second.items() if not c["passed"]]
+        return tuple(failed)
 
 
 class Parametric:
@@ -176,8 +155,8 @@ class Parametric:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class FittedModel(Judged):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class FittedModel(Parametric, Judged, Predicting, Simulating):
     """What the fits of all structures hold, linear or not; their own classes say what it means there."""
 
     structure: str
@@ -195,6 +174,21 @@ class FittedModel(Judged):
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def parameters(self) -> tuple[EstimatedParameter, ...]:  # type: ignore[override]
+        """Coefficients by the model's names, SI; one that was not estimated is fixed."""
+        model: Any = getattr(self, "model", None)
+        if model is None:
+            return ()
+        spread = np.full(model.theta.size, np.nan) if self.sd is None else self.sd
+        return tuple(
+            EstimatedParameter(
+                name=name, unit="1", value=x, sd=sd, ci95=(x - _NORMAL_95 * sd, x + _NORMAL_95 * sd),
+                role="fixed" if sd == 0 else "free", identifiable=bool(sd <= _SEEN * abs(x)),
+            )
+            for name, x, sd in zip(model.names, model.theta.tolist(), spread.tolist(), strict=True)
+        )  # fmt: skip
 
     @property
     def sd(self) -> Array | None:
@@ -243,8 +237,9 @@ def plain_json(value: Any) -> Any:
 
 def fields_json(value: Any, *, without: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, by name, and the verdict of a result that has one."""
-    found = {f.name: plain_json(getattr(value, f.name)) for f in fields(value) if f.name not in without}
-    return {"verdict": plain_json(value.verdict), **found} if isinstance(value, Judged) else found
+    written = (f.name for f in fields(value) if f.name not in without and f.metadata.get("written", True))
+    found = {name: plain_json(getattr(value, name)) for name in written}
+    return {"verdict": plain_json(value.verdict), **found} if isinstance(value, Result) else found
 
 
 def covariance_together(document: dict[str, Any]) -> dict[str, Any]:
@@ -496,8 +491,8 @@ class NoiseModel:
     sensor_sd: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Estimate(Parametric, Judged):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     """Result of the main job.
 
     Attributes

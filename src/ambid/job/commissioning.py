@@ -24,8 +24,8 @@ from ambid.estimation.estimate import Estimate
 from ambid.estimation.progress import Tick, silent
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Step, StepName, Wishes
-from ambid.job.data import load_bench
-from ambid.job.identification import evidence_of, identify, report_of
+from ambid.job.identification import identify
+from ambid.job.presentation import page
 from ambid.job.track_live import track_live
 from ambid.rig import Rig, rig_text
 from ambid.tracking.lines_file import TrackWriter
@@ -247,8 +247,7 @@ class _Guide:
     def _report(self) -> Step:
         assert self.estimate is not None
         self._tick("report")
-        evidence = evidence_of(self.estimate, load_bench(self._place / "record.h5", self._rig))
-        write_text(self._place / "report.html", report_of(evidence))
+        write_text(self._place / "report.html", page(self.estimate))
         return Step(name="report", findings=(f"{self._place / 'report.html'}",))
 
     def _track(self, amplitude_v: float) -> Step:

@@ -159,7 +159,7 @@ def fit(
             else _estimate_linear(structure_named(structure), data[0], second, wanted, criterion, options, clock, say)
         )
         clock.lap("checks")
-    return replace(found, timing_s=clock.laps)  # type: ignore[no-any-return]
+    return replace(found, timing_s=clock.laps, used=(data, second))  # type: ignore[no-any-return]
 
 
 def _estimate_linear(

@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Unpack
+from typing import TYPE_CHECKING, Literal, Unpack
 
 import numpy as np
 
@@ -27,8 +27,7 @@ if TYPE_CHECKING:
     from ambid.bearing.multistart import Signals
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
-    from ambid.job.bearing_records import BearingWords, TakenRecord
-    from ambid.report.figures import BearingEvidence, Evidence
+    from ambid.job.bearing_records import BearingWords
 
 
 def identify(
@@ -66,18 +65,6 @@ def identify(
     EstimationError
         If nothing can be identified from the record.
     """
-    return identify_used(record, rig, validate=validate, tick=tick, **reading)[0]
-
-
-def identify_used(
-    record: Source,
-    rig: Rig | str | Path | None,
-    *,
-    validate: Source | None = None,
-    tick: Tick | None = None,
-    **reading: Unpack[Reading],
-) -> tuple[Estimate, Record]:
-    """Return what `identify` does, and the part of the record that was used."""
     from ambid.bearing.linear import greybox
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
@@ -103,7 +90,7 @@ def identify_used(
         other = signals_of(load_bench(validate, rig, **reading), plant)
         estimate = replace(estimate, validation=validation(estimate, other))
         clock.lap("validate")
-    return replace(estimate, timing_s=clock.laps), bench
+    return replace(estimate, timing_s=clock.laps, used=bench)
 
 
 def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
@@ -222,19 +209,6 @@ def identify_nonlinear(
     EstimationError
         If nothing can be identified from the records.
     """
-    return identify_nonlinear_used(records, rig, held=held, validate=validate, tick=tick, **words)[0]
-
-
-def identify_nonlinear_used(
-    records: Sequence[Source],
-    rig: Rig | str | Path | None,
-    *,
-    held: Sequence[Source],
-    validate: Source | None,
-    tick: Tick | None,
-    **words: Unpack[BearingWords],
-) -> tuple[NonlinearBearingEstimate, tuple[TakenRecord, ...]]:
-    """Return what `identify_nonlinear` does, and the records as they were used, held ones last."""
     from ambid.bearing.magnet_estimate import estimate_bearing
     from ambid.bearing.magnet_likelihood import uncertainty
     from ambid.job.bearing_estimate import judge_bearing
@@ -260,27 +234,7 @@ def identify_nonlinear_used(
     say("check")
     estimate = judge_bearing(fit, uncertainty(fit), taken, delay_given=wanted != "auto")
     clock.lap("checks")
-    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench))
+    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=taken)
     if second is not None:
         estimate = replace(estimate, validation=validation(estimate, second.record))
-    return estimate, taken
-
-
-def evidence_of(estimate: Estimate | NonlinearBearingEstimate, used: Any) -> Evidence | BearingEvidence:
-    """Return what figures and report show beside an estimate: the record or records `used`, run through it again."""
-    from ambid.report.figures import Evidence, bearing_evidence
-    from ambid.validation.second_record import replay
-
-    if not isinstance(estimate, Estimate):
-        return bearing_evidence(estimate, [(t.record, t.start_s) for t in used])
-    run = replay(estimate, signals_of(used, model(estimate.model)))
-    return Evidence(estimate=estimate, run=run, start_s=used.start_s)
-
-
-def report_of(evidence: Evidence | BearingEvidence) -> str:
-    """Return the report of an estimate with the present date."""
-    from datetime import UTC, datetime
-
-    from ambid.report.page import report_html
-
-    return report_html(evidence, made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"))
+    return estimate

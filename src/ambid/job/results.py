@@ -10,18 +10,19 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_j
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.estimate import FIT_SCHEMA, Estimate, estimate_from_json
+from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
-from ambid.job.data import Channels, Reading, Source, check_same_bench, load_bench, signals_of
+from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 from ambid.physics.linear_model import model
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
-from ambid.validation.fits import objections
+from ambid.validation.fits import second_check
 from ambid.validation.fits import validation as fit_validation
 from ambid.validation.second_record import validation
+from ambid.validation.second_result import Validation
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate
@@ -75,43 +76,90 @@ def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:
     return found
 
 
-def validate(
-    known: AnyEstimate | AnyFit, path: Path, record: Source, rig: Rig | None = None, **reading: Unpack[Reading]
-) -> dict[str, Any]:
-    """Judge a result on a further record, of a rotor that moves.
+def data_of(
+    known: AnyEstimate | AnyFit, record: Any, rig: Rig | None = None, *, where: str, **reading: Unpack[Reading]
+) -> Any:
+    """Read a further record as a result wants it: a Record, IOData of a fit, a TakenRecord of a nonlinear bearing.
 
-    `path`: its file, for messages; `rig`: through which the record is read; default: as the result remembers it.
-    Returns with ``passed``; of a fit ``samples``, ``fit`` by output and ``objections``.
+    `rig`: through which it is read; default: as the result remembers it; `where`: name of the result, for messages.
     """
-    part = reading.get("from_s"), reading.get("to_s")
     if isinstance(known, BlackBoxFit | NonlinearFit):
         if rig is not None:
-            raise EstimationError(f"{path.name} is a black-box fit, which knows no rig. Leave --rig out")
+            raise EstimationError(f"{where} is a black-box fit, which knows no rig. Leave --rig out")
         channels = Channels(
             inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps")
         )
-        data = channels.read(record, part)
+        data = channels.read(record, (reading.get("from_s"), reading.get("to_s")))
         check_same_bench(known.units, known.dt, data)
-        found = fit_validation(known, data)
-        against = objections(known, found)
-        return {"samples": data.n_samples, "fit": found, "passed": not against, "objections": list(against)}
-    bench = rig_of(known, path) if rig is None else rig
+        return data
+    bench = rig_of(known, where) if rig is None else rig
     if isinstance(known, Estimate):
-        return dict(validation(known, signals_of(load_bench(record, bench, **reading), model(known.model))))
+        return load_bench(record, bench, **reading)
     from ambid.job.bearing_records import bearing_rig, take_record
-    from ambid.validation.nonlinear_bearing import validation as bearing_validation
 
-    return dict(bearing_validation(known, take_record(record, bearing_rig(bench), reading).record))
+    return take_record(record, bearing_rig(bench), reading)
 
 
-def rig_of(estimate: AnyEstimate, path: Path) -> Rig:
-    """Return the rig that an estimate remembers; `path` is its file, for messages."""
+def validate(
+    estimate: AnyEstimate | AnyFit | str | Path,
+    record: Source,
+    rig: Rig | str | Path | None = None,
+    **reading: Unpack[Reading],
+) -> Validation:
+    """Judge an estimate or a fit on another record of the same bench: nothing is fitted but offsets and initial state.
+
+    Parameters
+    ----------
+    estimate : Estimate, NonlinearBearingEstimate, BlackBoxFit, NonlinearFit, str or Path
+        A result, or its file.
+    record : Record, str or Path
+        Of a rotor that moves.
+    rig : Rig, str or Path, optional
+        Through which the record is read; default: as the estimate remembers it.
+    **reading
+        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps``, see `ambid.job.data.Reading`.
+
+    Returns
+    -------
+    Validation
+
+    Raises
+    ------
+    AmbidError
+        If estimate, record or rig break a rule.
+    """
+    known = load(estimate) if isinstance(estimate, str | Path) else estimate
+    name = Path(estimate).name if isinstance(estimate, str | Path) else ""
+    data = data_of(known, record, None if rig is None else known_rig(rig), where=name or "the estimate", **reading)
+    if isinstance(known, BlackBoxFit | NonlinearFit):
+        fit = fit_validation(known, data)
+        found: dict[str, Any] = {
+            "fit": fit,
+            "checks": {"second_record": second_check(known, fit)},
+            "samples": data.n_samples,
+        }
+        model_name, source = known.structure, data.record
+    elif isinstance(known, Estimate):
+        found, model_name = dict(validation(known, signals_of(data, model(known.model)))), known.model
+        source = data.provenance
+    else:
+        from ambid.validation.nonlinear_bearing import validation as bearing_validation
+
+        found, model_name = dict(bearing_validation(known, data.record)), known.model
+        source = data.remembered
+    checks = {k: c if isinstance(c, Check) else read_as(Check, c, k) for k, c in found["checks"].items()}
+    return Validation(
+        used=(known, data), estimate=name, record=str(source.get("file") or ""), model=model_name,
+        samples=found["samples"], fit=found["fit"], checks=checks,
+    )  # fmt: skip
+
+
+def rig_of(estimate: AnyEstimate, where: str) -> Rig:
+    """Return the rig that an estimate remembers; `where` is its name, for messages."""
     text, folder = estimate.rig.get("text"), estimate.rig.get("folder")
     if not isinstance(text, str) or not isinstance(folder, str):
-        raise EstimationError(f"estimate {path} does not hold its rig. Give --rig")
+        raise EstimationError(f"{where} does not hold its rig. Give --rig")
     try:
         return rig_from_text(text, Path(folder) / "rig.toml")
     except AmbidError as error:
-        raise EstimationError(
-            f"estimate {path}: the rig that it remembers cannot be used: {error}. Or give --rig"
-        ) from None
+        raise EstimationError(f"{where}: the rig that it remembers cannot be used: {error}. Or give --rig") from None

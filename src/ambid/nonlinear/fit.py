@@ -155,7 +155,7 @@ class LearningCurve:
     held_out: Array = field(default_factory=lambda: np.empty(0))
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class NonlinearFit(FittedModel):
     """An identified nonlinear model, file schema ``ambid.fit/1``.
 

@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse
+from ambid.estimation.result import Verdict
 from ambid.report.numbers import prefixed, response_unit
+from ambid.report.text import WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -29,6 +31,8 @@ Pair = tuple[int, int]  # output, input
 MEASURED, PREDICTED, BAND, BOUND = "#444444", "#0b6fb8", "#9ecae8", "#c0392b"
 NORMAL_95, NORMAL_99 = 1.959963984540054, 2.5758293035489004
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
+_NAMED = 6  # reasons that stand in a figure
 _CHI2_95 = 5.991464547107979  # of two degrees of freedom
 PIXELS = 1200  # samples from which a curve is drawn as the band of its extremes
 _ZOOM = 240  # samples of a close view
@@ -47,6 +51,27 @@ def stacked(title: str, parts: Sequence[tuple[float, Draw]], width: float = 11.0
     for place, (_, draw) in zip(np.atleast_1d(places), parts, strict=True):
         draw(place)
     return page
+
+
+def judged(figure: Figure, found: Verdict) -> Figure:
+    """Put the verdict above a figure: its word in colour, and the names of the checks that speak against it."""
+    from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
+
+    words, style = WORDS[found.word]
+    names = ", ".join(r.check for r in found.reasons[:_NAMED]) + (", …" if len(found.reasons) > _NAMED else "")
+    parts = [
+        ("verdict: ", {}),
+        (words, {"color": STYLES[style], "weight": "bold"}),
+        (f" – {names}" if names else "", {}),
+    ]
+    line = HPacker(children=[TextArea(x, textprops={"size": 10, **how}) for x, how in parts], pad=0, sep=0)
+    box = AnchoredOffsetbox(
+        "upper left", child=line, frameon=False, bbox_to_anchor=(0.0, 1.0), bbox_transform=figure.transFigure
+    )
+    box.set_in_layout(False)
+    figure.add_artist(box)
+    figure.suptitle(f"\n{figure.get_suptitle()}", fontsize=12)  # the empty line is its place
+    return figure
 
 
 def single(height: float, draw: Draw) -> Figure:

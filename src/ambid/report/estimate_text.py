@@ -30,7 +30,6 @@ from ambid.report.text import (
     status_words,
     timing_lines,
     title_line,
-    verdict_lines,
     warning_lines,
 )
 from ambid.units import counted
@@ -38,6 +37,7 @@ from ambid.units import counted
 if TYPE_CHECKING:
     from ambid.bearing.frequency import FrequencyEstimate
     from ambid.bearing.physical import PhysicalFit
+    from ambid.validation.second_result import Validation
 
 AnyEstimate = Estimate | NonlinearBearingEstimate
 
@@ -46,13 +46,12 @@ _UNITS = {"position": "m", "current": "A"}
 
 
 def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write an estimate, linear or of a nonlinear bearing, for people; colour does not change the layout."""
+    """Write an estimate, linear or of a nonlinear bearing, below its verdict; colour does not change the layout."""
     curves = curve_lines(estimate, width=width) if isinstance(estimate, NonlinearBearingEstimate) else []
     warnings = warning_lines(other_warnings(estimate.checks, estimate.warnings), width=width, paint=paint)
     validation = estimate.validation
     return joined(
         [
-            verdict_lines(estimate.verdict, width=width, paint=paint),
             header_lines(estimate, width=width, paint=paint),
             warnings if curves else [],
             parameter_lines(estimate.parameters, width=width, paint=paint, found=estimate.verdict),
@@ -189,6 +188,27 @@ def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
         rms = f"{sized(float(f['innovation_rms']), _UNITS[role])} rms"
         rows.append((role, f"{f['one_step']:.4f}", rms, f"{100 * float(f['ratio']):.3g} %"))
     return rows
+
+
+def validation_text(found: Validation, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write how a result does on a further record, below its verdict."""
+    first = next(iter(found.fit.values()))
+    rows = second_rows(found.fit) if isinstance(first["one_step"], Mapping) else validation_rows({"fit": found.fit})
+    head = f"{paint(found.record or 'record', 'strong')} judged with {found.estimate or 'a result'}, {found.model}"
+    checks = check_lines(found.checks, width=width, paint=paint, above=True)
+    return joined([[f"{head}; {found.samples} samples"], columns(rows), checks])
+
+
+def second_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
+    """Return a table of how a fit does on a second record, by output; errors in SI."""
+    rows: list[tuple[str, ...]] = [("fit", "one step", "rmse", "simulation", "rmse")]
+    for output, found in validation.items():
+        rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
+    return rows
+
+
+def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
+    return ("–", "–") if found is None or found["fit"] is None else (fraction(found["fit"]), f"{found['rmse']:.4g}")
 
 
 def physics_text(found: PhysicalFit | FrequencyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:

@@ -18,6 +18,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.physics.linear_model import model
 from ambid.report.drawing import (
     MEASURED,
+    PREDICTED,
     Pole,
     Traces,
     bode_panel,
@@ -42,6 +43,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     from ambid.report.drawing import Draw
+    from ambid.validation.second_result import Validation
 
 _LOWEST_HZ = 0.1
 _WIDEST = 1e9  # rad/s, standard deviation from which a pole counts as multiple: its derivative does not exist
@@ -57,7 +59,7 @@ class Evidence:
     """What the figures of an estimate show beside it."""
 
     estimate: Estimate
-    run: Replay  # a record run through the estimate's predictor
+    run: Replay | None  # a record run through the estimate's predictor; None: only what needs none is drawn
     start_s: float = 0.0  # time of the record's first sample in s
 
     @property
@@ -69,6 +71,7 @@ class Evidence:
     def traces(self) -> Traces:
         """What the panels of signals and residuals draw."""
         run, plant = self.run, model(self.estimate.model)
+        assert run is not None
         rate_hz = run.fit.problem.rate_hz
         return Traces(
             time_s=self.start_s + (run.first + np.arange(run.measured.shape[0])) / rate_hz,
@@ -82,11 +85,17 @@ class Evidence:
 
     def drawings(self) -> dict[str, tuple[float, Draw]]:
         """Return the drawings by name, each with its height in inches."""
-        traces, estimate = self.traces, self.estimate
-        n_y = len(traces.names)
+        estimate = self.estimate
+        found: dict[str, tuple[float, Draw]] = {}
+        if self.run is not None:
+            traces = self.traces
+            n_y = len(traces.names)
+            found |= {
+                "signals": (2.3 * n_y, lambda place: signals_panel(place, traces)),
+                "residuals": (2.2 * n_y, lambda place: residuals_panel(place, traces)),
+            }
         return {
-            "signals": (2.3 * n_y, lambda place: signals_panel(place, traces)),
-            "residuals": (2.2 * n_y, lambda place: residuals_panel(place, traces)),
+            **found,
             "bode": (4.6, lambda place: _bode(place, estimate)),
             "poles": (3.4, lambda place: _poles(place, estimate)),
         }
@@ -97,7 +106,7 @@ class BearingEvidence:
     """What the figures of a nonlinear bearing show beside it."""
 
     estimate: NonlinearBearingEstimate
-    traces: tuple[Traces, ...]  # one for each of its records: position and current
+    traces: tuple[Traces, ...]  # one for each of its records, position and current; without any no record is drawn
 
     @property
     def title(self) -> str:
@@ -106,21 +115,22 @@ class BearingEvidence:
 
     def drawings(self) -> dict[str, tuple[float, Draw]]:
         """Return the drawings by name, each with its height in inches."""
-        height = 0.7 + _ROW * len(self.traces)
+        height, traces = 0.7 + _ROW * len(self.traces), self.traces
         return {
             "curves": (3.6, lambda place: _curves(place, self.estimate)),
             "map": (3.6, lambda place: _map(place, self)),
-            "records": (height, lambda place: records_panel(place, self.traces)),
+            **({"records": (height, lambda place: records_panel(place, traces))} if traces else {}),
         }
 
 
 def bearing_evidence(
     estimate: NonlinearBearingEstimate, records: Sequence[tuple[BearingRecord, float]]
 ) -> BearingEvidence:
-    """Run the records of an estimate, each with the time of its first sample, through it again."""
+    """Run the records of an estimate, or others, each with the time of its first sample, through it again."""
     traces = []
-    for name, (record, start_s) in zip(estimate.noise, records, strict=True):
-        run = nonlinear_bearing.replay(estimate, record, noise_of=name)
+    own = len(records) == len(estimate.noise)
+    for name, (record, start_s) in zip(estimate.noise if own else [r.name for r, _ in records], records, strict=True):
+        run = nonlinear_bearing.replay(estimate, record, noise_of=name if own else None)
         traces.append(
             Traces(
                 title=name,
@@ -143,6 +153,24 @@ def overview(evidence: Evidence | BearingEvidence) -> Figure:
 def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
     """Draw the figures one by one, as a report shows them."""
     return {name: single(height, draw) for name, (height, draw) in evidence.drawings().items()}
+
+
+def validation_figure(found: Validation) -> Figure:
+    """Draw the one-step fit of each output on a further record."""
+    sizes = {
+        k: v["one_step"]["fit"] if isinstance(v["one_step"], dict) else v["one_step"] for k, v in found.fit.items()
+    }
+
+    def draw(place: Figure | SubFigure) -> None:
+        axes = place.subplots()
+        axes.barh(list(sizes), [np.nan if x is None else x for x in sizes.values()], color=PREDICTED, height=0.5)
+        axes.set_xlabel("one-step fit, 1 is perfect")
+        axes.set_xlim(right=1.0)
+        grid(axes)
+
+    return stacked(
+        f"{found.record or 'record'} judged with {found.estimate or 'a result'}", [(1.0 + 0.5 * len(sizes), draw)]
+    )
 
 
 # --- a linear plant -------------------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import TransferModel, pole_covariance, zero_covariance
 from ambid.blackbox.prediction import innovations_form, one_step, plant_form, simulation
-from ambid.errors import EstimationError
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
@@ -50,6 +49,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure, SubFigure
 
     from ambid.report.drawing import Draw
+    from ambid.validation.comparison import Comparison
 
 MOST_COEFFICIENTS = 25
 _ACROSS = 5  # correlations beside each other
@@ -73,10 +73,8 @@ class Bars:
 def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None = None) -> Figure:
     """Draw all figures of a fit with a model on one page.
 
-    `second`: a further record that a nonlinear fit was judged on.
+    `second`: a further record that a nonlinear fit was judged on. Without records what needs none is drawn.
     """
-    if not records:
-        raise EstimationError("no record was given. Pass those that the fit was estimated from")
     parts, n_y = _signals(fit, records, second), len(fit.outputs)
     width = max(11.0, 4.5 * n_y) if len(records) > 1 or second is not None else 11.0
     if isinstance(fit, BlackBoxFit):
@@ -92,6 +90,27 @@ def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], sec
     return stacked(_title(fit, records, second), parts, width)
 
 
+def comparison_figure(found: Comparison) -> Figure:
+    """Draw the fit of each structure on data that it has not seen, best first."""
+    entries = [x for x in found.entries if x.fit is not None]
+
+    def draw(place: Figure | SubFigure) -> None:
+        axes, at = place.subplots(), np.arange(len(entries))
+        for values, label, color, shift in (
+            ([x.one_step for x in entries], "one step", PREDICTED, -0.2),
+            ([x.simulation for x in entries], "simulation", BAND, 0.2),
+        ):
+            axes.barh(at + shift, [np.nan if v is None else v for v in values], 0.38, color=color, label=label)
+        axes.set_yticks(at, [f"{x.structure}{' (failed checks)' if x.failed else ''}" for x in entries])
+        axes.invert_yaxis()
+        axes.set_xlabel(f"fit on the {found.judged_on}, 1 is perfect")
+        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=8)
+        grid(axes)
+
+    name = found.record.get("file") or "record"
+    return stacked(f"{name}: structures compared", [(1.4 + 0.5 * len(entries), draw)])
+
+
 def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[tuple[float, Draw]]:
     """Coefficients or bands, correlations of the errors, learning curves."""
     parts: list[tuple[float, Draw]] = []
@@ -99,10 +118,10 @@ def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IODat
     if bars is not None:
         rows = min(len(bars.names), _ROWS)
         parts.append((1.1 + 0.21 * rows, lambda place: _draw_bars(place, bars)))
-    if fit.covariance is not None and (bars is None or bars.n_others):
+    if fit.covariance is not None and (bars is None or bars.n_others) and records:
         where, data = ("the second record", second) if second is not None else (_name(records[0], 0), records[0])
         parts.append((0.9 + 2.1 * data.n_outputs, lambda place: _draw_band(place, fit, data, where)))
-    shown = _correlations(fit, records)
+    shown = _correlations(fit, records) if records else []
     if shown:
         parts.append((1.9 * -(-len(shown) // _ACROSS) + 0.4, lambda place: _draw_correlations(place, shown)))
     if any(c.training.size for c in fit.curves):
@@ -111,6 +130,8 @@ def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IODat
 
 
 def _title(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None) -> str:
+    if not records:
+        return fit.structure
     what = _name(records[0], 0) if len(records) == 1 else f"{len(records)} records"
     more = f", validated on {_name(second, 0)}" if second is not None else ""
     left = len(records) - _RECORDS
@@ -126,6 +147,8 @@ def _signals(
     fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None
 ) -> list[tuple[float, Draw]]:
     """One record large, with a close view; several below each other."""
+    if not records:
+        return []
     found = [traces_of(fit, x, _name(x, k)) for k, x in enumerate(records[:_RECORDS])]
     if second is not None:
         title = f"second record, not fitted: {second.record.get('file') or 'record'}"

@@ -15,8 +15,9 @@ from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel, pole_covariance
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.report.estimate_text import names_words, physics_text
+from ambid.report.estimate_text import names_words, physics_text, second_rows
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
+from ambid.report.tables import sensitivity_text
 from ambid.report.text import (
     WIDTH,
     Paint,
@@ -25,7 +26,6 @@ from ambid.report.text import (
     columns,
     criteria_lines,
     fit_rows,
-    fraction,
     joined,
     other_warnings,
     plain,
@@ -33,11 +33,11 @@ from ambid.report.text import (
     status_words,
     timing_lines,
     title_line,
-    verdict_lines,
     warning_lines,
     wrapped,
 )
 from ambid.units import UNKNOWN
+from ambid.validation.sensitivity import SensitivityAnalysis
 
 if TYPE_CHECKING:
     from ambid.bearing.measured import Measured
@@ -57,7 +57,7 @@ _SOURCES = {
 
 
 def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write a fit for people; colour does not change the layout. Of a failed fit the settings and the reason."""
+    """Write a fit below its verdict; colour does not change the layout. Of a failed fit the settings and the reason."""
     trainings: list[str] = []
     if isinstance(fit, BlackBoxFit):
         own = [coefficient_lines(fit), pole_lines(fit, paint=paint)]
@@ -69,7 +69,6 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
     second = [] if fit.validation is None else [paint("on the second record", "strong"), *second_lines(fit.validation)]
     return joined(
         [
-            verdict_lines(fit.verdict, width=width, paint=paint),
             _header(fit, width, paint),
             *own,
             columns(fit_rows(fit.fit, fit.units, none)) if fit.fit else [],
@@ -79,8 +78,16 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
             check_lines(fit.checks, width=width, paint=paint, above=True),
             warning_lines(other_warnings(fit.checks, fit.warnings), width=width, paint=paint),
             timing_lines(fit.timing_s, width=width, paint=paint),
+            *([derived_text(x, width=width, paint=paint)] for x in getattr(fit, "derived", {}).values()),
         ]
     )
+
+
+def derived_text(found: Any, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what was derived from a fit: the sensitivity of its coefficients, or physical parameters."""
+    if isinstance(found, SensitivityAnalysis):
+        return sensitivity_text(found, width=width, paint=paint)
+    return physics_text(found, width=width, paint=paint)
 
 
 def _header(fit: BlackBoxFit | NonlinearFit, width: int, paint: Paint) -> list[str]:
@@ -113,16 +120,9 @@ def setting_text(value: object) -> str:
 
 def second_lines(validation: Mapping[str, Any]) -> list[str]:
     """Write how a fit does on a second record, by output; errors in SI. Of a nonlinear fit what is extrapolated too."""
-    rows = [("fit", "one step", "rmse", "simulation", "rmse")]
-    for output, found in validation.items():
-        rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
     outside = next((found.get("extrapolated") for found in validation.values()), None)
     more = [] if outside is None else [f"outside the training data: {100 * float(outside):.2g} % of it"]
-    return [*columns(rows), *more]
-
-
-def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:
-    return ("–", "–") if found is None or found["fit"] is None else (fraction(found["fit"]), f"{found['rmse']:.4g}")
+    return [*columns(second_rows(validation)), *more]
 
 
 # --- coefficients and poles of a linear model -----------------------------------------------------------------------

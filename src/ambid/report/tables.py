@@ -136,7 +136,7 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint 
     ]
     meaning = (
         "d: estimated parameters; BIC: above the smallest, on the data fitted; one-step, simulation: fit on data "
-        f"not used, 1 - |e|/|y - mean|; s: seconds, choice of orders included. {comparison.summary}."
+        f"not used, 1 - |e|/|y - mean|; s: seconds, choice of orders included. {comparison.meaning}."
     )
     first = wrapped([header], width) if paint is plain else [header]
     return joined([first, painted, wrapped(remarks, width, "  "), wrapped([meaning], width)])

@@ -11,11 +11,12 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, Verdict
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.result import Verdict
 from ambid.report.numbers import Quantity, quantity, sized
 from ambid.units import counted
 
-Style = Literal["good", "bad", "dim", "strong"]
+Style = Literal["good", "doubt", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
 
 WIDTH = 80
@@ -58,7 +59,7 @@ def title_line(name: object, what: str, samples: int, rate_hz: float, status: st
 
 WORDS: dict[str, tuple[str, Style]] = {
     "usable": ("usable", "good"),
-    "caution": ("use with caution", "bad"),
+    "caution": ("use with caution", "doubt"),
     "unusable": ("do not use", "bad"),
 }
 
@@ -102,7 +103,9 @@ def parameter_rows(
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
         words = verdict(p, found)
         good = p.identifiable and _word_for_all(found) == "usable"
-        style: Style = "dim" if p.role == "fixed" else "good" if good else "bad"
+        style: Style = (
+            "dim" if p.role == "fixed" else "good" if good else WORDS[found.word][1] if found.reasons else "bad"
+        )
         rows.append((p.name, q.text, interval_words(q), q.si, words, style))
     return rows
 

@@ -13,6 +13,7 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import fields_json
+from ambid.estimation.result import Reason, Result
 from ambid.validation.fits import judge
 from ambid.validation.orders import HELD_OUT, hold_out, select
 
@@ -36,9 +37,9 @@ class Entry:
         return () if self.fit is None else tuple(k for k, c in self.fit.checks.items() if not c.passed)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Comparison:
-    """Structures compared, best first."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Comparison(Result):
+    """Structures compared, best first, file schema ``ambid.comparison/1``."""
 
     entries: tuple[Entry, ...]  # sorted by the one-step fit on unseen data; those without one last
     inputs: tuple[str, ...]
@@ -46,8 +47,23 @@ class Comparison:
     fitted_samples: int
     judged_samples: int
     judged_on: str  # ``"second record"`` or ``"last 30 % of the record"``
-    summary: str  # one line: what the differences mean
+    meaning: str  # one line: what the differences mean
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What speaks against the best, and structures that could not be fitted."""
+        best, found = self.entries[0], list[Reason]()
+        sound = [x.structure for x in self.entries if x.fit is not None and x.fit.passed]
+        if best.one_step is None or not best.one_step > 0:
+            text = "no structure predicts better than the mean. Check columns, delay and orders"
+            found.append(Reason(check="one_step", text=text, grave=True))
+        if best.failed:
+            remedy = f"{sound[0]} passes all checks" if sound else "none passes all: try others, or other orders"
+            text = f"{best.structure}, the best, fails {', '.join(best.failed)}; {remedy}"
+            found.append(Reason(check="best", text=text))
+        found += [Reason(check=x.structure, text=x.refusal) for x in self.entries if x.fit is None]
+        return tuple(found)
 
     def as_dict(self) -> dict[str, object]:
         """Return the table, ready for JSON.
@@ -65,7 +81,8 @@ class Comparison:
             }
             for x in self.entries
         ]
-        return {**fields_json(self, without=("entries", "record")), "entries": entries}
+        fields = fields_json(self, without=("entries", "record", "meaning"))
+        return {**fields, "summary": self.meaning, "entries": entries}
 
 
 def compare(
@@ -108,7 +125,7 @@ def compare(
         fitted_samples=fitted.n_samples,
         judged_samples=other.n_samples,
         judged_on=where,
-        summary=_summary(ranked),
+        meaning=_summary(ranked),
         record=dict(data.record),
     )
 

@@ -131,7 +131,7 @@ def _conclude(
     more: list[str],
 ) -> AnyFit:
     one, free = (_sizes(records, runs, free=free) for free in (False, True))
-    return replace(
+    judged_fit = replace(
         fit,
         fit=output_fits(fit.outputs, one, free, fit.noise_covariance),
         criteria={} if one is None else _criteria(fit.n_estimated, records, runs),
@@ -139,6 +139,9 @@ def _conclude(
         validation=judged,
         warnings=(*fit.warnings, *more),
     )
+    if judged is None:
+        return judged_fit
+    return replace(judged_fit, checks={**checks, "second_record": second_check(judged_fit, judged)})
 
 
 def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
@@ -164,12 +167,11 @@ def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dic
     }
 
 
-def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return why a fit does not hold on a second record.
+def second_check(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> Check:
+    """Check that a fit holds on a second record; `found`: by output, as `validation` gives it.
 
-    `found`: by output, as `validation` gives it. Returns one
-    line each; empty where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the
-    record lies outside the training data (which a linear fit does not know).
+    It does where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the record
+    lies outside the training data (which a linear fit does not know).
     """
     said = []
     for name, sizes in found.items():
@@ -185,7 +187,8 @@ def objections(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> tup
     share = max((float(sizes.get("extrapolated", 0.0)) for sizes in found.values()), default=0.0)
     if share > _OUTSIDE:
         said.append(f"{100 * share:.2g} % of it lies outside the training data, where the model extrapolates")
-    return tuple(said)
+    detail = "; ".join(said) or f"one-step errors are at most {_GROWN:g} times as large as at identification"
+    return Check(passed=not said, detail=f"it does not hold on the second record: {detail}" if said else detail)
 
 
 def _sizes(records: Sequence[IOData], runs: Sequence[Run], *, free: bool) -> Sizes | None:

@@ -1,0 +1,226 @@
+"""What every result of every verb is: a verdict, a text, a figure, a page, a file and a table, under the same names.
+
+Results stand low, texts and figures high. A method of a result asks for what shows it when it is called, through
+`_shown` and `_predicted` below: the one place of the package that reaches upward (ARCHITECTURE.md).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+if TYPE_CHECKING:
+    import pandas
+    from matplotlib.figure import Figure
+
+    from ambid.arrays import Array
+
+
+def _shown(name: str) -> Any:
+    """Return a function that shows results."""
+    return getattr(import_module("ambid.job.presentation"), name)
+
+
+def _predicted(name: str) -> Any:
+    """Return a function that runs models."""
+    return getattr(import_module("ambid.job.prediction"), name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reason:
+    """Why a result is not simply usable."""
+
+    check: str  # its name; ``"status"`` for the search itself
+    text: str  # what was found, and what to do
+    grave: bool = False  # whether nothing of the result is to be used
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Verdict:
+    """Whether a result may be used, and what stands against it."""
+
+    word: Literal["usable", "caution", "unusable"]
+    reasons: tuple[Reason, ...]
+
+    @classmethod
+    def of(cls, reasons: tuple[Reason, ...]) -> Verdict:
+        """Judge by what stands against a result; grave reasons first."""
+        ordered = tuple(sorted(reasons, key=lambda r: not r.grave))
+        grave = any(r.grave for r in ordered)
+        return cls(word="unusable" if grave else "caution" if ordered else "usable", reasons=ordered)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Result:
+    """What a verb gives.
+
+    Attributes
+    ----------
+    used : object
+        What it was made from, for its figures; None after reading it from a file. Not written, not compared.
+    """
+
+    used: Any = field(default=None, compare=False, metadata={"written": False})
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What stands against the result."""
+        return ()
+
+    @property
+    def verdict(self) -> Verdict:
+        """Whether the result may be used, with reasons."""
+        return Verdict.of(self.reasons)
+
+    @property
+    def passed(self) -> bool:
+        """Whether the verdict is "usable"."""
+        return self.verdict.word == "usable"
+
+    def summary(self, *, width: int = 80) -> str:
+        """Return the result as the command prints it: the verdict first; no colour.
+
+        Parameters
+        ----------
+        width : int, optional
+            Columns of the terminal.
+
+        Returns
+        -------
+        str
+        """
+        return str(_shown("text")(self, width=width))
+
+    def plot(self, record: object = None) -> Figure:
+        """Draw the result, with the verdict above.
+
+        Parameters
+        ----------
+        record : object, optional
+            Record to draw beside it, as the function of the verb takes it. Default: the one that it was made from;
+            without any (a result that was read from a file) what needs none is drawn.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        figure: Figure = _shown("figure")(self, record)
+        return figure
+
+    def report(self, path: str | Path, record: object = None) -> None:
+        """Write a page with the result and its figures, all in one file.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ends in ``.html``; a page that exists is replaced.
+        record : object, optional
+            As `plot`.
+        """
+        _shown("write_page")(self, path, record)
+
+    def save(self, path: str | Path) -> None:
+        """Write the result as ``--json`` does; `ambid.load` reads it back.
+
+        Parameters
+        ----------
+        path : str or Path
+            A result that exists is replaced, anything else is refused.
+        """
+        _shown("write_document")(self, path)
+
+    def to_dataframe(self) -> pandas.DataFrame:
+        """Return the result as a table; needs pandas.
+
+        Returns
+        -------
+        pandas.DataFrame
+            A row for each parameter, coefficient, reporting interval, frequency or channel.
+        """
+        table: pandas.DataFrame = _shown("dataframe")(self)
+        return table
+
+    def __repr__(self) -> str:
+        return str(_shown("line")(self))
+
+    def _repr_html_(self) -> str:
+        """Return the table that a notebook shows."""
+        return str(_shown("notebook")(self))
+
+
+class Predicting:
+    """A result whose model runs on records."""
+
+    __slots__ = ()
+
+    def predict(self, record: Any, *, ahead: int = 1) -> dict[str, Array]:
+        """Predict the outputs of a record some samples ahead; nothing but offsets and initial state is fitted.
+
+        Parameters
+        ----------
+        record : Record, file or table
+            Of the same bench and rate, as the verb's function takes it.
+        ahead : int, optional
+            Samples; 1: each sample from all before it.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n_samples,), SI
+            By output; NaN where nothing precedes.
+        """
+        found: dict[str, Array] = _predicted("predict")(self, record, ahead)
+        return found
+
+    def validate(self, record: Any) -> Any:
+        """Judge the model on a further record, as ``ambid validate`` does.
+
+        Parameters
+        ----------
+        record : Record, file or table
+            Of the same bench and rate.
+
+        Returns
+        -------
+        Validation
+        """
+        return _predicted("validated")(self, record)
+
+
+class Simulating:
+    """A result whose model runs on inputs alone."""
+
+    __slots__ = ()
+
+    def simulate(self, u: Any) -> dict[str, Array]:
+        """Run the model on inputs alone, from rest at the operating point, without noise.
+
+        Parameters
+        ----------
+        u : ndarray, shape (n_samples,) or (n_samples, n_inputs), SI
+            Inputs, at the rate of the record that the model came from.
+
+        Returns
+        -------
+        dict of str to ndarray, shape (n_samples,), SI
+            By output. An unstable plant runs away.
+        """
+        found: dict[str, Array] = _predicted("simulate")(self, u)
+        return found
+
+
+class Linear:
+    """A result that is a linear plant."""
+
+    __slots__ = ()
+
+    def to_control(self) -> Any:
+        """Return the plant for python-control; needs the extra ``ambid[control]``.
+
+        Returns
+        -------
+        control.StateSpace or control.TransferFunction
+            SI units, about the operating point; without the delay of the input where the plant is continuous.
+        """
+        return _predicted("to_control")(self)

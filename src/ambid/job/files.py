@@ -1,0 +1,136 @@
+"""Files that are written: checked before the work begins, put in place together; no measured record is written over."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import zlib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Self
+
+from ambid.errors import AmbidError
+
+FIGURE_ENDINGS = (".png", ".svg", ".pdf")
+PAGE_ENDINGS = (".html", ".htm")
+_DRAWN = (FIGURE_ENDINGS, PAGE_ENDINGS)  # what such an option names is replaced
+_LOOKED = 64  # bytes of a file that say what it is
+_STREAMED = ("--json",)  # options that take - for standard output
+
+
+class Files:
+    """Files that are going to be written.
+
+    Each is written beside its place under another name; only when everything is there are all of them moved. After an
+    error or Ctrl-C nothing is left behind.
+
+    `inputs`: files that are read; none of them may be written over.
+    """
+
+    def __init__(self, *inputs: Path | None) -> None:
+        """Claim nothing yet."""
+        self._inputs = [path for path in inputs if path is not None]
+        self._claimed: list[Path] = []
+        self._staged: dict[Path, Path] = {}
+
+    def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = (), *, force: bool | None = None) -> None:
+        """Check that a file can be written, before any work is done.
+
+        `path`: the file; None: the option was not given; `option`: the option that names it, for messages; `suffixes`:
+        endings that it may have; any if empty; `force`: what the verb's --force says, None where it has none. Without
+        it only figures, reports, results and simulated records are written over, and that is told.
+        """
+        if path is None:
+            return
+        try:
+            self._check(path, option, suffixes)
+            if path.is_file() and not force and not (suffixes in _DRAWN or _made_here(path)):
+                remedy = "Choose another name" + ("" if force is None else ", or give --force")
+                raise AmbidError(f"{option} {path} exists already, and is no result of ambid. {remedy}")
+        except (OSError, RuntimeError) as failure:  # a name that no file can have, a link to itself
+            words = getattr(failure, "strerror", None) or failure
+            raise AmbidError(f"{option} {path} cannot be: {words}. Give another name") from None
+        self._claimed.append(path)
+
+    def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
+        folder = (path.resolve() if path.is_symlink() else path).parent
+        if path.exists() and not path.is_file() and not path.is_dir():
+            remedy = "Use - for standard output" if option in _STREAMED else "Name one"
+            raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. {remedy}")
+        if path.is_dir():
+            raise AmbidError(f"{option} {path} is a folder; a file is wanted. Name a file inside it")
+        if suffixes and not path.name.lower().endswith(tuple(suffixes)):
+            raise AmbidError(f"{option} {path} has to end in {' or '.join(suffixes)}. Rename it")
+        if not folder.is_dir():
+            raise AmbidError(f"{option} {path}: there is no folder {folder}. Make it first, or correct the path")
+        if not os.access(folder, os.W_OK):
+            raise AmbidError(f"{option} {path}: folder {folder} may not be written. Choose another folder")
+        for other in self._inputs:
+            if _same(path, other):
+                raise AmbidError(f"{option} {path} is also read; writing would destroy it. Choose another file")
+        for other in self._claimed:
+            if _same(path, other):
+                raise AmbidError(f"{option} {path} is named by two options. Choose another file for one of them")
+
+    def stage(self, path: Path, write: Callable[[Path], object]) -> None:
+        """Write a file under a name beside its own.
+
+        `path`: where the file will be; `write`: takes the present name, which ends like `path`, and writes it.
+        """
+        path = path.resolve()  # through a link, to the file that it stands for
+        beside = path.with_name(f".{os.getpid()}-{path.name}")
+        self._staged[path] = beside
+        try:
+            write(beside)
+        except OSError as failure:
+            raise AmbidError(
+                f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk"
+            ) from None
+
+    def stage_text(self, path: Path, text: str) -> None:
+        """Write a text file under a name beside its own.
+
+        `path`: where the file will be; `text`: what it holds, in UTF-8.
+        """
+        self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
+
+    def replaced(self, path: Path) -> None:
+        """Take note that a file is going to be replaced."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: object, *_: object) -> None:
+        try:
+            if kind is None:
+                for path, beside in self._staged.items():
+                    if path.exists() and path.stat().st_size:
+                        self.replaced(path)
+                    os.replace(beside, path)
+        finally:
+            for beside in self._staged.values():
+                beside.unlink(missing_ok=True)
+
+
+def _made_here(path: Path) -> bool:
+    """Whether a file is empty, or says that it is a result or a simulated record."""
+    with path.open("rb") as raw:
+        begin = raw.read(_LOOKED)
+    try:
+        if begin.startswith(b"\x1f\x8b"):
+            with gzip.open(path) as file:
+                begin = file.read(_LOOKED)
+        elif begin.startswith(b"\x89HDF"):
+            import h5py
+
+            with h5py.File(path) as found:
+                return b"simulat" in found["provenance"][()]
+    except (OSError, EOFError, KeyError, TypeError, ValueError, zlib.error):  # damaged: nobody knows what it was
+        return False
+    return not begin or begin.startswith((b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.'))
+
+
+def _same(a: Path, b: Path) -> bool:
+    if a.exists() and b.exists():
+        return a.samefile(b)
+    return a.resolve() == b.resolve()

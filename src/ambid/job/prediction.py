@@ -1,0 +1,114 @@
+"""What the models of results do: predict a record, run on inputs alone, become objects of python-control."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
+from ambid.blackbox.convert import state_space_to_control
+from ambid.blackbox.convert import to_control as black_box_to_control
+from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.prediction import errors_elsewhere, plant_form, run_states
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.job.data import signals_of
+from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
+from ambid.nonlinear.fit import NonlinearFit
+from ambid.physics.linear_model import StateSpace, discretise, model
+
+validated = validate
+
+
+def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int) -> dict[str, Array]:
+    """Predict the outputs of a record some samples ahead, (n_samples,) by output in SI; NaN where nothing precedes."""
+    if ahead < 1:
+        raise EstimationError(f"ahead is {ahead}; it is a number of samples, 1 or more. Correct it")
+    data = data_of(result, record, where="the result")
+    if isinstance(result, Estimate):
+        from ambid.estimation.likelihood import prediction_error
+        from ambid.validation.second_record import replay
+
+        signals, names = signals_of(data, model(result.model)), model(result.model).outputs
+        y, first = signals.y, replay(result, signals)
+        found = y[first.first + ahead - 1 :] - prediction_error(first.fit, ahead)
+    elif isinstance(result, BlackBoxFit):
+        y, names, run = data.y, result.outputs, errors_elsewhere(result, data)
+        e, power = run.one_step[ahead - 1 :].copy(), run.model.K
+        for j in range(1, ahead):
+            e += run.one_step[ahead - 1 - j : -j] @ (run.model.C @ power).T
+            power = run.model.A @ power
+        found = y[ahead - 1 :] - e
+    elif isinstance(result, NonlinearFit):
+        y, names = data.y, result.outputs
+        found = _nonlinear(result, data, ahead)
+    else:
+        from ambid.validation.nonlinear_bearing import replay as bearing_replay
+
+        if ahead > 1:
+            raise EstimationError("the nonlinear bearing is predicted one sample ahead. Leave ahead out")
+        y, names, found = data.record.y, ("position", "current"), bearing_replay(result, data.record).predicted
+    whole = np.vstack([np.full((y.shape[0] - found.shape[0], found.shape[1]), np.nan), found])
+    return dict(zip(names, whole.T, strict=True))
+
+
+def _nonlinear(fit: NonlinearFit, data: Any, ahead: int) -> Array:
+    """Predict by running freely from each sample on."""
+    from ambid.validation.fits import model_of
+
+    of = model_of(fit, data)
+    if ahead == 1:
+        return np.asarray(of.predict(data.u, data.y)[of.lag :])
+    n = data.n_samples - of.lag - ahead + 1
+    windows = (slice(k, k + of.lag + ahead) for k in range(n))
+    return np.array([of.simulate(data.u[w], data.y[w])[-1] for w in windows]).reshape(n, data.n_outputs)
+
+
+def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, Array]:
+    """Run a model on inputs alone, from rest at its operating point, (n_samples,) by output in SI."""
+    inputs = np.asarray(u, dtype=np.float64)
+    inputs = inputs[:, None] if inputs.ndim == 1 else inputs
+    wanted = len(model(result.model).inputs if isinstance(result, Estimate) else result.inputs)
+    if inputs.ndim != 2 or inputs.shape[1] != wanted or not np.all(np.isfinite(inputs)):
+        raise EstimationError(
+            f"the inputs have shape {np.shape(u)}; finite numbers of shape (n_samples, {wanted}) are wanted. Correct u"
+        )
+    if isinstance(result, Estimate):
+        plant, at = model(result.model), result.operating_point
+        y = _delayed(result, inputs - [at[role] for role in plant.inputs]) + [at[role] for role in plant.outputs]
+        return dict(zip(plant.outputs, y.T, strict=True))
+    if isinstance(result, BlackBoxFit):
+        form, z = plant_form(result), inputs - result.offsets.u
+        y = run_states(form.A, form.B, z) @ form.C.T + z @ form.D.T + result.offsets.y
+    else:
+        if result.model is None:
+            raise EstimationError(f"the fit has no model: {result.reason}. Fit again")
+        first = np.zeros((result.model.lag, len(result.outputs)))
+        first[:] = 0.0 if start is None else np.asarray(start, dtype=np.float64).reshape(first.shape)
+        y = result.model.simulate(inputs, first)
+    return dict(zip(result.outputs, y.T, strict=True))
+
+
+def _delayed(estimate: Estimate, u: Array) -> Array:
+    """Outputs (n, n_y) of a plant whose held input comes whole samples and a part of one late."""
+    c, dt = estimate.continuous, 1.0 / float(str(estimate.record["rate_hz"]))
+    late = estimate.delay[model(estimate.model).inputs[0]]
+    space = StateSpace(A=c.A, B=c.B, C=c.C, E=np.zeros((c.A.shape[0], 0)))
+    whole = discretise(space, dt)[0]
+    before = np.zeros_like(whole.B)
+    if late.fraction:
+        rest, part = discretise(space, (1.0 - late.fraction) * dt)[0], discretise(space, late.fraction * dt)[0]
+        before = rest.A @ part.B
+    shifted = np.vstack([np.zeros((late.samples + 1, u.shape[1])), u])
+    now, last = shifted[1 : 1 + u.shape[0]], shifted[: u.shape[0]]
+    return run_states(whole.A, np.hstack([whole.B - before, before]), np.hstack([now, last])) @ c.C.T
+
+
+def to_control(result: Any) -> Any:
+    """Return a linear plant as an object of python-control."""
+    if isinstance(result, BlackBoxFit):
+        return black_box_to_control(result.model)
+    at = linearised(result) if isinstance(result, NonlinearBearingEstimate) else result.continuous
+    return state_space_to_control(at.A, at.B, at.C)

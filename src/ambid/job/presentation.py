@@ -1,0 +1,309 @@
+"""How each kind of result is shown: one register of text, figure, page, document and table; one function for each.
+
+The methods of `ambid.estimation.result.Result` and the verbs come here; nothing else shows a result.
+"""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ambid.errors import AmbidError, EstimationError
+from ambid.estimation.estimate import EstimatedParameter, fields_json, json_text, plain_json
+from ambid.estimation.result import Result
+from ambid.job.files import PAGE_ENDINGS, Files
+from ambid.report.text import WIDTH, WORDS, Paint, joined, plain, verdict_lines
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from ambid.report.page import Page
+
+Table = tuple[str, Mapping[str, Sequence[object]]]
+"""Name of the column that is the index, and the columns."""
+
+_SHOWN = 6  # numbers in a short line
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """How one kind of result is shown."""
+
+    text: Callable[..., str]  # what stands below the verdict; takes width and paint
+    figure: Callable[[Any, Any], Figure]  # of the result and what it was made from, None where that is not known
+    document: Callable[[Any], str]  # its JSON
+    table: Callable[[Any], Table]
+    title: Callable[[Any], str]  # what it is, in a few words
+    page: Callable[[Any, Any], Page] | None = None  # as `figure`; default: text and figure
+
+
+def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Return a result for people, the verdict first."""
+    lines = verdict_lines(result.verdict, width=width, paint=paint)
+    return joined([lines, [view(result).text(result, width=width, paint=paint)]])
+
+
+def figure(result: Result, record: Any = None) -> Figure:
+    """Draw a result beside a record, or what it was made from, with the verdict above."""
+    from ambid.report.drawing import judged
+
+    return judged(view(result).figure(result, _beside(result, record)), result.verdict)
+
+
+def page(result: Result, record: Any = None) -> str:
+    """Return a page with a result and its figures as HTML."""
+    from ambid.report.page import Page, Section, page_html
+
+    known, used = view(result), _beside(result, record)
+    if known.page is None:
+        title = known.title(result)
+        said = Section(title="Result", text=known.text(result, width=WIDTH, paint=plain))
+        made = Page(title=title, sections=[said, Section(title="Figures", figure=known.figure(result, used))])
+    else:
+        made = known.page(result, used)
+    return page_html(made, result.verdict, made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"))
+
+
+def document(result: Result) -> str:
+    """Return the JSON of a result."""
+    return view(result).document(result)
+
+
+def dataframe(result: Result) -> Any:
+    """Return the table of a result as a pandas.DataFrame."""
+    try:
+        import pandas
+    except ImportError:
+        raise AmbidError("pandas is not installed, and a DataFrame needs it. Install pandas") from None
+    index, columns = view(result).table(result)
+    return pandas.DataFrame(dict(columns)).set_index(index)
+
+
+def line(result: Result) -> str:
+    """Return a result on one line: what it is, the verdict, main numbers."""
+    numbers = _numbers(result)
+    shown = ", ".join(f"{name} {said}" for name, said in numbers[:_SHOWN])
+    more = ", …" if len(numbers) > _SHOWN else ""
+    words = WORDS[result.verdict.word][0]
+    return f"<{type(result).__name__} {view(result).title(result)}: {words}{'; ' if shown else ''}{shown}{more}>"
+
+
+def notebook(result: Result) -> str:
+    """Return the verdict and the main numbers as a small table in HTML."""
+    words = WORDS[result.verdict.word][0]
+    head = f"<b>{html.escape(view(result).title(result))}</b>: {words}"
+    reasons = "".join(f"<li>{html.escape(f'{r.check}: {r.text}')}</li>" for r in result.verdict.reasons)
+    rows = "".join(f"<tr><th>{html.escape(n)}</th><td>{html.escape(said)}</td></tr>" for n, said in _numbers(result))
+    return f"<div>{head}{f'<ul>{reasons}</ul>' if reasons else ''}<table>{rows}</table></div>"
+
+
+def write_page(result: Result, path: str | Path, record: Any = None) -> None:
+    """Write the page of a result."""
+    with Files() as files:
+        files.claim(Path(path), "path", PAGE_ENDINGS)
+        files.stage_text(Path(path), page(result, record))
+
+
+def write_document(result: Result, path: str | Path) -> None:
+    """Write the JSON of a result."""
+    with Files() as files:
+        files.claim(Path(path), "path")
+        files.stage_text(Path(path), document(result))
+
+
+def view(result: Result) -> View:
+    """Return how a result is shown."""
+    name = type(result).__name__
+    if name not in _VIEWS:
+        raise EstimationError(f"a {name} has no text and no figure of its own. Show the result that it is part of")
+    return _VIEWS[name]()
+
+
+def _beside(result: Any, record: Any) -> Any:
+    """Return what is drawn beside a result: a record that is given, read as it wants it, or what it was made from."""
+    if record is None:
+        return result.used
+    from ambid.job.results import data_of
+
+    return data_of(result, record, where="the result")
+
+
+def _numbers(result: Any) -> list[tuple[str, str]]:
+    """Return name and value ± of a result's parameters, but fixed ones."""
+    from ambid.report.numbers import quantity
+
+    found: Sequence[EstimatedParameter] = getattr(result, "parameters", ())
+    return [(p.name, quantity(p.value, p.sd, p.unit).text.removesuffix(" 1")) for p in found if p.role != "fixed"]
+
+
+def _parameter_table(result: Any) -> Table:
+    return parameter_columns(result.parameters)
+
+
+def parameter_columns(parameters: Sequence[EstimatedParameter]) -> Table:
+    """Return parameters as columns, one row each."""
+    columns: dict[str, list[object]] = {
+        name: [getattr(p, name) for p in parameters] for name in ("name", "value", "sd", "unit", "role", "identifiable")
+    }
+    low, high = [p.ci95[0] for p in parameters], [p.ci95[1] for p in parameters]
+    return "name", {**columns, "ci95_low": low, "ci95_high": high}
+
+
+# --- the kinds ------------------------------------------------------------------------------------------------------
+
+
+def _estimate() -> View:
+    from ambid.physics.linear_model import model
+    from ambid.report.estimate_page import estimate_page
+    from ambid.report.estimate_text import estimate_text
+    from ambid.report.figures import Evidence, overview
+    from ambid.validation.second_record import replay
+
+    def evidence(e: Any, used: Any) -> Evidence:
+        from ambid.job.data import signals_of
+
+        run = None if used is None else replay(e, signals_of(used, model(e.model)))
+        return Evidence(estimate=e, run=run, start_s=0.0 if used is None else used.start_s)
+
+    return View(
+        text=estimate_text,
+        figure=lambda e, used: overview(evidence(e, used)),
+        page=lambda e, used: estimate_page(evidence(e, used)),
+        document=lambda e: str(e.dumps()),
+        table=_parameter_table,
+        title=lambda e: f"{e.record.get('file') or 'record'}, model {e.model}",
+    )
+
+
+def _bearing() -> View:
+    from ambid.report.estimate_page import estimate_page
+    from ambid.report.estimate_text import estimate_text, names_words
+    from ambid.report.figures import BearingEvidence, bearing_evidence, overview
+
+    def evidence(e: Any, used: Any) -> BearingEvidence:
+        taken = () if used is None else used if isinstance(used, tuple) else (used,)
+        return bearing_evidence(e, [(t.record, t.start_s) for t in taken])
+
+    return View(
+        text=estimate_text,
+        figure=lambda e, used: overview(evidence(e, used)),
+        page=lambda e, used: estimate_page(evidence(e, used)),
+        document=lambda e: str(e.dumps()),
+        table=_parameter_table,
+        title=lambda e: f"{names_words(list(e.noise))}, {e.law}",
+    )
+
+
+def _fit() -> View:
+    from ambid.blackbox.fit import BlackBoxFit
+    from ambid.blackbox.fit_file import fit_text as linear_document
+    from ambid.nonlinear.fit_file import nonlinear_fit_text
+    from ambid.report.fit_figures import fit_overview
+    from ambid.report.fit_text import fit_text
+
+    def drawn(f: Any, used: Any) -> Figure:
+        records, second = used if isinstance(used, tuple) else (() if used is None else (used,), None)
+        return fit_overview(f, records, second)
+
+    return View(
+        text=fit_text,
+        figure=drawn,
+        document=lambda f: linear_document(f) if isinstance(f, BlackBoxFit) else nonlinear_fit_text(f),
+        table=lambda f: parameter_columns(f.parameters),
+        title=lambda f: f"{', '.join(f.inputs)}{' → ' if f.inputs else ''}{', '.join(f.outputs)}, {f.structure}",
+    )
+
+
+def _validation() -> View:
+    from ambid.report.estimate_text import validation_text
+    from ambid.report.figures import validation_figure
+
+    def drawn(v: Any, used: Any) -> Figure:
+        if used is None:
+            return validation_figure(v)
+        known, data = used
+        return view(known).figure(known, data)
+
+    return View(
+        text=validation_text,
+        figure=drawn,
+        document=_fields_of("ambid.validation/1"),
+        table=lambda v: ("output", {"output": list(v.fit), **_numbers_of(list(v.fit.values()))}),
+        title=lambda v: f"{v.record or 'record'} judged with {v.estimate or 'an estimate'}, {v.model}",
+    )
+
+
+def _measured() -> View:
+    from ambid.bearing.measured import measured_text
+    from ambid.report.fit_text import frf_text
+    from ambid.report.response_figures import frf_figure
+
+    def table(m: Any) -> Table:
+        frf = m.response
+        columns: dict[str, Any] = {"frequency_hz": frf.frequency_hz}
+        for j, o in enumerate(frf.outputs):
+            for k, i in enumerate(frf.inputs):
+                columns |= {f"{o}/{i}": frf.G[:, j, k], f"{o}/{i} sd": frf.sd[:, j, k]}
+        return "frequency_hz", columns
+
+    return View(
+        text=frf_text, figure=lambda m, _: frf_figure(m), document=measured_text, table=table,
+        title=lambda m: f"{m.record.get('file') or 'record'}, frequency response, {m.response.frequency_hz.size} lines",
+    )  # fmt: skip
+
+
+def _comparison() -> View:
+    from ambid.report.fit_figures import comparison_figure
+    from ambid.report.tables import comparison_text
+
+    def document(c: Any) -> str:
+        return json_text({"schema": "ambid.comparison/1", "record": c.record.get("file"), **plain_json(c.as_dict())})
+
+    def table(c: Any) -> Table:
+        names = ("structure", "orders", "one_step", "simulation", "seconds", "n_estimated", "bic", "failed")
+        rows = [(x.structure, x.orders, x.one_step, x.simulation, x.seconds, x.fit and x.fit.n_estimated,
+                 x.fit and x.fit.criteria.get("bic"), ", ".join(x.failed)) for x in c.entries]  # fmt: skip
+        return "structure", dict(zip(names, zip(*rows, strict=True), strict=True))
+
+    return View(
+        text=comparison_text, figure=lambda c, _: comparison_figure(c), document=document, table=table,
+        title=lambda c: f"{c.record.get('file') or 'record'}, {len(c.entries)} structures compared",
+    )  # fmt: skip
+
+
+def _fields_of(schema: str) -> Callable[[Any], str]:
+    """Return a writer of all fields of a result."""
+
+    def write(result: Any) -> str:
+        return json_text({"schema": schema, **fields_json(result), "passed": result.passed})
+
+    return write
+
+
+def _numbers_of(rows: Sequence[Any]) -> dict[str, list[object]]:
+    """Return the numbers that all rows have, by name; those of a number in another behind a dot."""
+    flat = [_flat(row) for row in rows]
+    return {name: [row.get(name) for row in flat] for name in (flat[0] if flat else ())}
+
+
+def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    for name, x in row.items():
+        found |= _flat(x, f"{before}{name}.") if isinstance(x, Mapping) else {f"{before}{name}": x}
+    return found
+
+
+_VIEWS: Mapping[str, Callable[[], View]] = {
+    "Estimate": _estimate,
+    "NonlinearBearingEstimate": _bearing,
+    "BlackBoxFit": _fit,
+    "NonlinearFit": _fit,
+    "Validation": _validation,
+    "Measured": _measured,
+    "Comparison": _comparison,
+}
+"""By the name of the result's class: what shows it is imported when one is shown."""
