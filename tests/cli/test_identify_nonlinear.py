@@ -68,7 +68,8 @@ def test_several_records_to_files_and_table(at, ambid) -> None:
     assert figure.read_bytes().startswith(b"\x89PNG")
     again = json.loads(ambid("validate", out, "r3.csv", "--json", "-").out)
     assert again["fit"] == document["validation"]["fit"]
-    assert again["checks"] == document["validation"]["checks"]
+    for name, check in again["checks"].items():
+        assert check == {k: v for k, v in document["validation"]["checks"][name].items() if v is not None}
 
 
 def test_the_rig_says_what_is_known_and_the_options_change_it(at, ambid) -> None:

@@ -30,7 +30,7 @@ def test_the_right_structure_comes_first_and_refusals_last():
     assert found.entries[0].one_step > found.entries[1].one_step
     assert "reference" in found.entries[2].refusal
     assert "residuals_uncorrelated" in found.entries[1].failed
-    assert "arx" in found.summary
+    assert "arx" in found.meaning
     json.dumps(found.as_dict(), allow_nan=False)
 
 

@@ -29,8 +29,9 @@ from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 
-_NOISY = 0.25  # standard deviation over magnitude, median of the lines, from which a response is noise
-_LINES = 10
+_CLEAR = 0.25  # standard deviation over magnitude up to which a line is clear
+_LINES, _SHARE = 10, 0.1  # clear lines, and share of all, that a response wants
+_FEWEST = 3  # without which nothing is to be seen
 _STEP = 1e-3  # standard deviations of a coefficient over which a difference is taken
 
 
@@ -65,18 +66,16 @@ class Measured(Result):
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
-        """A response that noise hides or that has few lines, and what stands against the models fitted to it."""
+        """A response of which noise leaves few lines, and what stands against the models fitted to it."""
         frf, found = self.response, list[Reason]()
         with np.errstate(divide="ignore", invalid="ignore"):
-            share = np.nanmedian(frf.sd / np.abs(frf.G), axis=0)
-        worst = np.unravel_index(np.nanargmax(share), share.shape) if np.any(np.isfinite(share)) else None
-        if worst is not None and share[worst] > _NOISY:
+            clear = np.count_nonzero(frf.sd < _CLEAR * np.abs(frf.G), axis=0)
+        worst = np.unravel_index(np.argmin(clear), clear.shape)
+        least, lines = int(clear[worst]), frf.frequency_hz.size
+        if least < max(_LINES, _SHARE * lines):
             pair = f"{frf.inputs[worst[1]]} → {frf.outputs[worst[0]]}"
-            text = f"the noise of {pair} is {share[worst]:.0%} of it at half of the lines. Excite more, or longer"
-            found.append(Reason(check="noise", text=text, grave=bool(share[worst] > 1.0)))
-        if frf.frequency_hz.size < _LINES:
-            text = f"{frf.frequency_hz.size} lines are few to see a response by. Take a longer record or a wider band"
-            found.append(Reason(check="lines", text=text))
+            text = f"{least} of {lines} lines of {pair} stand out of the noise. Excite more, longer or in another band"
+            found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
         for name, model in (("fit", self.fit), ("physical", self.estimate)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
         return tuple(found)

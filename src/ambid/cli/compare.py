@@ -41,13 +41,12 @@ def command(
     """
     from ambid.job import compare
 
-    with Outputs(record, second, json=json, plot=plot, report=report) as outputs:
-        with progress("compare") as tick:
-            found = compare(
-                record, candidates, input=inputs, output=output, reference=reference,
-                open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, validate=second,
-                holdout=holdout, tick=tick,
-            )  # fmt: skip
-            outputs.give(found, tick)
+    with Outputs(record, second, json=json, plot=plot, report=report) as outputs, progress("compare") as tick:
+        found = compare(
+            record, candidates, input=inputs, output=output, reference=reference,
+            open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, validate=second,
+            holdout=holdout, tick=tick,
+        )  # fmt: skip
+        outputs.give(found, tick)
     outputs.show(found)
     end(failed=strict and not found.passed)

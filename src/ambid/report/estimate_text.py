@@ -193,18 +193,21 @@ def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
 def validation_text(found: Validation, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write how a result does on a further record, below its verdict."""
     first = next(iter(found.fit.values()))
-    rows = second_rows(found.fit) if isinstance(first["one_step"], Mapping) else validation_rows({"fit": found.fit})
+    of_fit = isinstance(first["one_step"], Mapping)
+    lines = second_lines(found.fit) if of_fit else columns(validation_rows({"fit": found.fit}))
     head = f"{paint(found.record or 'record', 'strong')} judged with {found.estimate or 'a result'}, {found.model}"
     checks = check_lines(found.checks, width=width, paint=paint, above=True)
-    return joined([[f"{head}; {found.samples} samples"], columns(rows), checks])
+    return joined([[f"{head}; {found.samples} samples"], lines, checks])
 
 
-def second_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
-    """Return a table of how a fit does on a second record, by output; errors in SI."""
+def second_lines(validation: Mapping[str, Any]) -> list[str]:
+    """Write how a fit does on a second record, by output; errors in SI. Of a nonlinear fit what is extrapolated too."""
     rows: list[tuple[str, ...]] = [("fit", "one step", "rmse", "simulation", "rmse")]
     for output, found in validation.items():
         rows.append((output, *_pair(found["one_step"]), *_pair(found.get("simulation"))))
-    return rows
+    outside = next((found.get("extrapolated") for found in validation.values()), None)
+    more = [] if outside is None else [f"outside the training data: {100 * float(outside):.2g} % of it"]
+    return [*columns(rows), *more]
 
 
 def _pair(found: Mapping[str, Any] | None) -> tuple[str, str]:

@@ -75,6 +75,9 @@ def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], sec
 
     `second`: a further record that a nonlinear fit was judged on. Without records what needs none is drawn.
     """
+    if fit.model is None:
+        reason = getattr(fit, "reason", "")
+        return stacked(_title(fit, records, second), [(1.0, lambda place: place.text(0.5, 0.5, reason, ha="center"))])
     parts, n_y = _signals(fit, records, second), len(fit.outputs)
     width = max(11.0, 4.5 * n_y) if len(records) > 1 or second is not None else 11.0
     if isinstance(fit, BlackBoxFit):

@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel, pole_covariance
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.report.estimate_text import names_words, physics_text, second_rows
+from ambid.report.estimate_text import names_words, physics_text, second_lines
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.tables import sensitivity_text
 from ambid.report.text import (
@@ -116,13 +116,6 @@ def setting_text(value: object) -> str:
     if isinstance(value, Sequence) and not isinstance(value, str):
         return "/".join(map(str, value))
     return f"{value:g}" if isinstance(value, float) else str(value)
-
-
-def second_lines(validation: Mapping[str, Any]) -> list[str]:
-    """Write how a fit does on a second record, by output; errors in SI. Of a nonlinear fit what is extrapolated too."""
-    outside = next((found.get("extrapolated") for found in validation.values()), None)
-    more = [] if outside is None else [f"outside the training data: {100 * float(outside):.2g} % of it"]
-    return [*columns(second_rows(validation)), *more]
 
 
 # --- coefficients and poles of a linear model -----------------------------------------------------------------------
