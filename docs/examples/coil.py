@@ -35,7 +35,7 @@ def main(seed: int = 1) -> dict[str, dict[str, float]]:
 
     found = {"truth (4.2)": {"gain": GAIN, "pole": POLE}, "thesis (4.3)": PRINTED}
     for estimator in (coil_least_squares, coil_instrumental):
-        result = estimator(record["voltage"], record["current"], RATE_HZ)
+        result = estimator(record["voltage"].values, record["current"].values, RATE_HZ)
         found[result.method] = {"gain": result.b, "pole": result.a}
     estimate = identify(record, default_rig("coil"))
     resistance, inductance = estimate.parameter("R"), estimate.parameter("L")

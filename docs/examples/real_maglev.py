@@ -80,7 +80,7 @@ def plain_least_squares(record: Record, cutoff_hz: float) -> float:
     result is biased, and depends on the cutoff.
     """
     smooth = lowpass(record, cutoff_hz)
-    x, i = smooth["position"], smooth["current"]
+    x, i = smooth["position"].values, smooth["current"].values
     acceleration = np.diff(x, n=2) * record.rate_hz**2
     regressors = np.column_stack([-x[1:-1], i[1:-1], np.ones(acceleration.size)])
     return float(np.linalg.lstsq(regressors, acceleration, rcond=None)[0][1])

@@ -1,4 +1,4 @@
-"""Draw the figures of docs/wiring.md: ``python docs/figures/draw.py [FOLDER]`` (default: beside this file)."""
+"""Draw the figures of README and docs/wiring.md: ``python docs/figures/draw.py [FOLDER]`` (default: here)."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ mpl.use("Agg")
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from matplotlib.patches import Arc, Polygon, Rectangle
 
 INK, POWER, SOFT = "#222222", "#b03a2e", "#5f6b76"
@@ -263,8 +264,46 @@ def sensors() -> plt.Figure:
     return figure
 
 
+def demo() -> Figure:
+    """What goes into `ambid demo`, and what comes out beside the truth."""
+    import ambid
+
+    data = Path(ambid.__file__).parent / "data"
+    record = ambid.read_record(data / "demo.csv.gz")
+    estimate, truth = ambid.identify(record, data / "demo.toml"), ambid.preset("unstable-bearing").parameters
+    free = [p for p in estimate.parameters if p.role == "free"]
+    figure = plt.figure(figsize=(9.0, 3.0), layout="constrained")
+    left, right = figure.subfigures(1, 2)
+    left.suptitle("in: 0.4 s of a levitated rotor", fontsize=10)
+    channels = zip(
+        left.subplots(3, 1, sharex=True),
+        (("voltage", 1.0, "V"), ("current", 1e3, "mA"), ("position", 1e6, "µm")),
+        strict=True,
+    )
+    for ax, (name, scale, unit) in channels:
+        ax.plot(record.time_s, scale * record.channel(name).values, color=SOFT, lw=0.6)
+        ax.set_ylabel(f"{name}\n[{unit}]")
+    ax.set_xlabel("time [s]")
+    right.suptitle("out: five parameters, error and 95 % interval in %", fontsize=10)
+    ax = right.subplots()
+    off = [100.0 * (p.value / truth[p.name] - 1.0) for p in free]
+    ax.errorbar(
+        off,
+        [p.name for p in free],
+        xerr=[196.0 * p.sd / abs(truth[p.name]) for p in free],
+        fmt="o",
+        capsize=4,
+        color="#0b6fb8",
+    )
+    ax.axvline(0.0, color=INK, lw=0.8)
+    ax.set_ylim(len(free) - 0.5, -0.5)
+    ax.set_xlabel("estimate against truth [%]")
+    ax.grid(axis="x", alpha=0.25)
+    return figure
+
+
 def main() -> None:
-    """Write both figures as SVG; with a folder as argument also as PNG, to look at."""
+    """Write the wiring as SVG (with a folder as argument also as PNG, to look at) and the demo as PNG."""
     folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
     kept = {"svg.fonttype": "none", "svg.hashsalt": "ambid", "font.family": "DejaVu Sans", "font.size": 9,
             "axes.titlesize": 9, "legend.fontsize": 8}  # fmt: skip
@@ -273,6 +312,7 @@ def main() -> None:
             figure.savefig(folder / f"{name}.svg", metadata={"Date": None})
             if len(sys.argv) > 1:
                 figure.savefig(folder / f"{name}.png", dpi=120)
+        demo().savefig(folder / "demo.png", dpi=110)
 
 
 if __name__ == "__main__":
