@@ -112,7 +112,8 @@ def _rig(seed: int) -> IOData:
     u = np.repeat(np.random.default_rng(seed).standard_normal(2000), 10) * 7.0
     r = simulate_preset(preset("thesis"), u, seed=seed).record
     return IOData(
-        u=r["voltage"][:, None], y=np.stack([r["position"], r["current"]], axis=1), dt=1e-4, inputs=("voltage",),
+        u=r["voltage"].values[:, None], y=np.stack([r["position"].values, r["current"].values], axis=1), dt=1e-4,
+        inputs=("voltage",),
         outputs=("position", "current"), units={"voltage": "V", "position": "m", "current": "A"}, open_loop=True,
     )  # fmt: skip
 

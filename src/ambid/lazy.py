@@ -11,7 +11,6 @@ import sys
 from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 
 def exports(package: str) -> tuple[Callable[[str], object], Callable[[], list[str]], list[str]]:
@@ -27,15 +26,6 @@ def exports(package: str) -> tuple[Callable[[str], object], Callable[[], list[st
         return value
 
     return load, lambda: sorted({*vars(module), *homes}), sorted(homes)
-
-
-def later(module: str, name: str) -> Any:
-    """Return what a module defines that stands above, or beside, the one that asks, at the time of a call.
-
-    For the methods by which records and results show and convert themselves, and for nothing else: tests/conventions
-    names the files that may.
-    """
-    return getattr(import_module(module), name)
 
 
 def _homes(source: str) -> dict[str, str]:

@@ -25,8 +25,12 @@ TIERS: tuple[tuple[str, ...], ...] = (
     ("units",),
     ("errors", "arrays", "compiled", "lazy"),
 )
-# The one inversion (ARCHITECTURE.md): methods of a result ask, when called, for what shows or runs it.
-ASKED = {("ambid.estimation.result", "ambid.job.presentation"), ("ambid.estimation.result", "ambid.job.prediction")}
+# The one inversion (ARCHITECTURE.md): methods of results and records ask, when called, for what shows or converts them.
+ASKED = {
+    ("ambid.estimation.result", "ambid.job.presentation"),
+    ("ambid.estimation.result", "ambid.job.prediction"),
+    ("ambid.record.record", "ambid.record.frames"),
+}
 RANK = {room: rank for rank, tier in enumerate(TIERS) for room in tier}
 
 

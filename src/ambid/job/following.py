@@ -71,10 +71,6 @@ class EstimatorWords(TypedDict, total=False):
     step: float | None
 
 
-class TrackWords(FollowingWords, EstimatorWords, total=False):
-    """What `track` is told."""
-
-
 def check_settings(said: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> None:
     """Refuse what `track` is told where it makes no sense or contradicts itself, in the `names` of the caller."""
     for name in ("every_s", "limit", "start_s", "rate_hz"):

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TypedDict, Unpack
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError
+from ambid.estimation.estimate import Estimate
+from ambid.job.results import read_linear_estimate, rig_of
+from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.record import Channel, Record
 from ambid.rig import Rig, load_rig
@@ -18,24 +21,10 @@ from ambid.signals import excitation as make_excitation
 from ambid.simulation.bench import Simulation
 from ambid.simulation.rig_bench import Bench
 
+Bearer = str | Path | Rig | Preset | Estimate
+"""Who has the numbers of a bench: a preset by name, a rig, a linear estimate, or a file of one of these."""
+
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
-
-
-class Words(TypedDict, total=False):
-    """How a bench is simulated."""
-
-    duration: float  # s, 1 by default
-    rate_hz: float | None  # the bench's by default
-    excitation: str  # "multisine" by default
-    amplitude: float | None  # peak in V, rms of a gaussian; what half of the limits allows by default
-    band: tuple[float, float] | None  # Hz; one period to a fifth of the rate by default
-    periods: int  # how often the excitation repeats
-    seed: int  # of excitation and noise
-    closed: bool | None  # with or without the controller; as the bench usually works by default
-    nonlinear: bool  # the nonlinear magnet instead of its linearisation
-    position: float | None  # nonlinear: where the loop holds the rotor, m
-    log_excitation: bool  # a channel of it too
-    force: bool  # a loop that is predicted unstable too
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,16 +35,53 @@ class Excited:
     peak: float  # V; rms of a gaussian
 
 
-def simulate(source: str | Path | Rig | Preset, **words: Unpack[Words]) -> Record:
+def simulate(
+    source: Bearer,
+    *,
+    duration: float = 1.0,
+    rate_hz: float | None = None,
+    excitation: str = "multisine",
+    amplitude: float | None = None,
+    band: tuple[float, float] | None = None,
+    periods: int = 1,
+    seed: int = 0,
+    closed: bool | None = None,
+    nonlinear: bool = False,
+    position: float | None = None,
+    log_excitation: bool = False,
+    force: bool = False,
+) -> Record:
     """Simulate a bench and return the record that it would log; equal seeds give equal records.
 
     Parameters
     ----------
-    source : str, Path, Rig or Preset
-        A preset by its name, or a rig or its file.
-    **words
-        ``duration``, ``rate_hz``, ``excitation``, ``amplitude``, ``band``, ``periods``, ``seed``, ``closed``,
-        ``nonlinear``, ``position``, ``log_excitation`` and ``force``, see `Words`.
+    source : str, Path, Rig, Preset or Estimate
+        A preset by its name; a rig or its file; a linear estimate or its file: the rig that it remembers, with the
+        numbers that it found.
+    duration : float, optional
+        Length in s.
+    rate_hz : float, optional
+        Sampling rate in Hz; default the bench's.
+    excitation : str, optional
+        One of `ambid.signals.EXCITATIONS`.
+    amplitude : float, optional
+        Peak in V, rms of a gaussian; default what half of the limits allows.
+    band : (float, float), optional
+        Of the excitation, in Hz; default one period to a fifth of the rate.
+    periods : int, optional
+        How often the excitation repeats.
+    seed : int, optional
+        Of excitation and noise.
+    closed : bool, optional
+        With or without the controller; default as the bench usually works.
+    nonlinear : bool, optional
+        The nonlinear magnet instead of its linearisation.
+    position : float, optional
+        Nonlinear: where the loop holds the rotor, m.
+    log_excitation : bool, optional
+        A channel of it too.
+    force : bool, optional
+        A loop that is predicted unstable too.
 
     Returns
     -------
@@ -74,11 +100,18 @@ def simulate(source: str | Path | Rig | Preset, **words: Unpack[Words]) -> Recor
     >>> record.n_samples, record.names
     (1000, ('voltage', 'current', 'position'))
     """
-    return simulate_used(source, **words)[0].record
+    done, _ = simulate_used(
+        source, duration=duration, rate_hz=rate_hz, excitation=excitation, amplitude=amplitude, band=band,
+        periods=periods, seed=seed, closed=closed, nonlinear=nonlinear, position=position,
+        log_excitation=log_excitation, force=force,
+    )  # fmt: skip
+    for line in done.warnings:
+        warnings.warn(line, stacklevel=2)
+    return done.record
 
 
 def simulate_used(
-    source: str | Path | Rig | Preset,
+    source: Bearer,
     *,
     duration: float = 1.0,
     rate_hz: float | None = None,
@@ -111,9 +144,7 @@ def simulate_used(
     return done, Excited(kind=excitation, peak=peak)
 
 
-def _bench(
-    source: str | Path | Rig | Preset, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None
-) -> Bench:
+def _bench(source: Bearer, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
     """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
     if isinstance(source, str) and source in preset_names():
         source = preset(source)
@@ -121,6 +152,10 @@ def _bench(
         if position is not None and source.plant is not None:
             source = replace(source, operating_point=source.plant.equilibrium(position))
         return Bench.of(source, rate, source.usually_closed if closed is None else closed, nonlinear=nonlinear)
+    if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
+        source = read_linear_estimate(source, f"{source} is no linear estimate; a simulation needs one. Give a rig")
+    if isinstance(source, Estimate):
+        source = _rig_of_estimate(source)
     found = source if isinstance(source, Rig) else load_rig(Path(source))
     if position is not None:
         found = replace(found, operating_point={**found.operating_point, "position": position})
@@ -129,6 +164,19 @@ def _bench(
             f"rig {found.source or found.name} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz"
         )
     return Bench.of(found, rate, closed, nonlinear=nonlinear)
+
+
+def _rig_of_estimate(estimate: Estimate) -> Rig:
+    """Return the rig that an estimate remembers, with the numbers that it found."""
+    rig = rig_of(estimate, "the estimate")
+    known = tuple(replace(p, role="fixed", value=estimate[p.name].value, sd=None) for p in rig.parameters)
+    late = next(iter(estimate.delay.values()))
+    loop = replace(rig.loop or Loop(), delay=late.samples + late.fraction)
+    rate = rig.record.rate_hz or float(str(estimate.record["rate_hz"]))
+    return replace(
+        rig, parameters=known, loop=loop, operating_point=dict(estimate.operating_point),
+        record=replace(rig.record, rate_hz=rate),
+    )  # fmt: skip
 
 
 def _samples(duration: float, rate_hz: float) -> int:

@@ -5,21 +5,22 @@ Read -> start (an estimate, or one identified from the beginning of the record) 
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, Literal, Unpack
+from typing import Literal
 
 import numpy as np
 
+from ambid.blackbox.data import Orders
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Reading, Source, known_rig
-from ambid.job.following import EstimatorWords, Following, TrackWords, check_settings
+from ambid.job.data import Names, Reading, Source, known_rig
+from ambid.job.following import EstimatorWords, Flag, Following, FollowingWords, Memory, OnLine, Pace, check_settings
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of
 from ambid.physics.linear_model import model
-from ambid.recursive.lines import Track, TrackLine
+from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig, load_rig
 from ambid.tracking.blocks import Block, Stretch
 from ambid.tracking.engine import run
@@ -37,35 +38,71 @@ def track(
     rig: Rig | str | Path | None = None,
     *,
     method: str = "rpem",
+    input: Names | None = None,  # noqa: A002 - the words of the command
+    output: Names | None = None,
+    reference: Names | None = None,
+    orders: Orders | str | None = None,
+    open_loop: bool = False,
+    step: float | None = None,
     start: Estimate | str | Path | None = None,
     start_s: float | None = None,
+    every_s: float = 0.01,
+    limit: float = 1.5,
+    memory: Memory = "auto",
+    pace: Pace = "fastest",
+    flags: Sequence[tuple[float, Flag]] = (),
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
+    units: Mapping[str, str] | None = None,
+    on_header: Callable[[TrackHeader], None] | None = None,
+    on_line: OnLine | None = None,
+    keep: bool = True,
     tick: Tick | None = None,
-    **words: Unpack[TrackWords],
 ) -> Track:
     """Follow the physical parameters of a bench through a record, or with another `method` what that estimates.
 
     Parameters
     ----------
-    record : Record, str or Path
+    record : file, Record, DataFrame, Dataset or dict of arrays
+        Rows may be missing or damaged.
     rig : Rig, str or Path, optional
         What is known of the bench; default: columns voltage, current and position, everything free.
     method : str, optional
         ``rpem``, the supervised tracker, or one of `ambid.job.track_estimator.METHODS`.
+    input, output, reference : str or sequence of str, optional
+        Names of channels, for methods that follow coefficients.
+    orders : str or Mapping[str, int], optional
+        Of those coefficients, as `ambid.fit`.
+    open_loop : bool, optional
+        Say to such a method that no feedback was at work.
+    step : float, optional
+        Of ``lms`` and ``nlms``, for signals of size one.
     start : Estimate, str or Path, optional
         Where tracking begins; default: an identification of the first part of the record.
     start_s : float, optional
         Length of that part, s.
+    every_s : float, optional
+        Reporting interval, s of record.
+    limit : float, optional
+        Acceptable model error, in multiples of that at identification.
+    memory : float, "auto" or "all", optional
+        How long data count: a time constant in s, found from the data, or for ever.
+    pace : {"fastest", "real-time"}, optional
+        Replay as fast as possible, or as the record was taken.
+    flags : sequence of (float, str), optional
+        What an operator sets and when, s of record: "track", "hold", "accept" or "revert".
     from_s, to_s : float, optional
         Part of the record to use, s.
     rate_hz : float, optional
-        Sampling rate for a file without a time column.
+        Sampling rate of a record without time.
+    units : Mapping of str to str, optional
+        Unit by column, for tables in memory.
+    on_header, on_line : callable, optional
+        Called once before the first line, and with each line; flags that `on_line` returns are set.
+    keep : bool, optional
+        Keep the lines for the result; without, memory stays constant.
     tick : callable, optional
-    **words
-        ``every_s``, ``limit``, ``memory``, ``pace``, ``flags``, ``on_header``, ``on_line`` and ``keep``, see
-        `Following`; of another method ``inputs``, ``outputs``, ``references``, ``orders``, ``open_loop`` and ``step``.
 
     Returns
     -------
@@ -78,18 +115,21 @@ def track(
     EstimationError
         If start or settings make no sense, or nothing can be identified to start from.
     """
-    said = {"start": start, "start_s": start_s, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz}
-    check_settings({**said, **words})
-    say, following, settings = tick or silent, dict[str, Any](words), EstimatorWords()
-    for name in EstimatorWords.__annotations__:
-        if name in following:
-            settings[name] = following.pop(name)  # type: ignore[literal-required]
-    how = Following(**following)
+    following = FollowingWords(
+        every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags, on_header=on_header, on_line=on_line,
+        keep=keep,
+    )  # fmt: skip
+    check_settings(
+        {**following, "start": start, "start_s": start_s, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz}
+    )
+    say, how, settings = tick or silent, Following(**following), EstimatorWords(
+        input=input, output=output, reference=reference, orders=orders, open_loop=open_loop, step=step,
+    )  # fmt: skip
     if not (rig is None or isinstance(rig, (Rig, str, Path))):
         raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
     given = load_rig(rig) if isinstance(rig, (str, Path)) else rig
-    part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz)
-    if method != "rpem" or settings:
+    part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units)
+    if method != "rpem" or any(settings.values()):
         from ambid.job.track_estimator import track_estimator
 
         if how.pace != "fastest" or how.flags:

@@ -148,16 +148,24 @@ def _of_pandas(table: Any) -> _Parts:
                 f"the DataFrame has a MultiIndex with {labels.nlevels} labels for each {what}; one is wanted. Select a"
                 " level first, or reset_index"
             )
-    columns = tuple(_Column(label=x, values=_series(table.iloc[:, j])) for j, x in enumerate(table.columns))
+    columns = tuple(_Column(label=x, values=table.iloc[:, j]) for j, x in enumerate(table.columns))
     return _Parts(what="the DataFrame", columns=columns, index=_Column(label=table.index.name, values=table.index))
 
 
-def _series(column: Any) -> Any:
-    """Return a pandas column as NumPy does not see it: its own missing values as NaN, dates without a time zone."""
-    kind = getattr(column.dtype, "kind", "O")
-    if kind in "iufb" and not isinstance(column.dtype, np.dtype):
-        return column.to_numpy(dtype=np.float64, na_value=np.nan)
-    return column.to_numpy(dtype=f"{'datetime' if kind == 'M' else 'timedelta'}64[ns]") if kind in "mM" else column
+def _plain(values: Any) -> np.ndarray:
+    """Return an array; missing values as NaN, dates without a time zone.
+
+    NumPy alone would take what lies under a mask, and make objects of the columns that only pandas knows.
+    """
+    dtype: Any = getattr(values, "dtype", None)
+    if np.ma.isMaskedArray(values):
+        values = np.ma.filled(values.astype(np.float64), np.nan)
+    elif hasattr(values, "to_numpy") and not isinstance(dtype, np.dtype) and hasattr(dtype, "kind"):
+        if dtype.kind in "iufb":
+            values = values.to_numpy(dtype=np.float64, na_value=np.nan)
+        elif dtype.kind == "M":
+            values = values.to_numpy(dtype="datetime64[ns]")
+    return np.asarray(values)
 
 
 def _of_xarray(table: Any) -> _Parts:
@@ -185,7 +193,7 @@ def _table(parts: _Parts, units: Mapping[str, str]) -> Table:
         name, text = _named(parts.what, column, left)
         if name in names:
             raise RecordError(f"{parts.what} has column {name!r} twice; names must differ. Rename one")
-        values = np.asarray(_plain(column.values))
+        values = _plain(column.values)
         if name.lower() in TIME_NAMES:
             time, text = len(names), _time_text(values, text)
         names.append(name)
@@ -242,12 +250,6 @@ def _text_of(name: str, unit: object) -> str:
     return unit
 
 
-def _plain(values: Any) -> Any:
-    """Return NaN where an array is masked: NumPy would take what lies under the mask."""
-    masked: Any = values
-    return masked.astype(np.float64).filled(np.nan) if isinstance(values, np.ma.MaskedArray) else values
-
-
 def _time_text(values: np.ndarray, text: str | None) -> str | None:
     """Dates and time differences come in seconds, whatever unit they had."""
     return "s" if values.dtype.kind in "mM" else text
@@ -281,7 +283,7 @@ def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
 
 def _index(parts: _Parts, index: _Column, units: dict[str, str]) -> tuple[str | None, Array] | None:
     """Return unit and values of an index that is time; None for one that counts rows."""
-    values = np.asarray(index.values)
+    values = _plain(index.values)
     labelled = index.label is not None
     name, text = _named(parts.what, index, units) if labelled else ("time", None)
     if values.dtype.kind in "iu" and not (labelled and name.lower() in TIME_NAMES):

@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from importlib import import_module
 from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
@@ -22,11 +23,15 @@ from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, RecordError, nearest
-from ambid.lazy import later
 
 if TYPE_CHECKING:
     import pandas
     import xarray
+
+
+def _tables(name: str) -> Any:
+    """Return a function that turns tables into records, or back."""
+    return getattr(import_module("ambid.record.frames"), name)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +56,7 @@ class Step:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Channel(NDArrayOperatorsMixin):
-    """One measured or simulated quantity; in NumPy's functions and arithmetic it stands for its values.
+    """One measured or simulated quantity; in arithmetic, and to NumPy's functions and methods, it is its values.
 
     Attributes
     ----------
@@ -94,6 +99,11 @@ class Channel(NDArrayOperatorsMixin):
     def __array_ufunc__(self, function: np.ufunc, method: str, *inputs: Any, **options: Any) -> Any:
         plain = [x.values if isinstance(x, Channel) else x for x in inputs]
         return getattr(function, method)(*plain, **options)
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("_"):
+            raise AttributeError(name)
+        return getattr(self.values, name)
 
     def __len__(self) -> int:
         return int(self.values.size)
@@ -248,7 +258,7 @@ class Record:
         >>> Record.from_dataframe({"current [mA]": [0, 1, 2, 3, 4, 5, 6, 7]}, rate_hz=1000.0)
         Record of 8 samples, 0.008 s at 1000 Hz: current [A]
         """
-        return later("ambid.record.frames", "read_table")(table, rate_hz=rate_hz, units=units, gaps=gaps)  # type: ignore[no-any-return]
+        return _tables("read_table")(table, rate_hz=rate_hz, units=units, gaps=gaps)  # type: ignore[no-any-return]
 
     def to_dataframe(self) -> pandas.DataFrame:
         """Return a pandas DataFrame: columns ``name [unit]``, time in s as its index; `from_dataframe` takes it back.
@@ -257,7 +267,7 @@ class Record:
         -------
         pandas.DataFrame
         """
-        return later("ambid.record.frames", "to_dataframe")(self)
+        return _tables("to_dataframe")(self)
 
     def to_xarray(self) -> xarray.Dataset:
         """Return an xarray Dataset: a variable a channel with its unit, over the coordinate time in s.
@@ -267,7 +277,7 @@ class Record:
         xarray.Dataset
             With rate, history and provenance as attributes.
         """
-        return later("ambid.record.frames", "to_xarray")(self)
+        return _tables("to_xarray")(self)
 
     def __repr__(self) -> str:
         listed = ", ".join(f"{c.name} [{c.unit}]" for c in self.channels)

@@ -65,7 +65,7 @@ def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) 
     check_gap_policy(gaps)
     if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
         raise RecordError(
-            f"{where} was sampled at {record.rate_hz:g} Hz but --rate says {rate_hz:g} Hz. Leave --rate out"
+            f"{where} was sampled at {record.rate_hz:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz. Leave it out"
         )
     values = np.column_stack([c.values for c in record.channels])
     table = Table(where=where, names=record.names, values=values, first_row=0, time=None)
@@ -129,7 +129,9 @@ def seconds(time: Array, name: str, text: str | None, where: str) -> Array:
             " Time must be in [s], [ms] or [us]"
         ) from None
     if unit.si != "s":
-        raise RecordError(f"{where}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]")
+        raise RecordError(
+            f"{where}: column {name!r} is in [{text}]; time must be in [s], [ms] or [us]. Correct the unit"
+        )
     return unit.to_si(time)
 
 
@@ -211,7 +213,7 @@ def check_gap_policy(gaps: str) -> None:
     `gaps`: what was asked for.
     """
     if gaps not in GAP_POLICIES:
-        raise RecordError(f"gaps = {gaps!r} is not known; choose one of {', '.join(GAP_POLICIES)}")
+        raise RecordError(f"gaps = {gaps!r} is not known. Choose one of {', '.join(GAP_POLICIES)}")
 
 
 def _enough(n: int, where: str, what: str) -> None:
