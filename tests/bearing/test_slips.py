@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing.columns import refuse_silent
+from ambid.bearing.lag import check_lag, lag_of, without_lag
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
@@ -172,6 +173,47 @@ def test_a_weak_or_spoiled_signal_is_still_a_signal():
         refuse_silent(bench.model, changed)
     with pytest.raises(EstimationError, match="'position' is unrelated"):
         refuse_silent(bench.model, replace(noisy, y=np.column_stack([rng.standard_normal(len(x)), i])))
+
+
+def late(role, samples):
+    """One channel logged some samples later than the others."""
+
+    def change(s):
+        y = s.y.copy()
+        column = ("position", "current").index(role)
+        y[:, column] = np.concatenate([np.full(samples, y[0, column]), y[:-samples, column]])
+        return replace(s, y=y)
+
+    return change
+
+
+@pytest.mark.parametrize("role", ["position", "current"])
+def test_a_channel_that_lags_is_named_with_its_lag(role):
+    bench = run("bearing", 6000, 11)
+    with pytest.raises(EstimationError, match=rf"channel '{role}' lags behind .*channels\.{role}\.delay = 5"):
+        greybox(bench.model, late(role, 5)(bench.signals), parameters(bench, fixed=("c",)))
+
+
+def test_the_lag_is_measured_to_a_fraction_of_a_sample():
+    for name in ("bearing", "thesis"):
+        signals = run(name, 6000, 11).signals
+        found = {n: lag_of(late("position", n)(signals) if n else signals) for n in (0, 1, 7)}
+        for n, lag in found.items():
+            assert lag.samples == pytest.approx(n, abs=max(0.1, 4 * lag.sd))
+            assert lag.shown == (n > 0)
+        assert lag_of(late("current", 2)(signals)).samples == pytest.approx(-2, abs=0.2)
+        assert lag_of(without_lag(late("position", 7)(signals), found[7])).samples == pytest.approx(0, abs=0.2)
+
+
+def test_an_estimate_with_a_lag_of_one_sample_is_not_to_be_used():
+    bench = run("bearing", 6000, 11)
+    check = check_lag(late("position", 1)(bench.signals))
+    assert not check.passed
+    assert check.values["samples"] == pytest.approx(1, abs=0.2)
+    assert "lags behind current by" in check.detail
+    assert check_lag(bench.signals).passed
+    still = replace(bench.signals, y=bench.signals.y * [0.0, 1.0])
+    assert "too little" in check_lag(still).detail
 
 
 @pytest.mark.parametrize(("name", "factor", "power"), [("m", 1e3, 3), ("R", 1e-3, -3)])

@@ -5,7 +5,7 @@ import pytest
 
 from ambid.errors import RecordError, UnitError
 from ambid.record import read_record
-from ambid.rig import bench_record, default_rig, draft_rig, load_rig, read_bench
+from ambid.rig import bench_record, default_rig, draft_rig, load_rig, read_bench, rig_text
 from tests.measured import ABSENT, MAGLEV
 
 DATA = MAGLEV
@@ -113,6 +113,20 @@ def test_mat_variables_come_from_the_rig(tmp_path, rig_file):
     r = read_bench(tmp_path / "r.mat", rig)
     assert r.rate_hz == 1000.0
     np.testing.assert_allclose(r["voltage"], t * 2e-3, rtol=1e-15)
+
+
+def test_a_channel_that_is_logged_late_is_taken_back(tmp_path, rig_file):
+    source = record(tmp_path, "time [s],u [V],i [A],x [m]")
+    text = COIL + '[channels.voltage]\ncolumn = "u"\n[channels.current]\ncolumn = "i"\ndelay = 3\n'
+    rig = load_rig(rig_file(text))
+    bench = bench_record(source, rig)
+    assert bench.n_samples == source.n_samples - 3
+    np.testing.assert_array_equal(bench["current"], source["i"][3:])
+    np.testing.assert_array_equal(bench["voltage"], source["u"][:-3])
+    assert dict(bench.history[-1].settings) == {"current": 3}
+    assert "delay = 3" in rig_text(rig, tmp_path)
+    with pytest.raises(RecordError, match="is late by 99"):
+        bench_record(source, load_rig(rig_file(text.replace("3\n", "99\n"))))
 
 
 def test_draft_of_plain_names_is_ready_to_use(tmp_path, rig_file):

@@ -9,6 +9,8 @@ import numpy as np
 
 from ambid.acquisition.device import Column, DeviceInfo
 from ambid.arrays import Array
+from ambid.errors import RigError
+from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.rig import Rig, bench_record
 from ambid.tracking.blocks import Block
@@ -35,6 +37,12 @@ class BenchView:
     def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
         self.rate_hz = info.rate_hz
         self._columns, self._rig = info.columns, rig
+        late = [c.role for c in rig.channels if c.delay not in ("auto", 0) and c.role not in model(rig.model).inputs]
+        if late:
+            raise RigError(
+                f"channels.{late[0]}.delay is taken back in a whole record only; samples of a device come in blocks. "
+                "Remove it for live work"
+            )
         spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
         seen = self.record(np.array([spare]))  # so that what does not fit is told at once
         self.units = {role: seen.channel(role).unit for role in roles}

@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.lag import lag_of, without_lag
 from ambid.bearing.multistart import Candidate, Delay, Signals, busiest, starts
 from ambid.bearing.rescue import reason
 from ambid.bearing.sizes import check_units
@@ -103,6 +104,7 @@ def refuse_mistaken(
         return
     below = as_is - (0.0 if searched else _GAIN)
     _refuse_units(model, signals, parameters, delay, follow, np.inf if searched else below)
+    _refuse_late(model, signals, parameters, delay, follow)
     better: list[tuple[float, str, str, list[Candidate]]] = []
     for text, remedy, changed in _changes(signals):
         found = _starts(model, changed, parameters, delay)
@@ -115,6 +117,25 @@ def refuse_mistaken(
             raise EstimationError(
                 f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
                 f"{remedy}"
+            )
+
+
+def _refuse_late(
+    model: LinearModel,
+    signals: Signals,
+    parameters: Sequence[Parameter],
+    delay: Delay,
+    follow: Callable[[Sequence[Candidate]], Fit],
+) -> None:
+    """Raise where a channel lags behind the others, and a bearing explains the record once that is taken back."""
+    lag = lag_of(signals)
+    if lag is not None and lag.shown and round(lag.samples):
+        found = _starts(model, without_lag(signals, lag), parameters, delay)
+        fit = _try(follow, found) if found else None
+        if fit is not None:
+            raise EstimationError(
+                f"{lag.describe(signals.rate_hz)}: no bearing explains the record as it is, but one does after that "
+                f"({_numbers(fit)})"
             )
 
 

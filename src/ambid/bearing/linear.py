@@ -17,6 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.columns import POOR, refuse_mistaken, refuse_silent
+from ambid.bearing.lag import late
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
 from ambid.errors import EstimationError
@@ -114,7 +115,7 @@ def _greybox(
     if as_is < POOR and (why or fit.problem.parameters(fit.vector).get("R", 1.0) <= 0.0):
         as_is = fit.criterion / fit.problem.n_used if fit.status != "failed" else np.inf
         refuse_mistaken(model, signals, parameters, delay, as_is, follow, searched=True)
-    if why:
+    if why and not late(model, signals):  # no plant explains a channel that lags
         fit = rescue(fit, why, model, signals, parameters, delay, how, follow, tick) or fit
     return replace(fit, start_s=start_s)
 

@@ -102,7 +102,7 @@ class OutputFit:
     innovation_sd: float  # SI
 
 
-_GRAVE = frozenset({"units", "plausible", "delay_in_range", "finite_prediction", "stable_predictor"})
+_GRAVE = frozenset({"units", "plausible", "delay_in_range", "in_time", "finite_prediction", "stable_predictor"})
 """Checks after whose failure no number is to be used."""
 
 _UNFINISHED = {

@@ -98,6 +98,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
 
     `bench`: the record it came from, channels named by role.
     """
+    from ambid.bearing.lag import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
@@ -118,6 +119,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
     if problem.model.name == "one-axis":
         checks["units"] = _units(fit, rig, signals_of(bench, problem.model), doubt=not checks["fixed_agree"].passed)
+        checks["in_time"] = check_lag(signals_of(bench, problem.model))
         if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)

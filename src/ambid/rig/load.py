@@ -177,17 +177,17 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
 
 def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path: Path) -> RigChannel:
     place = f"rig {path}: channels.{role}"
-    if entry.delay not in (None, 0) and role not in plant.inputs:
+    if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
-            f"{place}.delay is {entry.delay!r}; only inputs ({', '.join(plant.inputs)}) have a delay. Remove it"
+            f"{place}.delay is 'auto'; only of inputs ({', '.join(plant.inputs)}) it is found. Give whole samples"
         )
-    delay = entry.delay if entry.delay is not None else "auto"
+    delay = entry.delay if entry.delay is not None else "auto" if role in plant.inputs else 0
     return RigChannel(
         role=role,
         column=entry.column or role,
         unit=unit_of(entry.unit, f"{place}.unit").symbol if entry.unit else None,
         calibration=_calibration(entry, unit, place, path.parent),
-        delay=delay if role in plant.inputs else 0,
+        delay=delay,
         variable=entry.variable,
     )
 
@@ -592,7 +592,24 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
     history = (*record.history, *steps, Step(name=_SELECT, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
-    return replace(record, channels=(*channels, *others), history=history)
+    return _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
+
+
+def _taken_back(record: Record, rig: Rig) -> Record:
+    """Take channels that are logged late earlier by their delays, at the cost of the record's end."""
+    inputs = model(rig.model).inputs
+    late = {c.role: int(c.delay) for c in rig.channels if c.role not in inputs and c.delay not in ("auto", 0)}
+    if not late:
+        return record
+    n = record.n_samples - max(late.values())
+    if n < 1:
+        raise RecordError(
+            f"the record has {record.n_samples} samples; a channel of the rig is late by {max(late.values())}. Correct "
+            "channels.<role>.delay"
+        )
+    parts = ((c, late.get(c.name, 0)) for c in record.channels)
+    channels = tuple(replace(c, values=c.values[k : n + k].copy()) for c, k in parts)
+    return record.with_step(Step(name="advance", settings=MappingProxyType(late)), channels=channels)
 
 
 def _through_a_rig(record: Record, rig: Rig, wanted: Mapping[str, str]) -> Record:

@@ -44,7 +44,8 @@ class RigChannel:
     calibration : Calibration or None
         From the column's SI unit to the role's; None if the column is the role already.
     delay : int or "auto"
-        Samples by which the input acts later than logged; ``"auto"``: the identification finds it. 0 for outputs.
+        Samples by which an input acts later than logged (``"auto"``: the identification finds it), or by which
+        another channel is logged later than the rest.
     variable : str or None
         Variable of a ``.mat`` file that holds the column; None: it is called like the column.
     """
@@ -401,7 +402,7 @@ def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
     lines += [f"variable = {toml_text(c.variable)}"] if c.variable else []
     lines += [f"unit = {toml_text(c.unit)}"] if c.unit else []
     lines += _calibration_lines(c.calibration, c.role, folder) if c.calibration else []
-    if is_input:
+    if is_input or c.delay:
         lines.append('delay = "auto"' if c.delay == "auto" else f"delay = {c.delay}")
     return lines
 

@@ -1,0 +1,144 @@
+"""Whether position and current belong to the same instants: a channel that lags is no plant.
+
+The rotor's equation x'' = -(k_x/m) x + (k_i/m) i + constant is regressed over frequencies (`take_moments`: nothing
+measured is differentiated) with the current taken some samples later or earlier: where it explains most is the lag of
+one channel behind the other. A delay of the voltage is the model's own, and one of both channels is the same.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.multistart import Signals, Spectrum, busiest, take_moments
+from ambid.estimation.estimate import Check
+from ambid.physics.linear_model import LinearModel
+
+_LOOKED = 16384  # samples
+_FARTHEST = 40  # samples
+_BANDS = (0.15, 0.06, 0.025)  # of the Nyquist frequency: above, the noise of the position counts most
+_FEWEST = 20  # lines
+_SHARE = 0.7  # of the acceleration that has to be explained before a lag is one
+_SURE = 4.0  # standard deviations
+_LEAST = 0.5  # samples: a smaller lag moves parameters by a percent at most
+_STEPS = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lag:
+    """How much later the position is logged than the current; negative: the current lags."""
+
+    samples: float
+    sd: float
+    share: float  # part of the acceleration that is explained with it
+
+    @property
+    def shown(self) -> bool:
+        """Whether the record shows a lag that counts."""
+        return self.share > _SHARE and abs(self.samples) - _SURE * self.sd > _LEAST
+
+    @property
+    def channel(self) -> str:
+        """The channel that is late."""
+        return "position" if self.samples > 0 else "current"
+
+    def describe(self, rate_hz: float) -> str:
+        """Return what is late, by how much, and the remedy."""
+        late, other = abs(self.samples), "current" if self.samples > 0 else "position"
+        whole = f", or give channels.{self.channel}.delay = {round(late)}" if round(late) else ""
+        size = f"{late:.2g} samples ({1e3 * late / rate_hz:.3g} ms)"
+        return (
+            f"channel {self.channel!r} lags behind {other} by {size}. Sample both at the same instant and filter them "
+            f"alike{whole}" + ("; or eddy currents delay the force" if self.samples > 0 else "")
+        )
+
+
+def lag_of(signals: Signals) -> Lag | None:
+    """Measure the lag between position and current of a record of model one-axis; None where nothing moves."""
+    at = busiest(signals.u, _LOOKED)
+    x, i = (signals.y[at] - signals.y[at].mean(axis=0)).T
+    m = take_moments({"position": x, "current": i}, (), signals.rate_hz)
+    turn = m.omega / signals.rate_hz  # rad per sample
+    best: tuple[float, int, slice] = (0.0, 0, slice(0))
+    for band in _BANDS:
+        lines = slice(3, int(band * m.omega.size))
+        if lines.stop - lines.start >= _FEWEST:
+            rows = _rows(m.signals["position"], m.signals["current"][0], m.omega, lines)
+            best = max(best, (*_coarse(*rows, turn[lines]), lines), key=lambda b: b[0])
+    share, whole, lines = best
+    if share <= 0.0:
+        return None
+    target, stiffness, current = _rows(m.signals["position"], m.signals["current"][0], m.omega, lines)
+    samples, sd = float(whole), np.inf
+    for _ in range(_STEPS):  # Gauss-Newton on the fraction
+        moved = current * np.exp(-1j * turn[lines] * samples)
+        terms = np.column_stack([_real(stiffness), _real(moved), _real(-1j * turn[lines] * moved)])
+        size = np.linalg.norm(terms, axis=0)
+        values = np.linalg.lstsq(terms / size, _real(target), rcond=None)[0]
+        left = _real(target) - terms / size @ values
+        spread = np.linalg.pinv((terms / size).T @ (terms / size))[2, 2] * float(left @ left) / max(len(left) - 4, 1)
+        force = float(values[1] / size[1]) or np.inf
+        samples += float(np.clip(values[2] / size[2] / force, -0.5, 0.5))
+        sd = float(np.sqrt(spread)) / size[2] / abs(force)
+    return Lag(samples=samples, sd=sd, share=share)
+
+
+def late(model: LinearModel, signals: Signals) -> bool:
+    """Whether position or current of a record lag."""
+    found = lag_of(signals) if model.name == "one-axis" else None
+    return found is not None and found.shown
+
+
+def check_lag(signals: Signals) -> Check:
+    """Check that position and current are logged at the same instants."""
+    found = lag_of(signals)
+    if found is None or found.share <= _SHARE:
+        return Check(passed=True, detail="the current explains too little of the motion to tell whether a channel lags")
+    values = {"samples": found.samples, "sd": found.sd}
+    if found.shown:
+        return Check(passed=False, values=values, detail=found.describe(signals.rate_hz))
+    detail = f"position and current are logged at the same instants (lag {found.samples:.2g} ± {found.sd:.1g} samples)"
+    return Check(passed=True, values=values, detail=detail)
+
+
+def without_lag(signals: Signals, lag: Lag) -> Signals:
+    """Return a record whose late channel is taken earlier by whole samples, at the cost of its end."""
+    k = round(abs(lag.samples))
+    n = len(signals.u) - k
+    x, i = signals.y.T
+    moved = (x[k:], i[:n]) if lag.samples > 0 else (x[:n], i[k:])
+    return replace(signals, u=signals.u[:n], y=np.column_stack(moved))
+
+
+def _rows(
+    position: tuple[Spectrum, Spectrum, Spectrum], current: Spectrum, omega: Array, lines: slice
+) -> tuple[Spectrum, Spectrum, Spectrum]:
+    """Acceleration, position and current over some lines, weighted so that low and high ones count alike."""
+    weight = 1.0 / (omega[lines] + omega[lines][-1] / 3.0) ** 2
+    return position[2][lines] * weight, position[0][lines] * weight, current[lines] * weight
+
+
+def _coarse(target: Spectrum, stiffness: Spectrum, current: Spectrum, turn: Array) -> tuple[float, int]:
+    """The whole lag at which most is explained, and how much."""
+    aside, goal = _real(stiffness), _real(target)
+    if not (np.any(goal) and np.any(aside) and np.any(current)):
+        return 0.0, 0
+    aside = aside / float(np.linalg.norm(aside))
+    power, goal = float(goal @ goal), goal - aside * float(aside @ goal)
+    best, at = -1.0, 0
+    moved, step = current * np.exp(1j * turn * _FARTHEST), np.exp(-1j * turn)
+    for samples in range(-_FARTHEST, _FARTHEST + 1):
+        row = _real(moved)
+        row = row - aside * float(aside @ row)
+        gain = float(row @ goal) ** 2 / float(row @ row)
+        share = 1.0 - (float(goal @ goal) - gain) / power
+        if share > best:
+            best, at = share, samples
+        moved = moved * step
+    return best, at
+
+
+def _real(x: Spectrum) -> Array:
+    return np.concatenate([x.real, x.imag])
