@@ -10,8 +10,8 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from ambid.blackbox.words import settings_of
 from ambid.cli import fit as verb
-from ambid.cli.options import settings_of
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
 WORDS = ("--input", "u", "--output", "y", "--open-loop")

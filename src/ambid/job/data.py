@@ -44,6 +44,11 @@ class Clock:
         self.laps[name], self._last = now - self._last, now
 
 
+def sources_of(records: Source | Sequence[Source]) -> list[Source]:
+    """Return several records as a list, and one as a list of one."""
+    return list(records) if isinstance(records, (list, tuple)) else [records]  # type: ignore[list-item]
+
+
 def known_rig(rig: Rig | str | Path | None) -> Rig:
     """Return a rig, read from its file where it is none; by default all is free and columns are named like roles."""
     return default_rig() if rig is None else rig if isinstance(rig, Rig) else load_rig(rig)

@@ -17,7 +17,7 @@ from ambid.blackbox.words import Candidate, candidates_of, fixed_of, orders_of, 
 from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
-from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig
+from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig, sources_of
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model
 from ambid.record import GapPolicy
@@ -121,7 +121,7 @@ def fit(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
         rig=rig,
     )  # fmt: skip
-    sources: list[Source] = list(records) if isinstance(records, (list, tuple)) else [records]  # type: ignore[list-item]
+    sources = sources_of(records)
     nonlinear, wanted, fixed = structure in NONLINEAR_STRUCTURES, orders_of(orders), fixed_of(fix)
     chosen = settings_of(settings)
     if nonlinear:

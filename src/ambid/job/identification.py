@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, Unpack
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,9 +17,9 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of
+from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
 from ambid.physics.linear_model import model
-from ambid.record import Record
+from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
 
 if TYPE_CHECKING:
@@ -27,7 +27,6 @@ if TYPE_CHECKING:
     from ambid.bearing.multistart import Signals
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
-    from ambid.job.bearing_records import BearingWords
 
 
 def identify(
@@ -35,23 +34,34 @@ def identify(
     rig: Rig | str | Path | None = None,
     *,
     validate: Source | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-    **reading: Unpack[Reading],
 ) -> Estimate:
     """Identify the physical parameters of a bench from one record, and check the result.
 
     Parameters
     ----------
-    record : Record, str or Path
-        A file in the rig's columns, or a record whose channels are named by role.
+    record : file, Record, DataFrame, Dataset or dict of arrays
+        In the rig's columns. A table is one of pandas or polars, with columns ``name [unit]`` (or `units`) and time as
+        index, as a column ``time [s]`` or told by `rate_hz`; a Dataset one of xarray.
     rig : Rig, str or Path, optional
         What is known of the bench; default: columns voltage, current and position, everything free.
-    validate : Record, str or Path, optional
+    validate : as `record`, optional
         A second record of the same bench to validate the estimate on.
+    from_s, to_s : float, optional
+        Part of a record in which the rotor moves, in s; overrides the rig's.
+    rate_hz : float, optional
+        Sampling rate of a record without time, Hz.
+    gaps : {"error", "interpolate", "cut"}, optional
+        What to do about missing values; default: as the rig says, else refuse them.
+    units : Mapping of str to str, optional
+        Unit by column, for tables in memory.
     tick : callable, optional
         Called with the name of the present stage now and then (progress); may raise to interrupt.
-    **reading
-        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps``, of the second record too, see `ambid.job.data.Reading`.
 
     Returns
     -------
@@ -64,10 +74,21 @@ def identify(
         If record or rig break a rule.
     EstimationError
         If nothing can be identified from the record.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> record = ambid.simulate("thesis", duration=0.5, seed=1)
+    >>> estimate = ambid.identify(record)
+    >>> round(estimate["m"].value, 3), estimate["m"].unit, estimate.verdict.word
+    (0.1, 'kg', 'usable')
+
+    A table takes the place of the record: ``ambid.identify(record.to_dataframe(), "bench.toml")``.
     """
     from ambid.bearing.linear import greybox
 
     say, clock, rig = tick or silent, Clock(), known_rig(rig)
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
     bench, plant = load_bench(record, rig, **reading), model(rig.model)
     clock.lap("read")
     say("identify")
@@ -171,13 +192,21 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
 
 
 def identify_nonlinear(
-    records: Sequence[Source],
+    records: Source | Sequence[Source],
     rig: Rig | str | Path | None = None,
     *,
-    held: Sequence[Source] = (),
+    held: Source | Sequence[Source] = (),
     validate: Source | None = None,
+    magnet: Literal["auto", "single", "pair"] | None = None,
+    eddy: bool = False,
+    drift: bool = False,
+    off_below: float | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-    **words: Unpack[BearingWords],
 ) -> NonlinearBearingEstimate:
     """Identify one nonlinear bearing from several records at several operating points at once.
 
@@ -185,20 +214,24 @@ def identify_nonlinear(
 
     Parameters
     ----------
-    records : sequence of Record, str or Path
+    records : file, Record, DataFrame, Dataset or dict of arrays, or sequence of these
         In which the rotor moves.
     rig : Rig, str or Path, optional
         What is known of the bench, of the magnet in ``[magnet]``.
-    held : sequence of Record, str or Path, optional
+    held : as `records`, optional
         With the rotor held at rest at different distances: they show the coil.
-    validate : Record, str or Path, optional
+    validate : as one of the `records`, optional
         A further record, of a rotor that moves, to validate the estimate on.
+    magnet : {"auto", "single", "pair"}, optional
+        One magnet or two; default: as the rig says.
+    eddy, drift : bool, optional
+        Estimate an eddy pole, or a resistance that drifts, where the rig does not say so.
+    off_below : float, optional
+        Voltage at or below which the power stage is off, V; default: as the rig says.
+    from_s, to_s, rate_hz, gaps, units : optional
+        As `identify`; the part of every record in which the rotor moves.
     tick : callable, optional
         As `identify`.
-    **words
-        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps`` as `identify`, the part of every record in which the rotor moves;
-        ``magnet``, ``eddy``, ``drift`` and ``off_below``: what is known beside the rig, see
-        `ambid.job.bearing_records.MagnetWords`.
 
     Returns
     -------
@@ -214,11 +247,15 @@ def identify_nonlinear(
     from ambid.bearing.magnet_estimate import estimate_bearing
     from ambid.bearing.magnet_likelihood import uncertainty
     from ambid.job.bearing_estimate import judge_bearing
-    from ambid.job.bearing_records import bearing_rig, laws_of, numbers_of, take_all
+    from ambid.job.bearing_records import BearingWords, bearing_rig, laws_of, numbers_of, take_all
     from ambid.validation.nonlinear_bearing import validation
 
+    words = BearingWords(
+        magnet=magnet, eddy=eddy, drift=drift, off_below=off_below, from_s=from_s, to_s=to_s, rate_hz=rate_hz,
+        gaps=gaps, units=units,
+    )  # fmt: skip
     say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
-    taken, second = take_all(records, held, validate, bench, words, say)
+    taken, second = take_all(sources_of(records), sources_of(held), validate, bench, words, say)
     clock.lap("read")
     assert bench.magnet is not None
     laws, extend = laws_of(bench.magnet, [t.record for t in taken if not t.record.held])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -17,6 +18,7 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 from ambid.physics.linear_model import model
+from ambid.record import GapPolicy
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
 from ambid.validation.fits import second_check
@@ -87,8 +89,9 @@ def data_of(
         if rig is not None:
             raise EstimationError(f"{where} is a black-box fit, which knows no rig. Leave --rig out")
         channels = Channels(
-            inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps")
-        )
+            inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps"),
+            units=reading.get("units"),
+        )  # fmt: skip
         data = channels.read(record, (reading.get("from_s"), reading.get("to_s")))
         check_same_bench(known.units, known.dt, data)
         return data
@@ -104,7 +107,12 @@ def validate(
     estimate: AnyEstimate | AnyFit | str | Path,
     record: Source,
     rig: Rig | str | Path | None = None,
-    **reading: Unpack[Reading],
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
 ) -> Validation:
     """Judge an estimate or a fit on another record of the same bench: nothing is fitted but offsets and initial state.
 
@@ -112,12 +120,12 @@ def validate(
     ----------
     estimate : Estimate, NonlinearBearingEstimate, BlackBoxFit, NonlinearFit, str or Path
         A result, or its file.
-    record : Record, str or Path
+    record : file, Record, DataFrame, Dataset or dict of arrays
         Of a rotor that moves.
     rig : Rig, str or Path, optional
         Through which the record is read; default: as the estimate remembers it.
-    **reading
-        ``from_s``, ``to_s``, ``rate_hz`` and ``gaps``, see `ambid.job.data.Reading`.
+    from_s, to_s, rate_hz, gaps, units : optional
+        As `ambid.identify`.
 
     Returns
     -------
@@ -130,6 +138,7 @@ def validate(
     """
     known = load(estimate) if isinstance(estimate, str | Path) else estimate
     name = Path(estimate).name if isinstance(estimate, str | Path) else ""
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
     data = data_of(known, record, None if rig is None else known_rig(rig), where=name or "the estimate", **reading)
     if isinstance(known, BlackBoxFit | NonlinearFit):
         fit = fit_validation(known, data)
