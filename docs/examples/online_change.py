@@ -56,7 +56,7 @@ def main(seed: int = 1) -> Result:
             f"{name:4} {p.value:11.5g} ± {p.sd:.2g}, truth {truth[name]:.5g}, {(p.value - truth[name]) / p.sd:+.1f} sd"
         )
 
-    change = next(event for event in followed.summary.changes if event.parameter == "k_i")
+    change = next(event for event in followed.totals.changes if event.parameter == "k_i")
     t = np.array([line.t for line in followed.lines])
     value = np.array([line.parameters["k_i"].value for line in followed.lines])
     off = t[(t > CHANGE_S) & (np.abs(value / k_i - 1) > CLOSE)].max(initial=CHANGE_S)

@@ -116,9 +116,9 @@ def test_strict_ends_with_3_where_something_is_left_open(bench, ambid, job, whol
     unanswered = [replace(x, events=tuple(e for e in x.events if e.kind != "accepted")) for x in whole.lines]
     off = replace(whole.lines[-1], error=1.7)
     for lines, said in (
-        (whole.lines[: n + 3], "without information"),
-        (unanswered, "not answered"),
-        ((*whole.lines[:-1], off), "beyond the limit"),
+        (whole.lines[: n + 3], "without excitation"),
+        (unanswered, "not followed"),
+        ((*whole.lines[:-1], off), "above the limit"),
     ):
         job["track"] = replace(whole, lines=tuple(lines))
         lenient, strict = ambid("track", "record.csv"), ambid("track", "record.csv", "--strict")
@@ -135,9 +135,9 @@ def test_ctrl_c_keeps_the_track_and_says_so(bench, ambid, job, whole):
     assert "stopped before its end" in found.out
     kept = read_track("track.jsonl")
     assert kept.lines == whole.lines[:101]
-    assert kept.summary.complete is False
-    assert len(kept.summary.changes) == 1
-    assert json.loads((bench / "track.jsonl").read_text().splitlines()[-1]).keys() == {"summary"}
+    assert kept.totals.complete is False
+    assert len(kept.totals.changes) == 1
+    assert json.loads((bench / "track.jsonl").read_text().splitlines()[-1]).keys() == {"verdict", "summary"}
     assert (bench / "track.png").stat().st_size > 50_000
     assert signal.getsignal(signal.SIGINT) is before
 
@@ -181,7 +181,7 @@ def test_an_error_on_the_way_leaves_a_file_that_says_so(bench, ambid, job, whole
     assert (found.code, found.out, found.err) == (2, "", "ambid: the disk has gone. Bring it back\n")
     kept = read_track("track.jsonl")
     assert kept.lines == whole.lines[:30]
-    assert not kept.summary.complete
+    assert not kept.totals.complete
     assert not (bench / "track.png").exists()
 
 
@@ -210,17 +210,17 @@ def test_routine_decisions_do_not_bury_a_change(bench, ambid, job, whole):
 
 
 def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
-    from ambid.cli.track import truth_columns
+    from ambid.job.track_truth import truth_beside
     from ambid.report import track_figures
 
     rows = "\n".join(f"{k / 100},{k},{1600 + k},5" for k in range(50))
     (bench / "true.csv").write_text(f"time [s],voltage [V],true_R [mohm],true_m [V]\n{rows}\n".replace("mohm", "ohm"))
-    found = truth_columns(bench / "true.csv", None, {"R": "ohm", "m": "kg"})
+    found = truth_beside(bench / "true.csv", None, {"R": "ohm", "m": "kg"})
     assert list(found) == ["R"]
     assert found["R"][0][3] == pytest.approx(0.03)
     assert found["R"][1][3] == pytest.approx(1603.0)
     assert "'true_m' is in [V], the tracked number in [kg]" in capsys.readouterr().err
-    assert truth_columns(bench / "record.csv", None, {"R": "ohm"}) == {}
+    assert truth_beside(bench / "record.csv", None, {"R": "ohm"}) == {}
     given = {}
     drawn = track_figures.track_figure
     monkeypatch.setattr(track_figures, "track_figure", lambda h, truth: given.update(truth) or drawn(h, truth=truth))
@@ -290,7 +290,7 @@ def test_keys_set_flags_and_q_ends_with_the_terminal_as_before(bench):
     assert (bench / "flags").read_text().split() == ["hold", "track"]
     kept = read_track(bench / "track.jsonl")
     assert 0 < len(kept.lines) < 600
-    assert kept.summary.complete is False
+    assert kept.totals.complete is False
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="terminals as POSIX has them")

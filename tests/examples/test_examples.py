@@ -97,7 +97,7 @@ def test_the_laguerre_operator_keeps_the_condition():
 
 def test_a_change_is_found_while_the_rotor_levitates():
     result = example("online_change").main()
-    assert [change.parameter for change in result.track.summary.changes] == ["k_i"]
+    assert [change.parameter for change in result.track.totals.changes] == ["k_i"]
     assert 0.0 < result.detected_s < 0.02
     assert result.detected_s < result.found_s < 0.25
     last = result.track.lines[-1]

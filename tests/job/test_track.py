@@ -46,8 +46,8 @@ def kinds(found):
 def test_a_scenario_is_told_as_it_was(name, moved):
     record, truth = scenario(name, 2.4, at_s=1.6)
     found = track(record)
-    assert [e.parameter for e in found.summary.changes] == ([moved] if moved else [])
-    assert all(e.t == pytest.approx(1.6, abs=0.02) for e in found.summary.changes)
+    assert [e.parameter for e in found.totals.changes] == ([moved] if moved else [])
+    assert all(e.t == pytest.approx(1.6, abs=0.02) for e in found.totals.changes)
     assert far(found, truth) == {}
     assert found.lines[-1].state == "tracking"
 
@@ -57,7 +57,7 @@ def test_nothing_is_told_where_nothing_changes(name):
     record, truth = scenario(name, 2.5)
     found = track(record)
     assert kinds(found) == []
-    assert found.summary.update_s == 0.0
+    assert found.totals.update_s == 0.0
     assert {line.state for line in found.lines} == {"tracking"}
     assert far(found, truth) == {}
 
@@ -65,7 +65,7 @@ def test_nothing_is_told_where_nothing_changes(name):
 def test_a_coil_that_warms_is_followed_without_an_alarm():
     record, truth = scenario("drift", 5.0)
     found = track(record)
-    assert found.summary.changes == ()
+    assert found.totals.changes == ()
     assert found.lines[-1].parameters["R"].value == pytest.approx(truth["R"], rel=0.01)
     assert far(found, {n: v for n, v in truth.items() if n != "R"}) == {}
 
@@ -78,7 +78,7 @@ def test_a_spin_up_gives_the_unbalance_without_a_rig(tmp_path):
     last = found.lines[-1].extra
     assert last["unbalance"].value == pytest.approx(truth["unbalance"], rel=0.05)
     assert last["unbalance_phase"].value == pytest.approx(truth["unbalance_phase"], abs=0.05)
-    assert found.summary.changes == ()
+    assert found.totals.changes == ()
 
 
 def test_columns_of_other_units_are_no_rotation(tmp_path):
@@ -92,7 +92,7 @@ def test_a_quiet_rotor_after_a_start_from_an_estimate_is_frozen_and_thaws():
     loud, quiet = simulated(seconds=1.5), simulate_scenario("quiet", BENCH, duration_s=4.0, seed=3).record
     both = tuple(replace(c, values=np.concatenate([quiet[c.name][: 4 * RATE], c.values])) for c in loud.channels)
     found = track(replace(loud, channels=both), start=start(), every_s=0.05)
-    assert found.summary.changes == ()
+    assert found.totals.changes == ()
     states = [line.state for line in found.lines if 2.5 < line.t < 4.0]
     assert set(states) == {"frozen"}
     middle = next(line for line in found.lines if line.t >= 3.5)
@@ -146,15 +146,15 @@ def test_a_damaged_file_ends_at_the_same_estimate_and_says_what_was_left_out(tmp
     for name, value in found.lines[-1].parameters.items():
         assert abs(value.value - plain.lines[-1].parameters[name].value) < value.sd
         assert value.sd < 1.2 * plain.lines[-1].parameters[name].sd
-    assert found.summary.changes == ()
+    assert found.totals.changes == ()
     if rejected is not None:
-        assert found.summary.rejected_samples == rejected
+        assert found.totals.rejected_samples == rejected
     if how != "late":
-        assert found.summary.counts.get("rejected", 0) >= 1
+        assert found.totals.counts.get("rejected", 0) >= 1
     told = sum(e.samples or 0 for line in found.lines for e in line.events if e.kind == "rejected")
-    assert told == found.summary.rejected_samples
+    assert told == found.totals.rejected_samples
     assert np.diff([line.t for line in found.lines]) == pytest.approx(0.01)
-    assert found.summary.complete
+    assert found.totals.complete
 
 
 def test_lost_samples_all_over(tmp_path):
@@ -168,9 +168,9 @@ def test_lost_samples_all_over(tmp_path):
             lines[k] = lines[k].split(",")[0] + ",,,"
             gone.append(k)
     found = track(written(tmp_path / "r.csv", lines))
-    assert found.summary.rejected_samples == len(gone)
+    assert found.totals.rejected_samples == len(gone)
     assert far(found, TRUE) == {}
-    assert found.summary.changes == ()
+    assert found.totals.changes == ()
 
 
 def test_the_start_passes_over_a_damaged_beginning(tmp_path, steady):
@@ -189,7 +189,7 @@ def test_a_start_from_a_file_begins_at_the_first_sample(tmp_path, steady):
     found = track(record, start=tmp_path / "e.json", to_s=0.5)
     assert found.lines[0].t == pytest.approx(0.01)
     assert found.header.start["k_i"].value == pytest.approx(start(2).values["k_i"])
-    assert found.summary.samples == RATE // 2
+    assert found.totals.samples == RATE // 2
 
 
 def test_starts_that_do_not_fit_are_refused(tmp_path, steady):
@@ -253,7 +253,7 @@ def test_a_change_is_followed_at_any_limit_and_interval():
     record = simulated(step("k_i", 0.85, 1.6), seconds=2.2)
     for limit, every_s in ((1.1, 0.05), (5.0, 0.003)):
         found = track(record, limit=limit, every_s=every_s)
-        assert [e.parameter for e in found.summary.changes] == ["k_i"]
+        assert [e.parameter for e in found.totals.changes] == ["k_i"]
         assert isinstance(record, Record)
         assert far(found, {**TRUE, "k_i": 0.85 * TRUE["k_i"]}) == {}
         assert found.header.every_s == every_s
@@ -314,7 +314,7 @@ def test_an_incredible_value_is_rejected_not_learned(steady):
             values[6000:6020] = 1e10
         wild.append(replace(c, values=values))
     found = track(replace(steady[0], channels=tuple(wild)), start=start(2), to_s=0.6)
-    assert found.summary.rejected_samples == 20
+    assert found.totals.rejected_samples == 20
     assert kinds(found) == ["rejected"]
 
 

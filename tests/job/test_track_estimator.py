@@ -60,7 +60,7 @@ def test_coefficients_come_in_si_with_their_deviations(method: str, more: dict[s
     assert len(found.lines) == 40
     assert found.lines[-1].t == pytest.approx(N / RATE)
     assert found.lines[-1].error == pytest.approx(1.0, abs=0.4)
-    assert found.summary.samples + found.summary.rejected_samples == N
+    assert found.totals.samples + found.totals.rejected_samples == N
 
 
 def test_feedback_biases_and_is_told_unless_a_reference_is_the_instrument() -> None:
@@ -85,7 +85,7 @@ def test_joint_filters_follow_physical_parameters_from_an_identified_start(metho
         assert abs(value[name] - bench.parameters[name]) < 5 * sd[name]
     assert found.header.start["m"].value > 0
     assert found.header.units["force_offset"] == "N"
-    assert found.summary.samples == 8000
+    assert found.totals.samples == 8000
 
 
 @pytest.mark.parametrize(

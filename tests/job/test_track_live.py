@@ -46,8 +46,8 @@ def test_it_follows_the_bench_from_an_estimate(start):
     assert done.run.complete
     assert len(heard.numbers) == 6000
     assert done.overruns == 0
-    assert done.track.summary.samples == 6000
-    assert done.track.summary.rejected_samples == 0
+    assert done.track.totals.samples == 6000
+    assert done.track.totals.rejected_samples == 0
     assert done.track.lines[-1].t == pytest.approx(3.0, abs=0.02)
     for name, truth in TRUTH.items():
         value = done.track.lines[-1].parameters[name]
@@ -58,7 +58,7 @@ def test_without_a_start_it_identifies_the_first_part_and_tracks_the_rest():
     with Spoiled(RIG) as device:
         done = track_live(device, RIG, course(6.0), start_s=4.0)
     assert done.run.complete
-    assert done.track.summary.samples == 4000  # what came while it identified is tracked too, from the part's end on
+    assert done.track.totals.samples == 4000  # what came while it identified is tracked too, from the part's end on
     assert done.track.lines[-1].t == pytest.approx(6.0, abs=0.02)
 
 
@@ -67,7 +67,7 @@ def test_a_played_bench_waits_for_the_tracker(start, monkeypatch):
     with Spoiled(RIG) as device:
         done = track_live(device, RIG, course(8.0), start=start)
     assert done.overruns == 0
-    assert done.track.summary.samples == 16_000
+    assert done.track.totals.samples == 16_000
 
 
 def test_what_comes_in_many_short_blocks_waits_in_the_ring_while_the_tracker_is_busy(start):
@@ -87,14 +87,14 @@ def test_what_comes_in_many_short_blocks_waits_in_the_ring_while_the_tracker_is_
     with Hardware(RIG, block_samples=8) as device:
         done = track_live(device, RIG, course(8.0), start=start, taps=[heard], on_header=busy)
     assert done.overruns == 0
-    assert done.track.summary.samples == 16_000
+    assert done.track.totals.samples == 16_000
 
 
 def test_a_gap_is_seen_by_the_tracker(start):
     with Spoiled(RIG, lose=lambda d: d.excited and d.blocks == 300) as device:
         done = track_live(device, RIG, course(4.0), start=start)
     assert done.run.lost == 20
-    assert done.track.summary.samples + done.track.summary.rejected_samples >= 7980
+    assert done.track.totals.samples + done.track.totals.rejected_samples >= 7980
     assert any(e.kind == "rejected" and "20 samples" in e.why for line in done.track.lines for e in line.events)
 
 
@@ -117,7 +117,7 @@ def test_a_sample_outside_a_calibration_table_is_rejected_and_ends_nothing(start
         done = track_live(device, rig, course(4.0), start=start, taps=[heard])
     assert done.run.complete
     assert len(heard.numbers) == 8000
-    assert 1 <= done.track.summary.rejected_samples < 40
+    assert 1 <= done.track.totals.rejected_samples < 40
 
 
 def test_a_bench_that_changes_is_seen(start):
@@ -128,7 +128,7 @@ def test_a_bench_that_changes_is_seen(start):
     with Spoiled(RIG, spoil=change) as device:
         done = track_live(device, RIG, course(5.0), start=start)
     last = done.track.lines[-1]
-    assert done.track.summary.changes or last.error > 1.5 or last.parameters["R"].value > 7.0
+    assert done.track.totals.changes or last.error > 1.5 or last.parameters["R"].value > 7.0
 
 
 def test_a_run_that_is_too_short_is_refused_before_anything_moves(start):
@@ -160,7 +160,7 @@ def test_a_fault_while_it_tracks_ends_the_track_in_order(start):
     with Spoiled(RIG, spoil=trip) as device:
         done = track_live(device, RIG, course(60.0), start=start)
     assert done.run.fault is not None
-    assert done.track.summary is not None
+    assert done.track.totals is not None
     assert done.track.lines
 
 
@@ -217,7 +217,7 @@ def test_a_wish_to_end_ends_the_track_in_order(start):
             device, RIG, course(600.0), start=start, taps=[heard], stopped=lambda: len(heard.frames) > 150
         )
     assert done.run.interrupted
-    assert done.track.summary.samples == len(heard.numbers) > 3000
+    assert done.track.totals.samples == len(heard.numbers) > 3000
 
 
 def test_a_line_that_is_lost_is_raised(start, tmp_path):

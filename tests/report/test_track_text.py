@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import pytest
 
-from ambid.recursive.lines import Event, Latency, TrackedValue, TrackLine
-from ambid.report.track_text import change_words, speed_words, track_text, troubles_of, value_words
+from ambid.recursive.lines import Event, Latency, Track, TrackedValue, TrackLine
+from ambid.report.track_text import change_words, speed_words, track_text, value_words
 from tests.tracking.tracks import header, track_of
 
 
@@ -19,7 +19,7 @@ def track():
 
 
 def test_the_table_holds_values_intervals_and_the_way_from_the_start(track):
-    text = track_text(track.header, track.lines[-1], track.summary)
+    text = track_text(track)
     assert max(map(len, text.splitlines())) <= 80
     (row,) = re.findall(
         r"^k_i +([\d.]+) ± ([\d.]+) N/A +([\d.]+) … ([\d.]+) +(-[\d.]+) % +tracked$", text, re.MULTILINE
@@ -37,7 +37,7 @@ def test_the_table_holds_values_intervals_and_the_way_from_the_start(track):
 
 def test_stale_parameters_and_a_run_that_was_stopped_are_told(track):
     line = next(x for x in track.lines if x.state == "frozen")
-    text = track_text(track.header, line, replace(track.summary, complete=False), width=60)
+    text = track_text(replace(track, lines=(line,), totals=replace(track.totals, complete=False)), width=60)
     assert len(re.findall("STALE$", text, re.MULTILINE)) == 5
     assert "stopped before its end" in text
     assert "…" not in text.split("\n\n")[1]  # the interval is left out where there is no room
@@ -46,14 +46,14 @@ def test_stale_parameters_and_a_run_that_was_stopped_are_told(track):
 
 def test_lost_blocks_are_told(track):
     latency = Latency(median=1e-4, p99=2e-4, largest=1e-3, overruns=2, late=5)
-    text = track_text(track.header, track.lines[-1], replace(track.summary, latency=latency))
+    text = track_text(replace(track, totals=replace(track.totals, latency=latency)))
     assert "2 blocks LOST" in text
     assert "5 late" in text
 
 
 def test_many_events_are_not_all_listed(track):
     events = [Event(kind="accepted", t=0.1 * k, why=f"number {k}", parameter="R") for k in range(50)]
-    text = track_text(track.header, track.lines[-1], track.summary, events=events)
+    text = track_text(track, events=events)
     assert "30 earlier events are not shown" in text
     assert "number 29" not in text
     assert "number 30" in text
@@ -72,12 +72,15 @@ TROUBLES = {
 
 
 @pytest.mark.parametrize(("error", "state", "open_changes", "said"), TROUBLES.values(), ids=TROUBLES.keys())
-def test_what_is_wrong_at_the_end(error, state, open_changes, said):
+def test_what_is_wrong_at_the_end(track, error, state, open_changes, said):
     line = TrackLine(t=4.0, parameters={}, error=error, state=state)
-    changes = [Event(kind="change", t=3.0, why="", parameter=name) for name in open_changes]
-    found = troubles_of(header(), line, changes)
-    assert len(found) == len(said)
-    assert all(words in trouble for words, trouble in zip(said, found, strict=True))
+    changes = tuple(Event(kind="change", t=3.0, why="", parameter=name) for name in open_changes)
+    totals = replace(track.totals, unanswered=changes)
+    found = Track(header=header(), lines=(line,), totals=totals)
+    assert len(found.verdict.reasons) == len(said)
+    assert all(words in r.text for words, r in zip(said, found.verdict.reasons, strict=True))
+    grave = state == "changed" or error > 1.5 or bool(open_changes)
+    assert found.verdict.word == ("unusable" if grave else "caution" if said else "usable")
 
 
 def test_numbers_that_are_not_known_are_not_invented():
@@ -90,10 +93,9 @@ def test_numbers_that_are_not_known_are_not_invented():
     assert speed_words(2_400_000, 120.0, 2.0) == "1.2 million samples/s, 60 times real time"
 
 
-def test_warnings_of_the_start_are_printed_and_are_a_trouble(track):
+def test_warnings_of_the_start_are_reasons_and_no_parameter_is_green(track):
     head = replace(track.header, warnings=("the residuals are not white", "two fits disagree"))
-    troubles = troubles_of(head, track.lines[-1], ())
-    assert any("2 warnings" in t for t in troubles)
-    text = track_text(head, track.lines[-1], track.summary, troubles=troubles)
-    assert "warning: the residuals are not white" in text
-    assert "warning: two fits disagree" in text
+    found = replace(track, header=head)
+    assert [r.text for r in found.verdict.reasons if r.check == "start"] == list(head.warnings)
+    assert "use with caution" in track_text(found)
+    assert "tracked" not in track_text(found)

@@ -10,6 +10,7 @@ from dataclasses import replace
 import pytest
 
 from ambid.errors import AmbidError, RecordError
+from ambid.estimation.result import Verdict
 from ambid.recursive.lines import Event, TrackedValue, TrackLine
 from ambid.tracking.lines_file import (
     Tally,
@@ -29,7 +30,7 @@ def written(track, target):
         writer.header(track.header)
         for line in track.lines:
             writer.line(line)
-        writer.summary(track.summary)
+        writer.summary(track.totals)
 
 
 @pytest.fixture(scope="module")
@@ -130,11 +131,11 @@ def test_a_file_that_was_cut_anywhere_gives_its_whole_lines(track, file, tmp_pat
         whole = sum(end <= size for end in ends) - 1
         assert len(found.lines) in (whole, whole + 1)  # one more where only the line feed is missing
         assert found.lines == track.lines[: len(found.lines)]
-        assert not found.summary.complete
-    assert found.summary.rejected_samples == track.summary.rejected_samples
-    assert found.summary.changes == track.summary.changes
-    assert found.summary.updates == track.summary.updates
-    assert math.isnan(found.summary.computing_s)
+        assert not found.totals.complete
+    assert found.totals.rejected_samples == track.totals.rejected_samples
+    assert found.totals.changes == track.totals.changes
+    assert found.totals.updates == track.totals.updates
+    assert math.isnan(found.totals.computing_s)
     cut.write_bytes(data[: first - 20])
     with pytest.raises(RecordError, match="ends within its first line"):
         read_track(cut)
@@ -214,7 +215,7 @@ def test_a_tally_knows_which_changes_are_open():
     assert tally.open_changes == ()
     found = tally.summary(computing_s=1.0, complete=False)
     assert (found.samples, found.counts["change"], len(found.changes)) == (800, 3, 3)
-    assert summary_json(found)["summary"]["complete"] is False
+    assert summary_json(found, Verdict(word="usable", reasons=()))["summary"]["complete"] is False
 
 
 def test_the_header_names_units_and_start():

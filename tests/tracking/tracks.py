@@ -74,7 +74,7 @@ def track_of(
         updates=found.updates, rejected_samples=found.rejected_samples, changes=found.changes, counts=found.counts,
         latency=Latency(median=4.1e-4, p99=9e-4, largest=2.1e-3, overruns=0, late=3),
     )  # fmt: skip
-    return Track(header=head, lines=tuple(lines), summary=summary)
+    return Track(header=head, lines=tuple(lines), totals=summary)
 
 
 def truth_of(seconds: float = 60.0, rate_hz: float = 100.0) -> dict[str, tuple[np.ndarray, np.ndarray]]:

@@ -243,8 +243,8 @@ class Recording:
         def ending() -> None:
             if failures:
                 raise AmbidError(f"{failures[0]}; {self.path} holds all {runs[0].samples} samples")
-            if follower.summary is not None or (runs[0].fault is None and not self.stop.wished()):
-                follower.finish()
+            if follower.track is not None or (runs[0].fault is None and not self.stop.wished()):
+                follower.finish(Outputs())
 
         return tap.acquired(runs[0]), ending
 

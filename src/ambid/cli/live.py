@@ -11,6 +11,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
@@ -19,8 +20,8 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 import typer
 
 from ambid.cli.interrupts import INTERRUPTED, interrupts, signals
-from ambid.cli.output import end, json_path
-from ambid.cli.terminal import painter, progress
+from ambid.cli.output import Outputs, end, json_path
+from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
@@ -61,11 +62,13 @@ class Follower:
         """Begin before the run."""
         from ambid.tracking.lines_file import TrackWriter
 
+        self.record: Path | None = None  # which may hold the truth, and its rate where it has no time
+        self.rate_hz: float | None = None
         self.path, self.table = json_path(json), json != "-"
         self.header: TrackHeader | None = None
         self.last: TrackLine | None = None
         self.history: TrackHistory | None = None
-        self.summary: TrackSummary | None = None
+        self.track: Track | None = None  # what came of it
         self.code = 0
         target = self.path or (None if self.table else sys.stdout)
         self._writer = None if target is None else TrackWriter(target)
@@ -91,11 +94,14 @@ class Follower:
         The summary is written; it is not `complete` where the run was stopped, and None where that was before its first
         line.
         """
+        from ambid.job.following import Followed
+        from ambid.recursive.lines import Track
+
         found: TrackSummary | None = None
         with self._before_header, signals(self._signalled):
             self._say = self._before_header.enter_context(progress("track"))
             try:
-                found = job().summary
+                found = job().totals
             except BaseException as error:
                 if not interrupts(error):
                     self._abandon()
@@ -113,40 +119,44 @@ class Follower:
         if self._writer is not None and self._writer.begun and found is not None:
             self._writer.summary(found)
             self._writer.close()
-        self.summary = None if self.last is None else found
+        if self.header is not None and self.last is not None and found is not None and self._tally is not None:
+            found = replace(found, unanswered=self._tally.open_changes)
+            used = Followed(record=self.record, rate_hz=self.rate_hz, history=self.history, events=self.events)
+            self.track = Track(header=self.header, lines=(self.last,), totals=found, used=used)
 
     def finish(
-        self, *, drawn: Path | None = None, strict: bool = False, flags: Sequence[tuple[float, Flag]] = ()
+        self,
+        outputs: Outputs,
+        *,
+        drawn: Path | None = None,
+        strict: bool = False,
+        flags: Sequence[tuple[float, Flag]] = (),
     ) -> None:
-        """Print the table, say what was interrupted or not reached, and end with the exit code.
+        """Print the track, say what was interrupted or not reached, and end with the exit code.
 
-        `drawn`: the figure of the track; `strict`: whether troubles end with exit code 3; `flags`: as given.
+        `drawn`: the figure of the track; `strict`: whether all but a usable one ends with exit code 3; `flags`: as
+        given.
         """
-        from ambid.report.track_text import track_text, troubles_of
-
-        header, last, summary = self.header, self.last, self.summary
-        if summary is None or header is None or last is None or self._tally is None:
+        if self.track is None:
             if self.code:
                 print("ambid: interrupted before the first line of the track", file=sys.stderr)
                 raise typer.Exit(self.code)
             raise AmbidError(
                 "the record ends before the first reporting interval. Take a longer one, or a shorter --every"
             )
-        troubles = troubles_of(header, last, self._tally.open_changes)
-        if not summary.samples:
-            troubles = (*troubles, "no sample of the record was used: these are the values of the start")
         if self.table:
-            typer.echo(track_text(header, last, summary, events=self.events, troubles=troubles, paint=painter()))
+            outputs.show(self.track)
+        end_s = self.track.lines[-1].t
         if self.code:
             names = [str(x) for x in (self.path, drawn) if x]
             holds = f"; {' and '.join(names)} hold{'s' if len(names) == 1 else ''} the track so far" if names else ""
-            print(f"ambid: interrupted at {last.t:.4g} s of record{holds}", file=sys.stderr)
+            print(f"ambid: interrupted at {end_s:.4g} s of record{holds}", file=sys.stderr)
             raise typer.Exit(self.code)
         for t, flag in flags:
-            if t > last.t:
-                said = f"the last line is at {last.t:.6g} s, so it was never set. Give a time in the record"
+            if t > end_s:
+                said = f"the last line is at {end_s:.6g} s, so it was never set. Give a time in the record"
                 print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
-        end(failed=strict and bool(troubles))
+        end(failed=strict and not self.track.passed)
 
     def _abandon(self) -> None:
         """After an error: leave a file that says that it is not complete, if it can still be written."""
@@ -207,6 +217,8 @@ class Follower:
         assert self._tally is not None
         if self._writer is not None:
             if not self._writer.begun:
+                if self.path is not None and self.path.exists() and self.path.stat().st_size:
+                    print(f"{self.path.name} is replaced", file=sys.stderr)
                 self._writer.header(self.header)
             self._writer.line(line)
         if self.last is None:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import typer
 
 from ambid.cli.terminal import painter
+from ambid.estimation.progress import silent
 from ambid.job.files import FIGURE_ENDINGS, PAGE_ENDINGS, Files
 
 if TYPE_CHECKING:
@@ -49,7 +50,7 @@ class Outputs(Files):
         """Tell that a file is going to be replaced."""
         typer.echo(f"{path.name} is replaced", err=True)
 
-    def give(self, result: Result, tick: Tick) -> None:
+    def give(self, result: Result, tick: Tick = silent) -> None:
         """Write what is asked for of a result: its figure, its page, its JSON; `show` prints it."""
         from ambid.job import presentation
 

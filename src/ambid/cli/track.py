@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -13,11 +12,11 @@ import typer
 from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED
 from ambid.cli.options import option, switch
-from ambid.cli.output import Outputs
+from ambid.cli.output import Outputs, json_path
 from ambid.errors import AmbidError, nearest
 
 if TYPE_CHECKING:
-    from ambid.cli.live import Flag, Follower
+    from ambid.cli.live import Flag
     from ambid.recursive.lines import TrackHeader
 
 _NAMES = {
@@ -76,11 +75,9 @@ def command(
         Path | None,
         option("--plot FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
     ] = None,
+    report: opt.Report = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view, also on a terminal.")] = False,
-    strict: Annotated[
-        bool,
-        switch("--strict", "End with exit code 3 if a change stays unanswered, or the end is frozen or off the limit."),
-    ] = False,
+    strict: opt.Strict = False,
 ) -> None:
     """Follow the physical parameters of a bench through a record, as the tracker does beside a running machine.
 
@@ -104,9 +101,13 @@ def command(
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:
         raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or leave it out")
-    with Outputs(record, rig, start, json=json, plot=plot) as outputs:
+    with Outputs(record, rig, start, plot=plot, report=report) as outputs:
+        outputs.claim(json_path(json), "--json")
         bench = None if rig is None else load_rig(rig)
-        follower = Follower(json, keep=plot is not None, quiet=quiet, real_time=pace == "real-time")
+        follower = Follower(
+            json, keep=plot is not None or report is not None, quiet=quiet, real_time=pace == "real-time"
+        )
+        follower.record, follower.rate_hz = record, rate
 
         def begin(header: TrackHeader) -> None:
             _check_interval(every, header.rate_hz)
@@ -127,14 +128,14 @@ def command(
                 **given,
             )
         )
-        if follower.summary is not None:
+        if follower.track is not None:
             try:
-                outputs.draw(plot, lambda: _figure(follower, record, rate), str)
+                outputs.give(follower.track)
             except KeyboardInterrupt:
                 kept = f"; {follower.path} holds the track" if follower.path else ""
                 print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                 raise typer.Exit(INTERRUPTED) from None
-    follower.finish(drawn=plot, strict=strict, flags=times)
+    follower.finish(outputs, drawn=plot, strict=strict, flags=times)
 
 
 def _check_interval(every: float, rate_hz: float) -> None:
@@ -174,55 +175,3 @@ def _flags(texts: list[str] | None) -> tuple[tuple[float, Flag], ...]:
             raise AmbidError(f"--flag {text} is not of the form T:FLAG, such as 12.5:hold. Correct it")
         found.append((t, flag))
     return tuple(sorted(found, key=lambda f: f[0]))
-
-
-def _figure(follower: Follower, record: Path, rate: float | None) -> Any:
-    from ambid.report.track_figures import track_figure
-
-    assert follower.header is not None
-    assert follower.history is not None
-    units = follower.header.units
-    truth = truth_columns(record, rate, {name: units.get(name, "") for name in follower.history.names})
-    return track_figure(follower.history, truth=truth)
-
-
-def truth_columns(record: Path, rate: float | None, units: Mapping[str, str]) -> dict[str, tuple[Any, Any]]:
-    """Read the truth that a simulated record holds: columns ``true_NAME``.
-
-    `rate`: sampling rate in Hz, for a record without time; `units`: SI unit of each tracked number; empty where it is
-    not known. Returns ndarrays of shape (n_samples,), s of record and SI; without parameters that have no such column,
-    or one in another unit.
-    """
-    from ambid.record import read_record
-
-    if not _may_hold_truth(record):
-        return {}
-    try:
-        raw = read_record(record, rate_hz=rate, gaps="interpolate")
-    except AmbidError as refused:
-        print(f"ambid: drawn without the truth: {refused}", file=sys.stderr)
-        return {}
-    found = {}
-    for channel in raw.channels:
-        name = channel.name.removeprefix("true_")
-        if name == channel.name or name not in units:
-            continue
-        if units[name] not in ("", channel.unit):
-            inside = f"is in [{channel.unit}], the tracked number in [{units[name]}]"
-            print(f"ambid: column {channel.name!r} {inside}: it is not drawn", file=sys.stderr)
-            continue
-        found[name] = (raw.time_s, channel.values)
-    return found
-
-
-def _may_hold_truth(record: Path) -> bool:
-    """Look at the beginning of a text file, so that a long record is not read again for nothing."""
-    import gzip
-
-    if not record.name.lower().endswith((".csv", ".csv.gz")):
-        return True
-    try:
-        with gzip.open(record) if record.name.lower().endswith(".gz") else record.open("rb") as file:
-            return b"true_" in file.read(65536)
-    except (OSError, EOFError):
-        return False

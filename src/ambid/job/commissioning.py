@@ -261,8 +261,8 @@ class _Guide:
             writer.header(done.track.header)
             for line in done.track.lines:
                 writer.line(line)
-            if done.track.summary is not None:
-                writer.summary(done.track.summary)
+            if done.track.totals is not None:
+                writer.summary(done.track.totals)
         return judge.tracking(done, _LIMIT)
 
 

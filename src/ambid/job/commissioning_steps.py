@@ -390,7 +390,7 @@ def tracking(done: LiveTrack, limit: float) -> Step:
     the error is beyond the limit, or a change was found.
     """
     reasons = list(why_incomplete(done.run, "tracking"))
-    summary, lines = done.track.summary, done.track.lines
+    summary, lines = done.track.totals, done.track.lines
     if not lines or summary is None:
         return Step(name="track", reasons=tuple(reasons) or ("no line of the track came: track longer",))
     last = lines[-1]

@@ -11,7 +11,8 @@ from typing import Any, Literal, TypedDict
 from ambid.blackbox.data import Orders
 from ambid.errors import EstimationError, nearest
 from ambid.job.data import Names
-from ambid.recursive.lines import TrackHeader, TrackLine
+from ambid.recursive.lines import Event, TrackHeader, TrackLine
+from ambid.report.track_figures import TrackHistory
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Memory = float | Literal["auto", "all"]
@@ -34,17 +35,28 @@ class Following:
     flags: Sequence[tuple[float, Flag]] = ()  # what an operator sets and when, s of record
     on_header: Callable[[TrackHeader], None] | None = None  # called once before the first line
     on_line: OnLine | None = None  # called with each line; flags that it returns are set
-    keep: bool = True  # keep the lines for the result; without, memory stays constant
+    keep: bool = True  # keep all lines for the result; else the last one alone, and memory stays constant
 
     def collect(self, lines: list[TrackLine]) -> OnLine:
-        """Return what takes each line: kept in `lines` where that is wanted, and passed on."""
+        """Return what takes each line: kept in `lines`, all or the last one, and passed on."""
 
         def take(line: TrackLine) -> Sequence[Flag] | None:
-            if self.keep:
-                lines.append(line)
+            if not self.keep:
+                lines.clear()
+            lines.append(line)
             return None if self.on_line is None else self.on_line(line)
 
         return take
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Followed:
+    """What a track is drawn and told with beside its lines."""
+
+    record: Any = None  # which may hold the truth, in columns true_NAME, and its rate in Hz where it has no time
+    rate_hz: float | None = None
+    history: TrackHistory | None = None  # all lines as numbers, where only the last one was kept
+    events: Sequence[Event] = ()  # decisions that are told
 
 
 class FollowingWords(TypedDict, total=False):

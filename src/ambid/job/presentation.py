@@ -16,6 +16,7 @@ from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import EstimatedParameter, fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
+from ambid.recursive.lines import Track
 from ambid.report.text import WIDTH, WORDS, Paint, joined, plain, verdict_lines
 
 if TYPE_CHECKING:
@@ -39,6 +40,8 @@ class View:
     table: Callable[[Any], Table]
     title: Callable[[Any], str]  # what it is, in a few words
     page: Callable[[Any, Any], Page] | None = None  # as `figure`; default: text and figure
+    # what is drawn of a record that is given beside the result; default: as its model takes it
+    beside: Callable[[Any, Any], Any] | None = None
 
 
 def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
@@ -125,8 +128,11 @@ def view(result: Result) -> View:
 
 def _beside(result: Any, record: Any) -> Any:
     """Return what is drawn beside a result: a record that is given, read as it wants it, or what it was made from."""
+    known = view(result)
     if record is None:
         return result.used
+    if known.beside is not None:
+        return known.beside(result, record)
     from ambid.job.results import data_of
 
     return data_of(result, record, where="the result")
@@ -136,6 +142,9 @@ def _numbers(result: Any) -> list[tuple[str, str]]:
     """Return name and value ± of a result's parameters, but fixed ones."""
     from ambid.report.numbers import quantity
 
+    if isinstance(result, Track):
+        names = result.lines[-1].parameters if result.lines else ()
+        return [(n, quantity(result[n].value, result[n].sd, result[n].unit).text) for n in names]
     found: Sequence[EstimatedParameter] = getattr(result, "parameters", ())
     return [(p.name, quantity(p.value, p.sd, p.unit).text.removesuffix(" 1")) for p in found if p.role != "fixed"]
 
@@ -237,6 +246,34 @@ def _validation() -> View:
     )
 
 
+def _track() -> View:
+    from ambid.job.following import Followed
+    from ambid.job.track_truth import truth_beside
+    from ambid.report.track_figures import TrackHistory, track_figure
+    from ambid.report.track_text import track_text
+    from ambid.tracking.lines_file import track_document
+
+    def drawn(t: Any, used: Followed | None) -> Figure:
+        history = (None if used is None else used.history) or TrackHistory.of(t)
+        if used is None or used.record is None:
+            return track_figure(history)
+        units = {name: history.header.units.get(name, "") for name in history.names}
+        return track_figure(history, truth=truth_beside(used.record, used.rate_hz, units))
+
+    def table(t: Any) -> Table:
+        history = TrackHistory.of(t)
+        columns: dict[str, Any] = {"t": history.t, "state": [x.state for x in t.lines], "error": history.error}
+        for name in history.names:
+            columns |= dict(zip((name, f"{name} sd"), history.values(name)[:2], strict=True))
+        return "t", columns
+
+    return View(
+        text=lambda t, **how: track_text(t, events=() if t.used is None else t.used.events, **how),
+        figure=drawn, document=track_document, table=table, beside=lambda _, record: Followed(record=record),
+        title=lambda t: f"{t.header.record.get('file') or 'record'}, track of {t.totals.seconds_of_record:.4g} s",
+    )  # fmt: skip
+
+
 def _measured() -> View:
     from ambid.bearing.measured import measured_text
     from ambid.report.fit_text import frf_text
@@ -304,6 +341,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "NonlinearFit": _fit,
     "Validation": _validation,
     "Measured": _measured,
+    "Track": _track,
     "Comparison": _comparison,
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

@@ -252,7 +252,7 @@ def _follow(run: _Run, method: str, how: Following) -> Track:
         tally.add(line)
         take(line)
     summary = replace(tally.summary(computing_s=time.perf_counter() - begun), samples=run.estimator.n_used)
-    return Track(header=header, lines=tuple(lines), summary=summary)
+    return Track(header=header, lines=tuple(lines), totals=summary)
 
 
 def _line(run: _Run, part: slice) -> TrackLine:

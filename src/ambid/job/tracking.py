@@ -6,6 +6,7 @@ Read -> start (an estimate, or one identified from the beginning of the record) 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +18,17 @@ from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Names, Reading, Source, known_rig
-from ambid.job.following import EstimatorWords, Flag, Following, FollowingWords, Memory, OnLine, Pace, check_settings
+from ambid.job.following import (
+    EstimatorWords,
+    Flag,
+    Followed,
+    Following,
+    FollowingWords,
+    Memory,
+    OnLine,
+    Pace,
+    check_settings,
+)
 from ambid.job.track_start import BenchRows, Start, check_settling, credible_limits, rows_of, start_of
 from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
@@ -26,6 +37,7 @@ from ambid.tracking.blocks import Block, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
 from ambid.tracking.guard import ABSURD, StreamGuard
+from ambid.tracking.lines_file import Tally
 from ambid.tracking.numbers import Forcing
 from ambid.tracking.reporter import Reporter, header
 from ambid.tracking.ring import BlockRing
@@ -134,12 +146,14 @@ def track(
 
         if how.pace != "fastest" or how.flags:
             raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Leave them out")
-        return track_estimator(record, given, method, start, start_s, part, how, settings)
+        found = track_estimator(record, given, method, start, start_s, part, how, settings)
+        return replace(found, used=Followed(record=record, rate_hz=rate_hz))
     source = rows_of(record, given, **part)
     say("start")
     begin = start_of(source, known_rig(given), given=start, start_s=start_s, rig_speaks=given is not None)
     say("track")
-    return follow(source.replay.since(begin.first), source, begin, how)
+    found = follow(source.replay.since(begin.first), source, begin, how)
+    return replace(found, used=Followed(record=record, rate_hz=rate_hz))
 
 
 def follow(
@@ -155,14 +169,19 @@ def follow(
     supervisor = Supervisor(rpem, limit=how.limit, t0=source.t0, listener=lambda event: reporter.note(event))
     warm_up(numbers, how.memory)
     lines: list[TrackLine] = []
-    reporter = Reporter(
-        supervisor, every_s=how.every_s, on_line=how.collect(lines), flags=how.flags, t0=source.t0, first=first
-    )
+    take = how.collect(lines)
+
+    def counted(line: TrackLine) -> Sequence[Flag] | None:
+        tally.add(line)
+        return take(line)
+
+    reporter = Reporter(supervisor, every_s=how.every_s, on_line=counted, flags=how.flags, t0=source.t0, first=first)
     samples = None if live else int(np.count_nonzero(source.replay.numbers >= first))
     top = header(
         supervisor, limit=how.limit, every_s=reporter.every_s, method=f"rpem, memory {how.memory}",
         record={**source.origin, "samples": samples}, warnings=begin.warnings,
     )  # fmt: skip
+    tally = Tally(top)
     if how.on_header is not None:
         how.on_header(top)
     n_u = len(model(begin.estimate.model).inputs)
@@ -176,7 +195,8 @@ def follow(
         )  # fmt: skip
     reporter.finish()
     summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)
-    return Track(header=top, lines=tuple(lines), summary=summary)
+    summary = replace(summary, unanswered=tally.open_changes)
+    return Track(header=top, lines=tuple(lines), totals=summary)
 
 
 def _guard(source: BenchRows, estimate: Estimate) -> StreamGuard:

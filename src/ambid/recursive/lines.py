@@ -2,10 +2,21 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError, nearest
+from ambid.estimation.result import Reason, Result
+from ambid.physics.linear_model import model_names
+
+_VAGUE = 0.25  # relative standard deviation above which data do not show a parameter
+NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
 
 State = Literal["tracking", "frozen", "changed", "hold"]
 EventKind = Literal[
@@ -21,6 +32,9 @@ class TrackedValue:
     value: float  # SI
     sd: float
     stale: bool = False  # whether it is frozen for want of information: the value is the last that data showed
+
+
+_UNKNOWN = TrackedValue(value=math.nan, sd=math.nan)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,19 +137,83 @@ class TrackSummary:
     complete: bool = True  # false where the run was stopped, or its file ends before the summary
     # computing time of the slowest search for a new value after a change, s; 0 where there was none
     update_s: float = 0.0
+    # changes after which no new value of that parameter was accepted
+    unanswered: tuple[Event, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Track:
-    """A whole track, as kept for a figure or read back from a file.
+class Course:
+    """One tracked number: its last value and interval, and how it came there."""
+
+    name: str
+    unit: str  # SI
+    value: float
+    sd: float
+    ci95: tuple[float, float]
+    t: Array  # (n_lines,), end of each reporting interval, s of record
+    values: Array  # (n_lines,)
+    sds: Array  # (n_lines,)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
+class Track(Result):
+    """A whole track, file schema ``ambid.track/1``.
 
     Attributes
     ----------
     header : TrackHeader
     lines : tuple of TrackLine
-    summary : TrackSummary
+        The last one at least, unless the record ended before it.
+    totals : TrackSummary
     """
 
     header: TrackHeader
     lines: tuple[TrackLine, ...]
-    summary: TrackSummary
+    totals: TrackSummary
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What is wrong at its end: values that the data contradict are not to be used."""
+        if not self.lines:
+            text = "the record ends before the first reporting interval. Take a longer one, or a shorter --every"
+            return (Reason(check="lines", text=text, grave=True),)
+        last, header, found = self.lines[-1], self.header, list[Reason]()
+        if not self.totals.samples:
+            text = "no sample of the record was used: these are the values of the start. Look at its events"
+            found.append(Reason(check="samples", text=text, grave=True))
+        for e in self.totals.unanswered:
+            who = f"of {e.parameter} " if e.parameter else ""
+            text = f"the change {who}at {e.t:.4g} s was not followed by new values that passed validation"
+            found.append(Reason(check="change", text=f"{text}. Track on, or identify again", grave=True))
+        if last.state == "changed" and not self.totals.unanswered:
+            text = "the record ends while the data contradict the published values. Track on, or identify again"
+            found.append(Reason(check="change", text=text, grave=True))
+        if last.error > header.limit:
+            text = f"the model error at the end is {last.error:.3g}, above the limit {header.limit:g}. Identify again"
+            found.append(Reason(check="error", text=text, grave=True))
+        elif math.isnan(last.error):
+            found.append(Reason(check="error", text="the model error at the end is unknown. Track on"))
+        if last.state == "frozen":
+            text = "the record ends without excitation: the parameters are frozen at an earlier time. Excite more"
+            found.append(Reason(check="frozen", text=text))
+        vague = [
+            n for n, v in last.parameters.items() if self.header.model in model_names() and v.sd > _VAGUE * abs(v.value)
+        ]
+        if vague:
+            text = f"the record does not show {', '.join(vague)}: sd above {_VAGUE:.0%} of the value. Excite more"
+            found.append(Reason(check="identifiable", text=text))
+        return (*found, *(Reason(check="start", text=text) for text in header.warnings))
+
+    def __getitem__(self, name: str) -> Course:
+        names = [] if not self.lines else [*self.lines[-1].parameters, *self.lines[-1].extra]
+        if name not in names:
+            raise EstimationError(
+                f"the track has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
+            )
+        kept = [(x.t, {**x.parameters, **x.extra}.get(name, _UNKNOWN)) for x in self.lines]
+        last = kept[-1][1]
+        return Course(
+            name=name, unit=self.header.units.get(name, ""), value=last.value, sd=last.sd,
+            ci95=(last.value - NORMAL_95 * last.sd, last.value + NORMAL_95 * last.sd), t=np.array([t for t, _ in kept]),
+            values=np.array([v.value for _, v in kept]), sds=np.array([v.sd for _, v in kept]),
+        )  # fmt: skip

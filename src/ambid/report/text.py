@@ -20,7 +20,7 @@ Style = Literal["good", "doubt", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
 
 WIDTH = 80
-_USABLE = Verdict(word="usable", reasons=())
+USABLE = Verdict(word="usable", reasons=())
 
 
 def plain(text: str, style: Style) -> str:
@@ -83,7 +83,7 @@ def parameter_lines(
     *,
     width: int = WIDTH,
     paint: Paint = plain,
-    found: Verdict = _USABLE,
+    found: Verdict = USABLE,
 ) -> list[str]:
     """Return the table of parameters; where the verdict on all of them is not good, none is called identified.
 
@@ -95,14 +95,14 @@ def parameter_lines(
 
 
 def parameter_rows(
-    parameters: Sequence[EstimatedParameter], found: Verdict = _USABLE
+    parameters: Sequence[EstimatedParameter], found: Verdict = USABLE
 ) -> list[tuple[str, str, str, str, str, Style]]:
     """Return name, value, interval, value in SI and verdict of each parameter, and how the verdict is painted."""
     rows: list[tuple[str, str, str, str, str, Style]] = []
     for p in parameters:
         q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
         words = verdict(p, found)
-        good = p.identifiable and _word_for_all(found) == "usable"
+        good = p.identifiable and word_for_all(found) == "usable"
         style: Style = (
             "dim" if p.role == "fixed" else "good" if good else WORDS[found.word][1] if found.reasons else "bad"
         )
@@ -137,11 +137,11 @@ def verdict_table(
     return [lines[0], *(line.removesuffix(x) + paint(x, style) if x else line for line, (x, style) in body)]
 
 
-def verdict(p: EstimatedParameter, found: Verdict = _USABLE) -> str:
+def verdict(p: EstimatedParameter, found: Verdict = USABLE) -> str:
     """Say in a word or two where a parameter's value comes from, such as ``"prior, 87 % data"``."""
     if p.role == "fixed":
         return "fixed"
-    word = _word_for_all(found)
+    word = word_for_all(found)
     if word != "usable":
         return WORDS[word][0]
     if p.role == "prior":
@@ -150,7 +150,7 @@ def verdict(p: EstimatedParameter, found: Verdict = _USABLE) -> str:
     return "identified" if p.identifiable else "not identifiable"
 
 
-def _word_for_all(found: Verdict) -> str:
+def word_for_all(found: Verdict) -> str:
     """The verdict on every parameter: what the record does not show concerns some of them alone."""
     alone = all(r.check == "identifiable" for r in found.reasons)
     return "usable" if alone and found.word == "caution" else found.word

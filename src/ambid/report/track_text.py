@@ -8,10 +8,13 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.recursive.lines import Event, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.estimation.result import Verdict
+from ambid.recursive.lines import NORMAL_95, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import (
+    USABLE,
     WIDTH,
+    WORDS,
     Paint,
     columns,
     hanging,
@@ -19,9 +22,8 @@ from ambid.report.text import (
     joined,
     plain,
     verdict_table,
-    warning_lines,
+    word_for_all,
 )
-from ambid.tracking.lines_file import NORMAL_95
 from ambid.units import counted
 
 if TYPE_CHECKING:
@@ -38,31 +40,24 @@ _SPARK = 40  # columns of the error's recent past
 _DECISIONS = 6
 
 
-def track_text(
-    header: TrackHeader,
-    last: TrackLine,
-    summary: TrackSummary,
-    *,
-    events: Sequence[Event] = (),
-    troubles: Sequence[str] = (),
-    width: int = WIDTH,
-    paint: Paint = plain,
-) -> str:
-    """Write what a track came to.
+def track_text(track: Track, *, events: Sequence[Event] = (), width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what a track came to, below its verdict; colour does not change the layout.
 
-    `last`: the last one; `events`: decisions that are told in their order, beside the changes of the summary;
-    `troubles`: as `troubles_of` gives them; `width`: columns of the terminal; `paint`: adds colour; the layout does not
-    depend on it. Returns without a final line feed.
+    `events`: decisions that are told in their order, beside the changes of the whole.
     """
+    header, totals = track.header, track.totals
+    if not track.lines:
+        return header_line(header, totals, paint)
+    last = track.lines[-1]
+    error = "unknown" if math.isnan(last.error) else f"{last.error:.3g}"
     return joined(
         [
-            [header_line(header, summary, paint)],
-            parameter_lines(header, last, width=width, paint=paint),
+            [header_line(header, totals, paint)],
+            parameter_lines(header, last, width=width, paint=paint, found=track.verdict),
             extra_lines(header, last),
-            state_lines(header, last, troubles, width=width, paint=paint),
-            event_lines(events or summary.changes, width=width, paint=paint),
-            closing_lines(summary, paint),
-            warning_lines(header.warnings, width=width, paint=paint),
+            [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"],
+            event_lines(events or totals.changes, width=width, paint=paint),
+            closing_lines(totals, paint),
         ]
     )
 
@@ -80,17 +75,21 @@ def header_line(header: TrackHeader, summary: TrackSummary, paint: Paint = plain
     )
 
 
-def parameter_lines(header: TrackHeader, last: TrackLine, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
-    """Write the table of the parameters at the end of a track.
+def parameter_lines(
+    header: TrackHeader, last: TrackLine, *, found: Verdict = USABLE, width: int = WIDTH, paint: Paint = plain
+) -> list[str]:
+    """Write the table of the parameters at the end of a track; `found` is the verdict on all of them.
 
     `width`: columns of the terminal; where they are too few, the interval is left out; `paint`: adds colour. Returns a
     header and a line for each parameter.
     """
+    word = word_for_all(found)
+    usual = ("tracked", "good") if word == "usable" else WORDS[word]
     rows: list[tuple[str, ...]] = []
     for name, v in last.parameters.items():
         value, interval = value_words(v, header.units.get(name, ""))
         change = change_words(v, header.start.get(name))
-        rows.append((name, value, interval, change, *(("STALE", "bad") if v.stale else ("tracked", "good"))))
+        rows.append((name, value, interval, change, *(("STALE", "bad") if v.stale else usual)))
     head = ("", "value ± sd", "95 % interval", "from start", "verdict")
     return verdict_table(head, rows, right=3, spare=2, width=width, paint=paint)
 
@@ -126,46 +125,6 @@ def extra_lines(header: TrackHeader, last: TrackLine) -> list[str]:
     """Write what is tracked beside the parameters."""
     rows = [(name, value_words(v, header.units.get(name, ""))[0]) for name, v in last.extra.items()]
     return columns(rows) if rows else []
-
-
-def troubles_of(header: TrackHeader, last: TrackLine, open_changes: Sequence[Event]) -> tuple[str, ...]:
-    """Say what is wrong at the end of a track: what ``--strict`` ends with code 3 for.
-
-    `open_changes`: changes that were found, and not answered by accepted values. Returns empty where nothing is.
-    """
-    found = []
-    for e in open_changes:
-        who = f"of {e.parameter} " if e.parameter else ""
-        found.append(f"the change {who}at {e.t:.4g} s was not followed by new values that passed validation")
-    if last.state == "frozen":
-        found.append("the record ends without excitation: the parameters are frozen at an earlier time")
-    if last.state == "changed" and not open_changes:
-        found.append("the record ends while the data contradict the published values")
-    if last.error > header.limit:
-        found.append(f"the model error at the end is {last.error:.3g}, above the limit {header.limit:g}")
-    elif math.isnan(last.error):
-        found.append("the model error at the end is unknown")
-    if header.warnings:
-        n = counted(len(header.warnings), "warning")
-        found.append(f"the starting estimate failed its checks: {n}, see below")
-    return tuple(found)
-
-
-def state_lines(
-    header: TrackHeader,
-    last: TrackLine,
-    troubles: Sequence[str],
-    *,
-    width: int = WIDTH,
-    paint: Paint = plain,
-) -> list[str]:
-    """Write state and error at the end, and what is wrong there.
-
-    `width`: columns of the terminal; `paint`: adds colour.
-    """
-    error = "unknown" if math.isnan(last.error) else f"{last.error:.3g}"
-    lines = [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"]
-    return [*lines, *(x for trouble in troubles for x in hanging(f"{paint('✗', 'bad')} ", trouble, width, 2))]
 
 
 def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:

@@ -16,13 +16,13 @@ from typing import Any, Self, TextIO, TypeVar
 
 from ambid.errors import AmbidError, RecordError
 from ambid.estimation.estimate import fields_json, plain_json, read_as
+from ambid.estimation.result import Verdict
 from ambid.record.record import file_bytes
-from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import NORMAL_95, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 
 T = TypeVar("T")
 
 SCHEMA = "ambid.track/1"
-NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
 
 _dumps = json.JSONEncoder(ensure_ascii=False, allow_nan=False, check_circular=False).encode
 
@@ -66,13 +66,21 @@ def event_json(event: Event) -> dict[str, Any]:
     return {name: x for name, x in entries if name in ("kind", "t", "why") or x not in (None, {})}
 
 
-def summary_json(summary: TrackSummary) -> dict[str, Any]:
-    """Return the last line of a track, with the one key ``summary``."""
+def summary_json(summary: TrackSummary, verdict: Verdict) -> dict[str, Any]:
+    """Return the last line of a track, with the keys ``verdict`` and ``summary``."""
     more = {
         "changes": [event_json(e) for e in summary.changes],
+        "unanswered": [event_json(e) for e in summary.unanswered],
         "latency_s": None if summary.latency is None else fields_json(summary.latency),
     }
-    return {"summary": {**fields_json(summary, without=("changes", "latency")), **more}}
+    found = {**fields_json(summary, without=("changes", "unanswered", "latency")), **more}
+    return {"verdict": plain_json(verdict), "summary": found}
+
+
+def track_document(track: Track) -> str:
+    """Return the whole text of a track."""
+    end = summary_json(track.totals, track.verdict)
+    return "".join(f"{_dumps(x)}\n" for x in (header_json(track.header), *map(line_json, track.lines), end))
 
 
 def _value(v: TrackedValue) -> dict[str, Any]:
@@ -100,6 +108,8 @@ class TrackWriter:
         self._path = Path(target) if isinstance(target, (str, Path)) else None
         self._stream: TextIO | None = None if isinstance(target, (str, Path)) else target
         self._begun = False
+        self._header: TrackHeader | None = None
+        self._last: tuple[TrackLine, ...] = ()
 
     @property
     def begun(self) -> bool:
@@ -113,16 +123,19 @@ class TrackWriter:
                 self._stream = self._path.open("w", encoding="utf-8", newline="\n")
             except OSError as failure:
                 raise _unwritable(self._path, failure) from None
-        self._begun = True
+        self._begun, self._header = True, header
         self._put(header_json(header))
 
     def line(self, line: TrackLine) -> None:
         """Write the line of one reporting interval."""
+        self._last = (line,)
         self._put(line_json(line))
 
     def summary(self, summary: TrackSummary) -> None:
-        """Write the last line."""
-        self._put(summary_json(summary))
+        """Write the last line, with the verdict."""
+        if self._header is not None:
+            track = Track(header=self._header, lines=self._last, totals=summary)
+            self._put(summary_json(summary, track.verdict))
 
     def close(self) -> None:
         """Close the file; a stream that was handed in stays open."""
@@ -241,6 +254,7 @@ class Tally:
             changes=tuple(self._changes),
             counts=self.counts,
             complete=complete,
+            unanswered=self.open_changes,
         )
 
 
@@ -291,7 +305,7 @@ def read_track(path: str | Path) -> Track:
             )
         lines.append(line)
         tally.add(line)
-    return Track(header=header, lines=tuple(lines), summary=summary or tally.summary(complete=False))
+    return Track(header=header, lines=tuple(lines), totals=summary or tally.summary(complete=False))
 
 
 def _whole(row: bytes) -> bool:
@@ -336,8 +350,9 @@ def _header(document: Mapping[str, Any]) -> TrackHeader:
 def _line_or_summary(document: Mapping[str, Any]) -> TrackLine | TrackSummary:
     if "summary" in document:
         s = document["summary"]
-        changes = [{"kind": "change", **_event(e)} for e in s["changes"]]
-        return read_as(TrackSummary, {"counts": {}, **s, "changes": changes, "latency": s.get("latency_s")})
+        found = {"counts": {}, "unanswered": [], **s, "latency": s.get("latency_s")}
+        found |= {k: [{"kind": "change", **_event(e)} for e in found[k]] for k in ("changes", "unanswered")}
+        return read_as(TrackSummary, found)
     one = document.get("event")
     events = document.get("events", [] if one is None else [one])
     return read_as(TrackLine, {**document, "events": [_event(e) for e in events]})
