@@ -76,9 +76,9 @@ def test_extrapolation_is_marked(estimate):
 
 
 def test_every_record_is_drawn(evidence, estimate, drawn):
-    assert set(drawn) == {"curves", "map", "records"}
+    assert set(drawn) == {"force", "curves", "map", "records", "correlations"}
     titles = [a.get_title(loc="left") for a in drawn["records"].axes]
-    assert [t for t in titles if t] == list(estimate.noise)
+    assert [t for t in titles if t and "%" not in t] == list(estimate.noise)
     first, held = evidence.traces[0], evidence.traces[2]
     assert first.time_s[0] > 2.0
     assert np.all(np.isfinite(first.predicted))
@@ -89,8 +89,19 @@ def test_every_record_is_drawn(evidence, estimate, drawn):
 
 
 def test_the_line_of_balance_is_drawn_for_one_magnet(drawn):
-    where = drawn["map"].axes[0]
-    assert "carries the weight" in [t.get_text() for t in where.get_legend().get_texts()]
+    (legend,) = drawn["force"].legends
+    assert "carries the weight" in [t.get_text() for t in legend.get_texts()]
+
+
+def test_the_force_is_drawn_over_position_and_current_with_the_samples(evidence, estimate, drawn):
+    axes = drawn["force"].axes[0]
+    assert (axes.get_xlabel(), axes.get_ylabel()) == ("position [mm]", "current [A]")
+    assert axes.get_title(loc="left").startswith("force [")
+    low, high = estimate.range["position"]
+    left, right = axes.get_xlim()
+    assert left < 1e3 * low < 1e3 * high < right
+    points = np.concatenate([np.asarray(x.get_xdata()) for x in axes.lines if x.get_marker() == "."])
+    assert 1e3 * low <= points.min() < points.max() <= 1e3 * high
 
 
 def test_the_page_holds_all_and_escapes_names(evidence, estimate):
@@ -101,7 +112,7 @@ def test_the_page_holds_all_and_escapes_names(evidence, estimate):
     page = page_html(estimate_page(replace(evidence, estimate=e)), e.verdict, made="2001-02-03")
     assert "&lt;b&gt;one.csv" in page
     assert bad not in page
-    assert page.count("data:image/png") == 3
+    assert page.count("data:image/png") == 5
     assert "Curves over position and current" in page
     assert "2001-02-03" in page
     assert "hyperbolic law" in page  # what each number means

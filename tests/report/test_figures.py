@@ -1,12 +1,14 @@
 """Figures show what they say: bounds, envelopes, every unstable pole; and can be written."""
 
 import io
+import itertools
 
 import numpy as np
 import pytest
+from matplotlib.transforms import Bbox
 
-from ambid.report.drawing import autocorrelation, save, single
-from ambid.report.figures import figures, overview
+from ambid.report.drawing import NARROW, WIDE, Pole, autocorrelation, poles_panel, save, single, whiteness_panel
+from ambid.report.figures import figures, measured_beside, overview, responses
 
 
 @pytest.fixture(scope="module")
@@ -16,18 +18,22 @@ def drawn(unstable):
 
 @pytest.fixture(scope="module")
 def stable_signals(stable):
-    return single(*stable.drawings()["signals"])
+    return single(stable.drawings()["signals"])
 
 
 def test_the_overview_has_all_parts(unstable):
     page = overview(unstable)
-    titles = [axes.get_title() for axes in page.axes]
+    titles = [axes.get_title(loc="left") for axes in page.axes]
     for words in (
-        "measured and predicted",
-        "residuals",
-        "autocorrelation",
+        "position, the whole record",
+        "where the errors are largest",
+        "position residual: ",
+        "spectrum of the current residual",
+        "autocorrelation: position residual is white",
+        "current residual × past voltage: uncorrelated",
         "voltage → position",
         "poles of the identified",
+        "largest correlation",
     ):
         assert any(words in title for title in titles), words
     labels = {axes.get_ylabel() for axes in page.axes}
@@ -56,13 +62,67 @@ def test_long_records_are_drawn_by_their_extremes(stable, stable_signals):
     assert heights.max() == pytest.approx(scale * stable.run.measured[:, 0].max())
 
 
-def test_bounds_are_those_of_99_percent(unstable, drawn):
+def test_bounds_are_those_of_95_percent(unstable, drawn):
     axes = drawn["residuals"].axes[0]
     e, sd = unstable.run.innovations[:, 0], np.sqrt(unstable.estimate.noise.innovation_covariance[0, 0])
-    (label,) = [text.get_text() for text in axes.texts]
-    outside = float(label.split(" %")[0])
-    assert outside == pytest.approx(100 * np.mean(np.abs(e) > 2.5758 * sd), rel=0.05)
-    assert 0.2 < outside < 2.5  # 1 % of 3000, four standard errors
+    outside = float(axes.get_title(loc="left").split(": ")[1].split(" %")[0])
+    assert outside == pytest.approx(100 * np.mean(np.abs(e) > 1.96 * sd), rel=0.05)
+    assert 3.4 < outside < 6.6  # 5 % of 3000, four standard errors
+
+
+def test_correlations_of_white_residuals_keep_their_bounds(drawn):
+    own, cross = drawn["whiteness"].axes[:2]
+    for axes in (own, cross):
+        band, stems = axes.collections
+        limit = band.get_paths()[0].vertices[:, 1].max()
+        sizes = np.array([path[1, 1] for path in stems.get_segments()])
+        assert sizes.size == 50
+        assert np.mean(np.abs(sizes) <= limit) > 0.8
+
+
+def test_a_failed_check_is_seen_in_its_panel(unstable):
+    page = single(whiteness_panel(unstable.traces, ["residuals_white"]))
+    assert page.axes[0].get_title(loc="left") == "✗ autocorrelation: position residual is not white"
+    assert page.axes[1].get_title(loc="left") == "position residual × past voltage: uncorrelated"
+
+
+def test_the_measured_response_of_a_loop_agrees_with_the_plant(unstable):
+    found = measured_beside(unstable)
+    radius = found.confidence_radius()
+    plant = responses(unstable.estimate)
+    for o in range(2):
+        known = np.isfinite(radius[:, o, 0])
+        assert 1500.0 < found.frequency_hz[known].max() < 2500.0  # excited up to 2000 Hz, told in lines of 53 Hz
+        at = [np.interp(found.frequency_hz[known], plant.frequency_hz, f(plant.G[:, o, 0])) for f in (np.real, np.imag)]
+        off = np.abs(found.G[known, o, 0] - (at[0] + 1j * at[1]))
+        assert np.mean(off < radius[known, o, 0]) > 0.9
+
+
+@pytest.mark.parametrize("width", [WIDE, NARROW])
+def test_nothing_covers_anything_else(unstable, width):
+    shown = {k: block for k, block in unstable.drawings().items() if k in ("signals", "whiteness", "poles")}
+    for figure in (single(block, width) for block in shown.values()):
+        figure.draw_without_rendering()
+        boxes = [a.get_tightbbox() for a in figure.axes] + [x.get_window_extent() for x in figure.legends]
+        page = figure.bbox.padded(1.0)
+        for k, box in enumerate(boxes):
+            assert min(box.x0 - page.x0, page.x1 - box.x1, box.y0 - page.y0, page.y1 - box.y1) >= 0
+            for other in boxes[:k]:
+                shared = Bbox.intersection(box.padded(-1.0), other.padded(-1.0))
+                assert shared is None or min(shared.width, shared.height) < 1.0
+        for axes in figure.axes:
+            ticks = [t.get_window_extent() for t in axes.get_xticklabels() if t.get_text() and t.get_visible()]
+            assert all(a.x1 <= b.x0 + 0.5 for a, b in itertools.pairwise(sorted(ticks, key=lambda b: b.x0)))
+
+
+def test_poles_that_overlap_are_drawn_again_larger():
+    near = [Pole(value=x, covariance=None) for x in (1.02 + 0j, 0.98 + 0.004j, 0.98 - 0.004j, 0.1 + 0j)]
+    _, close, _ = single(poles_panel(near, "", "all", discrete=True)).axes
+    left, right = close.get_xlim()
+    assert left < 0.98 < 1.02 < right < 1.1
+    assert close.get_title(loc="left") == "close view of 3 of them"
+    apart = [Pole(value=x, covariance=None) for x in (-40 + 9j, -40 - 9j, 43 + 0j)]
+    assert len(single(poles_panel(apart, "", "all")).axes) == 2
 
 
 def test_autocorrelation_of_a_moving_average():
@@ -88,7 +148,7 @@ def test_the_unstable_pole_is_named(drawn):
 @pytest.mark.parametrize(("kind", "magic"), [("png", b"\x89PNG"), ("svg", b"<?xml"), ("pdf", b"%PDF")])
 def test_figures_are_written_and_equal_ones_are_equal(unstable, drawn, kind, magic):
     files = []
-    for figure in (drawn["poles"], single(*unstable.drawings()["poles"]))[: 2 if kind == "png" else 1]:
+    for figure in (drawn["poles"], single(unstable.drawings()["poles"]))[: 2 if kind == "png" else 1]:
         buffer = io.BytesIO()
         save(figure, buffer, kind=kind)
         files.append(buffer.getvalue())

@@ -32,14 +32,13 @@ def data() -> IOData:
 
 def test_poles_and_zeros_are_drawn_with_their_regions(data: IOData) -> None:
     fit = judge(structure("oe").estimator(data, {"nb": 3, "nf": 2, "nk": 1}), data)
-    (axes,) = (a for a in fit_overview(fit, [data]).findobj(Axes) if "zeros" in a.get_title())
+    (axes,) = (a for a in fit_overview(fit, [data]).findobj(Axes) if "zeros" in a.get_title(loc="left"))
     regions = [p for p in axes.patches if isinstance(p, Ellipse)]
     centres = np.array([complex(*p.get_center()) for p in regions])
     truth = np.array([POLES, POLES.conj(), ZEROS, ZEROS.conj()])
     assert len(regions) == 4
     assert np.max(np.min(np.abs(truth[:, None] - centres), axis=1)) < 0.02
     assert all(0 < p.width < 0.1 for p in regions)
-    assert "95 % regions" in axes.get_title()
 
 
 def test_time_is_that_of_the_record_after_a_cut(data: IOData) -> None:

@@ -129,9 +129,9 @@ def test_the_figure_shows_what_the_fit_says(fit: NonlinearFit) -> None:
     data = squared(400, 2)
     curve = LearningCurve(method="x", seconds=np.array([0.0, 0.1]), training=np.array([1.0, 0.5]))
     page = fit_overview(replace(fit, curves=(curve,)), [data])
-    titles = [a.get_title() for a in page.axes]
+    titles = [a.get_title(loc="left") for a in page.axes]
     assert "e of y, u²" in titles
-    assert "learning curves (dashed: held out)" in titles
+    assert {"learning over time", "learning over iterations"} <= set(titles)
     assert any("coefficients with 95 % intervals" in x for x in texts_of(page))
     traces = traces_of(fit, data)
     assert fit.model is not None
@@ -183,7 +183,7 @@ def test_of_weights_without_names_the_predictions_with_their_bands_are_drawn(fit
     texts = texts_of(page)
     assert "predictions with their bands" in texts
     assert not any("coefficients" in x for x in texts)
-    axes = next(a for a in page.axes if a.get_title() == "measured - predicted")
+    axes = next(a for a in page.axes if a.get_title(loc="left") == "measured less predicted")
     low, high = (float(f(axes.collections[0].get_datalim(axes.transData).intervaly)) for f in (np.min, np.max))
     scale = 1e-3 if "mm" in axes.get_ylabel() else 1.0
     sd = np.sqrt(fit.noise_covariance[0, 0])

@@ -10,7 +10,7 @@ from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_hex
 
 from ambid.recursive.lines import Event, TrackedValue
-from ambid.report.drawing import save
+from ambid.report.drawing import BAND, save
 from ambid.report.track_figures import STATES, TrackHistory, event_words, runs, track_figure, truth_words
 from tests.tracking.tracks import track_of, truth_of
 
@@ -32,9 +32,7 @@ def panel(figure, label):
 
 def band(axes):
     """Lower and upper edge of the 95 % band, both over its times."""
-    (found,) = (
-        c for c in axes.collections if isinstance(c, PolyCollection) and to_hex(c.get_facecolor()[0]) == "#9ecae8"
-    )
+    (found,) = (c for c in axes.collections if isinstance(c, PolyCollection) and to_hex(c.get_facecolor()[0]) == BAND)
     return found.get_paths()[0].vertices
 
 
@@ -82,7 +80,7 @@ def test_a_long_track_is_drawn_as_its_extremes():
     assert points.shape[0] < 12_000
     assert points[:, 1].max() == pytest.approx(3.0 + 1.959964 * 0.004)  # one line in 4000 is not smoothed away
     (legend,) = page.legends
-    assert "extremes of 3 lines each" in legend.get_texts()[0].get_text()
+    assert "extremes of 5 lines each" in legend.get_texts()[0].get_text()
 
 
 def test_a_band_that_begins_wide_does_not_hide_the_rest(track):

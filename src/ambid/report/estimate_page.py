@@ -29,36 +29,47 @@ if TYPE_CHECKING:
 _CAPTIONS = {
     "signals": (
         "Measured and predicted",
-        "Each sample predicted from all samples before it. Shaded: the stretch shown on the right.",
+        "Each sample predicted from all samples before it. Shaded: the stretch shown close. Long records are drawn by "
+        "the extremes of short stretches.",
     ),
     "residuals": (
-        "Innovations",
-        "Measured minus predicted. The residuals of a correct model are white: about 1 % outside the bounds, no "
-        "pattern.",
+        "Residuals",
+        "What the predictions leave of the measurement. For a right model 5 % of them lie outside the dashed bounds, "
+        "and their spectrum is flat.",
+    ),
+    "whiteness": (
+        "Residual tests",
+        "Residuals of a right model are correlated neither with their own past nor with past inputs. The verdicts are "
+        "those of the checks, which allow for the estimated parameters; the bands do not.",
     ),
     "bode": (
         "Frequency response of the identified plant",
-        "Computed from the physical parameters up to half the sampling rate, with the 95 % band that follows from "
-        "their covariance.",
+        "From the physical parameters, with the 95 % interval that their covariance gives. Points: measured without a "
+        "model, hold and delay of the input taken out.",
     ),
-    "poles": (
-        "Poles",
-        "Poles of the identified plant in open loop, with the 95 % regions that follow from the covariance.",
+    "poles": ("Poles", "Of the identified plant in open loop, with their 95 % regions."),
+    "correlations": (
+        "Uncertainty of the parameters",
+        "Parameters with a correlation near ±1 are known only together: what the data show is their combination. "
+        "A large condition number says the same of more than two.",
+    ),
+    "force": (
+        "Force",
+        "Force of the magnet over position and current, and how well it is known. Points: samples of the free rotor.",
     ),
     "curves": (
         "Curves",
-        "From one co-energy, so that force and back-EMF agree, with the bands that follow from the covariance. "
-        "Dotted outside the recorded range: there the law extrapolates, which the band does not cover.",
+        "From one co-energy, so that force and back-EMF agree. Dotted outside the recorded range: there the law "
+        "extrapolates, which the interval does not cover.",
     ),
     "map": (
         "Range of the records",
-        "Each point is a sample. For one magnet, the line shows where its force equals the weight; a rotor at rest "
-        "lies on it.",
+        "Each point is a sample. For one magnet, a rotor at rest lies where the force equals its weight.",
     ),
     "records": (
         "Records",
-        "Each sample predicted from all samples before it; errors relative to the standard deviation expected by "
-        "the predictor. The errors of a correct model are white: about 1 % outside the bounds, no pattern.",
+        "Each sample predicted from all samples before it; residuals over the standard deviation that the predictor "
+        "expects of them. For a right model 5 % lie outside the dashed bounds.",
     ),
 }
 _SIGNS = "Sign convention: force = k_i · current − k_x · position; an attracting magnet has k_x < 0."

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import cycle
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
@@ -14,16 +16,25 @@ from ambid.bearing.magnet_problem import BearingRecord
 from ambid.bearing.magnet_result import Curve, Curves, NonlinearBearingEstimate
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.model import StateSpaceModel, pole_covariance
+from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
+from ambid.estimation.linear import one_thread
 from ambid.physics.linear_model import model
 from ambid.report.drawing import (
+    BOUND,
+    CYCLE,
     MEASURED,
+    NORMAL_95,
     PREDICTED,
+    WIDE,
+    Block,
+    Panel,
     Pole,
     Traces,
     bode_panel,
+    correlations_panel,
     frequency_grid,
-    grid,
+    head,
     poles_panel,
     records_panel,
     residuals_panel,
@@ -31,18 +42,21 @@ from ambid.report.drawing import (
     signals_panel,
     single,
     stacked,
+    whiteness_panel,
 )
 from ambid.report.estimate_text import names_words
-from ambid.report.numbers import prefixed
+from ambid.report.numbers import prefixed, sized
 from ambid.report.text import pole_table
+from ambid.signals.local_response import frf_local
+from ambid.signals.response import FrequencyResponse
+from ambid.signals.spectra import power_spectrum
 from ambid.validation import nonlinear_bearing
 from ambid.validation.second_record import Replay
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.figure import Figure
 
-    from ambid.report.drawing import Draw
     from ambid.validation.second_result import Validation
 
 _LOWEST_HZ = 0.1
@@ -51,7 +65,10 @@ _LEVELS = 3  # currents or positions for which a curve is drawn
 _POINTS = 121
 _BEYOND = 0.1  # part of the usual range by which curves go beyond it
 _CLOUD = 1500  # points of a record in the map
-_ROW = 1.6  # height of a record, inches
+_INSTRUMENT_LAGS = 40  # residuals that a controller may still answer
+_OWN = 0.9  # part of the power of an input that no residual explains, from which the response is measured
+_LOBE = 2  # lines of a spectrum over which its window smears
+_MEASURED = 60_000  # samples of a record from which its response is measured
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,33 +89,33 @@ class Evidence:
         """What the panels of signals and residuals draw."""
         run, plant = self.run, model(self.estimate.model)
         assert run is not None
-        rate_hz = run.fit.problem.rate_hz
+        problem = run.fit.problem
         return Traces(
-            time_s=self.start_s + (run.first + np.arange(run.measured.shape[0])) / rate_hz,
+            time_s=self.start_s + (run.first + np.arange(run.measured.shape[0])) / problem.rate_hz,
             names=plant.outputs,
             units=tuple(plant.units[role] for role in plant.outputs),
             measured=run.measured,
             predicted=run.predicted,
             simulated=run.simulated,
             sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
+            inputs=problem.u[problem.skip :],
+            input_names=plant.inputs,
         )
 
-    def drawings(self) -> dict[str, tuple[float, Draw]]:
-        """Return the drawings by name, each with its height in inches."""
-        estimate = self.estimate
-        found: dict[str, tuple[float, Draw]] = {}
+    def drawings(self) -> dict[str, Block]:
+        """Return the blocks of the figure by name."""
+        e, found = self.estimate, dict[str, Block]()
         if self.run is not None:
-            traces = self.traces
-            n_y = len(traces.names)
-            found |= {
-                "signals": (2.3 * n_y, lambda place: signals_panel(place, traces)),
-                "residuals": (2.2 * n_y, lambda place: residuals_panel(place, traces)),
+            traces, failed = self.traces, [name for name, c in e.checks.items() if not c.passed]
+            found = {
+                "signals": signals_panel(traces),
+                "residuals": residuals_panel(traces),
+                "whiteness": whiteness_panel(traces, failed),
             }
-        return {
-            **found,
-            "bode": (4.6, lambda place: _bode(place, estimate)),
-            "poles": (3.4, lambda place: _poles(place, estimate)),
-        }
+        found |= {"bode": _bode(e, measured_beside(self)), "poles": _poles(e)}
+        if len(e.covariance_names) > 1:
+            found["correlations"] = correlations_panel(e.covariance_names, e.covariance, e.values)
+        return found
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -113,13 +130,15 @@ class BearingEvidence:
         """What stands above the figures."""
         return f"{names_words(list(self.estimate.noise))}: {self.estimate.law}"
 
-    def drawings(self) -> dict[str, tuple[float, Draw]]:
-        """Return the drawings by name, each with its height in inches."""
-        height, traces = 0.7 + _ROW * len(self.traces), self.traces
+    def drawings(self) -> dict[str, Block]:
+        """Return the blocks of the figure by name."""
+        e = self.estimate
         return {
-            "curves": (3.6, lambda place: _curves(place, self.estimate)),
-            "map": (3.6, lambda place: _map(place, self)),
-            **({"records": (height, lambda place: records_panel(place, traces))} if traces else {}),
+            "force": _force(self),
+            "curves": _curves(e),
+            "map": _map(self),
+            **({"records": records_panel(self.traces)} if self.traces else {}),
+            "correlations": correlations_panel(e.covariance_names, e.covariance, e.values),
         }
 
 
@@ -145,32 +164,29 @@ def bearing_evidence(
     return BearingEvidence(estimate=estimate, traces=tuple(traces))
 
 
-def overview(evidence: Evidence | BearingEvidence) -> Figure:
+def overview(evidence: Evidence | BearingEvidence, width: float = WIDE) -> Figure:
     """Draw all figures on one page, one below the other."""
-    return stacked(evidence.title, list(evidence.drawings().values()))
+    return stacked(evidence.title, list(evidence.drawings().values()), width)
 
 
-def figures(evidence: Evidence | BearingEvidence) -> dict[str, Figure]:
+def figures(evidence: Evidence | BearingEvidence, width: float = WIDE) -> dict[str, Figure]:
     """Draw the figures one by one, as a report shows them."""
-    return {name: single(height, draw) for name, (height, draw) in evidence.drawings().items()}
+    return {name: single(block, width) for name, block in evidence.drawings().items()}
 
 
-def validation_figure(found: Validation) -> Figure:
+def validation_figure(found: Validation, width: float = WIDE) -> Figure:
     """Draw the one-step fit of each output on a further record."""
     sizes = {
         k: v["one_step"]["fit"] if isinstance(v["one_step"], dict) else v["one_step"] for k, v in found.fit.items()
     }
 
-    def draw(place: Figure | SubFigure) -> None:
-        axes = place.subplots()
+    def draw(axes: Axes) -> None:
         axes.barh(list(sizes), [np.nan if x is None else x for x in sizes.values()], color=PREDICTED, height=0.5)
         axes.set_xlabel("one-step fit, 1 is perfect")
         axes.set_xlim(right=1.0)
-        grid(axes)
 
-    return stacked(
-        f"{found.record or 'record'} judged with {found.estimate or 'a result'}", [(1.0 + 0.5 * len(sizes), draw)]
-    )
+    block = Block(columns=[[Panel(draw=draw, height=0.5 + 0.5 * len(sizes))]])
+    return stacked(f"{found.record or 'record'} judged with {found.estimate or 'a result'}", [block], width)
 
 
 # --- a linear plant -------------------------------------------------------------------------------------------------
@@ -207,17 +223,52 @@ def poles(estimate: Estimate) -> list[Pole]:
     return sorted(roots(plant.poles(), spread, _WIDEST), key=lambda pole: pole.value.real)
 
 
-def _bode(figure: Figure | SubFigure, estimate: Estimate) -> None:
+def measured_beside(evidence: Evidence) -> FrequencyResponse | None:
+    """Measure the response of the record without a model, as the plant's own: without hold and delay of the input.
+
+    Feedback would bias a plain ratio of spectra. The reference is the part of the input that residuals, which a
+    controller answers, do not explain (joint input-output method); where that is not nearly all of the input, the
+    response is not known. None where the record shows none.
+    """
+    run, plant = evidence.run, model(evidence.estimate.model)
+    if run is None:
+        return None
+    problem = run.fit.problem
+    n, rate_hz = min(run.innovations.shape[0], _MEASURED), problem.rate_hz
+    u, e, y = problem.u[problem.skip :][:n], run.innovations[:n], run.measured[:n]
+    before = np.vstack([np.zeros((_INSTRUMENT_LAGS - 1, e.shape[1])), e])
+    rows = sliding_window_view(before, _INSTRUMENT_LAGS, axis=0).reshape(n, -1)
+    reference = u - rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ u, rcond=None)[0]
+    try:
+        with one_thread():
+            found = frf_local(
+                u, y - y.mean(axis=0), rate_hz, r=reference, inputs=plant.inputs, outputs=plant.outputs,
+                units=plant.units,
+            )  # fmt: skip
+    except EstimationError:
+        return None
+    own, all_of = (sum(power_spectrum(x, rate_hz).density for x in of.T) for of in (reference, u))
+    at = power_spectrum(u[:, 0], rate_hz).frequency_hz
+    shares = sliding_window_view(np.pad(own / np.maximum(all_of, 1e-300), _LOBE, "edge"), 2 * _LOBE + 1)
+    known = np.interp(found.frequency_hz, at, shares.min(axis=-1)) > _OWN
+    late = evidence.estimate.delay[plant.inputs[0]]
+    turns = found.frequency_hz / rate_hz
+    plain = np.exp(2j * np.pi * turns * (late.samples + late.fraction + 0.5)) / np.sinc(turns)
+    covariance = np.where(known[:, None, None], found.covariance * (np.abs(plain) ** 2)[:, None, None], np.inf)
+    return replace(found, G=found.G * plain[:, None, None], covariance=covariance, noise_covariance=None)
+
+
+def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
     late = {role: d.samples + d.fraction for role, d in estimate.delay.items()}
-    asides = {role: f", without its delay of {x:.3g} samples" for role, x in late.items() if x}
+    asides = {role: f", without its delay of {x:.3g} sample{'s' * (x != 1)}" for role, x in late.items() if x}
     plant = model(estimate.model)
-    bode_panel(figure, responses(estimate), plant.inputs, plant.outputs, plant.units, asides)
+    return bode_panel(responses(estimate), plant.inputs, plant.outputs, plant.units, asides, measured)
 
 
-def _poles(figure: Figure | SubFigure, estimate: Estimate) -> None:
+def _poles(estimate: Estimate) -> Block:
     found = poles(estimate)
     text = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
-    poles_panel(figure, found, "\n".join(text), "poles of the identified plant, 95 % regions")
+    return poles_panel(found, "\n".join(text), "poles of the identified plant")
 
 
 # --- a nonlinear bearing --------------------------------------------------------------------------------------------
@@ -229,27 +280,25 @@ def _wide(limits: tuple[float, float]) -> Array:
     return np.linspace(low - beyond, high + beyond, _POINTS)
 
 
-def _curves(figure: Figure | SubFigure, e: NonlinearBearingEstimate) -> None:
+def _curves(e: NonlinearBearingEstimate) -> Block:
     """k_i, k_x and L over the position at some currents."""
     x, levels = _wide(e.usual["position"]), np.linspace(*e.usual["current"], _LEVELS)
     scale, unit = prefixed(float(np.max(np.abs(x))), "m")
-    axes = figure.subplots(1, 3)
     found = [e.curves(x, level) for level in levels.tolist()]
-    for a, name, meaning in zip(
-        axes, ("k_i", "k_x", "L"), ("force–current factor", "stiffness", "inductance"), strict=True
-    ):
+
+    def over_position(axes: Axes, name: str, meaning: str) -> None:
         size, shown = _unit_of(found, name)
-        for k, (level, at) in enumerate(zip(levels, found, strict=True)):
+        for color, level, at in zip(CYCLE, levels, found, strict=False):
             inside = at.coil_inside if name == "L" else at.inside
-            _banded(a, x / scale, getattr(at, name), inside, size, f"C{k}", f"at {level:.3g} A")
-        a.set_xlabel(f"position [{unit}]")
-        a.set_ylabel(f"{name} [{shown}]")
-        a.set_title(f"{meaning} {name}", fontsize=10)
-        grid(a)
-    axes[0].legend(loc="best", fontsize=8, framealpha=0.85)
-    figure.suptitle(
-        "curves with 95 % bands; dotted outside the range of the free rotor (L: of all records)", fontsize=10
-    )
+            _banded(axes, x / scale, getattr(at, name), inside, size, color, f"at {sized(level, 'A')}")
+        axes.set_xlabel(f"position [{unit}]")
+        axes.set_ylabel(f"{name} [{shown}]")
+        head(axes, f"{meaning} {name}")
+
+    wanted = (("k_i", "force–current factor"), ("k_x", "position stiffness"), ("L", "inductance"))
+    panels = [Panel(draw=lambda axes, w=w: over_position(axes, *w), height=2.5) for w in wanted]  # type: ignore[misc]
+    title = "curves with 95 % intervals; dotted outside the range of the free rotor (L: of all records)"
+    return Block(columns=[[p] for p in panels], title=title)
 
 
 def _unit_of(found: Sequence[Curves], name: str) -> tuple[float, str]:
@@ -258,50 +307,76 @@ def _unit_of(found: Sequence[Curves], name: str) -> tuple[float, str]:
 
 
 def _banded(axes: Axes, x: Array, c: Curve, inside: NDArray[np.bool_], scale: float, color: str, label: str) -> None:
-    axes.fill_between(x, c.low / scale, c.high / scale, color=color, alpha=0.25, linewidth=0)
+    axes.fill_between(x, c.low / scale, c.high / scale, color=color, alpha=0.2, linewidth=0)
     axes.plot(x, c.value / scale, ":", color=color, linewidth=1.2)
     axes.plot(x, np.where(inside, c.value / scale, np.nan), "-", color=color, linewidth=1.6, label=label)
 
 
-def _map(figure: Figure | SubFigure, evidence: BearingEvidence) -> None:
+def _force(evidence: BearingEvidence) -> Block:
+    """The force over position and current, where the free rotor was, and a cut through it."""
+    e = evidence.estimate
+    x, i = np.meshgrid(_wide(e.range["position"])[::2], _wide(e.range["current"])[::2])
+    at = e.curves(x.ravel(), i.ravel())
+    force, inside = at.force.value.reshape(x.shape), at.inside.reshape(x.shape)
+    spread = NORMAL_95 * at.force.sd.reshape(x.shape)
+    scale, unit = prefixed(float(np.max(np.abs(x))), "m")
+    size, newton = prefixed(float(np.max(np.abs(force[inside]), initial=1e-12)), "N")
+    weight = e.values["m"] * e.values["g"]
+
+    def surface(axes: Axes, values: Array, what: str) -> None:
+        drawn = axes.contour(x / scale, i, values, levels=10, cmap="viridis", linewidths=1.2)
+        axes.clabel(drawn, fontsize=7, fmt="%g")
+        axes.contourf(x / scale, i, ~inside, levels=[0.5, 1.5], colors=["#ededed"], zorder=0)
+        for color, t in zip(CYCLE, evidence.traces, strict=False):
+            free = t.measured[np.isfinite(t.predicted[:, 0])]
+            points = free[:: max(1, free.shape[0] // _CLOUD)]
+            axes.plot(points[:, 0] / scale, points[:, 1], ".", color=color, markersize=1.5, alpha=0.35, zorder=0.5)
+        if weight and not e.law.pair:
+            axes.contour(x / scale, i, force + weight, levels=[0.0], colors=BOUND, linewidths=1.6, linestyles="--")
+            axes.plot([], [], "--", color=BOUND, label="carries the weight")
+        axes.set_xlim(x.min() / scale, x.max() / scale)
+        axes.set_ylim(i.min(), i.max())
+        axes.set_xlabel(f"position [{unit}]")
+        axes.set_ylabel("current [A]")
+        head(axes, what)
+
+    panels = [
+        Panel(draw=lambda axes: surface(axes, force / size, f"force [{newton}]"), height=3.0),
+        Panel(draw=lambda axes: surface(axes, spread / size, f"half of its 95 % interval [{newton}]"), height=3.0),
+    ]
+    return Block(
+        columns=[[p] for p in panels],
+        title="force over position and current; grey: outside the range of the free rotor",
+    )
+
+
+def _map(evidence: BearingEvidence) -> Block:
     """Where the records were, and L over the current."""
     e = evidence.estimate
-    where, over = figure.subplots(1, 2, width_ratios=(3, 2))
     scale, unit = prefixed(float(np.max(np.abs(e.coil_hull[:, 0]))), "m")
-    for k, t in enumerate(evidence.traces):
-        every = max(1, t.measured.shape[0] // _CLOUD)
-        used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
-        x, i = used[:, 0] / scale, used[:, 1]
-        held = not np.any(np.isfinite(t.predicted[:, 0]))
-        where.plot(x, i, "|" if held else ".", color=f"C{k % 10}", markersize=2.5, alpha=0.5)
-        where.plot([], [], "|" if held else "o", color=f"C{k % 10}", markersize=5, label=t.title)
-    for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
-        corners = np.vstack([hull, hull[:1]])
-        where.plot(corners[:, 0] / scale, corners[:, 1], "-", color=MEASURED, linewidth=width)
-    _balance(where, e, scale)
-    where.set_xlabel(f"position [{unit}]")
-    where.set_ylabel("current [A]")
-    where.set_title("positions and currents of the records; hulls of the free rotor and of all records", fontsize=10)
-    where.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0), fontsize=7, framealpha=0.85)
-    low, high = e.coil_hull[:, 1].min(), e.coil_hull[:, 1].max()
-    currents, levels = np.linspace(low, high, _POINTS), np.linspace(*e.usual["position"], _LEVELS)
-    found = [e.curves(np.full(_POINTS, x), currents) for x in levels.tolist()]
-    size, shown = _unit_of(found, "L")
-    for k, (x, at) in enumerate(zip(levels, found, strict=True)):
-        _banded(over, currents, at.L, at.coil_inside, size, f"C{k}", f"at {x / scale:.3g} {unit}")
-    over.set_xlabel("current [A]")
-    over.set_ylabel(f"L [{shown}]")
-    over.set_title("inductance over the current", fontsize=10)
-    over.legend(loc="best", fontsize=8, framealpha=0.85)
-    grid(where, over)
 
+    def where(axes: Axes) -> None:
+        for color, t in zip(cycle(CYCLE), evidence.traces, strict=False):
+            every = max(1, t.measured.shape[0] // _CLOUD)
+            used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
+            mark = "." if np.any(np.isfinite(t.predicted[:, 0])) else "|"
+            axes.plot(used[:, 0] / scale, used[:, 1], mark, color=color, markersize=2.5, alpha=0.6, label=t.title)
+        for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
+            corners = np.vstack([hull, hull[:1]])
+            axes.plot(corners[:, 0] / scale, corners[:, 1], "-", color=MEASURED, linewidth=width)
+        axes.set_xlabel(f"position [{unit}]")
+        axes.set_ylabel("current [A]")
+        head(axes, "range of the records: hulls of the free rotor and of all")
 
-def _balance(axes: Axes, e: NonlinearBearingEstimate, scale: float) -> None:
-    """The line on which one magnet carries the weight: where a rotor at rest has to be, whatever the dynamics say."""
-    weight = e.values["m"] * e.values["g"]
-    if e.law.pair or weight == 0.0:
-        return
-    x, i = np.meshgrid(_wide(e.usual["position"])[::4], np.linspace(*e.range["current"], 60))
-    force = e.curves(x.ravel(), i.ravel()).force.value.reshape(x.shape)
-    axes.contour(x / scale, i, force + weight, levels=[0.0], colors="black", linewidths=1.4, linestyles="--")
-    axes.plot([], [], "--", color="black", linewidth=1.4, label="carries the weight")
+    def inductance(axes: Axes) -> None:
+        low, high = e.coil_hull[:, 1].min(), e.coil_hull[:, 1].max()
+        currents, levels = np.linspace(low, high, _POINTS), np.linspace(*e.usual["position"], _LEVELS)
+        found = [e.curves(np.full(_POINTS, x), currents) for x in levels.tolist()]
+        size, shown = _unit_of(found, "L")
+        for color, x, at in zip(CYCLE, levels, found, strict=False):
+            _banded(axes, currents, at.L, at.coil_inside, size, color, f"at {sized(x, 'm')}")
+        axes.set_xlabel("current [A]")
+        axes.set_ylabel(f"L [{shown}]")
+        head(axes, "inductance L over the current")
+
+    return Block(columns=[[Panel(draw=where, height=2.8)], [Panel(draw=inductance, height=2.8)]])

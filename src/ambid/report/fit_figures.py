@@ -6,7 +6,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from itertools import cycle
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,21 +21,27 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
     BOUND,
+    CYCLE,
     MEASURED,
-    MOST_PAIRS,
     NORMAL_95,
     PREDICTED,
+    WIDE,
+    Block,
+    Panel,
     Traces,
     bode_panel,
     frequency_grid,
-    grid,
+    head,
+    log_axis,
     poles_panel,
     records_panel,
     residuals_panel,
     roots,
+    said_panel,
     signals_panel,
     stacked,
     stems,
+    whiteness_panel,
     worst_stretch,
 )
 from ambid.report.fit_text import is_weight, pole_lines, term_ratios
@@ -46,9 +53,8 @@ from ambid.validation.residuals import Correlation, correlations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure, SubFigure
+    from matplotlib.figure import Figure
 
-    from ambid.report.drawing import Draw
     from ambid.validation.comparison import Comparison
 
 MOST_COEFFICIENTS = 25
@@ -70,35 +76,32 @@ class Bars:
     n_others: int  # estimated numbers that are no coefficients: weights of a network
 
 
-def fit_overview(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None = None) -> Figure:
+def fit_overview(
+    fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None = None, width: float = WIDE
+) -> Figure:
     """Draw all figures of a fit with a model on one page.
 
-    `second`: a further record that a nonlinear fit was judged on. Without records what needs none is drawn.
+    `second`: a further record that a nonlinear fit was judged on; `width`: of the page, inches. Without records what
+    needs none is drawn, of a fit without a model its reason.
     """
     if fit.model is None:
-        reason = getattr(fit, "reason", "")
-        return stacked(_title(fit, records, second), [(1.0, lambda place: place.text(0.5, 0.5, reason, ha="center"))])
-    parts, n_y = _signals(fit, records, second), len(fit.outputs)
-    width = max(11.0, 4.5 * n_y) if len(records) > 1 or second is not None else 11.0
+        return stacked(_title(fit, records, second), [said_panel(getattr(fit, "reason", ""))], width)
+    blocks = _signals(fit, records, second)
     if isinstance(fit, BlackBoxFit):
         if fit.inputs:
-            asides: dict[str, str] = {}
-            parts.append(
-                (4.6, lambda place: bode_panel(place, fit_response(fit), fit.inputs, fit.outputs, fit.units, asides))
-            )
-        parts.append((3.6, lambda place: _poles(place, fit)))
-        width = max(width, 3.3 * min(MOST_PAIRS, len(fit.inputs) * n_y))
+            blocks.append(bode_panel(fit_response(fit), fit.inputs, fit.outputs, fit.units))
+        blocks.append(_poles(fit))
     else:
-        parts += _nonlinear_parts(fit, records, second)
-    return stacked(_title(fit, records, second), parts, width)
+        blocks += _nonlinear_blocks(fit, records, second)
+    return stacked(_title(fit, records, second), blocks, width)
 
 
-def comparison_figure(found: Comparison) -> Figure:
+def comparison_figure(found: Comparison, width: float = WIDE) -> Figure:
     """Draw the fit of each structure on data that it has not seen, best first."""
     entries = [x for x in found.entries if x.fit is not None]
 
-    def draw(place: Figure | SubFigure) -> None:
-        axes, at = place.subplots(), np.arange(len(entries))
+    def draw(axes: Axes) -> None:
+        at = np.arange(len(entries))
         for values, label, color, shift in (
             ([x.one_step for x in entries], "one step", PREDICTED, -0.2),
             ([x.simulation for x in entries], "simulation", BAND, 0.2),
@@ -107,29 +110,26 @@ def comparison_figure(found: Comparison) -> Figure:
         axes.set_yticks(at, [f"{x.structure}{' (failed checks)' if x.failed else ''}" for x in entries])
         axes.invert_yaxis()
         axes.set_xlabel(f"fit on the {found.judged_on}, 1 is perfect")
-        axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=2, fontsize=8)
-        grid(axes)
 
-    name = found.record.get("file") or "record"
-    return stacked(f"{name}: structures compared", [(1.4 + 0.5 * len(entries), draw)])
+    block = Block(columns=[[Panel(draw=draw, height=0.9 + 0.5 * len(entries))]])
+    return stacked(f"{found.record.get('file') or 'record'}: structures compared", [block], width)
 
 
-def _nonlinear_parts(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[tuple[float, Draw]]:
+def _nonlinear_blocks(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[Block]:
     """Coefficients or bands, correlations of the errors, learning curves."""
-    parts: list[tuple[float, Draw]] = []
+    blocks: list[Block] = []
     bars = bars_of(fit)
     if bars is not None:
-        rows = min(len(bars.names), _ROWS)
-        parts.append((1.1 + 0.21 * rows, lambda place: _draw_bars(place, bars)))
+        blocks.append(_draw_bars(bars))
     if fit.covariance is not None and (bars is None or bars.n_others) and records:
         where, data = ("the second record", second) if second is not None else (_name(records[0], 0), records[0])
-        parts.append((0.9 + 2.1 * data.n_outputs, lambda place: _draw_band(place, fit, data, where)))
+        blocks.append(_draw_band(fit, data, where))
     shown = _correlations(fit, records) if records else []
     if shown:
-        parts.append((1.9 * -(-len(shown) // _ACROSS) + 0.4, lambda place: _draw_correlations(place, shown)))
+        blocks.append(_draw_correlations(shown))
     if any(c.training.size for c in fit.curves):
-        parts.append((3.0 + 0.1 * len(fit.curves), lambda place: _draw_training(place, fit)))
-    return parts
+        blocks.append(_draw_training(fit))
+    return blocks
 
 
 def _title(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None) -> str:
@@ -146,9 +146,7 @@ def _name(data: IOData, k: int) -> str:
     return str(data.record.get("file") or f"record {k + 1}")
 
 
-def _signals(
-    fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None
-) -> list[tuple[float, Draw]]:
+def _signals(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[Block]:
     """One record large, with a close view; several below each other."""
     if not records:
         return []
@@ -156,13 +154,10 @@ def _signals(
     if second is not None:
         title = f"second record, not fitted: {second.record.get('file') or 'record'}"
         found.append(traces_of(fit, second, title, second=True))
-    n_y, only = len(fit.outputs), found[0]
-    if len(found) == 1:
-        return [
-            (2.3 * n_y, lambda place: signals_panel(place, only)),
-            (2.2 * n_y, lambda place: residuals_panel(place, only)),
-        ]
-    return [(0.4 + 1.8 * len(found), lambda place: records_panel(place, found))]
+    if len(found) > 1:
+        return [records_panel(found)]
+    failed = [name for name, c in fit.checks.items() if not c.passed]
+    return [signals_panel(found[0]), residuals_panel(found[0]), whiteness_panel(found[0], failed)]
 
 
 def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *, second: bool = False) -> Traces:
@@ -187,6 +182,8 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
         predicted=predicted[first:],
         simulated=None if free is None else free[first:],
         sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
+        inputs=data.u[first:],
+        input_names=data.inputs,
     )
 
 
@@ -206,7 +203,7 @@ def fit_response(fit: BlackBoxFit) -> ModelResponse:
     return with_spread(fit.structure, frequency, G, slopes.astype(np.complex128), fit.covariance)
 
 
-def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
+def _poles(fit: BlackBoxFit) -> Block:
     """Poles and zeros with 95 % regions, and beside them the poles in numbers."""
     poles, zeros = fit.model.poles(), fit.model.zeros()
     reach = 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))
@@ -217,11 +214,10 @@ def _poles(figure: Figure | SubFigure, fit: BlackBoxFit) -> None:
     far = int(zeros.size - np.count_nonzero(near))
     hidden = f"; {counted(far, 'zero')} farther out" if far else ""
     delayed = ", without the delay" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
-    poles_panel(
-        figure,
+    return poles_panel(
         roots(poles, of_poles, 1e3),
         "\n".join(pole_lines(fit)),
-        f"poles (x) and zeros (o), 95 % regions{hidden}{delayed}",
+        f"poles and zeros{hidden}{delayed}",
         zeros=roots(zeros[near], of_zeros, reach),
         discrete=fit.model.dt is not None,
     )
@@ -242,62 +238,41 @@ def _correlations(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correlat
     return [] if prepared is None else correlations(prepared, records[0].inputs, records[0].outputs)[:_MOST]
 
 
-def _draw_correlations(figure: Figure | SubFigure, shown: list[Correlation]) -> None:
-    rows = -(-len(shown) // _ACROSS)
-    axes = figure.subplots(rows, min(_ACROSS, len(shown)), squeeze=False, sharex=True)
-    for a in axes.flat[len(shown) :]:
-        a.axis("off")
-    for a, c in zip(axes.flat, shown, strict=False):
-        stems(a, c.lags, c.values, c.band)
-        a.set_title(c.title, fontsize=9)
-        a.tick_params(labelsize=8)
-        grid(a)
-    figure.suptitle("correlations over the lag in samples, with 99 % bounds (Billings and Voon 1986)", fontsize=10)
+def _draw_correlations(shown: list[Correlation]) -> Block:
+    def one(axes: Axes, c: Correlation) -> None:
+        stems(axes, c.lags, c.values, c.band)
+        axes.set_xlabel("lag [samples]")
+        head(axes, c.title)
+
+    columns = [[Panel(draw=lambda axes, c=c: one(axes, c)) for c in shown[k::_ACROSS]] for k in range(_ACROSS)]  # type: ignore[misc]
+    return Block(columns=[x for x in columns if x], title="correlations of residuals (Billings and Voon 1986)")
 
 
-def _draw_training(figure: Figure | SubFigure, fit: NonlinearFit) -> None:
-    by_time, by_step = figure.subplots(1, 2, sharey=True)
+def _draw_training(fit: NonlinearFit) -> Block:
     positive = [float(t) for c in fit.curves for t in c.seconds if t > 0]
     earliest = min(positive, default=1.0) / 2  # a logarithm has no zero
     methods = [c.method for c in fit.curves]
     names = [f"{k + 1}. {m}" if methods.count(m) > 1 else m for k, m in enumerate(methods)]
-    for k, c in enumerate(fit.curves):
-        color, seconds = f"C{k % 10}", np.maximum(c.seconds, earliest)
-        by_time.plot(seconds, c.training, ".-", color=color, markersize=3, linewidth=1.0, label=names[k])
-        by_step.plot(np.arange(c.training.size), c.training, ".-", color=color, markersize=3, linewidth=1.0)
-        if c.held_out.size == c.training.size:
-            by_time.plot(seconds, c.held_out, "--", color=color, linewidth=0.9)
-            by_step.plot(np.arange(c.training.size), c.held_out, "--", color=color, linewidth=0.9)
-    by_time.set_xlabel("time [s]")
-    by_step.set_xlabel("iteration")
-    by_step.xaxis.get_major_locator().set_params(integer=True)
-    _scaled(by_time, "x", [x for c in fit.curves for x in np.maximum(c.seconds, earliest)])
-    _scaled(by_time, "y", [x for c in fit.curves for x in (*c.training, *c.held_out)])
-    by_time.set_ylabel("rms error / sd of output")
-    by_time.set_title("learning curves (dashed: held out)", fontsize=10)
-    columns = 1 if max(map(len, names)) > 60 else 2
-    figure.legend(loc="outside lower center", fontsize=8, ncols=min(columns, len(names)), frameon=False)
-    grid(by_time, by_step)
+    sizes = [float(x) for c in fit.curves for x in (*c.training, *c.held_out) if np.isfinite(x) and x > 0]
+    times = [max(float(t), earliest) for c in fit.curves for t in c.seconds]
 
+    def draw(axes: Axes, by_time: bool) -> None:
+        for c, name, color in zip(fit.curves, names, cycle(CYCLE), strict=False):
+            at = np.maximum(c.seconds, earliest) if by_time else np.arange(c.training.size)
+            axes.plot(at, c.training, ".-", color=color, markersize=3, linewidth=1.0, label=name)
+            if c.held_out.size == c.training.size:
+                axes.plot(at, c.held_out, "--", color=color, linewidth=0.9, label="held out")
+        if by_time and max(times) > 5 * min(times):
+            log_axis(axes.xaxis, min(times), max(times))
+        if sizes and max(sizes) > 5 * min(sizes):
+            log_axis(axes.yaxis, min(sizes), max(sizes))
+        elif sizes and max(sizes) < 1.01 * min(sizes):  # a search that began where it ended is flat
+            axes.set_ylim(0.98 * min(sizes), 1.02 * max(sizes))
+        axes.set_xlabel("time [s]" if by_time else "iteration")
+        axes.set_ylabel("rms error / sd of output")
+        head(axes, f"learning over {'time' if by_time else 'iterations'}")
 
-def _scaled(axes: Axes, which: Literal["x", "y"], values: list[float]) -> None:
-    """A logarithmic axis where values span more than a factor of 5; labels that do not run into each other."""
-    from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
-
-    finite = [float(v) for v in values if np.isfinite(v) and v > 0]
-    if not finite or max(finite) < 5 * min(finite):
-        if which == "y" and finite and max(finite) < 1.01 * min(finite):  # a search that began where it ended is flat
-            axes.set_ylim(0.98 * min(finite), 1.02 * max(finite))
-        return
-    if which == "x":
-        axes.set_xscale("log")
-    else:
-        axes.set_yscale("log")
-    axis = axes.xaxis if which == "x" else axes.yaxis
-    wide = max(finite) > 100 * min(finite)
-    axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
-    axis.set_major_formatter(LogFormatterSciNotation() if wide else "{x:g}")
-    axis.set_minor_formatter(NullFormatter())
+    return Block(columns=[[Panel(draw=lambda axes, x=x: draw(axes, x), height=2.6)] for x in (True, False)])  # type: ignore[misc]
 
 
 def bars_of(fit: NonlinearFit) -> Bars | None:
@@ -340,16 +315,17 @@ def term_names(fit: NonlinearFit) -> set[str]:
     return {x for x in fit.model.names if x in chosen or any(x.startswith(f"{b}1/(") for b in below)}
 
 
-def _draw_bars(figure: Figure | SubFigure, bars: Bars) -> None:
+def _draw_bars(bars: Bars) -> Block:
     """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude."""
     columns = -(-len(bars.names) // _ROWS)
     per = -(-len(bars.names) // columns)
-    axes = figure.subplots(1, columns, squeeze=False)[0]
-    for c, a in enumerate(axes):
-        _bars(a, bars, slice(c * per, (c + 1) * per), per)
     more = f"; {bars.n_more} more, less significant, are not shown" if bars.n_more else ""
-    title = "coefficients with 95 % intervals, each on its own scale; red: zero lies inside"
-    figure.suptitle(f"{title}{more}", fontsize=10)
+    panels = [
+        Panel(draw=lambda axes, c=c: _bars(axes, bars, slice(c * per, (c + 1) * per), per), height=0.6 + 0.21 * per)  # type: ignore[misc]
+        for c in range(columns)
+    ]
+    title = "coefficients with 95 % intervals, each on its own scale; orange: zero lies inside"
+    return Block(columns=[[p] for p in panels], title=f"{title}{more}")
 
 
 def _bars(axes: Axes, bars: Bars, part: slice, rows: int) -> None:
@@ -358,18 +334,16 @@ def _bars(axes: Axes, bars: Bars, part: slice, rows: int) -> None:
     for y, value, half in zip(at, values, halves, strict=True):
         far = abs(value) + half
         color = BOUND if abs(value) < half else PREDICTED
-        axes.errorbar(value / far, y, xerr=half / far, fmt="o", color=color, markersize=3.5, capsize=2.5, linewidth=1.2)
+        axes.errorbar(value / far, y, xerr=half / far, fmt="o", color=color, markersize=3.5, capsize=2.5)
     axes.axvline(0, color=MEASURED, linewidth=0.8)
     texts = [f"{n} = {coefficient_text(float(v), float(h))}" for n, v, h in zip(names, values, halves, strict=True)]
     axes.set_yticks(at, texts)
     axes.set_xticks([0.0], ["0"])
     axes.set_xlim(-1.1, 1.1)
     axes.set_ylim(-0.7, rows - 0.3)
-    grid(axes)
-    axes.tick_params(labelsize=8)
 
 
-def _draw_band(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, where: str) -> None:
+def _draw_band(fit: NonlinearFit, data: IOData, where: str) -> Block:
     """Draw the predicted outputs with their 95 % bands, where the errors are largest.
 
     `fit`: with a covariance; `where`: which record it is, for the title.
@@ -384,30 +358,27 @@ def _draw_band(figure: Figure | SubFigure, fit: NonlinearFit, data: IOData, wher
     noise = np.maximum(np.diag(fit.noise_covariance), 0.0)
     outside = beyond(model.novelty(data.u, data.y)[first:last])
     t = data.start_s + np.arange(first, last) * data.dt
-    axes = figure.subplots(data.n_outputs, 2, squeeze=False, sharex="col", width_ratios=(3, 2))
-    for j, name in enumerate(data.outputs):
-        y, p = data.y[first:last, j], predicted[first:last, j]
+
+    def draw(axes: Axes, j: int, less: Array, what: str) -> None:
+        points, middle = (x[first:last, j] - less[first:last, j] for x in (data.y, predicted))
         own, both = NORMAL_95 * np.sqrt(variance[:, j]), NORMAL_95 * np.sqrt(variance[:, j] + noise[j])
-        for a, middle, points in ((axes[j, 0], p, y), (axes[j, 1], np.zeros_like(p), y - p)):
-            scale, unit = prefixed(float(np.max(np.abs(points))), fit.units[name])
-            for half, color, label in (
-                (both, BAND, "95 % of the measured"),
-                (own, PREDICTED, "95 % of the prediction"),
-            ):
-                low, high = (middle - half) / scale, (middle + half) / scale
-                a.fill_between(t, low, high, color=color, alpha=0.5, linewidth=0, label=label)
-            a.plot(t, middle / scale, color=PREDICTED, linewidth=1.0, label="predicted one step ahead")
-            inside = np.where(outside, np.nan, points / scale)
-            a.plot(t, inside, ".", color=MEASURED, markersize=3.5, label="measured")
-            if np.any(outside):
-                far = points[outside] / scale
-                a.plot(t[outside], far, "x", color=BOUND, markersize=4, label="measured, outside the training data")
-            a.set_ylabel(f"{name} [{unit}]" if a is axes[j, 0] else f"[{unit}]")
-            grid(a)
-    for a, title in zip(axes[0], (f"{where}, where errors are largest", "measured - predicted"), strict=True):
-        a.set_title(title, fontsize=10)
-        axes[-1, 0].set_xlabel("time [s]")
-        axes[-1, 1].set_xlabel("time [s]")
-    handles, labels = axes[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", fontsize=8, ncols=5, frameon=False)
-    figure.suptitle("predictions with their bands", fontsize=10)
+        scale, unit = prefixed(float(np.max(np.abs(points))), fit.units[data.outputs[j]])
+        for half, color, label in ((both, BAND, "95 % of the measured"), (own, PREDICTED, "95 % of the prediction")):
+            low, high = (middle - half) / scale, (middle + half) / scale
+            axes.fill_between(t, low, high, color=color, alpha=0.5, linewidth=0, label=label)
+        axes.plot(t, middle / scale, color=PREDICTED, linewidth=1.0, label="predicted one step ahead")
+        inside = np.where(outside, np.nan, points / scale)
+        axes.plot(t, inside, ".", color=MEASURED, markersize=3.5, label="measured")
+        if np.any(outside):
+            far = points[outside] / scale
+            axes.plot(t[outside], far, "x", color=BOUND, markersize=4, label="measured, outside the training data")
+        axes.set_xlabel("time [s]")
+        axes.set_ylabel(f"{data.outputs[j]} [{unit}]")
+        head(axes, what)
+
+    views = ((np.zeros_like(predicted), f"{where}, where errors are largest"), (predicted, "measured less predicted"))
+    columns = [
+        [Panel(draw=lambda axes, j=j, v=v: draw(axes, j, *v), height=2.1) for j in range(data.n_outputs)]  # type: ignore[misc]
+        for v in views
+    ]
+    return Block(columns=columns, widths=(3, 2), title="predictions with their bands")

@@ -13,16 +13,21 @@ from ambid.bearing.measured import Measured, ModelResponse, model_responses
 from ambid.report.drawing import (
     BAND,
     BOUND,
+    GREEN,
     MEASURED,
-    MOST_PAIRS,
+    ORANGE,
     PREDICTED,
+    WIDE,
+    Block,
     Complex,
     Pair,
+    Panel,
     angle_ticks,
-    grid,
+    head,
     magnitude_axis,
-    pair_axes,
+    pairs_panel,
     phase_axis,
+    stacked,
     unwrapped,
 )
 from ambid.report.numbers import sized
@@ -32,14 +37,14 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_NOISE, _DISTORTION, _RANGE = "#5f9a3f", "#d58a1f", "#d4d4d4"
+_NOISE, _DISTORTION, _RANGE = GREEN, ORANGE, "#d4d4d4"
 _MODELS: tuple[tuple[str, str, str], ...] = (
     (PREDICTED, BAND, "-"),
-    (BOUND, "#f1c4be", "--"),
+    (BOUND, "#f5cdb0", "--"),
 )  # line and band of the black-box fit and of the physical parameters
 _PHASE_KNOWN = 0.5  # radius of the 95 % region over the magnitude up to which the phase is
 _GRID = 800  # frequencies at which a model is drawn
-_STABLE, _FREQUENCY, _NEW, _MODE = "#0b6fb8", "#e08a1e", "#aaaaaa", "#c0392b"
+_STABLE, _FREQUENCY, _NEW, _MODE = PREDICTED, ORANGE, "#aaaaaa", BOUND
 _KINDS = (
     ("new", "x", _NEW),
     ("stable in frequency", "^", _FREQUENCY),
@@ -51,24 +56,18 @@ _WIDE = 100.0  # largest over smallest frequency from which the axis is logarith
 # --- a measured frequency response ----------------------------------------------------------------------------------
 
 
-def frf_figure(measured: Measured) -> Figure:
+def frf_figure(measured: Measured, width: float = WIDE) -> Figure:
     """Draw magnitude and phase of every pair: lines with 95 % bands, noise and distortion, the models over them."""
-    from matplotlib.figure import Figure
-
     frf = measured.response
-    pairs, f = [(j, k) for j in range(frf.n_outputs) for k in range(frf.n_inputs)], frf.frequency_hz
+    f = frf.frequency_hz
     models = model_responses(measured, np.geomspace(f[0], f[-1], _GRID)) if f.size > 1 else ()
-    page = Figure(figsize=(max(8.0, 5.5 * min(len(pairs), MOST_PAIRS)), 7.0), layout="constrained")
-    axes = pair_axes(page, pairs, frf.inputs, frf.outputs, frf.units)
-    for (magnitude, phase), pair in zip(axes, pairs, strict=False):
-        _magnitude(magnitude, measured, models, pair)
-        _phase(phase, measured, models, pair)
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    page.legend(handles, labels, loc="outside lower center", ncols=min(len(labels), 3), fontsize=9)
+    block = pairs_panel(
+        lambda axes, pair: _magnitude(axes, measured, models, pair),
+        lambda axes, pair: _phase(axes, measured, models, pair),
+        frf.inputs, frf.outputs, frf.units,
+    )  # fmt: skip
     name = measured.record.get("file") or "record"
-    some = f" ({len(axes)} of {len(pairs)} pairs)" if len(pairs) > len(axes) else ""
-    page.suptitle(f"{name}: frequency response, {frf.method}{some}", fontsize=12)
-    return page
+    return stacked(f"{name}: frequency response, {frf.method}", [block], width)
 
 
 def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
@@ -130,40 +129,57 @@ def _marker(n: int) -> float:
 # --- a stabilisation diagram ----------------------------------------------------------------------------------------
 
 
-def stabilisation_figure(found: Stabilisation) -> Figure:
+def stabilisation_figure(found: Stabilisation, width: float = WIDE) -> Figure:
     """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
-    from matplotlib.figure import Figure
+    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
+    logarithmic = bool(seen.size and seen.max() > _WIDE * seen.min())
+
+    def over_frequency(axes: Axes) -> None:
+        for mode in found.modes:
+            axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6, label="mode")
+        axes.set_xlabel("frequency of the pole [Hz]")
+        if logarithmic:
+            axes.set_xscale("log")
+
+    def damping(axes: Axes) -> None:
+        over_frequency(axes)
+        axes.set_ymargin(0.25)
+        stable = [p for p in found.poles if p.stable]
+        axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
+        for mode in found.modes:
+            at, words = (mode.frequency_hz, mode.damping), sized(mode.frequency_hz, "Hz")
+            axes.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
+        axes.axhline(0, color=_NEW, linewidth=0.8)
+        axes.set_ylabel("damping")
+        head(axes, "damping (under 0: unstable)")
+
+    def diagram(axes: Axes) -> None:
+        over_frequency(axes)
+        for k, (label, marker, color) in enumerate(_KINDS):
+            chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
+            frequency, orders = [p.frequency_hz for p in chosen], [p.order for p in chosen]
+            axes.plot(frequency, orders, marker, color=color, markersize=5, label=label, linestyle="none")
+        _orders(axes)
+        head(axes, "poles by order")
+
+    def values(axes: Axes) -> None:
+        size = np.asarray(found.singular_values)
+        axes.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
+        axes.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
+        axes.set_xlabel("singular value")
+        _orders(axes)
+        head(axes, f"least BIC: order {found.suggested}")
+
+    empty = Panel(draw=lambda axes: axes.axis("off"), height=0.2)
+    block = Block(
+        columns=[[Panel(draw=damping, height=2.0), Panel(draw=diagram, height=3.6)], [empty, Panel(draw=values)]],
+        widths=(4, 1),
+    )
+    return stacked(f"stabilisation diagram, {found.method}", [block], width)
+
+
+def _orders(axes: Axes) -> None:
     from matplotlib.ticker import MaxNLocator
 
-    page = Figure(figsize=(11, 7), layout="constrained")
-    page.suptitle(f"stabilisation diagram, {found.method}", fontsize=13)
-    (damping, empty), (diagram, values) = page.subplots(
-        2, 2, width_ratios=(4, 1), height_ratios=(1, 2), sharex="col", sharey="row"
-    )
-    empty.axis("off")
-    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
-    if seen.size and seen.max() > _WIDE * seen.min():
-        diagram.set_xscale("log")
-    for k, (label, marker, color) in enumerate(_KINDS):
-        chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
-        frequency, orders = [p.frequency_hz for p in chosen], [p.order for p in chosen]
-        diagram.plot(frequency, orders, marker, color=color, markersize=5, label=label, linestyle="none")
-    damping.set_ymargin(0.2)
-    damping.plot(frequency, [p.damping for p in chosen], "o", color=_STABLE, markersize=4)
-    for mode in found.modes:
-        diagram.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6)
-        at, words = (mode.frequency_hz, mode.damping), sized(mode.frequency_hz, "Hz")
-        damping.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
-    damping.axhline(0, color=_NEW, linewidth=0.8)
-    damping.set_ylabel("damping (under 0: unstable)")
-    diagram.set_xlabel("frequency of the pole [Hz]")
-    diagram.set_ylabel("order")
-    diagram.yaxis.set_major_locator(MaxNLocator(integer=True))
-    empty.legend(*diagram.get_legend_handles_labels(), loc="center", fontsize=8, title="poles", title_fontsize=9)
-    size = np.asarray(found.singular_values)
-    values.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
-    values.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
-    values.set_xlabel("singular value")
-    values.set_title(f"least BIC: order {found.suggested}", fontsize=10)
-    grid(damping, diagram, values)
-    return page
+    axes.set_ylabel("order")
+    axes.yaxis.set_major_locator(MaxNLocator(integer=True))

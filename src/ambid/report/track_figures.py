@@ -14,7 +14,22 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
-from ambid.report.drawing import BAND, MEASURED, NORMAL_95, PIXELS, PREDICTED, curve, extremes, grid
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    GREEN,
+    MEASURED,
+    NORMAL_95,
+    PIXELS,
+    PREDICTED,
+    SKY,
+    WIDE,
+    Block,
+    Panel,
+    curve,
+    extremes,
+    stacked,
+)
 from ambid.report.numbers import prefixed
 
 if TYPE_CHECKING:
@@ -24,8 +39,8 @@ if TYPE_CHECKING:
 STATES = ("tracking", "changed", "hold", "frozen")
 Truth = Mapping[str, tuple[Array, Array]]
 
-_TRUTH, _MARK, _STALE, _OVER = "#000000", "#d55e00", "#d9d9d9", "#d55e00"
-_STATE_COLOURS = {"tracking": "#009e73", "changed": "#d55e00", "hold": "#56b4e9", "frozen": "#bdbdbd"}
+_TRUTH, _MARK, _STALE, _OVER = "#000000", BOUND, "#d9d9d9", BOUND
+_STATE_COLOURS = {"tracking": GREEN, "changed": BOUND, "hold": SKY, "frozen": "#bdbdbd"}
 _STATE_HATCHES = {"tracking": "", "changed": "xxx", "hold": "...", "frozen": "///"}
 _MARKED: dict[str, Any] = {
     "change": "-.",
@@ -98,7 +113,9 @@ class TrackHistory:
         return value, sd, stale > 0
 
 
-def track_figure(track: Track | TrackHistory, *, truth: Truth | None = None, title: str | None = None) -> Figure:
+def track_figure(
+    track: Track | TrackHistory, *, truth: Truth | None = None, title: str | None = None, width: float = WIDE
+) -> Figure:
     """Draw a track.
 
     Parameters
@@ -109,32 +126,43 @@ def track_figure(track: Track | TrackHistory, *, truth: Truth | None = None, tit
         Each of shape (n,), s of record and SI.
     title : str, optional
         Default: the record's name, the model and the method.
+    width : float, optional
+        Inches.
 
     Returns
     -------
     matplotlib.figure.Figure
         One panel for each parameter, the error against its limit, the states.
     """
-    from matplotlib.figure import Figure
-
     history = track if isinstance(track, TrackHistory) else TrackHistory.of(track)
-    names, truth = history.names, truth or {}
-    heights = [*([1.55] * len(names)), 1.35, 0.34]
-    page = Figure(figsize=(11, sum(heights) + 1.4), layout="constrained")
-    axes = page.subplots(len(heights), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
-    head = history.header
-    page.suptitle(title or f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}", fontsize=13)
+    names, truth, head = history.names, truth or {}, history.header
     marks = [e for e in history.events if e.kind in _MARKED and np.isfinite(e.t)]
-    for panel, name in zip(axes[: len(names)], names, strict=True):
-        _parameter_panel(panel, history, name, truth.get(name))
-        _event_marks(panel, marks, name, history)
-    _error_panel(axes[-2], history)
-    _event_marks(axes[-2], marks, None, history)
-    _state_strip(axes[-1], history)
-    axes[-1].set_xlabel("time [s of record]")
-    axes[0].set_xlim(*_extent(history))
-    page.align_ylabels(axes[:-1])
-    _legend(page, history, bool(set(truth) & set(names)), marks)
+
+    def parameter(axes: Axes, name: str) -> None:
+        _parameter_panel(axes, history, name, truth.get(name))
+        _event_marks(axes, marks, name, history, width)
+        bottom(axes)
+
+    def error(axes: Axes) -> None:
+        _error_panel(axes, history)
+        _event_marks(axes, marks, None, history, width)
+        bottom(axes)
+
+    def state(axes: Axes) -> None:
+        _state_strip(axes, history)
+        bottom(axes)
+
+    def bottom(axes: Axes) -> None:
+        axes.set_xlim(*_extent(history))
+        axes.set_xlabel("time [s of record]")
+
+    panels = [Panel(draw=lambda axes, name=name: parameter(axes, name), height=1.55) for name in names]  # type: ignore[misc]
+    panels += [Panel(draw=error, height=1.35), Panel(draw=state, height=0.5)]
+    page = stacked(
+        title or f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}",
+        [Block(columns=[panels], legend=_legend(history, bool(set(truth) & set(names)), marks))], width,
+    )  # fmt: skip
+    page.align_ylabels(page.axes[:-1])
     return page
 
 
@@ -162,7 +190,6 @@ def _parameter_panel(axes: Axes, history: TrackHistory, name: str, truth: tuple[
     axes.set_ylabel(f"{name} [{unit}]" if unit else name)
     axes.ticklabel_format(axis="y", style="plain", useOffset=False)
     axes.set_axisbelow(True)
-    grid(axes)
     _say_change(axes, history, name, float(value[-1]))
 
 
@@ -212,10 +239,10 @@ def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], tru
 
 def _say(axes: Axes, text: str, where: Literal["left", "right"] = "right") -> None:
     """Write above the panel, where nothing is hidden."""
-    axes.set_title(text, fontsize=8, loc=where, color="#333333", pad=2)
+    axes.set_title(text, fontsize=8, loc=where, color="#333333", pad=3)
 
 
-def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: TrackHistory) -> None:
+def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: TrackHistory, width: float) -> None:
     """Draw a vertical line for each, and in the panel of the parameter that moved its name."""
     first, last = _extent(history)
     taken: list[float] = [-np.inf] * _LEVELS
@@ -227,7 +254,7 @@ def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: 
         if not own:
             continue
         text, at = event_words(e), (e.t - first) / max(last - first, 1e-300)
-        wide = 0.0068 * len(text)
+        wide = 0.0068 * WIDE / width * len(text)
         left = at + wide > 0.99
         begin = at - wide if left else at
         level = next((k for k, end in enumerate(taken) if end < begin), None)
@@ -272,7 +299,6 @@ def _error_panel(axes: Axes, history: TrackHistory) -> None:
     missing = f", not known in {unknown:.2g} %" if unknown else ""
     _say(axes, f"beyond the limit in {over:.2g} % of the lines{missing}")
     axes.set_axisbelow(True)
-    grid(axes)
 
 
 def _state_strip(axes: Axes, history: TrackHistory) -> None:
@@ -298,15 +324,15 @@ def _state_strip(axes: Axes, history: TrackHistory) -> None:
     axes.tick_params(labelsize=9)
 
 
-def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequence[Event]) -> None:
-    """One legend for the whole page, below it: nothing is hidden by it."""
+def _legend(history: TrackHistory, has_truth: bool, marks: Sequence[Event]) -> list[Any]:
+    """Return the entries of the legend of the page, which stands below it: nothing is hidden by it."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
 
     thin = f", extremes of {history.n_lines // PIXELS} lines each" if history.n_lines > 2 * PIXELS else ""
     entries: list[Any] = [
         Line2D([], [], color=PREDICTED, linewidth=1.4, label=f"accepted value{thin}"),
-        Patch(color=BAND, label="95 % band"),
+        Patch(color=BAND, label="95 % interval"),
     ]
     if has_truth:
         entries.append(Line2D([], [], color=_TRUTH, linestyle=(0, (4, 2)), linewidth=1.1, label="truth"))
@@ -322,7 +348,7 @@ def _legend(page: Figure, history: TrackHistory, has_truth: bool, marks: Sequenc
             entries.append(
                 Patch(facecolor=_STATE_COLOURS[name], hatch=_STATE_HATCHES[name], edgecolor="white", label=name)
             )
-    page.legend(handles=entries, loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+    return entries
 
 
 def runs(flags: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:

@@ -40,7 +40,7 @@ _WHITE_LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 13, 16, 20, 25)
 _PRODUCT_LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 _INPUT_LAGS, _LONGEST = 16, 400
 _LOOP_LAGS, _OWN_LAGS = 10, 20
-_NORMAL_99 = 2.5758293035489004
+_NORMAL_95 = 1.959963984540054
 
 Sizes = list[dict[str, float]]
 """Of each output: ``fit``, 1 - |e| / |y - mean|, and ``rmse``, SI."""
@@ -325,7 +325,7 @@ class Correlation:
     title: str
     lags: NDArray[np.int64]  # (n_lags,), samples, the second comes before the first by this much
     values: Array  # (n_lags,)
-    # (n_lags,), 99 % of the values are within -+ band if the model is right; the estimated numbers are accounted for
+    # (n_lags,), 95 % of the values are within -+ band if the model is right; the estimated numbers are accounted for
     band: Array
 
 
@@ -388,7 +388,7 @@ def correlations(
                 one.append((f"e of {output}, e × {name}", _score(of, o, mixed, lags)))
             one.append((f"e² of {output}, {name}²", _variance(of, o, u2, lags)))
         found += [
-            Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=_NORMAL_99 * s.sd)
+            Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=_NORMAL_95 * s.sd)
             for t, s in one
         ]
     return found

@@ -80,7 +80,7 @@ def test_feedback_is_seen_in_a_loop_and_not_without() -> None:
     assert seen == [1.0, 0.0]
 
 
-def test_bounds_hold_99_percent_of_the_correlations() -> None:
+def test_bounds_hold_95_percent_of_the_correlations() -> None:
     inside, count = 0, 0
     for seed in range(15):
         data = [squared(400, 1000 + seed), squared(300, 2000 + seed)]
@@ -95,7 +95,7 @@ def test_bounds_hold_99_percent_of_the_correlations() -> None:
             inside += int(np.sum(np.abs(c.values) <= c.band + 1e-12))
             count += c.values.size
     assert count == 15 * 5 * 20
-    assert abs(inside / count - 0.99) < 0.008
+    assert abs(inside / count - 0.95) < 0.02
 
 
 def test_a_level_error_at_one_operating_point_is_left_in_the_residuals() -> None:
