@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Bbox
 
-from ambid.report.drawing import NARROW, WIDE, Pole, autocorrelation, poles_panel, save, single, whiteness_panel
+from ambid.report.drawing import NARROW, WIDE, save, single
 from ambid.report.figures import figures, measured_beside, overview, responses
+from ambid.report.response_panels import Pole, poles_panel
+from ambid.report.signal_panels import autocorrelation, whiteness_panel
 
 
 @pytest.fixture(scope="module")

@@ -29,23 +29,15 @@ from ambid.report.drawing import (
     WIDE,
     Block,
     Panel,
-    Pole,
-    Traces,
-    bode_panel,
-    correlations_panel,
-    frequency_grid,
     head,
-    poles_panel,
-    records_panel,
-    residuals_panel,
-    roots,
-    signals_panel,
+    panel,
     single,
     stacked,
-    whiteness_panel,
 )
 from ambid.report.estimate_text import names_words
 from ambid.report.numbers import prefixed, sized
+from ambid.report.response_panels import Pole, bode_panel, correlations_panel, frequency_grid, poles_panel, roots
+from ambid.report.signal_panels import Traces, records_panel, residuals_panel, signals_panel, whiteness_panel
 from ambid.report.text import pole_table
 from ambid.signals.local_response import frf_local
 from ambid.signals.response import FrequencyResponse
@@ -296,7 +288,7 @@ def _curves(e: NonlinearBearingEstimate) -> Block:
         head(axes, f"{meaning} {name}")
 
     wanted = (("k_i", "force–current factor"), ("k_x", "position stiffness"), ("L", "inductance"))
-    panels = [Panel(draw=lambda axes, w=w: over_position(axes, *w), height=2.5) for w in wanted]  # type: ignore[misc]
+    panels = [panel(over_position, *w, height=2.5) for w in wanted]
     title = "curves with 95 % intervals; dotted outside the range of the free rotor (L: of all records)"
     return Block(columns=[[p] for p in panels], title=title)
 
@@ -341,8 +333,8 @@ def _force(evidence: BearingEvidence) -> Block:
         head(axes, what)
 
     panels = [
-        Panel(draw=lambda axes: surface(axes, force / size, f"force [{newton}]"), height=3.0),
-        Panel(draw=lambda axes: surface(axes, spread / size, f"half of its 95 % interval [{newton}]"), height=3.0),
+        panel(surface, force / size, f"force [{newton}]", height=3.0),
+        panel(surface, spread / size, f"half of its 95 % interval [{newton}]", height=3.0),
     ]
     return Block(
         columns=[[p] for p in panels],

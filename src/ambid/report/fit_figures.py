@@ -28,24 +28,24 @@ from ambid.report.drawing import (
     WIDE,
     Block,
     Panel,
-    Traces,
-    bode_panel,
-    frequency_grid,
     head,
     log_axis,
-    poles_panel,
+    panel,
+    said_panel,
+    stacked,
+)
+from ambid.report.fit_text import is_weight, pole_lines, term_ratios
+from ambid.report.numbers import prefixed
+from ambid.report.response_panels import bode_panel, frequency_grid, poles_panel, roots
+from ambid.report.signal_panels import (
+    Traces,
     records_panel,
     residuals_panel,
-    roots,
-    said_panel,
     signals_panel,
-    stacked,
     stems,
     whiteness_panel,
     worst_stretch,
 )
-from ambid.report.fit_text import is_weight, pole_lines, term_ratios
-from ambid.report.numbers import prefixed
 from ambid.report.text import coefficient_text
 from ambid.units import counted
 from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
@@ -244,7 +244,7 @@ def _draw_correlations(shown: list[Correlation]) -> Block:
         axes.set_xlabel("lag [samples]")
         head(axes, c.title)
 
-    columns = [[Panel(draw=lambda axes, c=c: one(axes, c)) for c in shown[k::_ACROSS]] for k in range(_ACROSS)]  # type: ignore[misc]
+    columns = [[panel(one, c) for c in shown[k::_ACROSS]] for k in range(_ACROSS)]
     return Block(columns=[x for x in columns if x], title="correlations of residuals (Billings and Voon 1986)")
 
 
@@ -272,7 +272,7 @@ def _draw_training(fit: NonlinearFit) -> Block:
         axes.set_ylabel("rms error / sd of output")
         head(axes, f"learning over {'time' if by_time else 'iterations'}")
 
-    return Block(columns=[[Panel(draw=lambda axes, x=x: draw(axes, x), height=2.6)] for x in (True, False)])  # type: ignore[misc]
+    return Block(columns=[[panel(draw, x, height=2.6)] for x in (True, False)])
 
 
 def bars_of(fit: NonlinearFit) -> Bars | None:
@@ -320,10 +320,7 @@ def _draw_bars(bars: Bars) -> Block:
     columns = -(-len(bars.names) // _ROWS)
     per = -(-len(bars.names) // columns)
     more = f"; {bars.n_more} more, less significant, are not shown" if bars.n_more else ""
-    panels = [
-        Panel(draw=lambda axes, c=c: _bars(axes, bars, slice(c * per, (c + 1) * per), per), height=0.6 + 0.21 * per)  # type: ignore[misc]
-        for c in range(columns)
-    ]
+    panels = [panel(_bars, bars, slice(c * per, (c + 1) * per), per, height=0.6 + 0.21 * per) for c in range(columns)]
     title = "coefficients with 95 % intervals, each on its own scale; orange: zero lies inside"
     return Block(columns=[[p] for p in panels], title=f"{title}{more}")
 
@@ -377,8 +374,5 @@ def _draw_band(fit: NonlinearFit, data: IOData, where: str) -> Block:
         head(axes, what)
 
     views = ((np.zeros_like(predicted), f"{where}, where errors are largest"), (predicted, "measured less predicted"))
-    columns = [
-        [Panel(draw=lambda axes, j=j, v=v: draw(axes, j, *v), height=2.1) for j in range(data.n_outputs)]  # type: ignore[misc]
-        for v in views
-    ]
+    columns = [[panel(draw, j, *v, height=2.1) for j in range(data.n_outputs)] for v in views]
     return Block(columns=columns, widths=(3, 2), title="predictions with their bands")

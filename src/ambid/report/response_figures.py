@@ -10,27 +10,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import Measured, ModelResponse, model_responses
-from ambid.report.drawing import (
-    BAND,
-    BOUND,
-    GREEN,
-    MEASURED,
-    ORANGE,
-    PREDICTED,
-    WIDE,
-    Block,
-    Complex,
-    Pair,
-    Panel,
-    angle_ticks,
-    head,
-    magnitude_axis,
-    pairs_panel,
-    phase_axis,
-    stacked,
-    unwrapped,
-)
+from ambid.report.drawing import BAND, BOUND, GREEN, MEASURED, ORANGE, PREDICTED, WIDE, Block, Panel, head, stacked
 from ambid.report.numbers import sized
+from ambid.report.response_panels import Complex, Pair, angle_ticks, magnitude_axis, pairs_panel, phase_axis, unwrapped
 from ambid.validation.stabilisation import Stabilisation
 
 if TYPE_CHECKING:

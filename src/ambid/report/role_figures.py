@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ambid.record import Record
-from ambid.report.drawing import BOUND, GREEN, MEASURED, PREDICTED, WIDE, Block, Panel, curve, head, stacked
+from ambid.report.drawing import BOUND, GREEN, MEASURED, PREDICTED, WIDE, Block, curve, head, panel, stacked
 from ambid.rig.roles import Candidate
 from ambid.signals.spectra import cross_spectra
 
@@ -47,8 +47,8 @@ def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], widt
         axes.set_xlabel("frequency [Hz]")
 
     columns = [
-        [Panel(draw=lambda axes, x=x, first=first: signal(axes, x, first), height=1.6) for x, first in rows],  # type: ignore[misc]
-        [Panel(draw=lambda axes, x=x: coherence(axes, x), height=1.6) for x, _ in rows],  # type: ignore[misc]
+        [panel(signal, x, first, height=1.6) for x, first in rows],
+        [panel(coherence, x, height=1.6) for x, _ in rows],
     ]
     title = f"{record.provenance.get('file', 'record')}: which column is which"
     return stacked(title, [Block(columns=columns, widths=(3, 2))] if rows else [], width)

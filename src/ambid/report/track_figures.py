@@ -28,6 +28,7 @@ from ambid.report.drawing import (
     Panel,
     curve,
     extremes,
+    panel,
     stacked,
 )
 from ambid.report.numbers import prefixed
@@ -156,7 +157,7 @@ def track_figure(
         axes.set_xlim(*_extent(history))
         axes.set_xlabel("time [s of record]")
 
-    panels = [Panel(draw=lambda axes, name=name: parameter(axes, name), height=1.55) for name in names]  # type: ignore[misc]
+    panels = [panel(parameter, name, height=1.55) for name in names]
     panels += [Panel(draw=error, height=1.35), Panel(draw=state, height=0.5)]
     page = stacked(
         title or f"{head.record.get('file') or 'record'}: model {head.model}, {head.method}",

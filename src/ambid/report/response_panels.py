@@ -1,0 +1,342 @@
+"""Panels of linear models: Bode diagrams with what was measured, poles and zeros, correlations of parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array
+from ambid.bearing.measured import ModelResponse
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    MEASURED,
+    NARROW,
+    NORMAL_95,
+    PREDICTED,
+    Block,
+    Panel,
+    head,
+    log_axis,
+    panel,
+)
+from ambid.report.numbers import response_unit
+from ambid.signals.response import FrequencyResponse
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+Complex = NDArray[np.complex128]
+Pair = tuple[int, int]  # output, input
+
+MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
+_CHI2_95 = 5.991464547107979  # of two degrees of freedom
+_NEAR = 0.06  # of the span of all poles, from which two of them lie too close
+_MARKS = 70  # frequencies at which a measured response stands beside a model
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pole:
+    """A pole or zero with the covariance of its real and imaginary part; None where it has none of first order."""
+
+    value: complex
+    covariance: Array | None  # (2, 2)
+
+
+def roots(values: Complex, covariance: Array | None, most: float) -> list[Pole]:
+    """Return roots with their spread where it is less than `most`: that of a multiple root is infinite."""
+    if covariance is None:
+        return [Pole(value=complex(x), covariance=None) for x in values]
+    usable = [bool(np.all(np.isfinite(c)) and np.max(np.abs(c)) < most**2) for c in covariance]
+    return [
+        Pole(value=complex(x), covariance=c if use else None)
+        for x, c, use in zip(values, covariance, usable, strict=True)
+    ]
+
+
+def frequency_grid(poles: Complex | Array, lowest_hz: float, nyquist_hz: float, n_frequencies: int = 600) -> Array:
+    """Return frequencies in Hz, even in the logarithm, with more points at lightly damped poles (rad/s)."""
+    extra = [
+        abs(p) / (2 * np.pi) + abs(p.real) / (2 * np.pi) * np.linspace(-5, 5, 41)
+        for p in poles
+        if p.imag > 0 and lowest_hz < abs(p) / (2 * np.pi) < nyquist_hz
+    ]
+    found = np.unique(np.concatenate([np.geomspace(lowest_hz, nyquist_hz, n_frequencies), *extra]))
+    return np.asarray(found[(found >= lowest_hz) & (found <= nyquist_hz)])
+
+
+def bode_panel(
+    r: ModelResponse,
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    units: Mapping[str, str],
+    asides: Mapping[str, str] | None = None,
+    measured: FrequencyResponse | None = None,
+) -> Block:
+    """Draw magnitude and phase of the first pairs with 95 % bands; `asides` by input stand in the titles.
+
+    `measured`: the same response without a model, drawn as points with their 95 % intervals where it is known.
+    """
+
+    def magnitude(axes: Axes, pair: Pair) -> None:
+        magnitude_axis(axes, r, pair)
+        if measured is not None:
+            marks(axes, measured, pair)
+
+    def phase(axes: Axes, pair: Pair) -> None:
+        phase_axis(axes, r, pair)
+        if measured is not None:
+            marks(axes, measured, pair, guide=r)
+
+    return pairs_panel(magnitude, phase, inputs, outputs, units, asides)
+
+
+def pairs_panel(
+    magnitude: Callable[[Axes, Pair], object],
+    phase: Callable[[Axes, Pair], object],
+    inputs: Sequence[str],
+    outputs: Sequence[str],
+    units: Mapping[str, str],
+    asides: Mapping[str, str] | None = None,
+) -> Block:
+    """Return a column of magnitude and phase for each of the first pairs (output, input), with titles and units."""
+    pairs = [(o, i) for o in range(len(outputs)) for i in range(len(inputs))]
+    shown = pairs[:MOST_PAIRS]
+
+    def above(axes: Axes, pair: Pair) -> None:
+        source, output = inputs[pair[1]], outputs[pair[0]]
+        magnitude(axes, pair)
+        axes.set_ylabel(f"magnitude [{response_unit(units, output, source)}]")
+        head(axes, f"{source} → {output}{(asides or {}).get(source, '')}")
+
+    def below(axes: Axes, pair: Pair) -> None:
+        phase(axes, pair)
+        axes.set_ylabel("phase [°]")
+        axes.set_xlabel("frequency [Hz]")
+
+    columns = [[panel(above, x, height=2.5), panel(below, x, height=1.8)] for x in shown]
+    return Block(columns=columns, title=f"{len(shown)} of {len(pairs)} pairs" if len(pairs) > len(shown) else "")
+
+
+def magnitude_axis(
+    axes: Axes,
+    r: ModelResponse,
+    pair: Pair,
+    *,
+    label: str = "identified plant",
+    band_label: str = "95 % interval",
+    colors: tuple[str, str] = (PREDICTED, BAND),
+    style: str = "-",
+) -> None:
+    """Draw the magnitude of a response with its 95 % band."""
+    size = np.abs(r.G[:, *pair])
+    spread = np.exp(np.minimum(NORMAL_95 * r.log_sd[:, *pair], 20.0))
+    axes.fill_between(r.frequency_hz, size / spread, size * spread, color=colors[1], label=band_label, linewidth=0)
+    axes.loglog(r.frequency_hz, size, color=colors[0], linewidth=1.4, label=label, linestyle=style)
+    axes.set_xlim(r.frequency_hz[0], r.frequency_hz[-1])
+    axes.set_ylim(0.5 * size.min(), 2 * size.max())
+
+
+def marks(axes: Axes, frf: FrequencyResponse, pair: Pair, guide: ModelResponse | None = None) -> None:
+    """Draw some lines of a measured response with 95 % intervals, where it is known: magnitudes, or, with a `guide`
+    whose turn they take, phases.
+    """
+    radius = frf.confidence_radius()[:, *pair]
+    known = np.flatnonzero(np.isfinite(radius) & (frf.frequency_hz > 0))
+    if not known.size:
+        return
+    f = frf.frequency_hz[known]
+    at = known[np.unique(np.searchsorted(f, np.geomspace(f[0], f[-1], _MARKS)).clip(max=f.size - 1))]
+    x, G, radius = frf.frequency_hz[at], frf.G[at, *pair], radius[at]
+    size, spread = np.abs(G), [np.minimum(radius, 0.999 * np.abs(G)), radius]
+    if guide is not None:
+        angle = unwrapped(guide.G[:, *pair])
+        near = np.interp(np.log(x), np.log(guide.frequency_hz), angle)
+        half = np.rad2deg(np.arcsin(np.minimum(radius / np.maximum(size, 1e-300), 1.0)))
+        seen = half < 90
+        x, half = x[seen], half[seen]
+        size, spread = np.rad2deg(near + np.angle(G * np.exp(-1j * near)))[seen], [half, half]
+        angle_ticks(axes, np.concatenate([np.rad2deg(angle), size]))
+    axes.errorbar(
+        x, size, spread, fmt="o", markersize=2.4, color=MEASURED, elinewidth=0.8, label="measured, 95 %", zorder=1.9
+    )
+
+
+def unwrapped(value: Complex, near: float = 0.0, known: NDArray[np.bool_] | None = None) -> Array:
+    """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`.
+
+    `known`: where noise leaves the phase known; elsewhere it stands within half a turn of its neighbours, since noise
+    that is unwrapped walks away.
+    """
+    at = np.arange(value.size) if known is None or not known.any() else np.flatnonzero(known)
+    line = np.unwrap(np.angle(value[at]))
+    guide = np.interp(np.arange(value.size), at, line - 2 * np.pi * np.round((line[0] - near) / (2 * np.pi)))
+    return np.asarray(guide + np.angle(value * np.exp(-1j * guide)))
+
+
+def phase_axis(
+    axes: Axes,
+    r: ModelResponse,
+    pair: Pair,
+    *,
+    near: float = 0.0,
+    colors: tuple[str, str] = (PREDICTED, BAND),
+    style: str = "-",
+) -> None:
+    """Draw the phase of a response with its 95 % band, begun within half a turn of `near` (rad)."""
+    angle = unwrapped(r.G[:, *pair], near)
+    spread = np.minimum(NORMAL_95 * r.phase_sd[:, *pair], np.pi)
+    low, high = np.rad2deg(angle - spread), np.rad2deg(angle + spread)
+    axes.fill_between(r.frequency_hz, low, high, color=colors[1], linewidth=0)
+    axes.semilogx(r.frequency_hz, np.rad2deg(angle), color=colors[0], linewidth=1.4, linestyle=style)
+    axes.set_xlim(r.frequency_hz[0], r.frequency_hz[-1])
+    angle_ticks(axes, np.rad2deg(angle))
+
+
+def angle_ticks(axes: Axes, degrees: Array) -> None:
+    """Let an axis hold angles, with ticks at whole parts of a turn."""
+    first, last = 45 * np.floor(degrees.min() / 45 - 0.3), 45 * np.ceil(degrees.max() / 45 + 0.3)
+    step = 45 if last - first <= 180 else 90 if last - first <= 720 else 180 * np.ceil((last - first) / 1440)
+    axes.set_ylim(first, last)
+    axes.set_yticks(np.arange(step * np.ceil(first / step), last + 1, step))
+
+
+def pole_region(axes: Axes, pole: Pole, color: str) -> None:
+    """Draw the 95 % region of a pole or zero; of a real one an interval."""
+    from matplotlib.patches import Ellipse
+
+    if pole.covariance is None:
+        return
+    if abs(pole.value.imag) == 0:
+        reach = NORMAL_95 * float(np.sqrt(pole.covariance[0, 0]))
+        axes.plot([pole.value.real - reach, pole.value.real + reach], [0, 0], color=color, linewidth=4, alpha=0.35)
+        return
+    size, direction = np.linalg.eigh(pole.covariance)
+    width, height = 2 * np.sqrt(_CHI2_95 * np.maximum(size, 0.0))
+    angle = float(np.rad2deg(np.arctan2(direction[1, 0], direction[0, 0])))
+    centre = (pole.value.real, pole.value.imag)
+    axes.add_patch(Ellipse(centre, width, height, angle=angle, facecolor=color, alpha=0.35, linewidth=0))
+
+
+def poles_panel(
+    poles: Sequence[Pole],
+    text: str,
+    title: str,
+    *,
+    zeros: Sequence[Pole] = (),
+    discrete: bool = False,
+) -> Block:
+    """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a text of numbers.
+
+    Poles that lie too close to be told apart on the scale of all of them are drawn again, larger.
+    """
+
+    def every(axes: Axes) -> None:
+        _roots(axes, poles, zeros, discrete=discrete)
+        axes.margins(0.15)
+        if discrete:
+            axes.set_aspect("equal", adjustable="datalim")
+        else:
+            low, high = axes.get_xlim()
+            axes.set_xlim(low, max(high, 0.15 * -low))
+        head(axes, title)
+
+    def close(axes: Axes) -> None:
+        _roots(axes, poles, zeros, discrete=discrete)
+        (left, right), (low, high) = _window(crowd)
+        axes.set_xlim(left, right)
+        axes.set_ylim(low, high)
+        head(axes, f"close view of {len(crowd)} of them")
+
+    def words(axes: Axes) -> None:
+        longest = max(map(len, text.splitlines()), default=1)
+        room: float = 3.5 if crowd or axes.figure.figure.get_figwidth() <= NARROW else 4.9
+        axes.axis("off")
+        axes.grid(False)
+        axes.text(
+            0.0, 0.97, text, fontsize=min(8.0, room * 72 / (0.61 * longest)), va="top", family="monospace",
+            transform=axes.transAxes, clip_on=False,
+        )  # fmt: skip
+
+    crowd = _crowd([p.value for p in (*poles, *zeros)])
+    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=1.0 + 0.14 * len(text.splitlines()))]]
+    if crowd:
+        columns.insert(1, [Panel(draw=close, height=3.0)])
+    return Block(columns=columns, widths=(4, 3, 4) if crowd else (1, 1), shared=False)
+
+
+def _crowd(values: Sequence[complex]) -> list[complex]:
+    """Roots that have a neighbour too near for the scale of all: those about the largest such group."""
+    span = max((abs(a - b) for a in values for b in values), default=0.0)
+    groups = [[b for b in values if abs(a - b) < _NEAR * span] for a in values]
+    return max((g for g in groups if len(g) > 1 and max(abs(a - g[0]) for a in g) > 0), key=len, default=[])
+
+
+def _window(crowd: Sequence[complex]) -> list[tuple[float, float]]:
+    """Limits of the real and the imaginary part around some roots, of one size, so that circles stay round."""
+    real, imaginary = [x.real for x in crowd], [x.imag for x in crowd]
+    half = 0.75 * max(max(real) - min(real), max(imaginary) - min(imaginary))
+    return [((min(x) + max(x)) / 2 - half, (min(x) + max(x)) / 2 + half) for x in (real, imaginary)]
+
+
+def _roots(axes: Axes, poles: Sequence[Pole], zeros: Sequence[Pole], *, discrete: bool) -> None:
+    """Poles, zeros, their regions and the border of stability; unstable poles in the colour of a warning."""
+    for pole in poles:
+        p = pole.value
+        unstable = abs(p) > 1 if discrete else p.real > 0
+        color, label = (BOUND, "unstable pole") if unstable else (PREDICTED, "pole")
+        axes.plot(p.real, p.imag, "x", color=color, markersize=8, markeredgewidth=1.8, label=label)
+        pole_region(axes, pole, color)
+    for zero in zeros:
+        z = zero.value
+        axes.plot(z.real, z.imag, "o", color=MEASURED, markersize=7, markerfacecolor="none", label="zero")
+        pole_region(axes, zero, MEASURED)
+    axes.axhline(0, color=MEASURED, linewidth=0.8)
+    if discrete:
+        angle = np.linspace(0, 2 * np.pi, 3601)
+        axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.8, label="border of stability")
+    else:
+        axes.axvline(0, color=MEASURED, linewidth=0.8, label="border of stability")
+    unit = "" if discrete else " [rad/s]"
+    axes.set_xlabel(f"real part{unit}")
+    axes.set_ylabel(f"imaginary part{unit}")
+
+
+def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[str, float]) -> Block:
+    """Draw the correlation matrix of estimated parameters, and how well each is known."""
+    sd = np.sqrt(np.diag(covariance))
+    rho = covariance / np.outer(sd, sd)
+    apart = np.abs(rho - np.eye(len(names)))
+    i, j = divmod(int(np.argmax(apart)), len(names))
+
+    def matrix(axes: Axes) -> None:
+        axes.imshow(rho, cmap="PuOr_r", vmin=-1.0, vmax=1.0, aspect="auto")
+        small = len(names) > 8
+        for k, row in enumerate(rho):
+            for m, x in enumerate(row):
+                color = "white" if abs(x) > 0.75 else "#1a1a1a"
+                axes.text(m, k, f"{x:.1f}" if small else f"{x:.2f}", ha="center", va="center", color=color, fontsize=7)
+        axes.set_xticks(range(len(names)), names, rotation=45 if small else 0)
+        axes.set_yticks(range(len(names)), names)
+        axes.grid(False)
+        size = float(np.linalg.cond(rho))
+        condition = f"{size:.0f}" if size < 1e5 else f"{size:.0e}"
+        head(axes, f"largest correlation {names[i]}, {names[j]}: {rho[i, j]:.3f}; condition number {condition}")
+
+    def known(axes: Axes) -> None:
+        size = np.array([abs(values[n]) for n in names])
+        percent = 100 * NORMAL_95 * sd / np.where(size > 0, size, np.nan)
+        at = np.arange(len(names))
+        axes.barh(at, percent, color=[PREDICTED if x < 50 else BOUND for x in percent], height=0.55)
+        log_axis(axes.xaxis, float(np.nanmin(percent)) / 2, float(np.nanmax(percent)))
+        axes.set_yticks(at, names)
+        axes.invert_yaxis()
+        axes.set_xlabel("half of the 95 % interval [% of the value]")
+        head(axes, "how well each parameter is known")
+
+    height = max(2.2, 0.28 * len(names) + 0.6)
+    return Block(columns=[[Panel(draw=draw, height=height)] for draw in (matrix, known)], shared=False)
