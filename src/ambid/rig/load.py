@@ -482,7 +482,7 @@ def unit_of(text: str, place: str) -> Unit:
 
 def read_bench(
     source: Source,
-    rig: Rig,
+    rig: Rig | str | Path,
     *,
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
@@ -495,7 +495,7 @@ def read_bench(
     ----------
     source : str, Path, Record, DataFrame, Dataset or Mapping of str to array
         As :func:`ambid.record.read_record` takes it. A record that went through a rig already stays as it is.
-    rig : Rig
+    rig : Rig, str or Path
         Its `record` settings are used where the arguments do not override them; ``record.from`` and ``to`` are left to
         the caller, who knows of other ones.
     rate_hz : float, optional
@@ -517,6 +517,7 @@ def read_bench(
     AmbidError
         If the file or its columns break a rule.
     """
+    rig = rig if isinstance(rig, Rig) else load_rig(rig)
     mat = isinstance(source, (str, Path)) and Path(source).suffix.lower() == ".mat"
     if rate_hz is None and not isinstance(source, Record):  # a record may have been resampled since
         rate_hz = rig.record.rate_hz
