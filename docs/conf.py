@@ -1,17 +1,18 @@
 """Sphinx settings. Pages are in Markdown, examples are run, commands and Python names describe themselves.
 
-Nothing is loaded from elsewhere when a page is read: formulas become MathML, and the theme brings no font from outside.
+Nothing is loaded from elsewhere when a page is read: MathJax comes from an installed package, in the form that
+draws without font files, and the theme uses the fonts of the machine.
 """
 
 import re
 import sys
+from importlib.metadata import files as installed_files
 from importlib.metadata import version as installed_version
 from pathlib import Path
 from typing import Any
 
-from latex2mathml.converter import convert
+from docutils import nodes
 from sphinx.application import Sphinx
-from sphinx.util import logging
 
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE))
@@ -22,23 +23,33 @@ author = "the ambid contributors"
 copyright = author  # noqa: A001
 release = version = installed_version("ambid")
 
-extensions = ["myst_parser", "numpydoc", "sphinx.ext.autodoc", "sphinx_gallery.gen_gallery"]
+extensions = [
+    "myst_parser",
+    "numpydoc",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.mathjax",
+    "sphinx_gallery.gen_gallery",
+]
 exclude_patterns = ["_site", "_templates", "examples", "notebooks", "**/*.ipynb"]
 myst_enable_extensions = ["amsmath", "dollarmath", "deflist"]
 myst_heading_anchors = 4
-suppress_warnings = ["config.cache"]  # the scraper below is a function, which Sphinx cannot compare
+# The scraper below is a function, which Sphinx cannot compare; an attribute of many classes has several targets.
+suppress_warnings = ["config.cache", "ref.python"]
 
 autodoc_typehints = "none"
 autodoc_member_order = "bysource"
 numpydoc_show_class_members = False
 
+_MATHJAX = next(f for f in installed_files("sphinx-mathjax-offline") or () if f.name == "tex-svg.js")
+
 html_theme = "furo"
 html_title = "ambid"
 html_show_sourcelink = False
 html_copy_source = False
-html_static_path = ["static"]
+html_static_path = ["static", str(_MATHJAX.locate())]
 html_css_files = ["pages.css"]
-html_math_renderer = "mathml"
+mathjax_path = _MATHJAX.name
+mathjax3_config = {"options": {"enableMenu": False}}  # which would load more
 html_theme_options = {"footer_icons": []}
 smartquotes_action = "qe"  # two hyphens begin an option
 pygments_style = "friendly"
@@ -75,23 +86,6 @@ sphinx_gallery_conf = {
 }
 
 
-def _formula(self: Any, node: Any) -> None:
-    """Write a formula as MathML, which browsers draw by themselves."""
-    block = node.tagname == "math_block"
-    text = node.astext()
-    if block and "\\begin{" not in text and ("\\\\" in text or "&" in text):
-        text = rf"\begin{{aligned}}{text}\end{{aligned}}"
-    try:
-        drawn = convert(text, display="block" if block else "inline")
-    except Exception as why:  # whatever the converter dislikes names the page
-        logging.getLogger(__name__).warning("formula %r: %s", text, why, location=node)
-        drawn = ""
-    self.body.append(f'<div class="formula">{drawn}</div>' if block else drawn)
-    from docutils.nodes import SkipNode
-
-    raise SkipNode
-
-
 def _formulas_are_text(_app: object, _what: str, _name: str, _obj: object, _options: object, lines: list[str]) -> None:
     """Keep |x|, x* and *args of formulas from being read as markup, outside of ``code``."""
     for k, line in enumerate(lines):
@@ -100,10 +94,19 @@ def _formulas_are_text(_app: object, _what: str, _name: str, _obj: object, _opti
         lines[k] = "``".join(parts)
 
 
+def _keep_numbers(_app: object, page: nodes.document) -> None:
+    """Give a numbered formula an environment that takes a number also where it holds several rows."""
+    for formula in page.findall(nodes.math_block):
+        text = formula.astext()
+        if "\\tag{" in text:
+            formula.children = [nodes.Text(rf"\begin{{equation}}{text.strip()}\end{{equation}}")]
+            formula["nowrap"] = True
+
+
 write_reference(HERE / "made" / "reference")
 
 
 def setup(app: Sphinx) -> None:
     """Connect what is above; first, so that numpydoc's own markup comes after it."""
-    app.add_html_math_renderer("mathml", inline_renderers=(_formula, None), block_renderers=(_formula, None))
     app.connect("autodoc-process-docstring", _formulas_are_text, priority=1)
+    app.connect("doctree-read", _keep_numbers)

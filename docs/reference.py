@@ -110,7 +110,8 @@ def _command(name: str, command: Any) -> Iterator[str]:
 
 def _text(said: str) -> str:
     """Help as Markdown: what would be read as markup is not."""
-    return re.sub(r"([*_<>|\[\]$\\])", r"\\\1", inspect.cleandoc(said).replace("\b", ""))
+    said = re.sub(r"([*_<>|\[\]$\\])", r"\\\1", inspect.cleandoc(said).replace("\b", ""))
+    return re.sub(r"(?<![\w-])--[a-z][a-z-]*", r"`\g<0>`", said)
 
 
 def _write(path: Path, text: str) -> None:
