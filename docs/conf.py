@@ -61,7 +61,8 @@ def _last_figure(block: tuple[Any, ...], names: dict[str, Any], settings: dict[s
     from sphinx_gallery.scrapers import figure_rst
 
     del block
-    found = names["example_globals"].get("___") or names["example_globals"].pop("figure", None)
+    known = names["example_globals"]
+    found = known.pop("figure") if "figure" in known else known.get("___")
     if not isinstance(found, Figure):
         return ""
     path = next(names["image_path_iterator"])

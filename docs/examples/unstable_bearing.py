@@ -62,4 +62,4 @@ def main(seed: int = 1) -> Result:
 
 
 if __name__ == "__main__":
-    main()
+    figure = main().estimate.plot()
