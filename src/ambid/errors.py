@@ -60,3 +60,14 @@ def refuse_given(given: Mapping[str, object], refusal: str) -> None:
     for name, value in given.items():
         if not (value is None or value is False or (isinstance(value, (Sequence, Mapping)) and not value)):
             raise EstimationError(refusal.replace("{}", name))
+
+
+LARGEST = 1e9
+"""What a time in s or an amplitude may be at most: beyond it is a slip, and numbers of samples would overflow."""
+
+
+def check_positive(given: Mapping[str, float | None]) -> None:
+    """Refuse numbers by option that are not positive, not finite or absurd; None was not given."""
+    for name, x in given.items():
+        if x is not None and not 0 < x <= LARGEST:
+            raise AmbidError(f"{name} is {x:g}; it must be a positive number, up to {LARGEST:g}. Correct it")

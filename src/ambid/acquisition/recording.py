@@ -13,6 +13,7 @@ from ambid.acquisition.quality import Quality, QualityReport
 from ambid.acquisition.recorder import JournalHeader, Recorded, Recorder
 from ambid.acquisition.session import Course, RunReport, Tap, run
 from ambid.errors import DeviceError
+from ambid.record import Record, read_record
 from ambid.rig import Rig
 from ambid.tracking.blocks import Frame
 
@@ -38,6 +39,13 @@ class Acquired:
     recorded: Recorded | None  # the record's file; None where no sample came
     troubles: tuple[DeviceError, ...]  # what the recorder told: a disk that is slow, nearly full, or failed
     not_stored: int = 0  # samples that came and are not in the record, because the disk was too slow or failed
+
+    @property
+    def record(self) -> Record:
+        """What was written, read back."""
+        if self.recorded is None:
+            raise DeviceError(f"{self.info.port}: nothing was recorded. Look at `run`, which says why")
+        return read_record(self.recorded.path)
 
 
 class Listeners(TypedDict, total=False):

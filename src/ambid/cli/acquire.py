@@ -7,33 +7,29 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Mapping
-from dataclasses import replace
+from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.devices import course_mode, open_bench
+from ambid.cli.devices import say_note
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
 from ambid.cli.terminal import painter, watching
-from ambid.errors import AmbidError, refuse_given
+from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquisition.amplitude import Trial
-    from ambid.acquisition.device import Device, Mode
+    from ambid.acquisition.device import Device
     from ambid.acquisition.recording import Acquired, Progress
     from ambid.acquisition.session import Course, RunReport
-    from ambid.cli.terminal import Watch
     from ambid.estimation.estimate import Estimate
     from ambid.recursive.lines import Track
     from ambid.rig import Rig
 
 _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
-_TRIAL_S = 2.0  # of each trial of an amplitude
 
 
 def command(
@@ -86,7 +82,8 @@ def command(
     PORT is a serial port, 'emulated' (the firmware on an emulated controller before a simulated bench), 'simulated'
     (a simulated bench alone), or 'replay:FILE'. What is recorded is in a journal at once: see 'ambid recover'.
     """
-    from ambid.acquisition.amplitude import Trial
+    from ambid.job.acquiring import Wish, acquire, ready
+    from ambid.report.device_text import progress_line
     from ambid.rig import load_rig
 
     if json is not None and track is None:
@@ -96,107 +93,53 @@ def command(
     with Outputs(rig, None if track in (None, "auto") else Path(str(track)), replayed) as outputs:
         outputs.claim(record, "-o", _ENDINGS, force=force)
         outputs.claim(json_path(json), "--json")
-    known = load_rig(rig)
-    chosen = course_mode(port, known, mode, excitation)
-    settle_s = (1.0 if chosen == "levitate" else 0.0) if settle is None else settle
-    opt.check_positive({"--seconds": seconds, "--amplitude": amplitude})
-    if not 0 <= settle_s <= opt.LARGEST:
-        raise AmbidError(f"--settle is {settle_s:g}; it must be a number, 0 to {opt.LARGEST:g}. Correct it")
-    _check_excitation(port, chosen, excitation, {"--amplitude": amplitude, "--band": between})
+    known, stop, behind = load_rig(rig), Stop(), None if bench is None else opt.preset_of(bench) or bench
+    words: dict[str, Any] = {
+        "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
+        "settle": settle, "seed": seed, "stopped": stop.wished,
+    }  # fmt: skip
+    wish, start, before = Wish(**words), start_of_track(track), _changed(record)
+    job = Recording(known, port, record, wish.trial(port, known).settle_s, stop, force=force)
     if (record.exists() or record.is_symlink()) and not force:
         raise AmbidError(f"-o {record} exists already. Choose another name, or give --force")
-    trial = Trial(name=str(excitation), band=between, mode=chosen, settle_s=settle_s, seconds=seconds, seed=seed)
-    job = Recording(known, port, record, trial, force=force)
-    start, before = start_of_track(track), _changed(record)
     try:
-        closes = chosen == "levitate" and not force
-        opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=closes)
-        with watching() as watch, signals(job.stop.take), opening as device:
-            course = job.course(device, watch, played=excitation is not None, amplitude=amplitude)
+        with watching() as watch, signals(stop.take):
+
+            def note(line: str) -> None:
+                watch.clear()
+                say_note(line)
+
+            def stage(name: str, _: float | None = None) -> None:
+                if name == "amplitude":
+                    watch.show(name, 0.0, "trials, small first")
+
+            def show(now: Progress) -> None:
+                watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
+
             if track is None:
-                done, track_end = job.record_only(device, course, watch), None
+                done, track_end = acquire(
+                    port, known, record, **words, bench=behind, pace=pace, force=force, on_note=note, on_progress=show,
+                    on_trouble=_say_trouble, tick=stage,
+                ), None  # fmt: skip
             else:
-                done, track_end = job.follow(device, course, start, json, quiet=quiet)
+                opening = ready(port, known, wish, bench=behind, pace=pace, force=force, note=note, tick=stage)
+                with opening as (device, course):
+                    done, track_end = job.follow(device, course, start, json, quiet=quiet)
     except KeyboardInterrupt:
         typer.echo(f"ambid: interrupted{_left(record, _changed(record) != before)}", err=True)
-        raise typer.Exit(job.stop.code or INTERRUPTED) from None
+        raise typer.Exit(stop.code or INTERRUPTED) from None
     job.tell(done, table=json != "-")
     if track_end is not None:
         track_end()
     job.finish(done, strict=strict)
 
 
-def _check_excitation(port: str, mode: Mode, name: str | None, given: Mapping[str, object]) -> None:
-    """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
-    if name is None:
-        refuse_given(given, "{} is of an excitation, and none is named. Give --excitation, or leave it out")
-    elif port.startswith("replay:"):
-        raise AmbidError("--excitation cannot be played to a record that is replayed. Leave it out")
-    elif mode == "sample":
-        raise AmbidError(
-            "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"
-        )
-
-
 class Recording:
     """One recording: what is played, what is written, and what ends it."""
 
-    def __init__(self, rig: Rig, port: str, record: Path, trial: Trial, *, force: bool) -> None:
+    def __init__(self, rig: Rig, port: str, record: Path, settle_s: float, stop: Stop, *, force: bool) -> None:
         """Take note of what is wanted."""
-        self.rig, self.port, self.path, self.trial, self.force = rig, port, record, trial, force
-        self.stop = Stop()
-
-    def course(self, device: Device, watch: Watch, *, played: bool, amplitude: float | None) -> Course:
-        """Say what the device is to do; find the amplitude of its excitation where none is given."""
-        from ambid.acquisition.amplitude import band_for
-        from ambid.acquisition.session import Course
-        from ambid.record.sampling import MIN_SAMPLES
-
-        rate_hz, trial = device.info.rate_hz, self.trial
-        samples = max(1, round(trial.seconds * rate_hz))
-        if samples < MIN_SAMPLES:
-            raise AmbidError(
-                f"--seconds is {trial.seconds:g}: {samples} samples at {rate_hz:g} Hz; a record has {MIN_SAMPLES} at"
-                f" least. Give {MIN_SAMPLES / rate_hz:.3g} or more"
-            )
-        if not played:
-            return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
-        trial = replace(trial, band=band_for(trial, rate_hz))
-        course = trial.course(1.0 if amplitude is None else amplitude, rate_hz)  # refused before anything moves
-        return trial.course(self._amplitude(device, trial, watch), rate_hz) if amplitude is None else course
-
-    def _amplitude(self, device: Device, trial: Trial, watch: Watch) -> float:
-        """Try small excitations first, and say which one was taken."""
-        from ambid.acquisition.amplitude import fitting_amplitude
-
-        watch.show("amplitude", 0.0, "trials, small first")
-        brief = replace(trial, seconds=_TRIAL_S)
-        try:
-            brief.course(1.0, device.info.rate_hz)
-        except AmbidError:  # an excitation of slow periods takes the whole record's length
-            brief = trial
-        try:
-            found = fitting_amplitude(device, self.rig, brief, stopped=self.stop.wished)
-        except AmbidError:
-            if self.stop.wished():
-                raise KeyboardInterrupt from None
-            raise
-        watch.clear()
-        typer.echo(f"ambid: note: amplitude {found:.3g} V, found by trials", err=True)
-        return found
-
-    def record_only(self, device: Device, course: Course, watch: Watch) -> Acquired:
-        """Record without a tracker."""
-        from ambid.acquisition.recording import acquire
-        from ambid.report.device_text import progress_line
-
-        def show(now: Progress) -> None:
-            watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
-
-        return acquire(
-            device, self.rig, self.path, course, force=self.force, on_progress=show, on_trouble=_say_trouble,
-            stopped=self.stop.wished,
-        )  # fmt: skip
+        self.rig, self.port, self.path, self.settle_s, self.stop, self.force = rig, port, record, settle_s, stop, force
 
     def follow(
         self, device: Device, course: Course, start: Estimate | None, json: str | None, *, quiet: bool
@@ -297,7 +240,7 @@ class Recording:
         if done.recorded is None and done.counters.samples:
             raise AmbidError(
                 f"{self.port} ended after {done.counters.samples / done.info.rate_hz:.4g} s, within the"
-                f" {self.trial.settle_s:g} s of --settle: nothing was recorded. Give a smaller --settle"
+                f" {self.settle_s:g} s of --settle: nothing was recorded. Give a smaller --settle"
             )
         if done.recorded is None:
             raise AmbidError(f"{self.port}: no sample came. Look at cable and supply")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -10,12 +10,10 @@ import typer
 
 from ambid.cli.completion import values_of
 from ambid.errors import AmbidError
+from ambid.errors import check_positive as check_positive
 
 if TYPE_CHECKING:
     from ambid.physics.presets import Preset
-
-LARGEST = 1e9
-"""What a time in s or an amplitude may be at most: beyond it is a slip, and numbers of samples would overflow."""
 
 
 def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> Any:
@@ -94,13 +92,6 @@ Pace = Annotated[
     switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
 ]
 Seed = Annotated[int, option("--seed N", "Seed of excitation and simulated noise.", True, min=0)]
-
-
-def check_positive(given: Mapping[str, float | None]) -> None:
-    """Refuse numbers by option that are not positive, not finite or absurd; None was not given."""
-    for name, x in given.items():
-        if x is not None and not 0 < x <= LARGEST:
-            raise AmbidError(f"{name} is {x:g}; it must be a positive number, up to {LARGEST:g}. Correct it")
 
 
 def band_of(text: str | None) -> tuple[float, float] | None:

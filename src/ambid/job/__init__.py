@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.job.acquiring import acquire as acquire
     from ambid.job.commissioning import commission as commission
     from ambid.job.data import load_bench as load_bench
     from ambid.job.data import read_data as read_data

@@ -144,26 +144,32 @@ def simulate_used(
     return done, Excited(kind=excitation, peak=peak)
 
 
-def _bench(source: Bearer, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
-    """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
+def bearer_of(source: Bearer) -> Rig | Preset:
+    """Return the preset or rig that a name, a file or an estimate stands for."""
     if isinstance(source, str) and source in preset_names():
-        source = preset(source)
+        return preset(source)
+    if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
+        source = read_linear_estimate(source, f"{source} is no linear estimate; a simulation needs one. Give a rig")
+    if isinstance(source, Estimate):
+        return _rig_of_estimate(source)
+    return source if isinstance(source, (Rig, Preset)) else load_rig(Path(source))
+
+
+def _bench(given: Bearer, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
+    """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
+    source = bearer_of(given)
     if isinstance(source, Preset):
         if position is not None and source.plant is not None:
             source = replace(source, operating_point=source.plant.equilibrium(position))
         return Bench.of(source, rate, source.usually_closed if closed is None else closed, nonlinear=nonlinear)
-    if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
-        source = read_linear_estimate(source, f"{source} is no linear estimate; a simulation needs one. Give a rig")
-    if isinstance(source, Estimate):
-        source = _rig_of_estimate(source)
-    found = source if isinstance(source, Rig) else load_rig(Path(source))
     if position is not None:
-        found = replace(found, operating_point={**found.operating_point, "position": position})
-    if rate is None and found.record.rate_hz is None:
+        source = replace(source, operating_point={**source.operating_point, "position": position})
+    if rate is None and source.record.rate_hz is None:
         raise AmbidError(
-            f"rig {found.source or found.name} names no rate; a simulation needs one. Give --rate HZ, or record.rate_hz"
+            f"rig {source.source or source.name} names no rate; a simulation needs one. Give --rate HZ, or"
+            " record.rate_hz"
         )
-    return Bench.of(found, rate, closed, nonlinear=nonlinear)
+    return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
 
 def _rig_of_estimate(estimate: Estimate) -> Rig:

@@ -32,6 +32,7 @@ from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.rig import Rig
+from ambid.rig.load import SELECTED
 from ambid.tracking.blocks import Block, Frame
 from ambid.tracking.replay import Replay
 from ambid.tracking.ring import BlockRing
@@ -121,7 +122,7 @@ class _Lead:
         )
         provenance = MappingProxyType({"file": port})
         self.source = BenchRows(
-            record=Record(channels=channels, rate_hz=view.rate_hz, provenance=provenance),
+            record=Record(channels=channels, rate_hz=view.rate_hz, provenance=provenance, history=(SELECTED,)),
             replay=Replay(
                 values=values, numbers=numbers, time_s=stamps, rate_hz=view.rate_hz, block_samples=_BLOCK_SAMPLES
             ),

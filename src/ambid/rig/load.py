@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
 
 
-_SELECT = "select"  # step in the history of a record that went through a rig
+SELECTED = Step(name="select")
+"""Says in the history of a record that its channels are named by role and calibrated."""
 
 
 def load_rig(path: str | Path) -> Rig:
@@ -574,7 +575,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
         If a column's unit is missing or unknown, or is not the role's and no gain or table turns it into that.
     """
     wanted = role_units(model(rig.model))
-    if any(step.name == _SELECT for step in record.history):
+    if any(step.name == SELECTED.name for step in record.history):
         return _through_a_rig(record, rig, wanted)
     for c in rig.channels:
         if c.column not in record.names:
@@ -591,7 +592,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
         channels.append(replace(channel, name=c.role))
         steps += [step] if step else []
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
-    history = (*record.history, *steps, Step(name=_SELECT, settings=columns))
+    history = (*record.history, *steps, replace(SELECTED, settings=columns))
     others = (record.channel(name) for name in beside if name not in found)
     return _taken_back(replace(record, channels=(*channels, *others), history=history), rig)
 

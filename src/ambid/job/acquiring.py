@@ -1,0 +1,274 @@
+"""The job of recording: a port and a rig in, a record on the disk out; who is interested is told meanwhile."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+from ambid.acquisition.amplitude import Trial, band_for, fitting_amplitude
+from ambid.acquisition.default_daq import default_daq_notes, with_default_daq
+from ambid.acquisition.device import Device, Mode
+from ambid.acquisition.recording import Acquired, Progress
+from ambid.acquisition.recording import acquire as record_course
+from ambid.acquisition.review import refuse_unstable, review
+from ambid.acquisition.session import Course
+from ambid.acquisition.settings import controller_settings
+from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, refuse_given
+from ambid.estimation.progress import Tick, silent
+from ambid.job.data import known_rig
+from ambid.job.simulation import bearer_of
+from ambid.physics.presets import Preset
+from ambid.record.sampling import MIN_SAMPLES
+from ambid.rig import Rig
+
+_TRIAL_S = 2.0  # of each trial of an amplitude
+_SAME_RATE = 1e-3  # a rate from a time column is rounded
+
+Note = Callable[[str], object]
+
+
+def _mute(_: object) -> None:
+    """Say nothing."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wish:
+    """What is to be recorded."""
+
+    seconds: float = 10.0
+    excitation: str | None = None  # None: nothing is played
+    amplitude: float | None = None  # V; None: found by trials, small first
+    band: tuple[float, float] | None = None  # Hz
+    mode: Mode | None = None  # None: levitate where the rig has a loop
+    settle: float | None = None  # s; None: 1 to levitate
+    seed: int = 0
+    stopped: Callable[[], bool] = field(default=lambda: False)
+
+    def trial(self, port: str, rig: Rig) -> Trial:
+        """Check it against port and rig, and complete it."""
+        mode = self.mode or _usual_mode(port, rig, self.excitation)
+        settle_s = (1.0 if mode == "levitate" else 0.0) if self.settle is None else self.settle
+        check_positive({"--seconds": self.seconds, "--amplitude": self.amplitude})
+        if not 0 <= settle_s <= LARGEST:
+            raise AmbidError(f"--settle is {settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
+        _check_excitation(port, mode, self.excitation, {"--amplitude": self.amplitude, "--band": self.band})
+        return Trial(
+            name=str(self.excitation),
+            band=self.band,
+            mode=mode,
+            settle_s=settle_s,
+            seconds=self.seconds,
+            seed=self.seed,
+        )
+
+    def course(self, device: Device, rig: Rig, trial: Trial, *, note: Note, tick: Tick) -> Course:
+        """Say what the device is to do; find the amplitude of its excitation where none is given."""
+        rate_hz = device.info.rate_hz
+        samples = max(1, round(trial.seconds * rate_hz))
+        if samples < MIN_SAMPLES:
+            raise AmbidError(
+                f"--seconds is {trial.seconds:g}: {samples} samples at {rate_hz:g} Hz; a record has {MIN_SAMPLES} at"
+                f" least. Give {MIN_SAMPLES / rate_hz:.3g} or more"
+            )
+        if self.excitation is None:
+            return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
+        trial = replace(trial, band=band_for(trial, rate_hz))
+        known = trial.course(1.0 if self.amplitude is None else self.amplitude, rate_hz)  # refused before all moves
+        if self.amplitude is not None:
+            return known
+        tick("amplitude")
+        brief = replace(trial, seconds=_TRIAL_S)
+        try:
+            brief.course(1.0, rate_hz)
+        except AmbidError:  # an excitation of slow periods takes the whole record's length
+            brief = trial
+        try:
+            found = fitting_amplitude(device, rig, brief, stopped=self.stopped)
+        except AmbidError:
+            if self.stopped():
+                raise KeyboardInterrupt from None
+            raise
+        note(f"amplitude {found:.3g} V, found by trials")
+        return trial.course(found, rate_hz)
+
+
+def acquire(
+    port: str,
+    rig: Rig | str | Path,
+    out: str | Path,
+    *,
+    seconds: float = 10.0,
+    excitation: str | None = None,
+    amplitude: float | None = None,
+    band: tuple[float, float] | None = None,
+    mode: Mode | None = None,
+    settle: float | None = None,
+    bench: str | Path | Rig | Preset | None = None,
+    pace: Literal["fastest", "real-time"] = "fastest",
+    seed: int = 0,
+    force: bool = False,
+    stopped: Callable[[], bool] = lambda: False,
+    on_note: Note = _mute,
+    on_progress: Callable[[Progress], object] = _mute,
+    on_trouble: Callable[[DeviceError], object] = _mute,
+    tick: Tick | None = None,
+) -> Acquired:
+    """Record what a controller samples: it keeps the rotor levitated, plays the excitation and protects the bench.
+
+    Parameters
+    ----------
+    port : str
+        A serial port, ``"emulated"`` (the firmware on an emulated controller before a simulated bench),
+        ``"simulated"`` (a simulated bench alone), or ``"replay:FILE"``.
+    rig : Rig, str or Path
+        Calibrations, ``[loop]``, ``[daq]``.
+    out : str or Path
+        Record to write: .h5, .hdf5, .csv or .csv.gz. A journal beside it holds what came so far.
+    seconds : float, optional
+        Length of the record in s.
+    excitation : {"multisine", "schroeder", "prbs", "steps"}, optional
+        What the controller adds to its output; default nothing.
+    amplitude : float, optional
+        Its peak in V; default found by trials, small first.
+    band : (float, float), optional
+        Its band in Hz; default that in which the rotor moves, or what the controller can play.
+    mode : {"sample", "drive", "levitate"}, optional
+        Output off; excitation without feedback; position loop on the controller. Default levitate where the rig has a
+        loop, sample a replay.
+    settle : float, optional
+        Time after the start that is not recorded, in s; default 1 to levitate.
+    bench : str, Path, Rig or Preset, optional
+        Plant behind an emulated or simulated controller; default daq.bench of the rig, or its own values.
+    pace : {"fastest", "real-time"}, optional
+        Of a device that is no hardware.
+    seed : int, optional
+        Of excitation and simulated noise.
+    force : bool, optional
+        Write over a record that exists, and close a loop that is predicted unstable.
+    stopped : callable, optional
+        Asked now and then; True ends the run.
+    on_note, on_progress, on_trouble, tick : callable, optional
+        Told what is made up or found, how far it is, of a disk that is slow or full, and of the present stage.
+
+    Returns
+    -------
+    Acquired
+        Its `record` is what was written. Also where a fault ended the run early: see ``run.fault``.
+
+    Raises
+    ------
+    AmbidError
+        If port, rig or wishes break a rule, a loop is predicted unstable, or the device or the disk fails.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> done = ambid.acquire("simulated", "bench.toml", "run.h5", seconds=5.0, excitation="prbs")  # doctest: +SKIP
+    >>> ambid.identify(done.record, "bench.toml")  # doctest: +SKIP
+    """
+    known, path = known_rig(rig), Path(out)
+    wish = Wish(
+        seconds=seconds, excitation=excitation, amplitude=amplitude, band=band, mode=mode, settle=settle, seed=seed,
+        stopped=stopped,
+    )  # fmt: skip
+    wish.trial(port, known)
+    if (path.exists() or path.is_symlink()) and not force:
+        raise AmbidError(f"-o {path} exists already. Choose another name, or give --force")
+    with ready(port, known, wish, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
+        return record_course(
+            device, known, path, course, force=force, on_progress=on_progress, on_trouble=on_trouble, stopped=stopped
+        )
+
+
+@contextmanager
+def ready(
+    port: str,
+    rig: Rig,
+    wish: Wish,
+    *,
+    bench: str | Path | Rig | Preset | None,
+    pace: Literal["fastest", "real-time"],
+    force: bool,
+    note: Note,
+    tick: Tick | None,
+) -> Iterator[tuple[Device, Course]]:
+    """Open a device, say what it is to do, and close it; arguments as those of `acquire`."""
+    trial, say = wish.trial(port, rig), tick or silent
+    closes = trial.mode == "levitate" and not force
+    with opened(port, rig, bench=bench, pace=pace, seed=wish.seed, closes=closes, note=note) as device:
+        course = wish.course(device, rig, trial, note=note, tick=say)
+        say("record")
+        yield device, course
+
+
+@contextmanager
+def opened(
+    port: str,
+    rig: Rig,
+    *,
+    bench: str | Path | Rig | Preset | None,
+    pace: Literal["fastest", "real-time"],
+    seed: int,
+    closes: bool,
+    note: Note,
+) -> Iterator[Device]:
+    """Open a device and close it.
+
+    `bench`: plant behind a controller that is no hardware; `pace`: of such a device; `seed`: of simulated noise;
+    `closes`: whether a loop is to be closed that has to be stable. Returns idle.
+    """
+    from ambid.acquisition.devices.choose import open_device
+
+    behind, invented = None if bench is None else bearer_of(bench), port in ("emulated", "simulated")
+    complete = with_default_daq(rig) if invented else rig
+    for line in default_daq_notes(rig) if invented else ():
+        note(line)
+    made = open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed)
+    if closes:
+        refuse_unstable(rig, made.info)
+    with made as device:
+        notes = (
+            _replay_notes(device, rig)
+            if port.startswith("replay:")
+            else review(complete, controller_settings(complete), parameters=device.info.plant)
+        )
+        for line in notes:
+            note(line)
+        yield device
+
+
+def _usual_mode(port: str, rig: Rig, excitation: str | None) -> Mode:
+    """Choose what a device does where the user does not say."""
+    if port.startswith("replay:"):
+        return "sample"
+    if rig.loop is not None and rig.loop.closed and not rig.open_loop:
+        return "levitate"
+    return "sample" if excitation is None else "drive"
+
+
+def _check_excitation(port: str, mode: Mode, name: str | None, given: Mapping[str, object]) -> None:
+    """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
+    if name is None:
+        refuse_given(given, "{} is of an excitation, and none is named. Give --excitation, or leave it out")
+    elif port.startswith("replay:"):
+        raise AmbidError("--excitation cannot be played to a record that is replayed. Leave it out")
+    elif mode == "sample":
+        raise AmbidError(
+            "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"
+        )
+
+
+def _replay_notes(device: Device, rig: Rig) -> tuple[str, ...]:
+    """Say where a record that is replayed has another rate than the rig: it keeps its own."""
+    rate = device.info.rate_hz
+    wanted = rig.daq.rate_hz if rig.daq is not None else rig.record.rate_hz
+    if device.info.kind != "replay" or wanted is None or math.isclose(rate, wanted, rel_tol=_SAME_RATE):
+        return ()
+    return (
+        f"{device.info.port} was taken at {rate:.6g} Hz, which it keeps; the rig says {wanted:g} Hz. Make sure that it"
+        " is of this bench",
+    )
