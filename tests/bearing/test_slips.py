@@ -12,11 +12,12 @@ from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
 from ambid.job import identify
-from ambid.physics.linear_model import Parameter
+from ambid.physics.linear_model import Parameter, model
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig
 from tests.bearing.benches import parameters, run
+from tests.conventions.sources import ROOT
 
 # m, k_x, k_i, R, L, and the largest voltage, current and travel: grams to tons, and the presets
 BENCHES = {
@@ -36,6 +37,16 @@ SLIPS = [(c, f) for c in ("voltage", "current", "position") for f in (1e3, 1e-3,
 def signals(voltage, current, travel):
     """Two samples that reach these largest values."""
     return Signals(u=np.array([[voltage], [-voltage]]), y=np.array([[travel, current], [0.0, -current]]), rate_hz=1e4)
+
+
+TIME = {"L": 1, "k_i": 1, "k_x": 1, "m": 3}  # powers of a time that is too long
+
+
+def mistimed(name, factor):
+    """Parameters and signals of a bench whose times are too long by a factor."""
+    values, largest = BENCHES[name]
+    found = {k: value * factor ** TIME.get(k, 0) for k, value in zip(NAMES, values, strict=True)}
+    return found, replace(signals(*largest), rate_hz=1e4 / factor)
 
 
 def slipped(name, channel, factor):
@@ -70,6 +81,65 @@ def test_a_slip_of_one_unit_is_named(name):
         assert f"channels.{channel}.gain" in check.detail
 
 
+@pytest.mark.parametrize("name", BENCHES)
+@pytest.mark.parametrize(("factor", "words"), [(1e3, "a rate in kHz read as Hz"), (1e-3, "times in s read as ms")])
+def test_a_wrong_unit_of_time_is_named(name, factor, words):
+    values, seen = mistimed(name, factor)
+    check = check_units(values, (), seen)
+    assert not check.passed
+    assert check.values["time_factor"] == factor
+    assert words in check.detail
+    assert "--rate" in check.detail
+
+
+def test_a_rate_ten_times_wrong_is_named_where_a_mass_is_known():
+    values, seen = mistimed("pump", 10.0)
+    assert check_units(values, (), seen).passed
+    weighed = Parameter(name="m", unit="kg", role="fixed", value=1.2)
+    check = check_units(values, (weighed,), seen)
+    assert check.values["time_factor"] == 10.0
+    assert "the sampling rate is ten times what was said" in check.detail
+
+
+COIL_SLIPS = [("voltage", 1e3), ("current", 1e3), ("voltage", 1e-3), ("current", 1e6)]
+
+
+@pytest.mark.parametrize(("channel", "factor"), COIL_SLIPS)
+def test_the_coil_alone_has_its_units_checked(channel, factor):
+    R, L, s = 1.6, 1.8e-3, {"voltage": 1.0, "current": 1.0} | {channel: factor}
+    seen = Signals(u=s["voltage"] * np.array([[5.0], [-5.0]]), y=s["current"] * np.array([[2.0], [-1.0]]), rate_hz=1e4)
+    values = {"R": R * s["voltage"] / s["current"], "L": L * s["voltage"] / s["current"]}
+    check = check_units(values, (), seen, model("coil"))
+    assert not check.passed
+    assert check.values[f"{channel}_factor"] == factor
+
+
+@pytest.mark.parametrize(("channel", "factor"), [("current", 1e3), ("position", 1e3), ("time", 1e3)])
+def test_the_rotor_alone_has_its_units_checked(channel, factor):
+    s = dict.fromkeys(("current", "position", "time"), 1.0) | {channel: factor}
+    i, x, t = s.values()
+    seen = Signals(u=i * np.array([[1.0], [-1.0]]), y=x * np.array([[2e-4], [0.0]]), rate_hz=1e4 / t)
+    values = {"m": 4.0, "k_x": -1.29e5 / t**2, "k_i": 55.7 * x / i / t**2}
+    known = Parameter(name="m", unit="kg", role="fixed", value=4.0)
+    assert check_units({"m": 4.0, "k_x": -1.29e5, "k_i": 55.7}, (known,), RMIT_SEEN, model("rotor")).passed
+    check = check_units(values, (known,), seen, model("rotor"))
+    assert check.values[f"{channel}_factor"] == factor
+
+
+RMIT_SEEN = Signals(u=np.array([[1.0], [-1.0]]), y=np.array([[2e-4], [0.0]]), rate_hz=1e4)
+
+
+def test_a_coils_sign_and_order_are_named():
+    bench = run("coil", 3000, 3)
+    v, i = bench.signals.u, bench.signals.y
+    swapped_both = replace(bench.signals, u=i, y=v)
+    for changed, words in ((replace(bench.signals, u=-v), "'voltage' is reversed"), (swapped_both, "are swapped")):
+        with pytest.raises(EstimationError, match=words):
+            greybox(bench.model, changed, parameters(bench))
+    with pytest.raises(EstimationError, match="channel 'current' is reversed"):  # a current of one sign tells which
+        greybox(bench.model, replace(bench.signals, y=-i - 10.0 * i.std()), parameters(bench))
+
+
 def test_a_known_mass_shows_a_slip_that_sizes_alone_do_not():
     values, _, seen = slipped_free("pump", "position", 1 / 0.0254)
     assert check_units(values, (), seen).passed
@@ -99,6 +169,11 @@ def test_sizes_scale_as_the_model_does():
         assert moved["k_x"] / moved["m"] == pytest.approx(theta["k_x"] / theta["m"])
         for k, beside in (("R", i), ("L", i), ("k_i", x)):
             assert moved[k] * beside / v == pytest.approx(theta[k])
+    late, _ = mistimed("pump", 2.0)
+    # m x'' = k_i i - k_x x and V = R i + L i' + k_i x' hold for the same samples twice as long apart
+    assert late["k_i"] / late["m"] * 4.0 == pytest.approx(theta["k_i"] / theta["m"])
+    assert late["k_x"] / late["m"] * 4.0 == pytest.approx(theta["k_x"] / theta["m"])
+    assert (late["L"] / 2.0, late["k_i"] / 2.0, late["R"]) == pytest.approx((theta["L"], theta["k_i"], theta["R"]))
     for size in SIZES:
         low, high = size.usual
         assert size.possible[0] < low < high < size.possible[1]
@@ -253,3 +328,14 @@ def test_an_estimate_names_a_current_in_another_unit(mass):
     assert not check.passed
     assert check.values["current_factor"] == 1e3
     assert "current is a thousand times too large (values in mA read as A)" in check.detail
+
+
+def test_the_page_on_checks_lists_every_size_with_its_ranges_and_source():
+    page = (ROOT / "docs" / "checks.md").read_text(encoding="utf-8")
+    rows = {row.split(" [")[0].removeprefix("| "): row for row in page.splitlines() if row.startswith("| ")}
+    for size in SIZES:
+        cells = [cell.strip() for cell in rows[size.name].split("|")]
+        low, high = (float(number) for number in cells[2].split(" … "))
+        assert (low, high) == size.usual
+        assert tuple(float(number) for number in cells[3].split(" … ")) == size.possible
+        assert cells[4] == size.source

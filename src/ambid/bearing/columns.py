@@ -7,8 +7,9 @@ badly, and those of the record with that sign or order changed lead to a fit tha
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
+from itertools import combinations
 
 import numpy as np
 
@@ -21,6 +22,10 @@ from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel, Parameter
+from ambid.rig.roles import Coil, coil_of
+
+Change = tuple[str, str, Signals]
+"""What may be wrong, what to do about it, and the record with it changed."""
 
 _LOOKED = 16384  # samples that show whether a column holds a signal
 _LAGS = (0, 1, 2, 4, 8, 16, 40)  # before and after
@@ -31,6 +36,8 @@ _SAME = 1e-9  # from a correlation of one
 POOR = 2.5  # criterion per sample of a start that may be the wrong record's; good ones are below 2
 _GAIN = 0.7  # fall of the criterion per sample by which a change of the record must do better
 
+_STRETCH = 4096  # samples that show a coil
+_CLEAR = 0.9  # part that a coil has to explain before its signs are believed
 _FOLLOWED = 2  # changes that are searched from, the best first
 
 
@@ -100,24 +107,58 @@ def refuse_mistaken(
     `as_is`: criterion per sample of the best start, infinite where there is none, or (`searched`) of a fit that failed;
     `follow`: searches from start values.
     """
-    if model.name != "one-axis" or (as_is < POOR and not searched):
+    coil = _coil(model, signals)
+    turned = coil is not None and coil.reversed and coil.share > _CLEAR
+    if as_is < POOR and not (searched or turned):
         return
     below = as_is - (0.0 if searched else _GAIN)
     _refuse_units(model, signals, parameters, delay, follow, np.inf if searched else below)
-    _refuse_late(model, signals, parameters, delay, follow)
+    if model.name == "one-axis":
+        _refuse_late(model, signals, parameters, delay, follow)
     better: list[tuple[float, str, str, list[Candidate]]] = []
-    for text, remedy, changed in _changes(signals):
+    likely, others = _likely(model, _changes(model, signals))
+    for text, remedy, changed in likely:  # one start and one search, where a coil shows what is wrong
+        _refuse_explained(text, remedy, _starts(model, changed, parameters, delay), follow)
+    for text, remedy, changed in others:
         found = _starts(model, changed, parameters, delay)
         per_sample = found[0].criterion / found[0].problem.n_used if found else np.inf
         if per_sample < below:
             better.append((per_sample, text, remedy, found))
     for _, text, remedy, found in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
-        fit = _try(follow, found)
-        if fit is not None and fit.problem.parameters(fit.vector)["R"] > 0:
-            raise EstimationError(
-                f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
-                f"{remedy}"
-            )
+        _refuse_explained(text, remedy, found, follow)
+
+
+def _refuse_explained(
+    text: str, remedy: str, found: Sequence[Candidate], follow: Callable[[Sequence[Candidate]], Fit]
+) -> None:
+    """Raise where a changed record, of which these are the start values, is explained."""
+    fit = _try(follow, found) if found else None
+    if fit is not None and _positive(fit):
+        raise EstimationError(
+            f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
+            f"{remedy}"
+        )
+
+
+def _coil(model: LinearModel, signals: Signals) -> Coil | None:
+    """The coil that a stretch of the record shows."""
+    at = busiest(signals.u, _STRETCH)
+    columns = dict(zip((*model.inputs, *model.outputs), [*signals.u[at].T, *signals.y[at].T], strict=True))
+    if "voltage" not in columns or "current" not in columns:
+        return None
+    return coil_of(columns["voltage"], columns["current"], columns.get("position"), signals.rate_hz)
+
+
+def _likely(model: LinearModel, changes: Iterable[Change]) -> tuple[list[Change], list[Change]]:
+    """Changes after which there is a clear coil between voltage and current, the clearest first; and the others."""
+    found, others = [], []
+    for change in changes:
+        coil = _coil(model, change[2])
+        if coil is not None and coil.share > _CLEAR and not coil.reversed:
+            found.append((coil.share, change))
+        else:
+            others.append(change)
+    return [change for _, change in sorted(found, key=lambda f: -f[0])], others
 
 
 def _refuse_late(
@@ -158,7 +199,7 @@ def _refuse_units(
     if not found or found[0].criterion / found[0].problem.n_used > below:
         return
     fit = _try(follow, found)
-    check = None if fit is None else check_units(fit.problem.parameters(fit.vector), parameters, signals)
+    check = None if fit is None else check_units(fit.problem.parameters(fit.vector), parameters, signals, model)
     if check is not None and not check.passed:
         raise EstimationError(check.detail)
 
@@ -180,33 +221,37 @@ def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate
     return fit if reason(fit) == "" else None
 
 
-def _changes(signals: Signals) -> list[tuple[str, str, Signals]]:
-    """What may be wrong, what to do about it, and the record with it changed."""
-    v, (x, i) = signals.u[:, 0], signals.y.T
-    bias = -float(np.mean(i)) > float(np.std(i))  # a current of one sign is positive where it is wired right
-    first, second = ("current", "voltage") if bias else ("voltage", "current")
-    return [
-        (
+def _positive(fit: Fit) -> bool:
+    theta = fit.problem.parameters(fit.vector)
+    return all(theta[p.name] > 0 for p in fit.problem.model.parameters if p.positive)
+
+
+def _changes(model: LinearModel, signals: Signals) -> Iterator[Change]:
+    """Yield one sign reversed, and two columns swapped."""
+    roles, size = (*model.inputs, *model.outputs), len(model.inputs)
+    columns = np.column_stack([signals.u, signals.y])
+
+    def changed(order: Sequence[int], sign: Sequence[float]) -> Signals:
+        moved = columns[:, order] * sign
+        return replace(signals, u=moved[:, :size], y=moved[:, size:])
+
+    own, same = list(range(len(roles))), [1.0] * len(roles)
+    if "voltage" in roles and "current" in roles:
+        i = columns[:, roles.index("current")]
+        bias = -float(np.mean(i)) > float(np.std(i))  # a current of one sign is positive where it is wired right
+        first, second = ("current", "voltage") if bias else ("voltage", "current")
+        yield (
             f"channel {first!r} is reversed (or {second!r} is)",
             f"Swap the sensor's leads, or reverse the sign of channels.{first}.gain",
-            replace(signals, u=-signals.u) if first == "voltage" else replace(signals, y=signals.y * [1.0, -1.0]),
-        ),
-        (
-            "channels 'voltage' and 'current' are swapped",
-            "Exchange channels.voltage.column and channels.current.column",
-            replace(signals, u=i[:, None], y=np.column_stack([x, v])),
-        ),
-        (
-            "channels 'position' and 'current' are swapped",
-            "Exchange channels.position.column and channels.current.column",
-            replace(signals, y=np.column_stack([i, x])),
-        ),
-        (
-            "channels 'position' and 'voltage' are swapped",
-            "Exchange channels.position.column and channels.voltage.column",
-            replace(signals, u=x[:, None], y=np.column_stack([v, i])),
-        ),
-    ]
+            changed(own, [-1.0 if role == first else 1.0 for role in roles]),
+        )
+    for a, b in combinations(own, 2):
+        order = [b if k == a else a if k == b else k for k in own]
+        yield (
+            f"channels {roles[a]!r} and {roles[b]!r} are swapped",
+            f"Exchange channels.{roles[a]}.column and channels.{roles[b]}.column",
+            changed(order, same),
+        )
 
 
 def _numbers(fit: Fit) -> str:

@@ -1,10 +1,10 @@
 """Slips of commissioning that leave a sound fit: a channel in another unit than its column says.
 
-A factor on one channel is an exact symmetry of the model. With voltage, current and position read too large by s_v, s_i
-and s_x, the same residuals belong to R s_v/s_i, L s_v/s_i, k_i s_v/s_x, k_x s_v s_i/s_x^2 and m s_v s_i/s_x^2: only
-sizes can tell. Each size below has a usual range over the machines that are built, wide because it holds micro-bearings
-and turbines alike; together they leave a factor of 1000 hardly any room. What a rig says of a parameter is one more
-size, of a narrow range.
+A factor on one channel is an exact symmetry of the model, and so is one on time. With voltage, current, position and
+time read too large by s_v, s_i, s_x and s_t, the same residuals belong to R s_v/s_i, L s_v s_t/s_i, k_i s_v s_t/s_x,
+k_x s_v s_i s_t/s_x^2 and m s_v s_i s_t^3/s_x^2: only sizes can tell. Each size below has a usual range over the
+machines that are built, wide because it holds micro-bearings and turbines alike; together they leave a factor of 1000
+hardly any room. What a rig says of a parameter is one more size, of a narrow range.
 """
 
 from __future__ import annotations
@@ -17,19 +17,26 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.estimation.estimate import Check
-from ambid.physics.linear_model import Parameter
+from ambid.physics.linear_model import LinearModel, Parameter, model
 
-CHANNELS = {"voltage": "V", "current": "A", "position": "m"}
-_SYMMETRY = {  # exponents of s_v, s_i, s_x
-    "R": (1, -1, 0),
-    "L": (1, -1, 0),
-    "k_i": (1, 0, -1),
-    "k_x": (1, 1, -2),
-    "m": (1, 1, -2),
-    "c": (1, 1, -2),
-    "voltage": (1, 0, 0),
-    "current": (0, 1, 0),
-    "position": (0, 0, 1),
+CHANNELS = {"voltage": "V", "current": "A", "position": "m", "time": "s"}
+_SYMMETRY = {  # exponents of s_v, s_i, s_x, s_t
+    "R": (1, -1, 0, 0),
+    "L": (1, -1, 0, 1),
+    "k_i": (1, 0, -1, 1),
+    "k_x": (1, 1, -2, 1),
+    "m": (1, 1, -2, 3),
+    "c": (1, 1, -2, 2),
+    "voltage": (1, 0, 0, 0),
+    "current": (0, 1, 0, 0),
+    "position": (0, 0, 1, 0),
+    "rate": (0, 0, 0, -1),
+}
+_OF_MASS = {  # of a magnet driven by a current, whose mass is known
+    "k_i": (0, -1, 1, -2),
+    "k_x": (0, 0, 0, -2),
+    "m": (0, 0, 0, 0),
+    "c": (0, 0, 0, -1),
 }
 _HIGH = 0.999
 _EXACT = 0.1  # power of ten within which a rig's value is a thousand times another
@@ -44,8 +51,16 @@ _FACTORS = {  # what a value is multiplied by when its unit is mistaken, for eve
 }
 _LENGTHS = {  # and for a position
     1 / 0.0254: "39.4 times too large (values in inches read as m)",
+    180 / np.pi: "57.3 times too large (degrees of a lever read as radians)",
     1 / 25.4e-6: "39 370 times too large (values in mil read as m)",
     0.0254e3: "25.4 times too large",
+}
+_TIMES = {  # and for time, of which the sampling rate may be a wrong number too
+    1e3: "a thousand times too large (times in ms read as s, or a rate in kHz read as Hz)",
+    1e-3: "a thousand times too small (times in s read as ms)",
+    10.0: "ten times too large (the sampling rate is ten times what was said)",
+    0.1: "ten times too small (the sampling rate is a tenth of what was said)",
+    1e6: "a million times too large (times in us read as s, or a rate in MHz read as Hz)",
 }
 
 
@@ -54,16 +69,15 @@ class Size:
     """A size of a bench: a product of powers of parameters and of signals' largest values."""
 
     name: str
-    of: Mapping[str, int]  # exponents of parameters in SI, and of the largest voltage, current and travel
+    of: Mapping[str, float]  # exponents of parameters in SI, largest voltage, current and travel, and rate
     unit: str
     usual: tuple[float, float]
     possible: tuple[float, float]
     source: str
 
-    @property
-    def symmetry(self) -> Array:
-        """Exponents of s_v, s_i, s_x."""
-        return np.asarray(np.sum([e * np.array(_SYMMETRY[k], dtype=float) for k, e in self.of.items()], axis=0))
+    def symmetry(self, of: Mapping[str, Sequence[int]]) -> Array:
+        """Exponents of s_v, s_i, s_x, s_t; `of`: those of each parameter and signal."""
+        return np.asarray(np.sum([e * np.array(of[k], dtype=float) for k, e in self.of.items()], axis=0))
 
 
 # Usual: of micro-bearings of a few grams to turbines of several tons. The presets, the benches that the thesis names
@@ -87,6 +101,14 @@ SIZES = (
          possible=(1e-3, 1e8), source="k_x/k_i = -i0/x0 (thesis eq. 1.6: 2460 A/m; 95 A/m for a ball at 10 mm)"),
     Size(name="acceleration per current, k_i/m", of={"k_i": 1, "m": -1}, unit="m/s^2/A", usual=(0.01, 1e4),
          possible=(1e-5, 1e7), source="2 g/i0 for one magnet against gravity (theory.md sec. 1)"),
+    Size(name="coil time constant, L/R", of={"L": 1, "R": -1}, unit="s", usual=(2e-5, 5.0), possible=(1e-7, 1e3),
+         source="47 ms in thesis eq. 4.10, 28 ms for the measured levitation; 0.2 ms for micro-coils"),
+    Size(name="bias stiffness over mass as a frequency, sqrt(-k_x/m)/(2 pi)", of={"k_x": 0.5, "m": -0.5}, unit="Hz",
+         usual=(0.2, 1000.0), possible=(0.01, 1e5),
+         source="sqrt(g/gap)/(2 pi) for a magnet that carries the weight: 7 Hz at 10 mm, 50 Hz at 0.1 mm (theory.md "
+         "sec. 1); stiff spindles some 100 Hz"),
+    Size(name="sampling rate", of={"rate": 1}, unit="Hz", usual=(50.0, 5e6), possible=(1.0, 1e9),
+         source="100 Hz for coils at rest to MHz of recorders; loops close at 1 to 20 kHz"),
     Size(name="acceleration, k_i i/m", of={"k_i": 1, "m": -1, "current": 1}, unit="m/s^2", usual=(0.01, 1e4),
          possible=(1e-4, 1e6), source="from a hundredth of the weight to the largest force of a magnet, some 100 g"),
     Size(name="power", of={"voltage": 1, "current": 1}, unit="V A", usual=(1e-4, 1e6), possible=(1e-10, 1e9),
@@ -103,47 +125,47 @@ class UnitSlip:
     text: str
 
 
-def check_units(values: Mapping[str, float], parameters: Sequence[Parameter], signals: Signals) -> Check:
+def check_units(
+    values: Mapping[str, float], parameters: Sequence[Parameter], signals: Signals, plant: LinearModel | None = None
+) -> Check:
     """Check that the sizes of parameters and signals are those of a bench, and name the slip of a unit if they are not.
 
     `values`: estimates in SI, all of them free where a rig's value is to count as evidence; `parameters`: what the rig
-    says; `signals`: of the record, of model one-axis.
+    says; `signals`: of the record; `plant`: default one-axis.
     """
+    plant = model("one-axis") if plant is None else plant
+    of = _SYMMETRY | ({} if "voltage" in plant.inputs else _OF_MASS)
     sizes = [*SIZES, *_said(parameters)]
-    largest = {
-        "voltage": _largest(signals.u[:, 0]),
-        "current": _largest(signals.y[:, 1]),
-        "position": 2.0 * _largest(signals.y[:, 0] - np.median(signals.y[:, 0])),
-    }
+    columns = dict(zip((*plant.inputs, *plant.outputs), np.column_stack([signals.u, signals.y]).T, strict=True))
+    largest = {role: _largest(x) for role, x in columns.items()} | {"rate": signals.rate_hz}
+    if "position" in columns:
+        largest["position"] = 2.0 * _largest(columns["position"] - np.median(columns["position"]))
     logs = np.array([_log(size, {**values, **largest}) for size in sizes])
     low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
     far = (logs - (low + high) / 2) / ((high - low) / 2)
     odd = [j for j in np.flatnonzero(~(np.abs(far) <= 1.0)) if np.isfinite(far[j])]
     if not odd:
         return Check(passed=True, values={"unusual": 0.0}, detail="all sizes are typical of magnetic bearings")
-    if all(sizes[j].source == "rig" for j in odd):
-        wrong = _mistaken_values(parameters, values)
-        if wrong:
-            return Check(
-                passed=False,
-                values={"unusual": float(len(odd))},
-                detail=" ".join(f"{w}." for w in wrong).removesuffix("."),
-            )
-    symmetry = np.array([size.symmetry for size in sizes])
-    slips = _slips(far, symmetry / ((high - low) / 2)[:, None])
+    symmetry = np.array([size.symmetry(of) for size in sizes])
+    slips = _slips(far, symmetry / ((high - low) / 2)[:, None], [c for c in CHANNELS if c in columns or c == "time"])
+    factors: dict[str, float] = {}
+    for slip in slips:
+        factors.setdefault(f"{slip.channel}_factor", slip.factor)
+    wrong = _mistaken_values(parameters, values) if all(sizes[j].source == "rig" for j in odd) else []
+    if wrong:  # a mass that is a thousand times off is a rate that is ten times off as well
+        wrong += [f"Or {slip.channel} is {slip.text}" for slip in slips if slip.channel == "time"]
+        late = {name: factor for name, factor in factors.items() if name == "time_factor"}
+        return Check(passed=False, values={**late, "unusual": float(len(odd))}, detail=". ".join(wrong))
     worst = max(odd, key=lambda j: abs(far[j]))
     what = f"{sizes[worst].name} = {10 ** logs[worst]:.3g} {sizes[worst].unit}"
     what += f" is unusual (usually {sizes[worst].usual[0]:.3g} to {sizes[worst].usual[1]:.3g})"
     if slips:
-        factors: dict[str, float] = {}
-        for slip in slips:
-            factors.setdefault(f"{slip.channel}_factor", slip.factor)
         words = ", or ".join(f"{slip.channel} is {slip.text}" for slip in slips)
         return Check(
             passed=False,
             values={**factors, "unusual": float(len(odd))},
             detail=f"{what}. All sizes are typical if {words}. Correct the unit in the record's header, or give "
-            f"channels.{slips[0].channel}.gain",
+            + ("--rate" if slips[0].channel == "time" else f"channels.{slips[0].channel}.gain"),
         )
     possible = all(s.possible[0] <= 10**x <= s.possible[1] for s, x in zip(sizes, logs, strict=True) if np.isfinite(x))
     return Check(
@@ -177,12 +199,13 @@ def _largest(signal: Array) -> float:
 
 def _log(size: Size, values: Mapping[str, float]) -> float:
     """Logarithm of a size; not a number where it does not apply."""
-    if "k_x" in size.of and len(size.of) > 1 and values["k_x"] >= 0:
+    if "k_x" in size.of and len(size.of) > 1 and values.get("k_x", 0.0) >= 0:
         return float("nan")  # a spring outweighs the magnet, and says nothing of bias and gap
     factors = [abs(values.get(name, 0.0)) for name in size.of]
     if not all(factors):
         return float("nan")
-    return float(np.dot(list(size.of.values()), np.log10(factors)))
+    turns = np.log10(2.0 * np.pi) if size.unit == "Hz" and "rate" not in size.of else 0.0
+    return float(np.dot(list(size.of.values()), np.log10(factors)) - turns)
 
 
 def _said(parameters: Sequence[Parameter]) -> list[Size]:
@@ -198,18 +221,22 @@ def _said(parameters: Sequence[Parameter]) -> list[Size]:
     return found
 
 
-def _slips(far: Array, moves: Array) -> list[UnitSlip]:
+def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
     """The factors on one channel after which every size is usual: the most likely, and those that are nearly as likely.
 
-    `far`: (n,), distances from the middles of the ranges in half widths; `moves`: (n, 3), what a power of ten moves.
+    `far`: (n,), distances from the middles of the ranges in half widths; `moves`: (n, 4), what a power of ten moves;
+    `channels`: those of the model, and time.
     """
     applies, found = np.isfinite(far), []
     most = float(np.sum(far[applies] ** 2)) - _GAIN
     for j, (channel, unit) in enumerate(CHANNELS.items()):
-        for factor, text in {**_FACTORS, **(_LENGTHS if channel == "position" else {})}.items():
+        if channel not in channels:
+            continue
+        own = _TIMES if channel == "time" else {**_FACTORS, **(_LENGTHS if channel == "position" else {})}
+        for factor, text in own.items():
             after = (far - moves[:, j] * np.log10(factor))[applies]
             if np.all(np.abs(after) <= 1.0):
-                rare = 0.0 if factor in (1e3, 1e-3) else _RARE
+                rare = 0.0 if factor in (1e3, 1e-3) and channel != "time" else _RARE
                 words = text.format(unit=unit)
                 found.append((float(np.sum(after**2)) + rare, UnitSlip(channel=channel, factor=factor, text=words)))
     found = sorted((f for f in found if f[0] < most), key=lambda f: f[0])

@@ -138,9 +138,10 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
     checks |= physical.assumption_checks(fit, known, delay_how)
     checks |= physical.physical_checks(fit, known, bench, robust=robust)
+    signals = signals_of(bench, problem.model)
+    checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
-        checks["units"] = _units(fit, rig, signals_of(bench, problem.model), doubt=not checks["fixed_agree"].passed)
-        checks["in_time"] = check_lag(signals_of(bench, problem.model))
+        checks["in_time"] = check_lag(signals)
         if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
@@ -162,14 +163,14 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
     from ambid.bearing.linear import greybox
     from ambid.bearing.sizes import check_units
 
-    check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals)
+    check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals, fit.problem.model)
     known = [p for p in rig.parameters if p.role != "free" and p.value]
     if not known or not (doubt or check.values["unusual"]):
         return check
     free = [replace(p, role="free", value=None, sd=None) if p in known else p for p in rig.parameters]
     with contextlib.suppress(EstimationError, np.linalg.LinAlgError):
         alone = greybox(fit.problem.model, signals, free, delay=fit.problem.delay, evaluations=0)
-        again = check_units(alone.problem.parameters(alone.vector), rig.parameters, signals)
+        again = check_units(alone.problem.parameters(alone.vector), rig.parameters, signals, fit.problem.model)
         if alone.status == "converged" and not again.passed:
             return again
     return check

@@ -45,8 +45,6 @@ _LIKE = 0.8  # how much a column that neither unit nor name gives away has to do
 class Coil:
     """The coil between two columns: V = R i + L i' + k x'."""
 
-    voltage: str
-    current: str
     share: float  # part of the variance of the integrated voltage that is explained, 0 to 1
     R: float  # in units of the columns, without a sign; 0 where the record does not show it
     L: float
@@ -124,29 +122,31 @@ def _named(c: Channel, role: str, record: Record) -> Candidate:
     return Candidate(role=role, channel=c, named=_name(c, role), signal=part, fits=0.0, why="")
 
 
-def _coils(record: Record, shown: Mapping[str, Sequence[Candidate]]) -> list[Coil]:
+def _coils(record: Record, shown: Mapping[str, Sequence[Candidate]]) -> dict[tuple[str, str], Coil]:
     """Coils between candidates for voltage and current, with the motion that suits them best."""
     if record.n_samples < _LEAST:
-        return []
+        return {}
     columns = {c.channel.name: c.channel.values[:_LOOKED] for cs in shown.values() for c in cs}
     motions: list[str | None] = [c.channel.name for c in shown["position"]]
-    found = []
+    found: dict[tuple[str, str], Coil] = {}
     for v, i in itertools.product(shown["voltage"], shown["current"]):
-        names = v.channel.name, i.channel.name
-        if names[0] != names[1]:
+        pair = v.channel.name, i.channel.name
+        if pair[0] != pair[1]:
             fits = [
-                _coil(names, columns, None if x is None else columns[x], record.rate_hz)
+                coil_of(columns[pair[0]], columns[pair[1]], None if x is None else columns[x], record.rate_hz)
                 for x in (motions or [None])
-                if x not in names
+                if x not in pair
             ]
-            found += sorted(fits, key=lambda c: -c.share)[:1]
+            found |= {pair: max(fits, key=lambda c: c.share)} if fits else {}
     return found
 
 
-def _coil(names: tuple[str, str], columns: Mapping[str, Array], x: Array | None, rate_hz: float) -> Coil:
-    """Least squares over windows; the window and delay at which the inductance explains most."""
-    v, i = (columns[name] for name in names)
-    best, found = -1.0, Coil(voltage=names[0], current=names[1], share=0.0, R=0.0, L=0.0)
+def coil_of(v: Array, i: Array, x: Array | None, rate_hz: float) -> Coil:
+    """Return the coil between two columns by least squares over windows; `x`: a position that moves in it.
+
+    The window and the delay are those at which the inductance explains most of what the other terms leave.
+    """
+    best, found = -1.0, Coil(share=0.0, R=0.0, L=0.0)
     for late, length in itertools.product(_DELAYS, _WINDOWS):
         n = v.size - late - 1
         starts = np.arange(0, n - length + 1, max(1, length // 2))
@@ -193,7 +193,7 @@ def _coherences(record: Record, names: set[str]) -> dict[tuple[str, str], float]
 
 def _judged(
     c: Candidate,
-    coils: Sequence[Coil],
+    coils: Mapping[tuple[str, str], Coil],
     coherent: Mapping[tuple[str, str], float],
     shown: Mapping[str, Sequence[Candidate]],
     record: Record,
@@ -211,11 +211,13 @@ def _judged(
             fits, source = max(pairs)
             words.append(f"{100.0 * fits:.0f} % of its power is coherent with {source}")
     else:
-        own = [x for x in coils if name == (x.voltage if c.role == "voltage" else x.current)]
-        best = max(own, key=lambda x: x.share, default=None)
-        if best is not None and best.share > 0:
-            fits, other = best.share, best.current if c.role == "voltage" else best.voltage
-            words.append(f"with {other} a coil explains {100.0 * fits:.1f} % ({_coil_words(best, record)})")
+        own = [pair for pair in coils if name == pair[c.role == "current"]]
+        best = max(own, key=lambda pair: coils[pair].share, default=None)
+        if best is not None and coils[best].share > 0:
+            fits, other = coils[best].share, best[c.role != "current"]
+            words.append(
+                f"with {other} a coil explains {100.0 * fits:.1f} % ({_coil_words(coils[best], best, record)})"
+            )
         elif best is not None:
             words.append("no coil (R, L > 0) between it and any other column")
     return replace(c, fits=fits, why="; ".join([*words, *_weak(c)]))
@@ -232,9 +234,9 @@ def _unit_words(c: Candidate) -> str:
     return f"{words} instead of [{ROLES[c.role]}]" + ("" if c.named == _UNNAMED else ", but the name fits")
 
 
-def _coil_words(coil: Coil, record: Record) -> str:
+def _coil_words(coil: Coil, pair: tuple[str, str], record: Record) -> str:
     R, L = coil.R, coil.L
-    if record.channel(coil.voltage).unit == "V" and record.channel(coil.current).unit == "A":
+    if [record.channel(name).unit for name in pair] == ["V", "A"]:
         words = f"R about {R:.2g} ohm, L about {L:.2g} H" if R else f"L about {L:.2g} H"
     else:
         words = f"L/R about {L / R:.2g} s" if R else "L > 0"
