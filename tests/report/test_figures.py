@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from matplotlib.transforms import Bbox
 
+from ambid.estimation.estimate import Check
 from ambid.report.drawing import NARROW, WIDE, save, single
-from ambid.report.figures import figures, measured_beside, overview, responses
+from ambid.report.figures import figures, measured_beside, overview, responses, validation_figure
 from ambid.report.response_panels import Pole, poles_panel
 from ambid.report.signal_panels import autocorrelation, whiteness_panel
+from ambid.validation.second_result import Validation
 
 
 @pytest.fixture(scope="module")
@@ -157,3 +159,32 @@ def test_figures_are_written_and_equal_ones_are_equal(unstable, drawn, kind, mag
     assert files[0].startswith(magic)
     if kind == "png":
         assert files[0] == files[1]
+
+
+def test_a_second_record_is_drawn_with_predictions_several_steps_ahead(unstable):
+    traces = unstable.traces_ahead()
+    assert list(traces.ahead) == [10, 100]
+    for k, predicted in traces.ahead.items():
+        assert np.all(np.isnan(predicted[: k - 1]))
+        error = np.std(traces.measured[k - 1 :] - predicted[k - 1 :], axis=0)
+        assert np.all(error >= 0.999 * np.std(traces.errors, axis=0))  # farther ahead is not better
+    found = validated(unstable.estimate)
+    page = validation_figure(found, [traces])
+    titles = [a.get_title(loc="left") for a in page.axes]
+    assert {"errors of the predictions: smaller is better", "growth of the errors with the horizon"} <= set(titles)
+    assert "✗ autocorrelation: position residual is not white" in titles
+    labels = {x.get_text() for place in page.subfigs for legend in place.legends for x in legend.get_texts()}
+    assert {"predicted 10 steps ahead", "predicted 100 steps ahead", "as the model expects"} <= labels
+
+
+def validated(estimate):
+    sizes = {
+        "one_step": 0.9,
+        "simulation": None,
+        "k_step": {"1": 0.9, "10": 0.8},
+        "k_step_ratio": {"1": 1.0, "10": 1.1},
+    }
+    return Validation(
+        estimate="a.json", record="b.csv", model=estimate.model, samples=3000,
+        fit={"position": sizes, "current": sizes}, checks={"residuals_white": Check(passed=False, detail="as it is")},
+    )  # fmt: skip

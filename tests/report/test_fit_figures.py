@@ -12,7 +12,8 @@ from scipy.signal import lfilter
 
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import structure
-from ambid.report.fit_figures import fit_overview, traces_of
+from ambid.report.fit_figures import comparison_figure, fit_overview, traces_of
+from ambid.validation.comparison import compare
 from ambid.validation.fits import judge
 
 POLES, ZEROS = 0.9 * np.exp(0.4j), 0.8 * np.exp(1.2j)
@@ -47,3 +48,18 @@ def test_time_is_that_of_the_record_after_a_cut(data: IOData) -> None:
     t = traces_of(fit, part).time_s
     assert part.start_s == t[0] == 3.0 + 500 * data.dt
     assert t[-1] == pytest.approx(3.0 + 1499 * data.dt)
+
+
+def test_structures_are_drawn_by_what_they_leave_of_unseen_data(data: IOData) -> None:
+    found = compare(data, [("oe", {"nb": 3, "nf": 2, "nk": 1}), ("arx", {"na": 1, "nb": 1, "nk": 1})])
+    page = comparison_figure(found, found.used)
+    errors, tests = page.axes[:2]
+    (one, free) = (np.asarray(x.get_xdata()) for x in errors.lines)
+    np.testing.assert_allclose(one, [100 * (1 - (x.one_step or 0)) for x in found.entries])
+    np.testing.assert_allclose(free, [100 * (1 - (x.simulation or 0)) for x in found.entries])
+    assert [t.get_text().split(",")[0] for t in errors.get_yticklabels()] == [x.structure for x in found.entries]
+    assert tests.get_xscale() == "log"
+    (whole,) = (a for a in page.axes if a.get_title(loc="left") == "y, the whole record")
+    low, high = whole.dataLim.intervalx
+    assert low == found.used.start_s > 13.9  # the held-out part, at its own time
+    assert high == pytest.approx(19.99)

@@ -271,6 +271,18 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
     return Errors(model=model, plant=plant, one_step=e, simulation=simulated, claims_noise=claims_noise)
 
 
+def errors_ahead(found: Errors, steps: int) -> Array:
+    """Return y minus its prediction `steps` samples ahead, (n_samples - steps + 1, n_outputs), SI.
+
+    Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
+    """
+    e, power = found.one_step[steps - 1 :].copy(), found.model.K
+    for j in range(1, steps):
+        e += found.one_step[steps - 1 - j : -j] @ (found.model.C @ power).T
+        power = found.model.A @ power
+    return np.asarray(e)
+
+
 def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
     """Run a record with an operating point of its own through a fit: a constant in every output is fitted.
 

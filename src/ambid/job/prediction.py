@@ -11,7 +11,7 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
 from ambid.blackbox.convert import state_space_to_control
 from ambid.blackbox.convert import to_control as black_box_to_control
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.prediction import errors_elsewhere, plant_form, run_states
+from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form, run_states
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import signals_of
@@ -36,11 +36,7 @@ def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int) -> dict[str, 
         found = y[first.first + ahead - 1 :] - prediction_error(first.fit, ahead)
     elif isinstance(result, BlackBoxFit):
         y, names, run = data.y, result.outputs, errors_elsewhere(result, data)
-        e, power = run.one_step[ahead - 1 :].copy(), run.model.K
-        for j in range(1, ahead):
-            e += run.one_step[ahead - 1 - j : -j] @ (run.model.C @ power).T
-            power = run.model.A @ power
-        found = y[ahead - 1 :] - e
+        found = y[ahead - 1 :] - errors_ahead(run, ahead)
     elif isinstance(result, NonlinearFit):
         y, names = data.y, result.outputs
         found = _nonlinear(result, data, ahead)

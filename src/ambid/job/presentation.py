@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
     from ambid.report.page import Page
+    from ambid.report.signal_panels import Traces
 
 Table = tuple[str, Mapping[str, Sequence[object]]]
 """Name of the column that is the index, and the columns."""
@@ -35,11 +36,12 @@ class View:
     """How one kind of result is shown."""
 
     text: Callable[..., str]  # what stands below the verdict; takes width and paint
-    figure: Callable[[Any, Any], Figure]  # of the result and what it was made from, None where that is not known
+    # of the result, what it was made from, None where that is not known, and the width of the page in inches
+    figure: Callable[[Any, Any, float], Figure]
     document: Callable[[Any], str]  # its JSON
     table: Callable[[Any], Table]
     title: Callable[[Any], str]  # what it is, in a few words
-    page: Callable[[Any, Any], Page] | None = None  # as `figure`; default: text and figure
+    page: Callable[[Any, Any], Page] | None = None  # as `figure`, of any width; default: text and figure
     # what is drawn of a record that is given beside the result; default: as its model takes it
     beside: Callable[[Any, Any], Any] | None = None
 
@@ -52,9 +54,9 @@ def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
 
 def figure(result: Result, record: Any = None) -> Figure:
     """Draw a result beside a record, or what it was made from, with the verdict above."""
-    from ambid.report.drawing import judged
+    from ambid.report.drawing import WIDE, judged
 
-    return judged(view(result).figure(result, _beside(result, record)), result.verdict)
+    return judged(view(result).figure(result, _beside(result, record), WIDE), result.verdict)
 
 
 def page(result: Result, record: Any = None) -> str:
@@ -65,7 +67,8 @@ def page(result: Result, record: Any = None) -> str:
     if known.page is None:
         title = known.title(result)
         said = Section(title="Result", text=known.text(result, width=WIDTH, paint=plain))
-        made = Page(title=title, sections=[said, Section(title="Figures", figure=known.figure(result, used))])
+        drawn = Section(title="Figures", figure=lambda width: known.figure(result, used, width))
+        made = Page(title=title, sections=[said, drawn])
     else:
         made = known.page(result, used)
     return page_html(made, result.verdict, made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"))
@@ -180,7 +183,7 @@ def _estimate() -> View:
 
     return View(
         text=estimate_text,
-        figure=lambda e, used: overview(evidence(e, used)),
+        figure=lambda e, used, width: overview(evidence(e, used), width),
         page=lambda e, used: estimate_page(evidence(e, used)),
         document=lambda e: str(e.dumps()),
         table=_parameter_table,
@@ -199,7 +202,7 @@ def _bearing() -> View:
 
     return View(
         text=estimate_text,
-        figure=lambda e, used: overview(evidence(e, used)),
+        figure=lambda e, used, width: overview(evidence(e, used), width),
         page=lambda e, used: estimate_page(evidence(e, used)),
         document=lambda e: str(e.dumps()),
         table=_parameter_table,
@@ -214,9 +217,9 @@ def _fit() -> View:
     from ambid.report.fit_figures import fit_overview
     from ambid.report.fit_text import fit_text
 
-    def drawn(f: Any, used: Any) -> Figure:
+    def drawn(f: Any, used: Any, width: float) -> Figure:
         records, second = used if isinstance(used, tuple) else (() if used is None else (used,), None)
-        return fit_overview(f, records, second)
+        return fit_overview(f, records, second, width)
 
     return View(
         text=fit_text,
@@ -228,14 +231,26 @@ def _fit() -> View:
 
 
 def _validation() -> View:
+    from ambid.bearing.magnet_result import NonlinearBearingEstimate
+    from ambid.estimation.estimate import Estimate
+    from ambid.physics.linear_model import model
     from ambid.report.estimate_text import validation_text
-    from ambid.report.figures import validation_figure
+    from ambid.report.figures import Evidence, bearing_evidence, validation_figure
+    from ambid.report.fit_figures import traces_of
+    from ambid.validation.second_record import replay
 
-    def drawn(v: Any, used: Any) -> Figure:
-        if used is None:
-            return validation_figure(v)
-        known, data = used
-        return view(known).figure(known, data)
+    def beside(known: Any, data: Any) -> Sequence[Traces]:
+        if isinstance(known, Estimate):
+            from ambid.job.data import signals_of
+
+            run = replay(known, signals_of(data, model(known.model)))
+            return (Evidence(estimate=known, run=run, start_s=data.start_s).traces_ahead(),)
+        if isinstance(known, NonlinearBearingEstimate):
+            return bearing_evidence(known, [(data.record, data.start_s)]).traces
+        return (traces_of(known, data, second=True),)
+
+    def drawn(v: Any, used: Any, width: float) -> Figure:
+        return validation_figure(v, () if used is None else beside(*used), width)
 
     return View(
         text=validation_text,
@@ -253,12 +268,12 @@ def _track() -> View:
     from ambid.report.track_text import track_text
     from ambid.tracking.lines_file import track_document
 
-    def drawn(t: Any, used: Followed | None) -> Figure:
+    def drawn(t: Any, used: Followed | None, width: float) -> Figure:
         history = (None if used is None else used.history) or TrackHistory.of(t)
         if used is None or used.record is None:
-            return track_figure(history)
+            return track_figure(history, width=width)
         units = {name: history.header.units.get(name, "") for name in history.names}
-        return track_figure(history, truth=truth_beside(used.record, used.rate_hz, units))
+        return track_figure(history, truth=truth_beside(used.record, used.rate_hz, units), width=width)
 
     def table(t: Any) -> Table:
         history = TrackHistory.of(t)
@@ -288,7 +303,7 @@ def _measured() -> View:
         return "frequency_hz", columns
 
     return View(
-        text=frf_text, figure=lambda m, _: frf_figure(m), document=measured_text, table=table,
+        text=frf_text, figure=lambda m, _, width: frf_figure(m, width), document=measured_text, table=table,
         title=lambda m: f"{m.record.get('file') or 'record'}, frequency response, {m.response.frequency_hz.size} lines",
     )  # fmt: skip
 
@@ -307,7 +322,7 @@ def _comparison() -> View:
         return "structure", dict(zip(names, zip(*rows, strict=True), strict=True))
 
     return View(
-        text=comparison_text, figure=lambda c, _: comparison_figure(c), document=document, table=table,
+        text=comparison_text, figure=comparison_figure, document=document, table=table,
         title=lambda c: f"{c.record.get('file') or 'record'}, {len(c.entries)} structures compared",
     )  # fmt: skip
 

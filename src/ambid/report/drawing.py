@@ -31,6 +31,7 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE, NARROW = 11.0, 4.6  # inches: a page, and the screen of a telephone
 PIXELS = 800  # stretches of which a long curve shows the extremes, about one for each column of pixels
+_LOGARITHMIC = 5.0  # ratio of limits from which an axis is
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
     "axes.titlesize": 9.5,
@@ -201,12 +202,16 @@ def extremes(t: Array, low: Array, high: Array) -> tuple[Array, Array, Array]:
 
 
 def log_axis(axis: Axis, low: float, high: float) -> None:
-    """Make an axis logarithmic between limits, with plain numbers where it spans less than two decades."""
+    """Set the limits of an axis, logarithmic where they are far apart; under two decades with plain numbers."""
     from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 
-    axis._set_axes_scale("log")  # type: ignore[attr-defined]
+    axes, upright = axis.axes, axis.axis_name == "y"  # type: ignore[attr-defined]
     wide = high > 100 * low
-    axis.set_view_interval(low / 1.1, high * 1.1, ignore=True)
+    if high > _LOGARITHMIC * low:
+        (axes.set_yscale if upright else axes.set_xscale)("log")
+    (axes.set_ylim if upright else axes.set_xlim)(low / 1.1, high * 1.1)
+    if high <= _LOGARITHMIC * low:
+        return
     axis.set_major_locator(LogLocator(subs=(1.0,) if wide else (1.0, 2.0, 5.0)))
     axis.set_major_formatter(LogFormatterSciNotation() if wide else "{x:g}")
     axis.set_minor_formatter(NullFormatter())

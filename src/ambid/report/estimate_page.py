@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from ambid.arrays import Array
 from ambid.estimation.estimate import Estimate
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.linear_model import model
+from ambid.report.drawing import single
 from ambid.report.estimate_text import (
     curve_rows,
     delay_lines,
@@ -19,7 +21,7 @@ from ambid.report.estimate_text import (
     seconds_of,
     validation_rows,
 )
-from ambid.report.figures import BearingEvidence, Evidence, figures
+from ambid.report.figures import BearingEvidence, Evidence
 from ambid.report.page import Page, Section, check_table
 from ambid.report.text import checks_of, other_warnings, parameter_rows
 
@@ -90,8 +92,8 @@ def estimate_page(evidence: Evidence | BearingEvidence) -> Page:
         Section(title="Checks", tables=[check_table(e.checks)]),
         *([] if e.validation is None else [_second(e.validation)]),
         *(
-            Section(title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=figure)
-            for name, figure in figures(evidence).items()
+            Section(title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=partial(single, block))
+            for name, block in evidence.drawings().items()
         ),
         Section(title="Rig", text=str(e.rig.get("text") or ""), folded=True),
     ]  # fmt: skip

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import cycle
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -18,6 +18,7 @@ from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.model import StateSpaceModel, pole_covariance
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
+from ambid.estimation.likelihood import prediction_error
 from ambid.estimation.linear import one_thread
 from ambid.physics.linear_model import model
 from ambid.report.drawing import (
@@ -25,11 +26,11 @@ from ambid.report.drawing import (
     CYCLE,
     MEASURED,
     NORMAL_95,
-    PREDICTED,
     WIDE,
     Block,
     Panel,
     head,
+    log_axis,
     panel,
     single,
     stacked,
@@ -51,6 +52,7 @@ if TYPE_CHECKING:
 
     from ambid.validation.second_result import Validation
 
+AHEAD = (10, 100)  # samples ahead for which predictions are drawn
 _LOWEST_HZ = 0.1
 _WIDEST = 1e9  # rad/s, standard deviation from which a pole counts as multiple: its derivative does not exist
 _LEVELS = 3  # currents or positions for which a curve is drawn
@@ -93,6 +95,16 @@ class Evidence:
             inputs=problem.u[problem.skip :],
             input_names=plant.inputs,
         )
+
+    def traces_ahead(self) -> Traces:
+        """Return what `traces` does, with predictions several samples ahead."""
+        run, traces = self.run, self.traces
+        assert run is not None
+        found = {}
+        for k in (k for k in AHEAD if k < traces.time_s.size // 2):
+            late = np.full((k - 1, len(traces.names)), np.nan)
+            found[k] = np.vstack([late, run.measured[k - 1 :] - prediction_error(run.fit, k)])
+        return replace(traces, ahead=found, second=True)
 
     def drawings(self) -> dict[str, Block]:
         """Return the blocks of the figure by name."""
@@ -166,19 +178,61 @@ def figures(evidence: Evidence | BearingEvidence, width: float = WIDE) -> dict[s
     return {name: single(block, width) for name, block in evidence.drawings().items()}
 
 
-def validation_figure(found: Validation, width: float = WIDE) -> Figure:
-    """Draw the one-step fit of each output on a further record."""
-    sizes = {
-        k: v["one_step"]["fit"] if isinstance(v["one_step"], dict) else v["one_step"] for k, v in found.fit.items()
-    }
+def validation_figure(found: Validation, beside: Sequence[Traces] = (), width: float = WIDE) -> Figure:
+    """Draw how a result does on a further record: its predictions one and more steps ahead, and their residuals.
 
-    def draw(axes: Axes) -> None:
-        axes.barh(list(sizes), [np.nan if x is None else x for x in sizes.values()], color=PREDICTED, height=0.5)
-        axes.set_xlabel("one-step fit, 1 is perfect")
-        axes.set_xlim(right=1.0)
+    `beside`: the record with its predictions; without it the sizes of the errors alone are drawn.
+    """
+    failed = [name for name, c in found.checks.items() if not c.passed]
+    blocks = [_sizes_ahead(found)]
+    if beside and beside[0].sd.ndim > 1:
+        blocks.append(records_panel(beside))
+    elif beside:
+        (traces,) = beside
+        blocks += [signals_panel(traces), residuals_panel(traces), whiteness_panel(traces, failed)]
+    return stacked(f"{found.record or 'record'} judged with {found.estimate or 'a result'}", blocks, width)
 
-    block = Block(columns=[[Panel(draw=draw, height=0.5 + 0.5 * len(sizes))]])
-    return stacked(f"{found.record or 'record'} judged with {found.estimate or 'a result'}", [block], width)
+
+def _sizes_ahead(found: Validation) -> Block:
+    """Parts of the outputs that predictions leave, and how they compare with what the model expects of itself."""
+    rows = [(o, what, left) for o, x in found.fit.items() for what, left in _left(x)]
+    ratios = {o: x["k_step_ratio"] for o, x in found.fit.items() if x.get("k_step_ratio")}
+
+    def left(axes: Axes) -> None:
+        names = list(found.fit)
+        at = range(len(rows), 0, -1)
+        colors = [CYCLE[names.index(o) % len(CYCLE)] for o, *_ in rows]
+        sizes = np.array([100 * max(x, 1e-6) for *_, x in rows])
+        axes.scatter(sizes, at, color=colors, s=28, zorder=3)
+        log_axis(axes.xaxis, sizes.min() / 2, max(100.0, sizes.max()))
+        axes.set_yticks(at, [f"{o}, {what}" for o, what, _ in rows])
+        axes.axvline(100, color=BOUND, linestyle="--", linewidth=1.0, label="as good as the mean")
+        axes.set_ylim(0.4, len(rows) + 0.6)
+        axes.set_xlabel("not explained [% of the output]")
+        head(axes, "errors of the predictions: smaller is better")
+
+    def growth(axes: Axes) -> None:
+        for (name, by_step), color in zip(ratios.items(), CYCLE, strict=False):
+            axes.plot([int(k) for k in by_step], list(by_step.values()), "o-", color=color, label=name)
+        axes.axhline(1.0, color=MEASURED, linewidth=0.8, linestyle="--", label="as the model expects")
+        axes.set_xscale("log")
+        axes.set_ylim(0.0, max(2.0, 1.1 * max(max(x.values()) for x in ratios.values())))
+        axes.set_xlabel("samples ahead")
+        axes.set_ylabel("error / expected error")
+        head(axes, "growth of the errors with the horizon")
+
+    height = 0.8 + 0.24 * len(rows)
+    columns = [[panel(left, height=height)], *([[panel(growth, height=height)]] if ratios else [])]
+    return Block(columns=columns, widths=(3, 2) if ratios else (), shared=False)
+
+
+def _left(sizes: Mapping[str, Any]) -> list[tuple[str, float]]:
+    """Return what was predicted, and which part 1 - fit of an output that leaves."""
+    fits = {"one step ahead": sizes["one_step"]}
+    fits |= {f"{k} steps ahead": x for k, x in (sizes.get("k_step") or {}).items() if k != "1"}
+    fits["simulated"] = sizes.get("simulation")
+    plain = {name: x["fit"] if isinstance(x, Mapping) else x for name, x in fits.items()}
+    return [(name, 1 - x) for name, x in plain.items() if x is not None and np.isfinite(x)]
 
 
 # --- a linear plant -------------------------------------------------------------------------------------------------
@@ -241,7 +295,8 @@ def measured_beside(evidence: Evidence) -> FrequencyResponse | None:
         return None
     own, all_of = (sum(power_spectrum(x, rate_hz).density for x in of.T) for of in (reference, u))
     at = power_spectrum(u[:, 0], rate_hz).frequency_hz
-    shares = sliding_window_view(np.pad(own / np.maximum(all_of, 1e-300), _LOBE, "edge"), 2 * _LOBE + 1)
+    share = (own / np.maximum(all_of, 1e-300))[_LOBE:]  # the first lines have lost the mean
+    shares = sliding_window_view(np.pad(share, (2 * _LOBE, _LOBE), "edge"), 2 * _LOBE + 1)
     known = np.interp(found.frequency_hz, at, shares.min(axis=-1)) > _OWN
     late = evidence.estimate.delay[plant.inputs[0]]
     turns = found.frequency_hz / rate_hz

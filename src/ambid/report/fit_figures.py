@@ -16,7 +16,7 @@ from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import TransferModel, pole_covariance, zero_covariance
-from ambid.blackbox.prediction import innovations_form, one_step, plant_form, simulation
+from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, innovations_form, one_step, plant_form, simulation
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
@@ -27,13 +27,13 @@ from ambid.report.drawing import (
     PREDICTED,
     WIDE,
     Block,
-    Panel,
     head,
     log_axis,
     panel,
     said_panel,
     stacked,
 )
+from ambid.report.figures import AHEAD
 from ambid.report.fit_text import is_weight, pole_lines, term_ratios
 from ambid.report.numbers import prefixed
 from ambid.report.response_panels import bode_panel, frequency_grid, poles_panel, roots
@@ -49,7 +49,7 @@ from ambid.report.signal_panels import (
 from ambid.report.text import coefficient_text
 from ambid.units import counted
 from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
-from ambid.validation.residuals import Correlation, correlations
+from ambid.validation.residuals import P_LEAST, Correlation, correlations
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -62,6 +62,7 @@ _ACROSS = 5  # correlations beside each other
 _MOST = 20
 _RECORDS = 6  # that are drawn
 _ROWS = 13  # of coefficients below each other
+_LEAST_P = 1e-12  # p-value that is drawn as the smallest
 _LEAD = 500  # samples in which derivatives that are recursions settle
 
 
@@ -96,23 +97,49 @@ def fit_overview(
     return stacked(_title(fit, records, second), blocks, width)
 
 
-def comparison_figure(found: Comparison, width: float = WIDE) -> Figure:
-    """Draw the fit of each structure on data that it has not seen, best first."""
+def comparison_figure(found: Comparison, held_out: IOData | None = None, width: float = WIDE) -> Figure:
+    """Draw the errors of each structure on data that it has not seen, best first, and its residual tests.
+
+    `held_out`: those data; then the best structure is drawn beside them.
+    """
     entries = [x for x in found.entries if x.fit is not None]
+    at = np.arange(len(entries))
 
-    def draw(axes: Axes) -> None:
-        at = np.arange(len(entries))
-        for values, label, color, shift in (
-            ([x.one_step for x in entries], "one step", PREDICTED, -0.2),
-            ([x.simulation for x in entries], "simulation", BAND, 0.2),
-        ):
-            axes.barh(at + shift, [np.nan if v is None else v for v in values], 0.38, color=color, label=label)
-        axes.set_yticks(at, [f"{x.structure}{' (failed checks)' if x.failed else ''}" for x in entries])
-        axes.invert_yaxis()
-        axes.set_xlabel(f"fit on the {found.judged_on}, 1 is perfect")
+    def named(axes: Axes) -> None:
+        axes.set_yticks(at, [f"{x.structure}, {x.fit.n_estimated} numbers" for x in entries if x.fit is not None])
+        axes.set_ylim(len(entries) - 0.5, -0.5)
 
-    block = Block(columns=[[Panel(draw=draw, height=0.9 + 0.5 * len(entries))]])
-    return stacked(f"{found.record.get('file') or 'record'}: structures compared", [block], width)
+    def unexplained(axes: Axes) -> None:
+        kinds = (
+            ([x.one_step for x in entries], "one step ahead", "o"),
+            ([x.simulation for x in entries], "simulated", "D"),
+        )
+        sizes = [[np.nan if v is None else 100 * max(1 - v, 1e-6) for v in values] for values, *_ in kinds]
+        for x, (_, label, mark) in zip(sizes, kinds, strict=True):
+            axes.plot(x, at, mark, color=PREDICTED if mark == "o" else BOUND, label=label)
+        log_axis(axes.xaxis, float(np.nanmin(sizes)) / 1.5, 1.5 * float(np.nanmax(sizes)))
+        named(axes)
+        axes.set_xlabel("not explained [% of the outputs]")
+        head(axes, f"errors on the {found.judged_on}: smaller is better")
+
+    def tests(axes: Axes) -> None:
+        for name, mark, color in (("residuals_white", "o", PREDICTED), ("residuals_uncorrelated", "D", BOUND)):
+            found_p = [x.fit.checks[name].p if x.fit is not None and name in x.fit.checks else None for x in entries]
+            p = [np.nan if v is None else max(v, _LEAST_P) for v in found_p]
+            axes.plot(p, at, mark, color=color, markerfacecolor="none", label=name.replace("_", " "))
+        axes.axvline(P_LEAST, color=MEASURED, linestyle="--", linewidth=1.0, label="fails to the left")
+        log_axis(axes.xaxis, _LEAST_P, 1.0)
+        named(axes)
+        axes.set_xlabel(f"p-value of the residual test (drawn from {_LEAST_P:g})")
+        head(axes, "residual tests on the fitted data")
+
+    height = 0.8 + 0.32 * len(entries)
+    blocks = [Block(columns=[[panel(unexplained, height=height)], [panel(tests, height=height)]], shared=False)]
+    if held_out is not None and entries and entries[0].fit is not None:
+        traces = traces_of(entries[0].fit, held_out, second=True)
+        blocks += [signals_panel(traces), residuals_panel(traces)]
+    name, best = found.record.get("file") or "record", entries[0].structure if entries else "none"
+    return stacked(f"{name}: structures compared, {best} predicts unseen data best", blocks, width)
 
 
 def _nonlinear_blocks(fit: NonlinearFit, records: Sequence[IOData], second: IOData | None) -> list[Block]:
@@ -165,9 +192,19 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
 
     Returns no simulation where it diverges, or without inputs.
     """
+    ahead: dict[int, Array] = {}
     if isinstance(fit, BlackBoxFit):
         first, predicted = 0, one_step(innovations_form(fit), data.u, data.y, fit.offsets)
         free = simulation(plant_form(fit), data.u, data.y, fit.offsets)
+        if second:
+            errors = errors_elsewhere(fit, data)
+            predicted, free = (
+                data.y - errors.one_step,
+                None if errors.simulation is None else data.y - errors.simulation,
+            )
+            for k in (k for k in AHEAD if k < data.n_samples // 2):
+                late = np.full((k - 1, data.n_outputs), np.nan)
+                ahead[k] = np.vstack([late, data.y[k - 1 :] - errors_ahead(errors, k)])
     else:
         found = run(fit, data)
         first, predicted = found.lag, data.y - found.one_step
@@ -181,6 +218,7 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
         measured=data.y[first:],
         predicted=predicted[first:],
         simulated=None if free is None else free[first:],
+        ahead=ahead,
         sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
         inputs=data.u[first:],
         input_names=data.inputs,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from importlib.resources import files
@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 from ambid.estimation.estimate import Check
 from ambid.estimation.result import Verdict
-from ambid.report.drawing import save
+from ambid.report.drawing import NARROW, WIDE, save
 from ambid.report.text import WORDS
 
 if TYPE_CHECKING:
@@ -35,17 +35,16 @@ class Section:
     paragraphs: Sequence[str] = ()
     tables: Sequence[Table] = ()
     text: str = ""  # as on a terminal
-    figure: Figure | None = None
+    figure: Callable[[float], Figure] | None = None  # draws it on a page of some width, inches
     note: str = ""  # behind tables and figure
     folded: bool = False
 
-    @property
-    def image(self) -> str:
-        """The figure as PNG in base 64; empty without one."""
+    def image(self, width: float) -> str:
+        """Return the figure as PNG in base 64, drawn for a page of some width in inches; empty without one."""
         if self.figure is None:
             return ""
         buffer = io.BytesIO()
-        save(self.figure, buffer, kind="png")
+        save(self.figure(width), buffer, kind="png")
         return base64.b64encode(buffer.getvalue()).decode()
 
 
@@ -79,5 +78,11 @@ def page_html(page: Page, verdict: Verdict, *, made: str = "") -> str:
     last += [("versions", ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]
     words, style = WORDS[verdict.word]
     return template.render(
-        page=page, words=words, style=style, reasons=verdict.reasons, provenance=[*page.provenance, *last]
+        page=page,
+        words=words,
+        style=style,
+        reasons=verdict.reasons,
+        provenance=[*page.provenance, *last],
+        wide=WIDE,
+        narrow=NARROW,
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -36,7 +37,7 @@ Pair = tuple[int, int]  # output, input
 MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
 _CHI2_95 = 5.991464547107979  # of two degrees of freedom
 _NEAR = 0.06  # of the span of all poles, from which two of them lie too close
-_MARKS = 70  # frequencies at which a measured response stands beside a model
+_MARKS = 18  # frequencies of each decade at which a measured response stands beside a model
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -150,7 +151,11 @@ def marks(axes: Axes, frf: FrequencyResponse, pair: Pair, guide: ModelResponse |
     if not known.size:
         return
     f = frf.frequency_hz[known]
-    at = known[np.unique(np.searchsorted(f, np.geomspace(f[0], f[-1], _MARKS)).clip(max=f.size - 1))]
+    at = known[
+        np.unique(
+            np.searchsorted(f, np.geomspace(f[0], f[-1], 2 + int(_MARKS * np.log10(f[-1] / f[0])))).clip(max=f.size - 1)
+        )
+    ]
     x, G, radius = frf.frequency_hz[at], frf.G[at, *pair], radius[at]
     size, spread = np.abs(G), [np.minimum(radius, 0.999 * np.abs(G)), radius]
     if guide is not None:
@@ -253,17 +258,19 @@ def poles_panel(
         head(axes, f"close view of {len(crowd)} of them")
 
     def words(axes: Axes) -> None:
-        longest = max(map(len, text.splitlines()), default=1)
-        room: float = 3.5 if crowd or axes.figure.figure.get_figwidth() <= NARROW else 4.9
+        room, lines = 4.9, text.splitlines()
+        if crowd or axes.figure.figure.get_figwidth() <= NARROW:
+            room, lines = 3.5, [x for line in lines for x in textwrap.wrap(line, 58, subsequent_indent="    ")]
+        longest = max(map(len, lines), default=1)
         axes.axis("off")
         axes.grid(False)
         axes.text(
-            0.0, 0.97, text, fontsize=min(8.0, room * 72 / (0.61 * longest)), va="top", family="monospace",
+            0.0, 0.97, "\n".join(lines), fontsize=min(8.0, room * 72 / (0.61 * longest)), va="top", family="monospace",
             transform=axes.transAxes, clip_on=False,
         )  # fmt: skip
 
     crowd = _crowd([p.value for p in (*poles, *zeros)])
-    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=1.0 + 0.14 * len(text.splitlines()))]]
+    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=0.8 + 0.2 * len(text.splitlines()))]]
     if crowd:
         columns.insert(1, [Panel(draw=close, height=3.0)])
     return Block(columns=columns, widths=(4, 3, 4) if crowd else (1, 1), shared=False)

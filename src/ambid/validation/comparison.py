@@ -119,6 +119,7 @@ def compare(
         raise EstimationError(f"none of the structures could be fitted; {found[0].structure}: {found[0].refusal}")
     ranked = tuple(sorted(found, key=lambda x: -np.inf if x.one_step is None else x.one_step, reverse=True))
     return Comparison(
+        used=other,
         entries=ranked,
         inputs=data.inputs,
         outputs=data.outputs,
