@@ -205,7 +205,18 @@ def test_a_report_is_written(session):
     assert "k_i" in (session.folder / "r.html").read_text()
 
 
-FUNCTIONS = ("identify", "identify_nonlinear", "fit", "frf", "compare", "simulate", "track", "validate", "load")
+FUNCTIONS = (
+    "identify",
+    "identify_nonlinear",
+    "fit",
+    "frf",
+    "compare",
+    "simulate",
+    "track",
+    "validate",
+    "load",
+    "acquire",
+)
 
 
 @pytest.mark.parametrize("name", FUNCTIONS)
@@ -254,6 +265,20 @@ def test_a_calibration_is_applied_once(session):
     lacks = replace(once, channels=tuple(c for c in once.channels if c.name != "position"))
     with pytest.raises(ambid.AmbidError, match=r"went through a rig already.*'position' is not there"):
         ambid.identify(lacks, session.rig)
+
+
+def test_a_record_is_acquired_and_never_written_over(tmp_path):
+    rig, told = tmp_path / "bench.toml", list[str]()
+    rig.write_text(preset_text(preset("prototype")))
+    played = {"seconds": 1.0, "excitation": "prbs", "amplitude": 0.5, "on_note": told.append}
+    done = ambid.acquire("simulated", rig, tmp_path / "run.h5", **played)
+    assert done.record["excitation"].max() == pytest.approx(0.5, rel=0.05)
+    assert done.record.n_samples == 2000
+    assert any("made up" in line for line in told)
+    with pytest.raises(ambid.AmbidError, match="exists already"):
+        ambid.acquire("simulated", rig, tmp_path / "run.h5", **played)
+    with pytest.raises(ambid.AmbidError, match="nothing can be excited"):
+        ambid.acquire("simulated", rig, tmp_path / "other.h5", **played, mode="sample")
 
 
 def test_what_a_simulation_meets_is_said():

@@ -17,7 +17,7 @@ def estimate(record):
 
 
 def test_what_the_commands_do_stands_in_the_package():
-    for name in ("identify", "fit", "frf", "compare", "simulate", "track", "load"):
+    for name in ("identify", "fit", "frf", "compare", "simulate", "track", "load", "validate", "acquire"):
         assert callable(getattr(ambid, name)), name
         assert name in ambid.__all__
         assert ">>> " in getattr(ambid, name).__doc__ or "Parameters" in getattr(ambid, name).__doc__
