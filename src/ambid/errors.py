@@ -52,6 +52,12 @@ def nearest(word: str, known: Sequence[str]) -> str:
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
+def counted(n: float | str, noun: str) -> str:
+    """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``; a number may be text already."""
+    text = f"{n:.3g}" if isinstance(n, float) else str(n)
+    return f"{text} {noun}{'' if text == '1' else 's'}"
+
+
 def refuse_given(given: Mapping[str, object], refusal: str) -> None:
     """Refuse the first option that was given although it has no use; its name replaces ``{}`` in the refusal.
 

@@ -156,12 +156,6 @@ def known_units() -> tuple[str, ...]:
     return (*_SUGGESTED, *_KNOWN_COMPOUNDS)
 
 
-def counted(n: float | str, noun: str) -> str:
-    """Return a number of things, as in ``1 sample``, ``2 samples``, ``3.25 samples``; a number may be text already."""
-    text = f"{n:.3g}" if isinstance(n, float) else str(n)
-    return f"{text} {noun}{'' if text == '1' else 's'}"
-
-
 def _plain(text: str) -> str:
     """Write µ, Ω, ², · in plain letters and single spaces."""
     for fancy, letters in (("µ", "u"), ("μ", "u"), ("Ω", "ohm"), ("Ω", "ohm"), ("²", "^2"), ("·", " "), ("*", " ")):
@@ -174,7 +168,7 @@ def _factor(symbol: str, text: str) -> tuple[float, _Powers, int]:
     base, _, power = symbol.partition("^")
     if base in _ATOMS and (not power or re.fullmatch(r"-?[1-9]", power)):
         return (*_ATOMS[base], int(power or 1))
-    raise UnitError(f"unit {text!r} is not known; the nearest known: {nearest_unit(text)}. Write one of these")
+    raise UnitError(f"unit {text!r} is unknown; nearest: {nearest_unit(text)}. Write one of these")
 
 
 def nearest_unit(text: str) -> str:

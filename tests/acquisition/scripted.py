@@ -57,7 +57,7 @@ class ScriptedDevice:
             return self.waiting.pop(0) if self.waiting else None
         if self.pulled_at is not None and self.block >= self.pulled_at:
             self.pulled = True
-            raise DeviceError("script: the line is lost. Look at the cable")
+            raise DeviceError("script: the line is lost. Check the cable")
         if self.silent_from is not None and self.block >= self.silent_from:
             return None
         if self.block >= self.blocks:

@@ -90,8 +90,8 @@ def test_a_bench_that_moves_by_itself_is_not_driven_ever_less():
     look, sizes = moving(lambda size: 5e-4 + 1e-4 * size)  # half the way to the trip without any excitation
     size = found(look)
     assert len(sizes) == 2
-    assert "uses 51 % of the room of position, 36 % are allowed" in size.reasons[0]
-    assert "the bench moves by itself; see to noise and gains" in size.reasons[0]
+    assert "moves position through 51 % of its available range; 36 % are allowed" in size.reasons[0]
+    assert "the bench moves by itself; check noise and gains" in size.reasons[0]
 
 
 def test_trials_that_never_fit_end_with_a_reason():
@@ -125,7 +125,8 @@ def test_a_given_size_is_only_tried():
     assert sizes == [2.0]
     assert found(look, given=7.0).reasons == ()  # more than its part: whoever gives a size has decided that
     assert (
-        "uses 95 % of the room of position, 85 % are allowed: give a smaller one" in found(look, given=9.5).reasons[0]
+        "moves position through 95 % of its available range; 85 % are allowed: give a smaller one"
+        in found(look, given=9.5).reasons[0]
     )
 
 
@@ -175,5 +176,8 @@ def test_a_bench_without_a_loop_is_driven_by_most_of_its_voltage(text):
 
 def test_a_bench_that_does_not_hover_has_no_amplitude():
     rig = prototype(("kd = 92.57", "kd = 0.0"))
-    with Spoiled(rig) as device, pytest.raises(DeviceError, match=r"no amplitude was found: .*out_of_gap.*--amplitude"):
+    with (
+        Spoiled(rig) as device,
+        pytest.raises(DeviceError, match=r"no suitable amplitude was found: .*out_of_gap.*--amplitude"),
+    ):
         fitting_amplitude(device, rig, TRIAL)

@@ -28,7 +28,7 @@ def recorder(tmp_path):
 
 def test_a_record_that_came_into_being_meanwhile_is_kept_and_so_are_the_samples(recorder):
     recorder.path.write_text("mine", encoding="utf-8")
-    with pytest.raises(DeviceError, match=r"exists already.*What was recorded is in .*a\.h5\.journal: ambid recover"):
+    with pytest.raises(DeviceError, match=r"already exists.*What was recorded is in .*a\.h5\.journal: ambid recover"):
         recorder.close()
     assert recorder.path.read_text(encoding="utf-8") == "mine"
     with JournalReader.open(recorder.journal) as journal:

@@ -53,9 +53,9 @@ def test_full_scales_are_a_quarter_wider_than_the_limits():
     s = controller_settings(rig)
     assert (s.duty_off, s.duty_bias, s.setpoint) == (0, 400, 512)
     assert default_daq_notes(bench(text=BARE)) == (
-        "voltage: 0 to 800 counts made up as 0 to 12 V",
-        "position: 0 to 1023 counts made up as 0.00075 to 0.01325 m",
-        "current: 0 to 1023 counts made up as -0.25 to 2.25 A",
+        "voltage: 0 to 800 counts assumed to be 0 to 12 V",
+        "position: 0 to 1023 counts assumed to be 0.00075 to 0.01325 m",
+        "current: 0 to 1023 counts assumed to be -0.25 to 2.25 A",
     )
 
 
@@ -78,7 +78,7 @@ def test_every_preset_gets_settings(name):
 
 def test_a_loop_that_is_too_steep_for_ten_bits_is_refused():
     """Of 22 mm a count is 22 um: the ball's derivative would turn one count into a fifth of the pulse width."""
-    with pytest.raises(RigError, match=r"loop\.kd is -6\.332e\+05 steps of the controller, which takes 524288 at most"):
+    with pytest.raises(RigError, match=r"loop\.kd is -6\.332e\+05 steps of the controller, whose limit is 524288:"):
         controller_settings(with_default_daq(of_preset("levitated-ball")))
 
 

@@ -164,15 +164,15 @@ def test_steps_fill_the_record_four_times():
         ("sine", {}, "excitation 'sine' is unknown; a controller plays steps, prbs, multisine, schroeder"),
         ("prbs", {"amplitude_v": 0.0}, "excitation amplitude 0.0 V; it must be a positive number"),
         ("prbs", {"band": (10.0, 1500.0)}, "it must lie between 0 and 1000 Hz, low end first"),
-        ("prbs", {"seconds": 0.0}, "has no two ticks"),
+        ("prbs", {"seconds": 0.0}, "has fewer than two ticks"),
         ("steps", {"band": (1.0, 2.0)}, "excitation 'steps' has no band"),
         (
             "prbs",
             {"band": (0.01, 1000.0)},
-            "needs a register of 18 bits; the controller has 15. With that top it begins at 0.061 Hz",
+            "needs a register of 18 bits; the controller has 15. For the same upper end it can start at 0.061 Hz",
         ),
         ("prbs", {"band": (0.1, 200.0), "seconds": 10.0}, "has a period of 16.38 s, longer than the record of 10 s"),
-        ("multisine", {"band": (0.5, 400.0)}, "from 0.5 Hz it goes to 200 Hz, and to 400 Hz it begins at 1 Hz"),
+        ("multisine", {"band": (0.5, 400.0)}, "from 0.5 Hz it reaches 200 Hz, and for 400 Hz it must start at 1 Hz"),
         (
             "multisine",
             {"band": (4.0, 400.0), "seconds": 0.5},
@@ -198,5 +198,5 @@ def test_volts_become_counts_that_leave_room():
     p = made("prbs")
     assert amplitude_counts(p, rig, 400, (20, 780)) == 67
     for volts in (0.01, 11.5):
-        with pytest.raises(DeviceError, match=r"there is room for 1 to 380, 0\.03 to 11\.4 V"):
+        with pytest.raises(DeviceError, match=r"1 to 380 are possible, 0\.03 to 11\.4 V"):
             amplitude_counts(made("prbs", amplitude_v=volts), rig, 400, (20, 780))

@@ -63,7 +63,7 @@ def test_an_excitation_of_many_seconds_is_not_waited_for_longer_than_one():
 
 def test_an_excitation_that_never_shows_is_an_error():
     device = ScriptedDevice(blocks=2000, excited_late=10**9)
-    with pytest.raises(DeviceError, match="excitation was ordered and does not show in 10 s"):
+    with pytest.raises(DeviceError, match="excitation was started but is not visible in 10 s"):
         ran(device, program=SQUARE)
     assert device.state == "idle"
 
@@ -162,7 +162,7 @@ def test_a_device_that_has_no_more_ends_the_run():
 def test_silence_is_an_error_and_the_device_is_stopped():
     device = ScriptedDevice(silent_from=2)
     heard = Listener()
-    with pytest.raises(DeviceError, match=r"script: no sample came for 5 s.*1000 in a second.*cable"):
+    with pytest.raises(DeviceError, match=r"script: no sample came for 5 s.*1000 per second.*cable"):
         ran(device, taps=[heard], seconds=1.0)
     assert heard.numbers == list(range(20))
     assert device.told[-1] == "stop"
@@ -224,4 +224,4 @@ def test_each_cause_of_a_fault_is_said_with_a_remedy(cause):
     text = fault_words(DeviceEvent(kind="fault", sample=7, what=cause))
     assert text.startswith(f"{cause}, ")
     assert " at sample 7. " in text
-    assert not text.endswith("See to the cause")
+    assert not text.endswith("Remove the cause")

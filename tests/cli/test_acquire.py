@@ -96,7 +96,7 @@ def test_a_slow_excitation_gets_a_trial_as_long_as_it_needs(acquire):
 def test_a_rig_without_calibrations_gives_si_columns_that_are_identified(acquire, ambid, rig):
     done = acquire("--seconds", "3", "--excitation", "prbs", "--settle", "0.5", rig=f"{rig}.toml")
     assert done.code == 0
-    assert "made up as" in done.err
+    assert "assumed to be" in done.err
     units = {c.name: c.unit for c in read_record("o.h5").channels}
     assert units.items() >= {"voltage": "V", "current": "A"}.items()
     assert units.get("position", "m") == "m"
@@ -178,11 +178,11 @@ def test_a_replay_that_ends_early_says_so(acquire):
         (("--band", "20:1", "--excitation", "prbs"), "--band is '20:1'"),
         (("--excitation", "multisin"), "'multisin'"),
         (("--excitation", "chirp"), "multisine"),
-        (("--excitation", "multisine", "--mode", "sample"), "--mode sample has its output off"),
+        (("--excitation", "multisine", "--mode", "sample"), "--mode sample keeps the output off"),
         (("--excitation", "multisine", "--band", "2:66", "--seconds", "1"), "needs 2 s"),
         (("--json", "t.jsonl"), "--json writes a track"),
         (("--track", "none.json"), "none.json does not exist"),
-        (("--track", "auto", "--seconds", "3"), "tracking wants 5 s to begin with, and the run has 3 s"),
+        (("--track", "auto", "--seconds", "3"), "tracking needs 5 s for its start, and the run lasts 3 s"),
         (("--mode", "hover"), "hover"),
         (("--bench", "nothing"), "nothing"),
         (("--sekonds", "3"), "--sekonds"),
@@ -205,9 +205,9 @@ def test_wrong_words_are_refused_in_one_line(acquire, place, words, said):
         ({"port": "/dev/ttyNONE"}, "/dev/ttyNONE does not exist"),
         ({"port": "replay:none.h5"}, "none.h5 does not exist"),
         ({"rig": "none.toml"}, "none.toml"),
-        ({"record": "o.txt"}, "has to end in .h5"),
+        ({"record": "o.txt"}, "must end in .h5"),
         ({"record": "nowhere/o.h5"}, "there is no folder nowhere"),
-        ({"record": "rig.toml"}, "has to end in .h5"),
+        ({"record": "rig.toml"}, "must end in .h5"),
     ],
 )
 def test_what_is_not_there_is_refused_in_one_line(acquire, options, said):
@@ -223,7 +223,7 @@ def test_a_record_that_exists_is_kept_unless_forced(acquire, place, monkeypatch)
     monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: opened.append(1))
     done = acquire("--seconds", "1")
     assert (done.code, opened) == (2, [])
-    assert "o.h5 exists already" in done.err
+    assert "o.h5 already exists" in done.err
     assert "--force" in done.err
     assert (place / "o.h5").read_text() == "precious"
     monkeypatch.undo()
@@ -236,7 +236,7 @@ def test_an_excitation_that_a_record_cannot_play(acquire):
     acquire("--seconds", "1")
     done = acquire("--excitation", "prbs", port="replay:o.h5", record="r.h5")
     assert done.code == 2
-    assert "cannot be played to a record" in done.err
+    assert "cannot act on a replayed record" in done.err
 
 
 # Ended early.
@@ -411,7 +411,7 @@ def test_a_tracker_that_fails_leaves_the_whole_record(acquire, place, monkeypatc
     monkeypatch.setattr("ambid.job.track_live.start_of", refuse)
     done = acquire("--seconds", "6", *PLAYED, "--track", "auto")
     assert done.code == 2
-    assert "tracking ended, the recording goes on: nothing can be identified" in done.err
+    assert "tracking ended, recording continues: nothing can be identified" in done.err
     assert done.err.splitlines()[-1].endswith("o.h5 holds all 12000 samples")
     assert samples() == 12_000
 

@@ -82,14 +82,14 @@ def test_a_link_to_nowhere_is_refused_before_anything_is_recorded(ambid, folder)
     os.symlink("nowhere/x.h5", "to_no_folder.h5")
     os.symlink("x.h5", "to_no_file.h5")
     refused(ambid(*SHORT, "-o", "to_no_folder.h5"), "there is no folder")
-    refused(ambid(*SHORT, "-o", "to_no_file.h5"), "exists already")
+    refused(ambid(*SHORT, "-o", "to_no_file.h5"), "already exists")
 
 
 def test_a_record_is_not_replayed_onto_itself(ambid, folder):
     assert ambid(*SHORT).code == 0
     before = (folder / "a.h5").read_bytes()
     words = ("acquire", "--port", "replay:a.h5", "--rig", "p.toml", "-o", "./a.h5", "--force", "--seconds", "0.02")
-    refused(ambid(*words), "is also read; writing would destroy it")
+    refused(ambid(*words), "is also an input, which would be overwritten")
     assert (folder / "a.h5").read_bytes() == before
 
 
@@ -121,11 +121,11 @@ def test_a_record_in_other_units_than_the_rigs_is_not_replayed(ambid, folder):
 
 def test_a_record_of_another_rate_than_the_rigs_is_told(ambid, folder):
     words = replayed(folder)
-    assert "taken at" not in ambid(*words).err
+    assert "recorded at" not in ambid(*words).err
     (folder / "p.toml").write_text(PROTOTYPE.replace("rate_hz = 2000.0", "rate_hz = 1000.0"), encoding="utf-8")
     done = ambid(*words, "--force")
     assert done.code == 0
-    assert "r.csv was taken at 2000 Hz, which it keeps; the rig says 1000 Hz" in done.err
+    assert "r.csv was recorded at 2000 Hz, which is kept; the rig says 1000 Hz" in done.err
 
 
 def test_a_journal_that_is_kept_is_told_and_a_replay_is_not_called_a_device(ambid, folder):
@@ -136,7 +136,7 @@ def test_a_journal_that_is_kept_is_told_and_a_replay_is_not_called_a_device(ambi
     assert "note: a.h5.journal is kept: it holds 40 samples" in done.err
     assert "ambid recover a.h5.journal" in done.err
     assert "a.h5: 60 samples" in done.out
-    assert "the record that is replayed runs back" in " ".join(done.out.split())
+    assert "the replayed record runs backwards" in " ".join(done.out.split())
     assert "Restart" not in done.out
 
 
@@ -183,7 +183,7 @@ def test_a_port_that_was_mistyped_is_recognised(ambid, folder):
         ("third = '" + "z" * 1000 + "'", ("daq.third", "200")),
         ("baud = 99999999999999999999", ("daq.baud", "300 to 12000000")),
         ("duty = [0]", ("daq.duty is [0]", "[low, high]")),
-        ("duty_off = 410", ("daq.duty_off is 410", "has to be 0 V within 2% of 12 V")),
+        ("duty_off = 410", ("daq.duty_off is 410", "must be 0 V within 2% of 12 V")),
     ],
 )
 def test_strange_entries_of_daq_are_refused(ambid, folder, entry, parts):
@@ -232,7 +232,7 @@ def test_a_gain_too_small_for_any_count_is_refused(ambid, folder, role):
     lines = [line if "gain " not in line else "gain = 1e-300" for line in after.split("\n\n")[0].splitlines()]
     rest = after[len(after.split("\n\n")[0]) :]
     (folder / "p.toml").write_text(f"{before}[channels.{role}]\n" + "\n".join(lines) + rest, encoding="utf-8")
-    refused(ambid(*SHORT), f"channels.{role}", "each count has to be another value")
+    refused(ambid(*SHORT), f"channels.{role}", "each count needs a value of its own")
 
 
 @pytest.mark.parametrize("says", [None, "hello", "[1]", "{}"])
@@ -250,8 +250,8 @@ def test_a_program_that_is_no_emulated_bench_is_refused(ambid, folder, monkeypat
 @pytest.mark.parametrize(
     ("sound", "changed", "parts"),
     [
-        ("[-0.9e-3, 0.9e-3]", "[-1e-9, 1e-9]", ("rig p.toml", "has no two counts in it", "Widen daq.trip.position")),
-        ("lift_ms = 300", "lift_ms = 0", ("out_of_gap", "daq.lift_ms = 0 was over: raise it")),
+        ("[-0.9e-3, 0.9e-3]", "[-1e-9, 1e-9]", ("rig p.toml", "spans less than two counts", "Widen daq.trip.position")),
+        ("lift_ms = 300", "lift_ms = 0", ("out_of_gap", "daq.lift_ms = 0: raise it")),
         ("rate_hz = 2000.0", "rate_hz = 2001.0", ("rig p.toml: daq.rate_hz is 2001 Hz",)),
     ],
 )
@@ -276,7 +276,7 @@ def test_an_amplitude_is_told_in_few_digits(ambid, folder, volts):
 
 @pytest.mark.skipif(not os.path.exists("/dev/null"), reason="no /dev/null here")
 def test_only_what_may_go_to_standard_output_is_advised_to(ambid, folder):
-    refused(ambid(*SHORT, "-o", "/dev/null"), "is a device or a pipe; a file is wanted. Name one")
+    refused(ambid(*SHORT, "-o", "/dev/null"), "is a device or a pipe; it must be a file. Name one")
 
 
 def test_a_replay_of_nothing_is_refused(ambid, folder):

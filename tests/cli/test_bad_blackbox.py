@@ -52,7 +52,7 @@ def refused(found, folder, *words):
         (("--validate", "units.csv"), "'u' is in A in the second record, in V in the first"),
         (("--validate", "slow.csv"), "the second record is sampled at 500 Hz, the first at 1000 Hz"),
         (("--validate", "still.csv"), "'y' is constant in the second record"),
-        (("--validate-from", "0.1"), "none is given. Give --validate"),
+        (("--validate-from", "0.1"), "need a second record. Give --validate"),
         (("--criterion", "bicc"), "Did you mean 'bic'?"),
         (("--criterion", "aic"), "orders are given"),
         (("--input", "u"), "named twice"),
@@ -71,7 +71,7 @@ def test_another_scale_of_the_same_unit_is_the_same_channel(bench, ambid):
 @pytest.mark.parametrize("structure", ["arx", "n4sid", "pbsid", "rfir", "srivc", "weakform"])
 @pytest.mark.parametrize(
     ("record", "said"),
-    [("tiny.csv", "'y' moves by only 2"), ("huge.csv", "'u' reaches 3"), ("twins.csv", "'u' and 'v'")],
+    [("tiny.csv", "'y' varies by only 2"), ("huge.csv", "'u' reaches 3"), ("twins.csv", "'u' and 'v'")],
 )
 def test_records_that_cannot_be_computed_with(bench, ambid, structure, record, said):
     more = ("--input", "v") if record == "twins.csv" else ()

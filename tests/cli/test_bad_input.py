@@ -85,7 +85,7 @@ def gap(values):
 # Damages of the text of the record: what the one line has to say.
 RECORDS = {
     "missing unit": (header("current [mA]", "current"), r"column 'current' has no unit.*current \[unit\]"),
-    "wrong unit": (header("current [mA]", "current [mV]"), r"'current' is in \[mV\]; the rig wants a current in \[A\]"),
+    "wrong unit": (header("current [mA]", "current [mV]"), r"'current' is in \[mV\]; the rig needs a current in \[A\]"),
     "unknown unit": (header("current [mA]", "current [Amps]"), r"'current' is in \[Amps\], an unknown unit"),
     "position in volt": (header("position [um]", "position [V]"), r"'position' is in \[V\].*gain or table"),
     "swapped headers": (
@@ -144,7 +144,7 @@ def truncated_gzip(text):
 # Damages of the file itself: its name, its bytes, what is said.
 FILES = {
     "truncated gzip": ("record.csv.gz", truncated_gzip, r"truncated gzip"),
-    "no gzip": ("record.csv.gz", str.encode, r"not a sound gzip"),
+    "no gzip": ("record.csv.gz", str.encode, r"not a valid gzip"),
     "gzip without its name": ("record.csv", lambda t: gzip.compress(t.encode()), r"gzipped although"),
     "empty gzip": ("record.csv.gz", lambda t: gzip.compress(b""), r"empty inside"),
     "Latin-1": ("record.csv", lambda t: t.replace("um", "µm").encode("latin-1"), r"row 2: byte 0xb5 is not UTF-8"),
@@ -173,7 +173,7 @@ RIGS = {
     "missing channel": ('[channels.current]\ncolumn = "current"', "", r"\[channels\.current\] is missing"),
     "column twice": ('column = "position"', 'column = "current"', r"column 'current' is both"),
     "column that is not there": ('column = "position"', 'column = "x_upper"', r"no column 'x_upper'"),
-    "unknown model": ('"one-axis"', '"two-axis"', r"no model 'two-axis'.*one-axis"),
+    "unknown model": ('"one-axis"', '"two-axis"', r"model 'two-axis' is unknown.*one-axis"),
     "unknown parameter": ("k_x =", "kx =", r"unknown parameter 'kx'.*'k_x'"),
     "negative mass": (M, 'm = { value = -4.0, unit = "kg" }', r"parameters\.m.*-4\.0 kg; it must be positive"),
     "prior without sd": (M, 'm = { value = 4.0, unit = "kg", role = "prior" }', r"parameters\.m is a prior with no sd"),
@@ -184,7 +184,7 @@ RIGS = {
     "fixed without value": (M, 'm = { unit = "kg", role = "fixed" }', r"parameters\.m is fixed but has no value"),
     "value without unit": (M, "m = { value = 4.0 }", r"parameters\.m has a value but no unit"),
     "unit of another kind": (M, 'm = { value = 4.0, unit = "N" }', r"parameters\.m.*\[N\].*\[kg\]"),
-    "unknown unit of a parameter": (M, 'm = { value = 4.0, unit = "stone" }', r"'stone' is not known"),
+    "unknown unit of a parameter": (M, 'm = { value = 4.0, unit = "stone" }', r"'stone' is unknown"),
     "number in quotes": (M, 'm = { value = "4.0", unit = "kg" }', r"value is '4\.0'; it must be a number"),
     "NaN in the rig": (M, 'm = { value = nan, unit = "kg" }', r"parameters\.m\.value is nan; it must be finite"),
     "infinity in the rig": (M, 'm = { value = inf, unit = "kg" }', r"parameters\.m\.value is inf; it must be finite"),

@@ -52,12 +52,12 @@ OUTPUTS = {
     "no folder": (["--json", "no/found.json"], "there is no folder no"),
     "a folder": (["--json", "."], "is a folder"),
     "in a file": (["--json", "rig.toml/found.json"], "there is no folder rig.toml"),
-    "the record": (["--json", "record.csv"], "is also read"),
-    "the rig by another path": (["--json", "../{name}/rig.toml"], "is also read"),
-    "the second record": (["--json", "second.csv", "--validate", "second.csv"], "is also read"),
+    "the record": (["--json", "record.csv"], "is also an input"),
+    "the rig by another path": (["--json", "../{name}/rig.toml"], "is also an input"),
+    "the second record": (["--json", "second.csv", "--validate", "second.csv"], "is also an input"),
     "twice": (["--plot", "a.png", "--report", "a.html", "--json", "./a.png"], "two options"),
-    "no picture": (["--plot", "a.jpeg"], "has to end in .png or .svg or .pdf"),
-    "no page": (["--report", "a.pdf"], "has to end in .html"),
+    "no picture": (["--plot", "a.jpeg"], "must end in .png or .svg or .pdf"),
+    "no page": (["--report", "a.pdf"], "must end in .html"),
 }
 
 

@@ -43,7 +43,7 @@ def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
     done = ambid(*VERBS[verb], "measured.csv")
     assert done.code == 2, done.out
     assert len(done.err.splitlines()) == 1
-    assert "measured.csv exists already" in done.err
+    assert "measured.csv already exists" in done.err
     assert target.read_text() == MEASURED
 
 

@@ -79,14 +79,14 @@ def test_orders_are_another_name_for_settings(at, ambid) -> None:
         (("--structure", "narmax", "--at-rest"), "--at-rest is for linear structures"),
         (("--structure", "narmax", "--criterion", "aic"), "--criterion is for linear"),
         (("--structure", "narmax", "--settings", "degree"), "not NAME=VALUE"),
-        (("--structure", "narmax", "--settings", "ny=1,ny=2"), "ny stands twice"),
+        (("--structure", "narmax", "--settings", "ny=1,ny=2"), "ny is given twice"),
         (("--structure", "narmax", "--settings", "degree=high"), "degree"),
         (("--structure", "narmax", "--settings", "dgree=2"), "Did you mean 'degree'"),
         (("--structure", "arx", "--seed", "1"), "--seed is for nonlinear structures"),
         (("--structure", "arx", "--settings", "na=1"), "--settings is for nonlinear structures"),
         (("--structure", "narmaxx"), "Did you mean 'narmax'"),
         (("r1.csv", "--structure", "arx"), "takes one record"),
-        (("--structure", "narmax", "--plot", "fit.txt"), "has to end in"),
+        (("--structure", "narmax", "--plot", "fit.txt"), "must end in"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(at, ambid, words, said) -> None:
@@ -163,7 +163,7 @@ def test_settings_as_they_are_written() -> None:
 def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     words = ("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0")
     for more, said in (
-        (("./r0.csv",), "record r0.csv is given twice; it would count twice. Leave one out"),
+        (("./r0.csv",), "record r0.csv is given twice and would count twice. Omit one"),
         (("--validate", "r0.csv"), "--validate r0.csv is fitted to as well"),
         (("--validate", "r0.csv", "--to", "3", "--validate-from", "2"), "--validate r0.csv is fitted to as well"),
     ):

@@ -163,7 +163,7 @@ REFUSED = {
     "a part outside": ((*SIGNALS, *REFERENCE, "--from", "100"), "100"),
     "too high an order": ((*SIGNALS, *REFERENCE, "--band", "5:20", "--orders", "nf=12"), "Lower the orders"),
     "a figure of no kind": ((*SIGNALS, *REFERENCE, "--plot", "a.txt"), "--plot"),
-    "the record as figure": ((*SIGNALS, *REFERENCE, "--json", "loop.csv"), "also read"),
+    "the record as figure": ((*SIGNALS, *REFERENCE, "--json", "loop.csv"), "is also an input"),
 }
 
 

@@ -101,9 +101,9 @@ def test_the_rig_says_what_is_known_and_the_options_change_it(at, ambid) -> None
         (("r1.csv", "--nonlinear", "--validate", "fast.csv"), "fast.csv, to judge on, is sampled at 4000 Hz"),
         (("r1.csv", "--nonlinear", "--to", "0.02"), "has 40 samples"),
         (("r1.csv", "none.csv", "--nonlinear"), "none.csv does not exist"),
-        (("r1.csv", "--nonlinear", "--rig", "coil.toml"), "a nonlinear bearing wants 'one-axis'"),
+        (("r1.csv", "--nonlinear", "--rig", "coil.toml"), "a nonlinear bearing needs 'one-axis'"),
         (("r1.csv", "--nonlinear", "--rig", "wrong.toml"), "unknown parameter 'L_leek'"),
-        (("r1.csv", "--nonlinear", "--json", "r1.csv"), "is also read"),
+        (("r1.csv", "--nonlinear", "--json", "r1.csv"), "is also an input"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line_and_nothing_is_written(at, ambid, words, said) -> None:
@@ -164,7 +164,7 @@ def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     copy.write_bytes(Path("r1.csv").read_bytes())
     words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear")
     for more, said in (
-        ((copy,), "r1.csv and copy.csv hold the same samples; they would count twice. Leave one out"),
+        ((copy,), "r1.csv and copy.csv hold the same samples and would count twice. Omit one"),
         (("--held", copy), "r1.csv and copy.csv hold the same samples"),
         (("--validate", copy), "copy.csv, to judge on, holds samples that the estimate is fitted to"),
         (("--off-below", "1e300"), "every voltage is at or below off_below"),

@@ -20,11 +20,11 @@ def test_the_prototypes_rig_is_written_and_its_controller_takes_it(bench, ambid)
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ((), "neither a record nor --preset given"),
+        ((), "neither a record nor --preset was given"),
         (("record.csv", "--preset", "prototype"), "both a record and --preset were given"),
         (
             ("--preset", "prototyp"),
-            "--preset 'prototyp' is no bench; there are thesis, unstable-bearing,",
+            "--preset 'prototyp' is unknown; known: thesis, unstable-bearing,",
         ),
         (("--preset", "prototyp"), "Did you mean 'prototype'?"),
         (("--preset", "prototype", "--rate", "100"), "--rate and --gaps are for reading a record"),

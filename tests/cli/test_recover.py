@@ -68,7 +68,7 @@ def test_a_complete_journal_says_so_and_an_incomplete_end_too(left, ambid):
     lines = found.out.splitlines()
     assert len(lines) == 4
     assert "29 blocks" in lines[2]
-    assert "at its end not of a whole block" in lines[2]
+    assert "at its end are not a whole block" in lines[2]
     assert same_bits(values_of("cut.h5"), values_at(0, 29 * ROWS))
 
 
@@ -77,7 +77,7 @@ def test_a_damaged_block_is_counted_and_becomes_rows_without_values(left, ambid)
     found = ambid("recover", "run.h5.journal", "--delete")
     assert found.code == 0
     assert "1 block damaged, in 1 place; 20 samples missing in 1 place (read it with --gaps)" in found.out
-    assert "is kept: not all of it is in the record" in found.out
+    assert "is kept: the record does not hold all of it" in found.out
     assert (left / "run.h5.journal").exists()
     refused = ambid("identify", "run.h5")
     assert refused.code == 2
@@ -89,7 +89,7 @@ def test_a_record_that_exists_is_written_over_only_with_force(left, ambid):
     (left / "run.h5").write_text("precious")
     found = ambid("recover", "run.h5.journal")
     assert found.code == 2
-    assert "run.h5 exists already" in found.err
+    assert "run.h5 already exists" in found.err
     assert (left / "run.h5").read_text() == "precious"
     assert ambid("recover", "run.h5.journal", "--force").code == 0
     assert len(values_of("run.h5")) == BLOCKS * ROWS
@@ -157,7 +157,7 @@ def test_a_record_that_holds_anything_else_keeps_the_journal(left, ambid, change
     before = (left / "run.h5").read_bytes()
     found = ambid("recover", "run.h5.journal", "--delete")
     assert (found.code, found.out) == (2, "")
-    assert "run.h5 exists already" in found.err
+    assert "run.h5 already exists" in found.err
     assert (left / "run.h5.journal").exists()
     assert (left / "run.h5").read_bytes() == before
 
@@ -178,7 +178,7 @@ def test_a_damaged_journal_stays_although_the_record_holds_what_is_left_of_it(le
     found = ambid("recover", "run.h5.journal", "--delete")
     assert found.code == 0
     assert "run.h5 holds that already with 1 block damaged" in found.out
-    assert "is kept: not all of it is in the record" in found.out
+    assert "is kept: the record does not hold all of it" in found.out
     assert (left / "run.h5.journal").exists()
 
 
@@ -196,7 +196,7 @@ def test_another_name_and_another_format(left, ambid):
         (["empty.journal"], "is empty"),
         (["run.h5.journal", "-o", "run.mat"], "is written as"),
         (["run.h5.journal", "-o", "none/run.h5"], "there is no folder"),
-        (["run.h5.journal", "-o", "run.h5.journal"], "also read"),
+        (["run.h5.journal", "-o", "run.h5.journal"], "is also an input"),
         (["run.h5.journal", "run.h5.journal", "-o", "a.h5"], "one by one"),
         ([], "Missing argument"),
     ],
@@ -218,7 +218,7 @@ def test_a_journal_without_a_block_is_refused(left, ambid):
     (left / "none.h5.journal").write_bytes(data)
     found = ambid("recover", "none.h5.journal")
     assert found.code == 2
-    assert "no sound block" in found.err
+    assert "no intact block" in found.err
 
 
 def test_a_recording_that_goes_on_is_left_alone(left, ambid):

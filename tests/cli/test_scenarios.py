@@ -130,4 +130,4 @@ def test_lost_samples_want_a_text_file_and_options_of_a_scenario_want_one(here, 
     assert ".csv.gz" in simulated(ambid, "dropped", out="r.h5").err
     found = ambid("simulate", "rmit", "-o", "r.csv", "--at", "1")
     assert (found.code, found.out) == (2, "")
-    assert "without --scenario has no --at" in found.err
+    assert "--at is for --scenario" in found.err

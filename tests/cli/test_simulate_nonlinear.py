@@ -63,8 +63,8 @@ def test_the_prototypes_rig_simulates_in_its_counts(tmp_path, monkeypatch, ambid
         ("levitated-ball", "k = { value = 0.00013043767313019396, ", "k = { ", ("--nonlinear",), "no value for k;"),
         ("rmit", "", "", ("--nonlinear",), "has no [magnet]"),
         ("levitated-ball", "", "", ("--nonlinear", "--position", "-0.01"), "closes an air gap"),
-        ("levitated-ball", "", "", ("--position", "0.01"), "a simulation without --nonlinear has no --position"),
-        ("levitated-ball", "", "", ("--scenario", "none", "--position", "0.01"), "--scenario has no --position"),
+        ("levitated-ball", "", "", ("--position", "0.01"), "--position is for --nonlinear"),
+        ("levitated-ball", "", "", ("--scenario", "none", "--position", "0.01"), "--scenario takes no --position"),
     ],
 )
 def test_what_cannot_be_simulated_is_refused_on_one_line(

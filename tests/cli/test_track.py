@@ -83,10 +83,10 @@ REFUSED = {
     "no time": (["--flag", "hold"], "--flag hold is not of the form T:FLAG"),
     "no number": (["--flag", "soon:hold"], "--flag soon:hold is not of the form T:FLAG"),
     "pace": (["--pace", "slow"], "'--pace'"),
-    "two starts": (["--start", "rig.toml", "--start-seconds", "1"], "Leave one of them out"),
-    "the record": (["--json", "record.csv"], "is also read"),
-    "the start": (["--start", "e.json", "--json", "e.json"], "is also read"),
-    "no picture": (["--plot", "track.jpeg"], "has to end in .png"),
+    "two starts": (["--start", "rig.toml", "--start-seconds", "1"], "Omit one of them"),
+    "the record": (["--json", "record.csv"], "is also an input"),
+    "the start": (["--start", "e.json", "--json", "e.json"], "is also an input"),
+    "no picture": (["--plot", "track.jpeg"], "must end in .png"),
     "rig": (["--rig", "none.toml"], "none.toml does not exist"),
 }
 

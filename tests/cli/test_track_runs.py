@@ -21,7 +21,7 @@ def numbers_only(value):
 
 def lines_of(path):
     def refuse(constant):
-        raise AssertionError(f"{constant} is no number of JSON")
+        raise AssertionError(f"{constant} is not a JSON number")
 
     return [json.loads(line, parse_constant=refuse) for line in path.read_text().splitlines()]
 
@@ -134,4 +134,4 @@ def test_a_start_of_another_rate_is_refused(here, ambid):
     (here / "slow.json").write_text(json.dumps(whole))
     found = ambid("track", "change.csv", "--start", "slow.json")
     assert (found.code, len(found.err.splitlines())) == (2, 1)
-    assert "they have to agree" in found.err
+    assert "they must agree" in found.err

@@ -170,7 +170,7 @@ def test_the_page_on_nonlinear_models_runs_and_shows_what_comes_out(tmp_path, mo
             assert run_verb(words[1:]) == 0, line
             said[words[words.index("--structure") + 1] if "fit" in words else words[1]] = capsys.readouterr().out
     assert {"ball.h5", "other.h5", "ball.json", "ball.png"} <= {p.name for p in tmp_path.iterdir()}
-    assert "other.h5 judged with ball.json" in said["validate"]
+    assert "other.h5 tested with ball.json" in said["validate"]
     assert "2 records: narmax" in said["narmax"]
     rows = re.compile(r"^(a\d\d|b3) +(-?[\d.]+) ± ([\d.]+)()$", re.MULTILINE)
     text = page.read_text(encoding="utf-8")

@@ -134,5 +134,5 @@ def test_what_the_emulated_bench_does_not_know_is_refused(written, change):
     if "magnet" in change:
         change = {"magnet": dataclasses.replace(b.plant.magnet, **change["magnet"])}
     other = dataclasses.replace(b, plant=dataclasses.replace(b.plant, **change))
-    with pytest.raises(DeviceError, match="knows none"):
+    with pytest.raises(DeviceError, match="has none of them"):
         written(bench=other)

@@ -170,7 +170,7 @@ class Silent(SimulatedDevice):
         if self.playing and timeout_s > 0:
             self.left -= 1
             if self.left < 0:
-                raise DeviceError("the line is lost. Look at the cable")
+                raise DeviceError("the line is lost. Check the cable")
         return super().read(timeout_s)
 
 

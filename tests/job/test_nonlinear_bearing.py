@@ -121,7 +121,7 @@ def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
 
 
 def test_what_is_asked_wrongly_is_refused(balls, rig):
-    with pytest.raises(EstimationError, match="every one holds the rotor"):
+    with pytest.raises(EstimationError, match="no record with a moving rotor"):
         identify_nonlinear([], rig, held=balls, magnet="single")
 
 
@@ -131,7 +131,7 @@ def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, ri
     assert free.warnings == ()
     assert free.record.knock is None
     taken = take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(np.quantile(x, 0.5))))), Reading())
-    assert "counts as unknown" in taken.warnings[0]
+    assert "is treated as unknown" in taken.warnings[0]
     assert "lies on a stop" in taken.warnings[1]
     assert np.count_nonzero(taken.record.cut) == taken.record.u.size - taken.record.kept.shape[0] > 0
     with pytest.raises(EstimationError, match="nowhere free for 100 samples"):
@@ -140,7 +140,7 @@ def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, ri
     taken = take_record(balls[0], replace(rig, limits=Limits(voltage=(0.0, high))), Reading())
     assert taken.record.u.max() == high
     assert taken.record.u.size == u.size  # none thrown away
-    assert "the limit was taken" in taken.warnings[0]
+    assert "replaced by the limit" in taken.warnings[0]
 
 
 def test_one_signal_in_two_channels_is_refused_and_a_held_rotor_that_moves_is_told(balls, rig):
@@ -149,12 +149,12 @@ def test_one_signal_in_two_channels_is_refused_and_a_held_rotor_that_moves_is_to
     bench = bearing_rig(rig)
     free = take_record(balls[0], bench, Reading())
     twice = replace(free.record, y=np.column_stack([1e-4 * free.record.y[:, 1] + 0.01, free.record.y[:, 1]]))
-    with pytest.raises(EstimationError, match="position and current are one signal but for scale and offset"):
+    with pytest.raises(EstimationError, match="position and current are the same signal up to scale and offset"):
         check_together([replace(free, record=twice)], None)
     rocking = take_record(balls[1], bench, Reading(), held=True)
     (moving, told) = check_together([free, rocking], None)
     assert not moving.warnings
-    assert "said to be held, but its position scatters by" in told.warnings[-1]
+    assert "declared held, but its position scatters by" in told.warnings[-1]
 
 
 def test_a_failed_search_is_refused_in_words(balls, rig, monkeypatch):
@@ -163,5 +163,5 @@ def test_a_failed_search_is_refused_in_words(balls, rig, monkeypatch):
     monkeypatch.setattr(
         "ambid.bearing.magnet_estimate.estimate_bearing", lambda *_, **__: SimpleNamespace(status="failed")
     )
-    with pytest.raises(EstimationError, match="the search led to numbers without a predictor"):
+    with pytest.raises(EstimationError, match="the search ended without a stable predictor"):
         identify_nonlinear(balls, rig)

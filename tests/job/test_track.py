@@ -197,7 +197,7 @@ def test_starts_that_do_not_fit_are_refused(tmp_path, steady):
     half = replace(record, rate_hz=RATE / 2)
     with pytest.raises(AmbidError, match="20000 Hz, the record of 'one-axis' at 10000 Hz"):
         track(half, start=start(2))
-    with pytest.raises(AmbidError, match="they have to agree"):
+    with pytest.raises(AmbidError, match="they must agree"):
         track(record, replace(default_rig("coil"), record=default_rig().record), start=start(2))
 
 

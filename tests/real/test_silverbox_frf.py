@@ -44,7 +44,7 @@ def test_ten_realisations_of_an_odd_multisine_are_found(record, experiments, mea
     assert measured.details["lines"] == tuple(range(1, 2685, 2))
     # 150 Hz is three times the mains: it is in the measured input at a line that the excitation leaves out
     assert any("even lines 2014 " in w for w in measured.warnings)
-    assert sum("samples lead the 1 whole periods" in w for w in measured.warnings) == 10
+    assert sum("samples precede the 1 whole periods" in w for w in measured.warnings) == 10
 
 
 def test_the_resonance_is_near_70_hz_and_the_gain_one(measured):

@@ -100,7 +100,7 @@ def test_truncated_gzip(tmp_path):
 def test_gzip_that_is_none_or_empty(tmp_path):
     path = tmp_path / "r.csv.gz"
     path.write_bytes(text(rows()))
-    with pytest.raises(RecordError, match="not a sound gzip"):
+    with pytest.raises(RecordError, match="not a valid gzip"):
         read_record(path)
     path.write_bytes(gzip.compress(b""))
     with pytest.raises(RecordError, match="empty inside"):

@@ -75,7 +75,7 @@ def test_values_that_are_not_finite_obey_the_same_rules_as_csv(tmp_path):
 
 def test_rate_that_contradicts_the_file(tmp_path):
     write_record(record(), tmp_path / "r.h5")
-    with pytest.raises(RecordError, match=r"--rate\) says 1000 Hz. Leave it out"):
+    with pytest.raises(RecordError, match=r"--rate\) says 1000 Hz. Omit it"):
         read_record(tmp_path / "r.h5", rate_hz=1000.0)
 
 

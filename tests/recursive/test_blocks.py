@@ -120,7 +120,7 @@ def test_quiet_neither_winds_up_nor_moves_the_blocks():
     after, wide = coefficients(found)
     np.testing.assert_array_less(np.abs(after - TRUTH), 4 * wide)
     assert np.all(wide < 20 * sd)  # forgetting stops at four; what the noise is, is remembered longer
-    assert any("too little moved" in w for w in found.warnings)
+    assert any("hardly excited" in w for w in found.warnings)
 
 
 def test_a_loop_wants_its_reference():

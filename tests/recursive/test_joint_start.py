@@ -66,7 +66,7 @@ def test_an_estimate_that_cannot_be_gone_on_from_is_refused(begun):
     with pytest.raises(EstimationError, match="10000 Hz"):
         JointEkf.from_estimate(begun, 10_000.0)
     gain = replace(begun, noise=replace(begun.noise, form="gain", disturbance_sd={}, sensor_sd={}))
-    with pytest.raises(EstimationError, match="wants levels"):
+    with pytest.raises(EstimationError, match="needs levels"):
         JointEkf.from_estimate(gain, RATE)
 
 
@@ -78,7 +78,7 @@ def test_an_estimate_that_cannot_be_gone_on_from_is_refused(begun):
         ({"sensor_sd": {"current": 0.0}}, "must be positive"),
         ({"sensor_sd": {}}, "lacks current"),
         ({"free": ()}, "no parameter is free"),
-        ({"covariance": np.eye(3)}, "want"),
+        ({"covariance": np.eye(3)}, "need"),
         ({"covariance": np.array([[1e-4, 1e-3], [1e-3, 1e-4]])}, "not positive definite"),
         ({"covariance": np.diag([100.0, 1e-12])}, "more than its size"),
         ({"values": {"R": -1.0, "L": 1.0}}, "must be positive"),

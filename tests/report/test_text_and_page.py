@@ -44,7 +44,7 @@ def test_failed_checks_and_warnings_are_shown_once(unstable):
         unstable.estimate,
         status="stalled",
         checks={"plausible": failed},
-        warnings=("the search did not converge: treat the numbers as a first guess", failed.detail),
+        warnings=("the search did not converge: treat the values as a first guess", failed.detail),
     )
     text = estimate_text(e)
     assert text.splitlines()[0] == "verdict: do not use"

@@ -84,7 +84,7 @@ def test_what_is_wrong_at_the_end(track, error, state, open_changes, said):
 
 
 def test_numbers_that_are_not_known_are_not_invented():
-    assert value_words(TrackedValue(value=math.nan, sd=1.0), "ohm") == ("not known", "")
+    assert value_words(TrackedValue(value=math.nan, sd=1.0), "ohm") == ("unknown", "")
     assert value_words(TrackedValue(value=1.6, sd=math.inf), "ohm") == ("1.6 ohm ± ?", "")
     assert change_words(TrackedValue(value=1.0, sd=0.1), None) == ""
     assert change_words(TrackedValue(value=1.0, sd=0.1), TrackedValue(value=0.0, sd=0.1)) == ""

@@ -49,7 +49,7 @@ def test_rpm_and_degrees_become_si(rig_file, tmp_path):
 
 def test_turns_per_second_are_not_taken_for_an_angular_speed(rig_file):
     rig = load_rig(rig_file(PLAIN + TURNING))
-    with pytest.raises(UnitError, match=r"'tacho' is in \[Hz\]; the rig wants a speed in \[rad/s\]"):
+    with pytest.raises(UnitError, match=r"'tacho' is in \[Hz\]; the rig needs a speed in \[rad/s\]"):
         bench_record(record("Hz"), rig)
     turns = load_rig(rig_file(PLAIN + TURNING + f"gain = {2 * np.pi!r}\n"))
     assert bench_record(record("Hz"), turns)["speed"][0] == pytest.approx(20 * np.pi)

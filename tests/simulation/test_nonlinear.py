@@ -145,7 +145,7 @@ def test_leaving_the_air_gap_is_an_error(name: str, volts: float) -> None:
     # the equations themselves go on through the pole face
     p = preset(name)
     assert p.plant is not None
-    with pytest.raises(ModelError, match=r"air gap or the finite numbers at sample \d+"):
+    with pytest.raises(ModelError, match=r"air gap or diverges at sample \d+"):
         simulate(p.plant, np.full(4000, volts), rate_hz=p.rate_hz, seed=0, operating_point=p.operating_point)
 
 

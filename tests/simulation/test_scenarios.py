@@ -273,7 +273,7 @@ def test_bad_requests_are_refused(rig: Rig) -> None:
         simulate_scenario("steady", free)
     with pytest.raises(ModelError, match="does not limit its voltage"):
         simulate_scenario("saturation", free, amplitude=1.0)
-    with pytest.raises(RigError, match="names no rate"):
+    with pytest.raises(RigError, match="gives no rate"):
         simulate_scenario("steady", replace(rig, record=type(rig.record)()))
     coil = rig_from_text(
         'schema = "ambid.rig/1"\nmodel = "coil"\n[parameters]\nR = { value = 1.5, unit = "ohm" }\n'

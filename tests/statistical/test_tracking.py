@@ -100,5 +100,5 @@ def test_a_start_that_hardly_knows_a_parameter_says_so():
         multisine(6000, 2000.0, amplitude=0.25, band=(1.0, 300.0), seed=1, amplitude_is="rms"),
         seed=1,
     ).record
-    assert any("the start knows m" in line for line in tracked_numbers(identify(record)).warnings)
+    assert any("the start determines m" in line for line in tracked_numbers(identify(record)).warnings)
     assert tracked_numbers(bearing_start(20_000, 1)).warnings == ()

@@ -161,7 +161,7 @@ def test_noise_that_rises_or_falls_is_not_taken_for_a_parameter():
         assert {alarm.by for _, alarm in alarms} == {"noise"}
         assert all(alarm.parameter is None and alarm.size == 0.0 for _, alarm in alarms)
         assert alarms[0][1].noise == pytest.approx(high**2, rel=0.3)
-        assert "no one number" in alarms[0][1].why
+        assert "no single parameter" in alarms[0][1].why
 
 
 def test_several_numbers_at_once_are_not_taken_for_one():

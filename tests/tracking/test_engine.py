@@ -150,7 +150,7 @@ class DyingReplay:
 
 def test_a_process_that_dies_is_told_of_when_what_it_left_is_delivered():
     sink = Sink()
-    with pytest.raises(EstimationError, match="died with exit code 7"):
+    with pytest.raises(EstimationError, match="ended early with exit code 7"):
         engine(DyingReplay(), sink, producer="process")
     np.testing.assert_array_equal(sink.values(), X[:300])
 

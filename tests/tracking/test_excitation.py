@@ -75,7 +75,7 @@ def test_from_the_start_without_information():
     monitor = monitor_of(triangle(5, 4))
     events, _ = fed(monitor, np.zeros((5, 5)), 300)
     assert len(events) == 3
-    assert all("tell nothing" in e.why for e in events)
+    assert all("no information" in e.why for e in events)
     assert 0.5 < events[0].t < 1.0  # not before half of the window is filled
 
 
@@ -149,6 +149,6 @@ def test_what_makes_no_sense_is_refused():
     before = monitor.sd.copy()
     with pytest.raises(EstimationError, match="not finite"):
         monitor.update(block(np.full((5, 5), np.nan)), 1.0)
-    with pytest.raises(EstimationError, match="other numbers"):
+    with pytest.raises(EstimationError, match="other parameters"):
         monitor.update(block(np.eye(4)), 1.0)
     assert np.array_equal(monitor.sd, before)

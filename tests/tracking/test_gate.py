@@ -86,7 +86,7 @@ def test_a_candidate_that_is_better_and_wrong_all_the_same_is_refused_in_absolut
     gate.propose(0.7 * truth, np.linalg.inv(400 * INFORMATION), 1.0, "on the way")
     event, _ = judged(gate, truth, rng)
     assert event.kind == "refused"
-    assert "misfit" in event.why
+    assert "lack of fit" in event.why
     assert gate.last.gain > 0
     assert gate.last.misfit == event.values["misfit"]
 
@@ -108,7 +108,7 @@ def test_a_claim_that_quiet_data_cannot_judge_waits_and_is_refused():
     gate.propose(*estimate(moved(12.0), 20, rng), 1.0, "a claim")
     event, n = judged(gate, moved(12.0), rng, J=J / 1000)
     assert (event.kind, n) == ("refused", 50)
-    assert "cannot tell" in event.why
+    assert "do not distinguish" in event.why
 
 
 def test_overdispersion_widens_what_chance_allows():

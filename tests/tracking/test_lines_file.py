@@ -150,15 +150,15 @@ def changed(text, row, old, new):
 
 DAMAGE = {
     "another schema": (lambda x: changed(x, 0, "track/1", "fit/1"), "line 1: the schema is 'ambid.fit/1'"),
-    "half a line in the middle": (lambda x: changed(x, 3, '"error"', '"err'), "line 4: it is no JSON"),
+    "half a line in the middle": (lambda x: changed(x, 3, '"error"', '"err'), "line 4: it is not JSON"),
     "a missing key": (lambda x: changed(x, 3, '"error"', '"mistake"'), "line 4: 'error' is missing"),
     "a word for a number": (
         lambda x: changed(x, 2, '"sd": ', '"sd": "x", "y": '),
         "parameters.m.sd is 'x' instead of a number",
     ),
-    "no number of JSON": (lambda x: changed(x, 2, '"sd": ', '"sd": NaN, "y": '), "line 3: it is no JSON"),
+    "not a JSON number": (lambda x: changed(x, 2, '"sd": ', '"sd": NaN, "y": '), "line 3: it is not JSON"),
     "a word for a count": (lambda x: x.replace('"samples": 14', '"samples": "14"'), "instead of a whole number"),
-    "nested without end": (lambda x: x.replace(x.split("\n")[3], "[" * 100_000), "line 4: it is no JSON"),
+    "nested without end": (lambda x: x.replace(x.split("\n")[3], "[" * 100_000), "line 4: it is not JSON"),
     "an unknown state": (lambda x: changed(x, 2, '"tracking"', '"asleep"'), "state is 'asleep' instead of 'tracking'"),
     "an unknown event": (
         lambda x: x.replace('"kind": "change"', '"kind": "miracle"'),
@@ -166,12 +166,12 @@ DAMAGE = {
     ),
     "another parameter": (
         lambda x: changed(x, 2, '"k_x"', '"k_y"'),
-        "parameter 'k_x' stands here or in the lines before",
+        "parameter 'k_x' is either here or in the lines before",
     ),
     "a line twice": (lambda x: x.replace(x.split("\n")[4], "\n".join(2 * [x.split("\n")[4]])), "does not come after"),
-    "something behind": (lambda x: x + x.split("\n")[4] + "\n", "behind the summary"),
+    "something behind": (lambda x: x + x.split("\n")[4] + "\n", "follows the summary"),
     "a list": (lambda x: "[1]\n" + x, "line 1: the schema is None"),
-    "no track at all": (lambda x: "time [s],a [V]\n0,1\n", "line 1: it is no JSON"),
+    "no track at all": (lambda x: "time [s],a [V]\n0,1\n", "line 1: it is not JSON"),
 }
 
 

@@ -61,7 +61,7 @@ def test_wrong_and_opposite_flags_are_refused():
         operator.set("holt")
     operator.set("revert")
     operator.set("revert")
-    with pytest.raises(EstimationError, match="'revert' waits"):
+    with pytest.raises(EstimationError, match="'revert' is still pending"):
         operator.set("accept")
     assert operator.take() == "revert"
     operator.set("accept")

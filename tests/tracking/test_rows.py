@@ -105,7 +105,7 @@ def test_a_row_counts_under_one_kind():
     _, guard, out = given(values, limits=100.0)
     assert guard.samples == {"nan": 1, "range": 1}
     why = [passed.why for passed in out if not isinstance(passed, Stretch)]
-    assert why[0] == "1 samples from 5 on hold a value that is not finite"
+    assert why[0] == "1 sample from 5 on: not finite"
 
 
 def test_without_limits_only_what_no_bearing_can_show_is_refused():

@@ -117,7 +117,7 @@ def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
     if report.interrupted:
         return (f"{what} was interrupted after {report.samples} of {report.wanted} samples",)
     if report.lost:
-        return (f"{report.lost} of {report.wanted} samples were lost during {what}: look at cable, baud rate and load",)
+        return (f"{report.lost} of {report.wanted} samples were lost during {what}: check cable, baud rate and load",)
     if not report.complete:
         return (f"{what} ended after {report.samples} of {report.wanted} samples",)
     return ()
@@ -186,7 +186,7 @@ def find_amplitude(
     """
     low, high = room.voltage
     if given is None and not math.isfinite(high - low):
-        why = "the rig has no loop.limits.voltage to choose an amplitude from: give one"
+        why = "the rig has no loop.limits.voltage to derive an amplitude from: give one"
         return Size(amplitude_v=math.nan, used=math.nan, findings=(), reasons=(why,))
     size = _FIRST * (high - low) / 2.0 if given is None else given
     tried: list[tuple[float, float]] = []  # size, and what it used
@@ -198,7 +198,7 @@ def find_amplitude(
             return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
         worst, used = _used(seen, room, resting, use)
         tried.append((size, used))
-        findings.append(f"{size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}")
+        findings.append(f"{size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range")
         larger_or_smaller = _next_size(tried, use) if given is None else None
         if larger_or_smaller is None:
             break
@@ -226,7 +226,7 @@ def fitting_amplitude(
         if not found.reasons:
             return found.amplitude_v
         reasons = found.reasons
-    raise DeviceError(f"{device.info.port}: no amplitude was found: {'; '.join(reasons)}. Give --amplitude")
+    raise DeviceError(f"{device.info.port}: no suitable amplitude was found: {'; '.join(reasons)}. Give --amplitude")
 
 
 def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
@@ -255,10 +255,14 @@ def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tupl
     size, used = tried[-1]
     if used <= most:
         return ()
-    said = f"an excitation of {size:.3g} V uses {100.0 * used:.0f} % of the room of {worst}, {100.0 * most:.0f} % are"
+    said = (
+        f"an excitation of {size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range; "
+        f"{100.0 * most:.0f} % are"
+    )
     if _at_the_floor(tried):
         return (
-            f"{said} allowed, and a larger one used hardly more: the bench moves by itself; see to noise and gains",
+            f"{said} allowed, and a larger amplitude hardly moved it more: the bench moves by itself; check noise "
+            "and gains",
         )
     return (f"{said} allowed: give a smaller one",)
 

@@ -63,7 +63,7 @@ def _calibrated(rig: Rig, c: RigChannel, notes: list[str]) -> RigChannel:
     low, high = _full_scale(rig, c.role)
     top = PWM_TOP if c.role == "voltage" else ADC_TOP
     of = Calibration(unit_in="1", unit_out=_UNITS[c.role], gain=(high - low) / top, offset=low)
-    notes.append(f"{c.role}: 0 to {top} counts made up as {low:.4g} to {high:.4g} {_UNITS[c.role]}")
+    notes.append(f"{c.role}: 0 to {top} counts assumed to be {low:.4g} to {high:.4g} {_UNITS[c.role]}")
     return replace(c, calibration=of, unit=None)
 
 
@@ -71,8 +71,8 @@ def _full_scale(rig: Rig, role: str) -> Interval:
     low, high = UNLIMITED if rig.limits is None else getattr(rig.limits, role)
     if not (math.isfinite(low) and math.isfinite(high)):
         raise RigError(
-            f"{who(rig)}: channels.{role} has no calibration, and there is no loop.limits.{role} to make one from. Give"
-            " one of them"
+            f"{who(rig)}: channels.{role} has no calibration, and there is no loop.limits.{role} to derive one "
+            "from. Give one of them"
         )
     if role == "voltage":
         return low, high
@@ -93,12 +93,12 @@ _REMEDY: Mapping[str, str] = MappingProxyType(
     {
         "overrun": "Lower daq.rate_hz",
         "host_silent": "Free the machine, or raise daq.host_ms",
-        "over_current": "Excite less, look at the coil, or widen daq.trip.current if the coil bears it",
-        "out_of_gap": "Change the gains of [loop], excite less, or look at sensor and daq.trip.position",
+        "over_current": "Excite less, check the coil, or widen daq.trip.current if the coil can bear it",
+        "out_of_gap": "Change the gains of [loop], excite less, or check sensor and daq.trip.position",
         "interlock": "Close the loop: cable, emergency stop",
-        "line_break": "Look at the cable",
-        "self_test": "See what the self-test names",
-        "watchdog": "Look at the supply, and at the firmware's build",
+        "line_break": "Check the cable",
+        "self_test": "Correct what the self-test names",
+        "watchdog": "Check the supply and the firmware build",
     }
 )
 """What to do about each cause of `messages.toml`."""
@@ -115,8 +115,8 @@ def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int =
     about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
     at = "" if fault.sample is None else f" at sample {fault.sample}"
     meaning = "" if about is None else f", {about}"
-    remedy = _REMEDY.get(fault.what, "See to the cause")
+    remedy = _REMEDY.get(fault.what, "Remove the cause")
     lifted = (lift_ms + _AT_ONCE_MS) * rate_hz / 1e3  # a rate that is not known compares false
     if fault.what == "out_of_gap" and fault.sample is not None and fault.sample <= lifted:
-        remedy = f"The rotor was not up when daq.lift_ms = {lift_ms} was over: raise it, or change the gains of [loop]"
+        remedy = f"The rotor was not levitated within daq.lift_ms = {lift_ms}: raise it, or change the gains of [loop]"
     return f"{fault.what}{meaning}{at}. {remedy}"

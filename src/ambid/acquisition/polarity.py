@@ -123,7 +123,7 @@ class _Pulses:
                 return 0
         again = self._play(-volts, hold_s)
         if again.current_change * seen.current_change > 0.0:
-            raise _End("the current goes the same way whichever way the voltage is pulsed: look at its sensor")
+            raise _End("the current goes the same way whichever way the voltage is pulsed: check its sensor")
         return _sign(seen.current_change)
 
     def _sign_of_motion(self) -> int:

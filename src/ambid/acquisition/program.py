@@ -63,15 +63,17 @@ def program(
 def _check(name: str, amplitude_v: float, band: tuple[float, float] | None, rate_hz: float, seconds: float) -> None:
     if name in _INSTEAD:
         raise DeviceError(
-            f"excitation {name!r} cannot be played by a controller, which has a square wave, a shift register and a"
-            f" short table. The nearest is {_INSTEAD[name]!r} in the same band; give that"
+            f"excitation {name!r} cannot be played by a controller, which has a square wave, a shift register and "
+            f"a short table. The nearest is {_INSTEAD[name]!r} in the same band; give that"
         )
     if name not in NAMES:
         raise DeviceError(f"excitation {name!r} is unknown; a controller plays {', '.join(NAMES)}. Give one of them")
     if not (math.isfinite(amplitude_v) and amplitude_v > 0.0):
         raise DeviceError(f"excitation amplitude {amplitude_v} V; it must be a positive number. Give another")
     if not (math.isfinite(seconds) and seconds * rate_hz >= 2.0):
-        raise DeviceError(f"an excitation of {seconds:g} s at {rate_hz:g} Hz has no two ticks. Give more seconds")
+        raise DeviceError(
+            f"an excitation of {seconds:g} s at {rate_hz:g} Hz has fewer than two ticks. Give more seconds"
+        )
     if band is not None and not 0.0 <= band[0] < band[1] <= rate_hz / 2.0:
         raise DeviceError(
             f"excitation band {band[0]:g} to {band[1]:g} Hz; at {rate_hz:g} Hz it must lie between 0 and"
@@ -82,7 +84,7 @@ def _check(name: str, amplitude_v: float, band: tuple[float, float] | None, rate
 def _steps(amplitude_v: float, band: tuple[float, float] | None, ticks: int) -> Program:
     """Four periods of a square wave in the record, or as many more as keep a step within the controller's counter."""
     if band is not None:
-        raise DeviceError("excitation 'steps' has no band. Leave the band out, or choose 'prbs' for steps in a band")
+        raise DeviceError("excitation 'steps' has no band. Omit the band, or choose 'prbs' for steps in a band")
     edges = max(2 * _PERIODS, 2 * math.ceil(ticks / (2 * _LONGEST_HOLD)))
     return Program(kind="step", amplitude=amplitude_v, hold=max(1, ticks // edges), length=2)
 
@@ -96,15 +98,16 @@ def _prbs(amplitude_v: float, band: tuple[float, float] | None, rate_hz: float, 
         bits = max(least, math.ceil(math.log2(rate_hz / (hold * low) + 1.0) - 1e-9))
         if bits > most:
             raise DeviceError(
-                f"a prbs from {low:g} to {high:g} Hz needs a register of {bits} bits; the controller has {most}. With"
-                f" that top it begins at {rate_hz / (hold * (2**most - 1)):.3g} Hz; raise the low or lower the high end"
+                f"a prbs from {low:g} to {high:g} Hz needs a register of {bits} bits; the controller has {most}. "
+                f"For the same upper end it can start at {rate_hz / (hold * (2**most - 1)):.3g} Hz; raise the "
+                "lower or reduce the upper end"
             )
     else:
         bits = min(max(least, int(math.log2(ticks / (_PERIODS * hold) + 1.0))), most)
     if (period := (2**bits - 1) * hold) > ticks:
         raise DeviceError(
-            f"a prbs from {low:g} to {high:g} Hz has a period of {period / rate_hz:.4g} s, longer than the record of"
-            f" {ticks / rate_hz:.4g} s. Record longer, or raise the low end of the band"
+            f"a prbs from {low:g} to {high:g} Hz has a period of {period / rate_hz:.4g} s, longer than the record "
+            f"of {ticks / rate_hz:.4g} s. Record longer, or raise the lower end of the band"
         )
     start = int(np.random.default_rng(seed).integers(1, 2**bits))
     return Program(kind="prbs", amplitude=amplitude_v, hold=hold, length=bits, seed=start)
@@ -126,16 +129,16 @@ def _multisine(
     top = rate_hz / 2.0 if hold == 1 else _HIGHEST * rate_hz / hold
     if high > top * (1 + 1e-9):
         raise DeviceError(
-            f"a {name} from {low:g} to {high:g} Hz does not fit into a table of {TABLE_LENGTH} elements: from"
-            f" {low:g} Hz it goes to {top:.4g} Hz, and to {high:g} Hz it begins at"
-            f" {_lowest(high, rate_hz):.4g} Hz. Narrow the band, or choose 'prbs'"
+            f"a {name} from {low:g} to {high:g} Hz does not fit into a table of {TABLE_LENGTH} elements: from "
+            f"{low:g} Hz it reaches {top:.4g} Hz, and for {high:g} Hz it must start at "
+            f"{_lowest(high, rate_hz):.4g} Hz. Narrow the band, or choose 'prbs'"
         )
     length = min(TABLE_LENGTH, ticks // (_PERIODS * hold))
     if length < _SHORTEST_TABLE or (low > 0.0 and hold * length * low < rate_hz * (1 - 1e-9)):
         needed = _PERIODS * max(1.0 / low if low else 0.0, _SHORTEST_TABLE / rate_hz)
         raise DeviceError(
-            f"a {name} from {low:g} Hz needs {needed:.4g} s for {_PERIODS} periods; the record has"
-            f" {ticks / rate_hz:.4g} s. Record longer, or raise the low end of the band"
+            f"a {name} from {low:g} Hz needs {needed:.4g} s for {_PERIODS} periods; the record has "
+            f"{ticks / rate_hz:.4g} s. Record longer, or raise the lower end of the band"
         )
     x = multisine(
         length,
@@ -244,8 +247,8 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
     room = min(duty_bias - duty[0], duty[1] - duty_bias)
     if not 1 <= counts <= room:
         raise DeviceError(
-            f"{who(rig)}: an excitation of {program.amplitude:.4g} V is {exact:.3g} counts of pulse width; about rest"
-            f" at {duty_bias} counts there is room for 1 to {room}, {step:.3g} to {step * room:.4g} V. Give another"
+            f"{who(rig)}: an excitation of {program.amplitude:.4g} V is {exact:.3g} counts of pulse width; about "
+            f"rest at {duty_bias} counts 1 to {room} are possible, {step:.3g} to {step * room:.4g} V. Give another"
         )
     return counts
 

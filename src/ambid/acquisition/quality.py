@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ambid.acquisition.device import Column, DeviceInfo, Program
 from ambid.acquisition.program import period_ticks
 from ambid.arrays import Array
+from ambid.errors import counted
 from ambid.tracking.blocks import Frame
 
 _DIFFERENCES = np.array([1.0, -3.0, 3.0, -1.0])
@@ -353,8 +354,8 @@ def verdict(report: QualityReport, info: DeviceInfo) -> tuple[str, ...]:
 
 def _absurd(column: ColumnQuality) -> str:
     return (
-        f"{column.name} goes from {column.least:.4g} to {column.most:.4g}: too large for its mean and spread to be"
-        " numbers. Look at what gives it"
+        f"{column.name} ranges from {column.least:.4g} to {column.most:.4g}, which is too large for a mean and "
+        "standard deviation. Check its source"
     )
 
 
@@ -362,26 +363,26 @@ def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[str]:
     replay = info.kind == "replay"  # what was is over: nothing of it is mended at a line or a device
     if report.lost:
         share = report.lost / (report.lost + report.samples)
-        yield f"{report.lost} samples lost in {report.gaps} gaps ({share:.2%}): " + (
-            "they are missing in the record that is replayed. Read it with --gaps"
+        yield f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): " + (
+            "they are missing in the replayed record. Read it with --gaps"
             if replay
             else "the line or the host is too slow. Lower daq.rate_hz, or free the machine"
         )
     if report.repeated:
-        yield f"{report.repeated} samples came twice and were left out: " + (
-            "the time of the record that is replayed runs back. Look at its time column"
+        yield f"{counted(report.repeated, 'sample')} came twice and were omitted: " + (
+            "the time of the replayed record runs backwards. Check its time column"
             if replay
             else "the device counts wrongly. Restart it"
         )
     if report.damaged:
-        where = "record that is replayed" if replay else "device"
-        yield f"{report.damaged} samples hold a value that is no number: left out. Look at the {where}"
+        where = "replayed record" if replay else "device"
+        yield f"{counted(report.damaged, 'sample')} with a value that is not a number omitted. Check the {where}"
     off = abs(report.measured_hz - report.rate_hz)
     # only hardware keeps the time of this world; NaN compares false
     if info.kind == "serial" and off > _RATE * report.rate_hz and off > _SURE * report.measured_sd:
         yield (
-            f"{report.measured_hz:.6g} samples a second come, not {report.rate_hz:g}: the controller's clock is wrong."
-            " Look at its crystal, or at the firmware's build"
+            f"{report.measured_hz:.6g} samples arrive per second instead of {report.rate_hz:g}: the controller "
+            "clock is wrong. Check its crystal, or the firmware build"
         )
 
 
@@ -389,13 +390,13 @@ def _range(column: ColumnQuality) -> Iterator[str]:
     """Judge how a sensor fills its converter."""
     if column.saturated > _SATURATED:
         yield (
-            f"{column.name} is at an end of the converter's range in {column.saturated:.2%} of the samples: there it is"
-            " not measured. Lower the sensor's gain, shift its offset, or excite less"
+            f"{column.name} is at an end of the converter range in {column.saturated:.2%} of the samples, where it "
+            "is not measured. Reduce the sensor gain, shift its offset, or excite less"
         )
     elif column.used is not None and 0.0 < column.used < _USED:
         yield (
-            f"{column.name} uses {column.used:.1%} of the converter's range: its steps are coarse. Raise the"
-            " sensor's gain, or excite more"
+            f"{column.name} uses {column.used:.1%} of the converter range, so its resolution is coarse. Raise the "
+            "sensor gain, or excite more"
         )
 
 
@@ -405,27 +406,27 @@ def _ordered(column: ColumnQuality, excited: bool) -> Iterator[str]:
         return
     if column.saturated > _LIMITED:
         yield (
-            f"{column.name} is at its limit in {column.saturated:.1%} of the samples: the loop is not linear there."
-            " Excite less, or widen daq.duty"
+            f"{column.name} is saturated in {column.saturated:.1%} of the samples: the loop is not linear there. "
+            "Excite less, or widen daq.duty"
         )
     if excited and column.sd == 0.0:
-        yield f"{column.name} stands still although an excitation was ordered. Drive or levitate to play it"
+        yield f"{column.name} is constant although an excitation was requested. Drive or levitate to play it"
 
 
 def _content(column: ColumnQuality, report: QualityReport) -> Iterator[str]:
     """Judge what is in a sensor's signal."""
     if column.sd == 0.0:
-        yield f"{column.name} stands still at {column.mean:.6g}: no sensor there? Look at its cable and supply"
+        yield f"{column.name} is constant at {column.mean:.6g}: no sensor there? Check its cable and supply"
         return
     if report.excited and column.still_s > _STILL_S:
         yield (
-            f"{column.name} stood still for {column.still_s:.2g} s although an excitation plays: the rotor rests on a"
-            " stop, or a cable is loose. Look at it"
+            f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
+            "stop, or a cable is loose. Check both"
         )
     told = report.excited and column.noise_by == "periods" and column.role != "extra"
     if told and column.snr_db is not None and column.snr_db < _SNR_DB:
         rest = 1.0 / (1.0 + 10.0 ** (column.snr_db / 10.0))
         yield (
-            f"{column.name}: signal over noise is {column.snr_db:.0f} dB, under {_SNR_DB:.0f}: {rest:.0%} of its power"
-            " does not come from the excitation. Excite more, or in a band that the plant follows"
+            f"{column.name}: the signal-to-noise ratio is {column.snr_db:.0f} dB (limit {_SNR_DB:.0f}): {rest:.0%} "
+            "of its power does not come from the excitation. Excite more, or in a band that the plant follows"
         )

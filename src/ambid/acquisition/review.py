@@ -34,8 +34,8 @@ def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, f
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:
         lines.append(
-            f"at {settings.rate_hz:g} Hz the controller only samples: its output is on at {output_rates()} only."
-            " Give daq.rate_hz such a rate to drive or levitate"
+            f"at {settings.rate_hz:g} Hz the controller only samples: its output works at {output_rates()} only. "
+            "Give such a daq.rate_hz to drive or levitate"
         )
     if settings.closed:
         lines += [*_rounding(rig, settings), *_slopes(rig, settings), *_stability(rig, settings, parameters)]
@@ -54,8 +54,8 @@ def _voltage(rig: Rig, settings: ControllerSettings) -> list[str]:
     if volts[0] >= low - slack and volts[1] <= high + slack:
         return []
     return [
-        f"daq.duty lets the voltage go from {volts[0]:.4g} to {volts[1]:.4g} V, beyond loop.limits.voltage ({low:.4g}"
-        f" to {high:.4g} V): a simulation is limited earlier than the bench. Make them agree"
+        f"daq.duty allows {volts[0]:.4g} to {volts[1]:.4g} V, beyond loop.limits.voltage ({low:.4g} to {high:.4g} "
+        "V): a simulation saturates earlier than the bench. Make them agree"
     ]
 
 
@@ -69,11 +69,11 @@ def _trips(rig: Rig, settings: ControllerSettings) -> list[str]:
         near = min(rest - low, high - rest)
         # an end at the converter's own end cannot trip: nothing to be near to
         if near < _NEAR_TRIP and not (low == 0 and rest - low == near):
-            lines.append(f"{role} rests {near} counts from its trip: noise may trip it. Widen daq.trip.{role}")
+            lines.append(f"{role} at rest is {near} counts from its trip: noise may trip it. Widen daq.trip.{role}")
         if high - low < _COARSE:
             lines.append(
-                f"{role} has {high - low} counts between its trips: too coarse to control or to identify with. Use a"
-                " sensor or a divider that fills the converter"
+                f"{role} has {high - low} counts between its trips: too coarse for control and identification. Use "
+                "a sensor or a divider that fills the converter"
             )
     return lines
 
@@ -99,8 +99,8 @@ def _rounding(rig: Rig, settings: ControllerSettings) -> list[str]:
         error = abs(getattr(settings, name) - value) / abs(value) if value else 0.0
         if error > _ROUNDED:
             lines.append(
-                f"loop.{name} is {value:.2f} steps of the controller, rounded by {error:.1%}. Use a sensor with fewer"
-                f" counts, or a larger loop.{name}"
+                f"loop.{name} is {value:.2f} steps of the controller, rounded by {error:.1%}. Use a sensor with "
+                f"fewer counts, or a larger loop.{name}"
             )
     return lines
 
@@ -116,8 +116,8 @@ def _slopes(rig: Rig, settings: ControllerSettings) -> list[str]:
         least, most = scale_of(rig, role).slopes(low, high)
         if most > _BENT * least:
             lines.append(
-                f"the slope of channels.{role}.table changes by a factor {most / least:.2g} over its range; the loop"
-                " has the gains of the rest point everywhere. Narrow the range, or see that the loop bears it"
+                f"the slope of channels.{role}.table changes by a factor {most / least:.2g} over its range; the "
+                "loop uses the gains at rest everywhere. Narrow the range, or make sure that the loop tolerates it"
             )
     return lines
 
@@ -154,8 +154,8 @@ def predicted(
     missing = [p.name for p in rig.parameters if p.name not in known and p.name not in parameters]
     if missing:
         return None, (
-            f"the loop could not be checked for stability, as the rig has no value for {', '.join(missing)}. A rough"
-            " value of each is enough"
+            "the stability of the loop could not be checked, because the rig has no value for "
+            f"{', '.join(missing)}. A rough value of each is enough"
         )
     whose = "the rig's own plant" + (f" with {', '.join(lent)} of the bench" if lent else "")
     try:

@@ -30,8 +30,8 @@ TABLE_LENGTH = 1000
 BYTE_BITS = 11
 """Bit times that a byte may take on the line: ten, and one kept for answers."""
 FASTEST_OUTPUT, SLOWEST_OUTPUT = 8, 20
-"""Shortest and longest tick with which the output may be on, periods: a tick's work has to be done in time while
-commands come, and a fault has to end in the safe state within 2 ms."""
+"""Shortest and longest tick with which the output may be on, periods: a tick's work must be done in time while
+commands come, and a fault must end in the safe state within 2 ms."""
 LARGEST_GAIN = 2**19
 """Largest step number of a gain: no product can then overflow the controller's arithmetic."""
 SHORTEST_PERIOD, LONGEST_PERIOD = 5, 20_000
@@ -120,8 +120,8 @@ def scale_of(rig: Rig, role: str) -> Scale:
     steps = np.diff(of.out)
     if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
         raise RigError(
-            f"{who(rig)}: channels.{role}.table rises and falls, or stands still; the controller needs one value"
-            " for each count and back. Cut the table to a part that only rises or only falls"
+            f"{who(rig)}: channels.{role}.table is not monotonic; the controller needs one value for each count "
+            "and back. Cut the table to a part that only rises or only falls"
         )
     _check_slopes(rig, role, of.raw, of.out)
     ends = None if of.extrapolate else (float(of.raw[0]), float(of.raw[-1]))
@@ -142,8 +142,8 @@ def _check_slopes(rig: Rig, role: str, raw: Array, si: Array) -> None:
         slopes = np.concatenate([np.diff(si) / np.diff(raw), np.diff(raw) / np.diff(si)])
     if not np.all(np.isfinite(slopes)):
         raise RigError(
-            f"{who(rig)}: channels.{role} gives {si[0]:.6g} at {raw[0]:g} counts and {si[-1]:.6g} at {raw[-1]:g}; each"
-            " count has to be another value. Correct its gain, offset or table"
+            f"{who(rig)}: channels.{role} gives {si[0]:.6g} at {raw[0]:g} counts and {si[-1]:.6g} at {raw[-1]:g}; "
+            "each count needs a value of its own. Correct its gain, offset or table"
         )
 
 
@@ -183,9 +183,9 @@ def duty_range(rig: Rig, daq: Daq, voltage: Scale) -> tuple[int, int]:
     if high - low < _FEWEST_DUTY:
         volts = np.sort(voltage.to_si([0.0, PWM_TOP]))
         raise RigError(
-            f"{who(rig)}: the pulse width may go from {low} to {high} counts; the loop needs"
-            f" {_FEWEST_DUTY} at least. By channels.voltage, 0 to {PWM_TOP} counts are {volts[0]:.4g} to"
-            f" {volts[1]:.4g} V. Correct that calibration, daq.duty or loop.limits.voltage"
+            f"{who(rig)}: the pulse width may be {low} to {high} counts; the loop needs at least {_FEWEST_DUTY}. "
+            f"By channels.voltage, 0 to {PWM_TOP} counts are {volts[0]:.4g} to {volts[1]:.4g} V. Correct that "
+            "calibration, daq.duty or loop.limits.voltage"
         )
     if voltage.ends is not None and (low < voltage.ends[0] or high > voltage.ends[1]):
         raise RigError(
@@ -207,8 +207,8 @@ def duty_off(rig: Rig, daq: Daq, voltage: Scale) -> int:
     if abs(volts[off]) > _OFF_SHARE * most and not never_on:
         asked = "daq.duty_off is" if daq.duty_off is not None else "the pulse width nearest to 0 V is"
         raise RigError(
-            f"{who(rig)}: {asked} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state has to be"
-            f" 0 V within {_OFF_SHARE:.0%} of {most:.4g} V. Correct daq.duty_off or that calibration"
+            f"{who(rig)}: {asked} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state must be 0 V "
+            f"within {_OFF_SHARE:.0%} of {most:.4g} V. Correct daq.duty_off or that calibration"
         )
     return off
 
@@ -218,8 +218,8 @@ def trip_counts(rig: Rig, scale: Scale) -> tuple[int, int]:
     wanted = rig.trip("current" if scale.role == "current" else "position")
     if not all(map(math.isfinite, wanted)):
         raise RigError(
-            f"{who(rig)} has neither daq.trip.{scale.role} nor loop.limits.{scale.role}; the controller needs to"
-            " know where to go to its safe state. Give one of them"
+            f"{who(rig)} has neither daq.trip.{scale.role} nor loop.limits.{scale.role}; the controller needs to "
+            "know when to enter its safe state. Give one of them"
         )
     ends = np.sort(scale.to_counts(wanted))
     low, high = math.ceil(ends[0] - _ROUND_OFF), math.floor(ends[1] + _ROUND_OFF)
@@ -229,8 +229,9 @@ def trip_counts(rig: Rig, scale: Scale) -> tuple[int, int]:
         raise _beyond(rig, scale, wanted)
     if low >= high and 0.0 <= ends[0] < ends[1] <= ADC_TOP:
         raise RigError(
-            f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, has no two counts in it: one is"
-            f" {abs(scale.slope(float(ends.mean()))):.3g} by channels.{scale.role}. Widen daq.trip.{scale.role}"
+            f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, spans less than two "
+            f"counts: one is {abs(scale.slope(float(ends.mean()))):.3g} by channels.{scale.role}. Widen "
+            f"daq.trip.{scale.role}"
         )
     if low >= high or low > ADC_TOP or high < 0:
         raise _beyond(rig, scale, wanted)
@@ -253,9 +254,9 @@ def _one_sided(scale: Scale, wanted: Interval, low: int, high: int) -> tuple[int
 def _beyond(rig: Rig, scale: Scale, wanted: Interval) -> RigError:
     shown = np.sort(scale.to_si([0.0, float(ADC_TOP)]))
     return RigError(
-        f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, is not inside what the"
-        f" converter can show, {shown[0]:.4g} to {shown[1]:.4g} (0 to {ADC_TOP} counts by channels.{scale.role}): it"
-        f" would never trip. Narrow daq.trip.{scale.role}, or correct the calibration"
+        f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, is not inside the range of the "
+        f"converter, {shown[0]:.4g} to {shown[1]:.4g} (0 to {ADC_TOP} counts by channels.{scale.role}): it would "
+        f"never trip. Narrow daq.trip.{scale.role}, or correct the calibration"
     )
 
 
@@ -282,9 +283,9 @@ def period_of(rate_hz: float) -> int:
         return period
     near = sorted({_possible(math.ceil(exact)), _possible(math.floor(exact))}, reverse=True)
     raise DeviceError(
-        f"daq.rate_hz is {rate_hz:g} Hz; a tick of the controller is a whole number of periods of {PWM_HZ:g} Hz,"
-        f" {SHORTEST_PERIOD} to {LONGEST_PERIOD} of them. The nearest: give"
-        f" {' or '.join(f'{PWM_HZ / n:.10g}' for n in near)} Hz"
+        f"daq.rate_hz is {rate_hz:g} Hz; a tick of the controller is a whole number of periods of {PWM_HZ:g} Hz, "
+        f"{SHORTEST_PERIOD} to {LONGEST_PERIOD} of them. The nearest rates: "
+        f"{' or '.join(f'{PWM_HZ / n:.10g}' for n in near)} Hz"
     )
 
 

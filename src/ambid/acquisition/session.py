@@ -205,8 +205,8 @@ class _Run:
         self._unheard += len(block.values)
         if self._unheard > _LONGEST_WAIT_S * self._rate_hz:
             raise DeviceError(
-                f"{self._device.info.port}: the excitation was ordered and does not show in"
-                f" {_LONGEST_WAIT_S:g} s of samples. Give a larger amplitude"
+                f"{self._device.info.port}: the excitation was started but is not visible in {_LONGEST_WAIT_S:g} s "
+                "of samples. Give a larger amplitude"
             )
         return None
 
@@ -246,8 +246,8 @@ class _Run:
             silent += 1
             if silent > _SILENT_LOOKS:
                 raise DeviceError(
-                    f"{self._device.info.port}: no sample came for {_SILENT_LOOKS * _LOOK_S:g} s; the device should"
-                    f" send {self._device.info.rate_hz:g} in a second. Look at cable and supply, and start again"
+                    f"{self._device.info.port}: no sample came for {_SILENT_LOOKS * _LOOK_S:g} s; the device "
+                    f"should send {self._device.info.rate_hz:g} per second. Check cable and supply, and start again"
                 )
 
 

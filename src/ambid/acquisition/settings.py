@@ -185,8 +185,8 @@ def _daq(rig: Rig) -> Daq:
         )
     if rig.daq is None:
         raise RigError(
-            f"{who(rig)} has no section [daq]; the controller has to be told its rate, pulse widths and trips."
-            " Add [daq] (docs/rig.md)"
+            f"{who(rig)} has no section [daq]; the controller needs its rate, pulse widths and trips. Add [daq] "
+            "(docs/rig.md)"
         )
     return rig.daq
 
@@ -231,15 +231,15 @@ def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
 def _gain(rig: Rig, name: str, value: float) -> int:
     if abs(value) > LARGEST_GAIN:
         raise RigError(
-            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, which takes {LARGEST_GAIN} at most: one"
-            " count of the sensor would order too much. Use a sensor of a smaller range, lower that gain, or correct"
-            " the calibrations"
+            f"{who(rig)}: loop.{name} is {value:.4g} steps of the controller, whose limit is {LARGEST_GAIN}: one "
+            "count of the sensor would demand too much. Use a sensor of a smaller range, reduce that gain, or "
+            "correct the calibrations"
         )
     steps = round(value)
     if value != 0.0 and abs(steps) < _FEWEST_STEPS:
         raise RigError(
-            f"{who(rig)}: loop.{name} is {value:.2g} steps of the controller, fewer than {_FEWEST_STEPS}: too"
-            f" small to be held. Raise loop.{name}, set it to 0, or use a sensor with fewer counts"
+            f"{who(rig)}: loop.{name} is {value:.2g} steps of the controller, fewer than {_FEWEST_STEPS}: too "
+            f"small to be represented. Raise loop.{name}, set it to 0, or use a sensor with fewer counts"
         )
     return steps
 
@@ -248,8 +248,8 @@ def _check_line(rig: Rig, daq: Daq, settings: ControllerSettings) -> None:
     bits = BYTE_BITS * (_FRAME_BYTES + 2 * len(carried(settings)))
     if bits * settings.rate_hz > daq.baud:
         raise RigError(
-            f"{who(rig)}: {settings.rate_hz:g} samples a second of {bits} bit times each do not fit into daq.baud ="
-            f" {daq.baud} bit/s, but {daq.baud / bits:.0f} do. Lower daq.rate_hz"
+            f"{who(rig)}: {settings.rate_hz:g} samples per second of {bits} bit times each exceed daq.baud = "
+            f"{daq.baud} bit/s, which carries {daq.baud / bits:.0f}. Lower daq.rate_hz"
         )
 
 

@@ -207,7 +207,7 @@ def _data(
         raise EstimationError(f"three blocks: {n} samples are too few for six coefficients; give at least 100")
     for name, c in zip(("voltage", "current", "position"), columns, strict=True):
         if np.ptp(c) == 0:
-            raise EstimationError(f"three blocks: the {name} is constant; nothing can be learned from it. Excite it")
+            raise EstimationError(f"three blocks: the {name} is constant; it carries no information. Excite it")
     r = (
         np.empty((n - delay, 0))
         if reference is None

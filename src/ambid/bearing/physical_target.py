@@ -16,9 +16,8 @@ from ambid.arrays import Array
 from ambid.bearing.multistart import Moments
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, TransferModel, response_covariance
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.physics.linear_model import DiscreteSpace, LinearModel, discretise
-from ambid.units import counted
 
 Complex = NDArray[np.complex128]
 

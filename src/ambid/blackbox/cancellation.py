@@ -17,7 +17,9 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import PolynomialModel, StateSpaceModel, TransferModel, roots_at
+from ambid.errors import counted
 from ambid.estimation.estimate import Check
+from ambid.estimation.uncertainty import p_text
 
 Complex = NDArray[np.complex128]
 _CHI2_999 = (10.827566170662733, 13.815510557964274)  # of one and two degrees of freedom
@@ -44,15 +46,16 @@ def orders_supported(fit: BlackBoxFit) -> Check | None:
     if pairs:
         worst = min(pairs, key=lambda c: c.distance)
         detail = (
-            f"{n} pole{'s' if n > 1 else ''} cannot be told from a zero ({worst.where}: pole {_shown(worst.pole)}, "
+            f"{counted(n, 'pole')} cannot be distinguished from a zero ({worst.where}: pole {_shown(worst.pole)}, "
             f"zero {_shown(worst.zero)}): the order is higher than the data support. Lower it"
         )
-    elif idle:
+    elif idle and p is not None:
         detail = (
-            f"the last coefficients {', '.join(idle)} may all be zero (p = {p:.2g}): fewer would do. Lower the orders"
+            f"the last coefficients {', '.join(idle)} may all be zero ({p_text(p)}): a lower order suffices. Lower "
+            "the orders"
         )
     else:
-        detail = "no pole meets a zero, and the last coefficients are not zero"
+        detail = "no pole–zero cancellation, and the last coefficients are not zero"
     return Check(passed=not pairs and not idle, p=p, values={"cancellations": float(n)}, detail=detail)
 
 

@@ -121,8 +121,8 @@ def _delayed(model: TransferModel, o: int, i: int) -> tuple[Array, Array]:
     if model.delay[i]:
         if model.dt is None:
             raise ModelError(
-                f"the continuous model has a delay of {model.delay[i]:g} s, which has no place in a rational transfer "
-                "function. Set the delay apart, or use a discrete structure"
+                f"the continuous model has a delay of {model.delay[i]:g} s, which a rational transfer function "
+                "cannot hold. Remove the delay, or use a discrete structure"
             )
         later = round(model.delay[i] / model.dt)
     return model.num[o][i], np.concatenate([model.den[o][i], np.zeros(later)])

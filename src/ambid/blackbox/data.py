@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, counted, nearest
 from ambid.record import Record
 
 _LARGEST = 1e60  # squares of ratios of channels have to stay inside the range of floating-point numbers
@@ -72,7 +72,7 @@ class IOData:
         twice = sorted({x for x in names if names.count(x) > 1})
         if twice:
             raise EstimationError(
-                f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ. Leave one out"
+                f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ. Omit one"
             )
         _no_copies(np.hstack([self.u, self.y]), (*self.inputs, *self.outputs))
 
@@ -108,7 +108,9 @@ class IOData:
             If the part is empty or outside the record.
         """
         if not 0 <= first < last <= self.n_samples:
-            raise EstimationError(f"samples {first} to {last} of a record of {self.n_samples}; give a part inside it")
+            raise EstimationError(
+                f"samples {first} to {last} of a record of {self.n_samples}; they must lie inside it. Correct the part"
+            )
         cut = {name: getattr(self, name)[first:last] for name in ("u", "y", "reference")}
         return replace(self, start_s=self.start_s + first * self.dt, **cut)
 
@@ -127,7 +129,7 @@ def io_data(
     excitation; `open_loop`: say that no feedback was at work.
     """
     if not outputs:
-        raise EstimationError("no output is named; a model needs at least one. Give --output COLUMN")
+        raise EstimationError("no output was named; a model needs at least one. Give --output COLUMN")
     n = record.n_samples
 
     def columns(names: Sequence[str]) -> Array:
@@ -161,8 +163,8 @@ def _columns(values: Array, what: str, names: tuple[str, ...], n: int) -> Array:
         return np.empty((n, 0))
     if array.shape != (n, len(names)):
         raise EstimationError(
-            f"the {what}s have shape {array.shape} for {len(names)} name(s) and {n} samples of the outputs; "
-            "they must be (n_samples, n_channels), time along axis 0. Pass one column for each name"
+            f"the {what}s have shape {array.shape} for {counted(len(names), 'name')} and {counted(n, 'sample')} of "
+            "the outputs; they must be (n_samples, n_channels), time along axis 0. Pass one column for each name"
         )
     if not np.all(np.isfinite(array)):
         row, column = (int(i[0]) for i in np.nonzero(~np.isfinite(array)))
@@ -184,8 +186,8 @@ def _no_copies(values: Array, names: tuple[str, ...]) -> None:
         for k in range(i):
             if np.array_equal(values[:, i], values[:, k]) and np.ptp(values[:, i]) > 0:
                 raise EstimationError(
-                    f"channels {names[k]!r} and {names[i]!r} hold the same numbers; a model cannot tell them apart. "
-                    "Leave one out"
+                    f"channels {names[k]!r} and {names[i]!r} hold the same values; a model cannot distinguish "
+                    "them. Omit one"
                 )
 
 
@@ -195,10 +197,10 @@ def _check_size(array: Array, what: str, names: tuple[str, ...]) -> None:
         low, high = float(column.min()), float(column.max())
         peak, span = max(-low, high), high / 2 - low / 2
         if peak > _LARGEST or 0.0 < span < _SMALLEST:
-            size = f"reaches {peak:.3g}" if peak > _LARGEST else f"moves by only {2 * span:.3g}"
+            size = f"reaches {peak:.3g}" if peak > _LARGEST else f"varies by only {2 * span:.3g}"
             raise EstimationError(
-                f"{what} {name!r} {size} in SI units; {_SMALLEST:g} to {_LARGEST:g} can be computed with. "
-                "Check its unit, or scale it"
+                f"{what} {name!r} {size} in SI units; the computable range is {_SMALLEST:g} to {_LARGEST:g}. Check "
+                "its unit, or scale it"
             )
 
 
@@ -220,7 +222,7 @@ def check_order_names(who: str, orders: Orders, allowed: Sequence[str], needed: 
     for name in orders:
         if name not in allowed:
             raise EstimationError(
-                f"{who}: order {name!r} is not known; it takes {takes}.{nearest(name, allowed)} Leave it out"
+                f"{who}: order {name!r} is unknown; it takes {takes}.{nearest(name, allowed)} Omit it"
             )
     for name in needed:
         if name not in orders:
@@ -274,7 +276,7 @@ def check_length(who: str, data: IOData, rows: int, unknowns: int) -> None:
     `rows`: samples that are left after lags; `unknowns`: numbers to be estimated for one output.
     """
     if not data.n_inputs:
-        raise EstimationError(f"{who}: no input is named; it estimates the way from inputs to outputs. Give --input")
+        raise EstimationError(f"{who}: no input was named; it estimates the path from inputs to outputs. Give --input")
     if rows < 4 * unknowns or rows < 20:
         raise EstimationError(
             f"{who}: {data.n_samples} samples for {unknowns} unknowns; at least {max(20, 4 * unknowns)} rows are "
@@ -284,7 +286,7 @@ def check_length(who: str, data: IOData, rows: int, unknowns: int) -> None:
         for name, column in zip(names, np.ptp(values, axis=0), strict=True):
             if column == 0:
                 raise EstimationError(
-                    f"{who}: channel {name!r} is constant; nothing can be learned from it. Excite it, or leave it out"
+                    f"{who}: channel {name!r} is constant; it carries no information. Excite it, or omit it"
                 )
 
 

@@ -82,18 +82,18 @@ STRUCTURES: Mapping[str, Structure] = {
         "polynomial",
         "instrumental",
         ("iv4", "na nb nk", "biased", "A y = B u + noise of any colour"),
-        ("cliv", "na nb nk", "consistent", "A y = B u + noise of any colour, in a loop with its reference"),
+        ("cliv", "na nb nk", "consistent", "A y = B u + noise of any colour, in closed loop with its reference"),
     ),
     **_register(
         "transfer function",
         "instrumental_continuous",
         ("srivc", "nb nf nk", "biased", "y = B(s)/F(s) u + noise, continuous time"),
-        ("clsrivc", "nb nf nk", "consistent", "y = B(s)/F(s) u + noise, in a loop with its reference"),
+        ("clsrivc", "nb nf nk", "consistent", "y = B(s)/F(s) u + noise, in closed loop with its reference"),
     ),
     **_register(
         "polynomial",
         "instrumental",
-        ("two-stage", "nb nf nk", "consistent", "y = B/F u in a loop: reference to input, then oe"),
+        ("two-stage", "nb nf nk", "consistent", "y = B/F u in closed loop: reference to input, then oe"),
     ),
     **_register(
         "state space",
@@ -101,14 +101,19 @@ STRUCTURES: Mapping[str, Structure] = {
         ("n4sid", "n", "biased", "x+ = A x + B u + K e, subspace by oblique projection"),
         ("moesp", "n", "biased", "x+ = A x + B u + K e, subspace, past without future inputs"),
         ("cva", "n", "biased", "x+ = A x + B u + K e, subspace by canonical variates"),
-        ("pbsid", "n", "consistent", "x+ = A x + B u + K e, subspace from a long autoregression; stands feedback"),
+        (
+            "pbsid",
+            "n",
+            "consistent",
+            "x+ = A x + B u + K e, subspace from a long autoregression; consistent in closed loop",
+        ),
     ),
     **_register(
         "state space",
         "state_space_search",
-        ("sspem", "n", "with noise model", "x+ = A x + B u + K e by prediction error: the sharpest"),
+        ("sspem", "n", "with noise model", "x+ = A x + B u + K e by prediction error: statistically efficient"),
     ),
-    **_register("polynomial", "impulse", ("rfir", "nb nk", "biased", "y = B u + e, many taps with a fading prior")),
+    **_register("polynomial", "impulse", ("rfir", "nb nk", "biased", "y = B u + e, many taps with a decaying prior")),
     **_register(
         "transfer function",
         "weak_form",
@@ -146,7 +151,7 @@ def structure(name: str) -> Structure:
         )
     if name not in STRUCTURES:
         known = ", ".join(STRUCTURES)
-        raise EstimationError(f"structure {name!r} is not known; known: {known}.{nearest(name, list(STRUCTURES))}")
+        raise EstimationError(f"structure {name!r} is unknown; known: {known}.{nearest(name, list(STRUCTURES))}")
     return STRUCTURES[name]
 
 
@@ -234,11 +239,10 @@ def build_fit(
         raise EstimationError(f"{name}: no finite coefficients fit this record. Lower the orders, or check the columns")
     found = list(warnings)
     if status != "converged":
-        found.insert(0, "the search did not converge: treat the numbers as a first guess")
+        found.insert(0, "the search did not converge: treat the values as a first guess")
     if structure(name).feedback == "biased" and data.n_inputs and not data.open_loop:
         found.append(
-            f"{name} is biased where a controller was at work, and nothing says that this record is open loop: "
-            "use bj, armax or pbsid, or say --open-loop if there was no feedback"
+            f"{name} is biased by feedback. Use bj, armax or pbsid, or give --open-loop if the record is open loop"
         )
     return BlackBoxFit(
         structure=name,

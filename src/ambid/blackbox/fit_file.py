@@ -31,7 +31,7 @@ from ambid.estimation.estimate import (
 
 _LARGEST = 1e100  # what a number in a file may be: beyond, its square is not finite any more
 NO_INNOVATIONS = (
-    "none: a frequency response has no innovations, and its noise stands in the covariance of the coefficients"
+    "none: a frequency response has no innovations; its noise is part of the covariance of the coefficients"
 )
 
 
@@ -100,7 +100,7 @@ def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) ->
                 rows[which].append([])
             rows[which][o].append(theta[place])
         return "transfer_function", rows
-    raise ModelError(f"a model of type {type(model).__name__} has no place in a file")
+    raise ModelError(f"a model of type {type(model).__name__} cannot be stored in a file")
 
 
 def _poles_json(fit: BlackBoxFit) -> list[dict[str, Any]]:
@@ -161,7 +161,7 @@ def _finite(value: Any, what: str) -> Array:
 def _rate(d: Mapping[str, Any]) -> float:
     rate = d["rate_hz"]
     if isinstance(rate, bool) or not isinstance(rate, int | float) or not 1 / _LARGEST < rate < _LARGEST:
-        raise ValueError("the rate is no positive number")
+        raise ValueError("the rate is not a positive number")
     return float(rate)
 
 

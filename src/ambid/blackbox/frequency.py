@@ -124,9 +124,7 @@ class Lines:
         expected, sd = share * float(np.sum(mean)), float(np.sqrt(share * np.sum(variance) * self.alike))
         probability = float(gamma.sf(cost, (expected / sd) ** 2, scale=sd**2 / expected))
         passed = probability > SUSPICIOUS
-        say = (
-            "as large as noise alone leaves" if passed else "larger than noise explains: model errors, or a wrong order"
-        )
+        say = "as expected from noise alone" if passed else "larger than noise explains: model errors, or a wrong order"
         return Check(
             passed=passed,
             detail=f"cost {cost:.5g}, expected {expected:.5g} with sd {sd:.3g}: {say}",
@@ -151,9 +149,9 @@ def check_lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
     for what, values in (("frequency", f[:, None]), ("G", G.reshape(n, -1)), ("covariance", C.reshape(n, -1))):
         bad = np.nonzero(~np.all(np.isfinite(values), axis=1))[0]
         if bad.size:
-            raise EstimationError(f"the {what} is not finite on line {bad[0]}; leave lines without excitation out")
+            raise EstimationError(f"the {what} is not finite on line {bad[0]}; omit lines without excitation")
     if np.any(f < 0) or np.any(np.diff(f) <= 0):
-        raise EstimationError("the frequencies are not increasing from 0 or above; sort the lines and leave twins out")
+        raise EstimationError("the frequencies must increase from 0 or above; sort the lines and remove duplicates")
     if 2 * n * m < n_estimated or n < 2:
         raise EstimationError(
             f"{n} lines of {m} numbers are too few for {n_estimated} coefficients. Lower the orders, or measure "
@@ -236,9 +234,9 @@ def build_response_fit(
     check = checked.verdict(cost, n_estimated)
     found = [*warnings, *frf.warnings]
     if not converged:
-        found.insert(0, "the search did not converge: treat the numbers as a first guess")
+        found.insert(0, "the search did not converge: treat the values as a first guess")
     if not check.passed:
-        found.insert(0, f"{name}: {check.detail}; standard deviations hold for noise alone")
+        found.insert(0, f"{name}: {check.detail}; standard deviations cover noise only")
     return BlackBoxFit(
         structure=name,
         orders=dict(orders),
@@ -358,13 +356,13 @@ def frf_ml(
     if domain not in ("s", "z"):
         raise EstimationError(f"domain {domain!r}; it must be 's' or 'z'. Give one of them")
     if domain == "z" and frf.hold != "zoh":
-        raise EstimationError("a model in z wants an input that is held over a sample; this one is not. Use domain 's'")
+        raise EstimationError("a model in z needs an input that is held over a sample; this one is not. Use domain 's'")
     if delay != "auto" and not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct it")
     form = _form(frf, orders, domain)
     period = form.lines.dt
     if domain == "z" and delay != "auto" and abs(delay / period - round(delay / period)) > 1e-9:
-        raise EstimationError(f"a delay of {delay} s is no whole number of samples of {period} s. Use domain 's'")
+        raise EstimationError(f"a delay of {delay} s is not a whole number of samples of {period} s. Use domain 's'")
     with one_thread():
         best = _best_fit(form, delay, domain)
     return _result(frf, best, domain)
@@ -378,7 +376,7 @@ def _best_fit(
     lags = period * np.arange(MAX_DELAY + 1.0) if delay == "auto" else np.array([delay])
     found = sorted((start for lag in lags for start in _starts(form, float(lag))), key=lambda c: c[0])
     if not found:
-        raise EstimationError("no start fits these lines; lower the orders, or check G and its covariance")
+        raise EstimationError("no starting values fit these lines; lower the orders, or check G and its covariance")
     best: tuple[float, _Form, Array, float, bool] | None = None
     for _, at, vector, lag in found[:_RACE]:
         free = replace(at, delay_free=delay == "auto" and domain == "s")
@@ -540,7 +538,7 @@ def _hold_warning(at: _Form) -> list[str]:
     if at.dt is not None or not at.lines.held:
         return []
     return [
-        "the input is held over a sample: a model in s leaves out what the hold folds down; a model in z, or the "
+        "the input is held over a sample: a model in s neglects the aliasing of the hold; a model in z, or the "
         "grey box, is exact"
     ]
 

@@ -352,7 +352,7 @@ def _block_rows(ln: Lines, n: int) -> int:
     least, most = n // n_y + 2, int(2 * ln.n_lines * n_u) // (n_y + n_u)
     if least > most:
         raise EstimationError(
-            f"order {n} wants {least} block rows, and {ln.n_lines} lines tell {most} apart. Lower the order, or "
+            f"order {n} needs {least} block rows, and {ln.n_lines} lines distinguish {most}. Lower the order, or "
             "measure more lines"
         )
     return int(max(least, min(2 * n + 2, most // 2)))

@@ -28,8 +28,9 @@ from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instruments import autoregression
 from ambid.blackbox.model import Offsets, PolynomialModel
 from ambid.blackbox.polynomial_predictor import Layout, arx_layout
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.linear import one_thread
+from ambid.estimation.uncertainty import p_text
 from ambid.signals.delay import lagged_triangle
 
 
@@ -263,9 +264,9 @@ _NOISE_ORDER = 20  # highest of the noise's autoregression
 _OLDER = 10  # lags beyond the taps that are looked at
 _SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
 _WITHIN = (
-    "inputs and outputs depend on each other within the same sample (p = {p:.2g}). If the controller acts without "
-    "delay, that is as it should be; if the plant does, its first tap is not zero, as is taken for granted here, and "
-    "the later ones are off. Where there was no feedback say open_loop (--open-loop): then the first tap is estimated"
+    "inputs and outputs depend on each other within the same sample ({p}). This is normal if the controller acts "
+    "without delay; if the plant does, its first tap is not zero, as is assumed here, and the later ones are "
+    "biased. Without feedback give open_loop (--open-loop): then the first tap is estimated"
 )
 
 
@@ -356,7 +357,7 @@ def impulse_response(data: IOData, n_taps: int) -> ImpulseResponse:
         If the record is too short, or fewer than two taps are asked for.
     """
     if n_taps < 2:
-        raise EstimationError(f"impulse response: {n_taps} tap(s); at least 2 make a response. Ask for more")
+        raise EstimationError(f"impulse response: {counted(n_taps, 'tap')}; at least 2 make a response. Ask for more")
     values = np.zeros((n_taps, data.n_outputs, data.n_inputs))
     covariance = np.zeros((data.n_outputs, data.n_inputs, n_taps, n_taps))
     noise_sd, warnings = (_direct if data.open_loop else _through_autoregression)(data, values, covariance)
@@ -395,7 +396,7 @@ def _through_autoregression(data: IOData, values: Array, covariance: Array) -> t
     scale = taps.y_sd[:, None] / taps.u_sd
     values[1:] = found * scale
     covariance[:, :, 1:, 1:] = spread * scale[:, :, None, None] ** 2
-    warnings = () if taps.within_sample > _SEEN else (_WITHIN.format(p=taps.within_sample),)
+    warnings = () if taps.within_sample > _SEEN else (_WITHIN.format(p=p_text(taps.within_sample)),)
     return np.sqrt(np.diag(taps.noise)) * taps.y_sd, warnings
 
 
@@ -528,7 +529,7 @@ def correlation_analysis(data: IOData, n_lags: int) -> Correlation:
     from scipy.stats import norm
 
     if not data.n_inputs:
-        raise EstimationError("correlation analysis: no input is named. Give --input")
+        raise EstimationError("correlation analysis: no input was named. Give --input")
     n, order = data.n_samples - _WHITENING, _WHITENING
     if n_lags < 1 or n < 4 * n_lags + 4 * order + 20:
         raise EstimationError(
@@ -540,7 +541,7 @@ def correlation_analysis(data: IOData, n_lags: int) -> Correlation:
     for i, name in enumerate(data.inputs):
         u = data.u[:, i] - data.u[:, i].mean()
         if not np.any(u):
-            raise EstimationError(f"input {name!r} is constant; nothing can be learned from it. Excite it")
+            raise EstimationError(f"input {name!r} is constant; it carries no information. Excite it")
         whitening = _whitening_filter(u, order)
         white = lfilter(whitening, 1.0, u)[order:]
         for o in range(data.n_outputs):
@@ -550,14 +551,15 @@ def correlation_analysis(data: IOData, n_lags: int) -> Correlation:
             outside = int(np.sum(np.abs(values[:n_lags, o, i]) > band[o, i]))
             if outside > _allowed(n_lags):
                 warnings.append(
-                    f"{outside} of {n_lags} negative lags from {name!r} to {data.outputs[o]!r} stand out: feedback was "
-                    "at work, and these responses are biased. Use impulse_response"
+                    f"{outside} of {n_lags} negative lags from {name!r} to {data.outputs[o]!r} are significant: "
+                    "there is feedback, and these responses are biased. Use impulse_response"
                 )
     if data.n_inputs > 1:
         together = np.abs(np.corrcoef(data.u.T) - np.eye(data.n_inputs)).max()
         if together > 4 / np.sqrt(n):
             warnings.append(
-                f"inputs are correlated (up to {together:.2f}): one at a time is biased. Use impulse_response"
+                f"inputs are correlated (up to {together:.2f}), which biases one-at-a-time estimates. Use "
+                "impulse_response"
             )
     lags = np.arange(-n_lags, n_lags + 1)
     return Correlation(

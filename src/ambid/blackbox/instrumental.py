@@ -507,8 +507,8 @@ def _first_stage(who: str, data: IOData) -> tuple[Array, int, tuple[str, ...]]:
         ()
         if lags >= memory
         else (
-            f"the loop remembers its reference for {memory} samples, and the record allows a first stage of {lags}: "
-            "what is left out counts as noise. Take a longer record, or cliv",
+            f"the loop remembers its reference for {memory} samples, and the record allows a first stage of "
+            f"{lags}: the rest counts as noise. Use a longer record, or cliv",
         )
     )
     return basis @ (basis.T @ u) + mean, lags, warnings

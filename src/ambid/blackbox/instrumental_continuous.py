@@ -279,7 +279,7 @@ def transfer_orders(who: str, data: IOData, orders: Orders, more: int = 1) -> Tr
     check_order_names(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
     n_u = data.n_inputs
     if not n_u:
-        raise EstimationError(f"{who}: no input is named; it estimates the way from inputs to outputs. Give --input")
+        raise EstimationError(f"{who}: no input was named; it estimates the path from inputs to outputs. Give --input")
     nb, n = order_per_input(who, orders, "nb", 1, n_u), single_order(who, orders, "nf", 1)
     if max(nb) > n + more:
         raise EstimationError(
@@ -549,9 +549,9 @@ def _clsrivc_fit(
         )
         if c.freedom and chi2.sf(c.misfit, c.freedom) < _UNLIKELY:
             warnings.append(
-                f"output {data.outputs[o]!r}: no continuous model of these orders has the sampled model that the data "
-                f"show (misfit {c.misfit:.3g} for {c.freedom} degrees of freedom): check nb, nf and the delay nk, and "
-                "that the input is held over a sample"
+                f"output {data.outputs[o]!r}: no continuous model of these orders matches the sampled model of the "
+                f"data (chi-square {c.misfit:.3g} with {c.freedom} degrees of freedom): check nb, nf and the delay "
+                "nk, and that the input is held over a sample"
             )
     warnings += weak_instruments([f.solution for f in found], data.outputs)
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))

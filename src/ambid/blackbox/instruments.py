@@ -142,8 +142,8 @@ def solve(instruments: Array, regressors: Array, target: Array, *, who: str) -> 
     left, values, right = np.linalg.svd(Q.T @ (regressors / size), full_matrices=False)
     if not np.all(np.isfinite(values)) or values[-1] <= _BLIND * values[0]:
         raise EstimationError(
-            f"{who}: the input or reference does not move every term of this model, so that its coefficients have no "
-            "single solution. Lower the orders, excite more frequencies, or give more independent references"
+            f"{who}: the input or reference does not excite every term of this model, so that its coefficients are "
+            "not unique. Lower the orders, excite more frequencies, or give more independent references"
         )
     inverse = (right.T / values) @ left.T / size[:, None]
     theta = inverse @ (Q.T @ target)
@@ -164,9 +164,9 @@ def weak_instruments(solutions: Sequence[Solution], outputs: Sequence[str]) -> l
     """
     found = [(x.strength(), name) for x, name in zip(solutions, outputs, strict=True)]
     return [
-        f"the instruments of {name!r} are weak: the reference or input moves one combination of the terms hardly more "
-        f"than noise does (first-stage F = {F:.2g}, under {_WEAK:g}). The estimate leans towards least squares, and "
-        "errors may be many times the standard deviations given. Excite more, take a longer record, or use bj or armax"
+        f"the instruments of {name!r} are weak: the reference or input excites one combination of the terms hardly "
+        f"more than noise does (first-stage F = {F:.2g}, below {_WEAK:g}). The estimate tends to least squares, "
+        "and errors may be many times the standard deviations. Excite more, use a longer record, or use bj or armax"
         for F, name in found
         if F < _WEAK
     ]
@@ -219,8 +219,8 @@ def require_reference(who: str, data: IOData) -> None:
     """Refuse data without a reference."""
     if not data.references:
         raise EstimationError(
-            f"{who}: no reference is named; its instruments come from the loop's outer excitation, which no noise "
-            "reaches. Give --reference COLUMN, or use bj, armax or pbsid, which want none"
+            f"{who}: no reference was named; its instruments come from the loop's external excitation, which is "
+            "free of noise. Give --reference COLUMN, or use bj, armax or pbsid, which need none"
         )
 
 
@@ -236,7 +236,7 @@ def reference_part(who: str, data: IOData) -> ReferencePart:
     n, n_w, n_r = data.n_samples, w.shape[1], r.shape[1]
     highest = min(_HIGHEST, n // (10 * (n_w + n_r)))
     if highest < 1:
-        raise EstimationError(f"{who}: {n} samples are too few to see the loop. Give a longer record")
+        raise EstimationError(f"{who}: {n} samples are too few to identify the loop. Give a longer record")
     R, width = _triangle(w, r, highest), n_w + n_r
     for p in _by_criterion(R, n - highest, n_w, n_r, highest):
         size = 1 + n_r + p * width
@@ -253,8 +253,8 @@ def reference_part(who: str, data: IOData) -> ReferencePart:
             n_y = data.n_outputs
             return ReferencePart(u=out[:, n_y:], y=out[:, :n_y], order=p, memory=found.shape[0])
     raise EstimationError(
-        f"{who}: no stable loop from {', '.join(data.references)} to inputs and outputs fits this record. "
-        "Check the reference column, or cut the part where the loop runs away"
+        f"{who}: no stable loop from {', '.join(data.references)} to inputs and outputs fits this record. Check "
+        "the reference column, or cut out the part where the loop is unstable"
     )
 
 

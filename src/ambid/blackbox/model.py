@@ -880,7 +880,7 @@ class TransferModel(RationalModel):
         from scipy.signal import tf2ss
 
         if self.dt is None and any(self.delay):
-            raise ModelError("a continuous model with a delay has no state space. Set the delay apart, or discretise")
+            raise ModelError("a continuous model with a delay has no state space. Remove the delay, or discretise")
         blocks, n_u, n_y = [], self.n_inputs, self.n_outputs
         D = np.zeros((n_y, n_u))
         for o, i in np.ndindex(n_y, n_u):

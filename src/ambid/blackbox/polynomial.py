@@ -37,6 +37,7 @@ from ambid.blackbox.polynomial_search import (
 )
 from ambid.errors import EstimationError
 from ambid.estimation.linear import directions, one_thread
+from ambid.estimation.uncertainty import p_text
 
 _LEAST_SEEN = 1e-14  # singular value, of scaled columns, that stands for a direction not seen at all
 _FAR = 10.0  # standard deviations of y: an offset beyond is put on the input
@@ -69,7 +70,7 @@ def polynomial_fit(
     if scaled.at_rest:
         warnings += not_at_rest(layouts, fits, scaled)
     if estimated_delay and any(k >= LARGEST_DELAY for x in layouts for k in x.nk):
-        warnings.append(f"the delay was looked for up to {LARGEST_DELAY} samples and may be longer: give nk")
+        warnings.append(f"the delay was searched up to {LARGEST_DELAY} samples and may be longer: give nk")
     details: dict[str, object] = {
         "iterations": [f.iterations for f in fits],
         "condition": [min(f.directions.condition, 1e300) for f in fits],
@@ -212,9 +213,8 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
         size, sd = _outermost(fit.theta, armax.places["A", None], covariance)
         if size > 1.0 + _SDS * sd:
             found.append(
-                f"output {o}: the plant looks unstable (armax finds a pole of magnitude {size:.4g}, "
-                f"sd {sd:.1g}), which this structure cannot hold: its "
-                "predictor would be unstable too. Use armax, arx or ararmax"
+                f"output {o}: the plant looks unstable (armax finds a pole of magnitude {size:.4g}, sd {sd:.1g}), "
+                "and this structure would give an unstable predictor. Use armax, arx or ararmax"
             )
     return found
 
@@ -227,7 +227,7 @@ def _blind(model: PolynomialModel, o: int, fit: Minimum) -> Iterator[str]:
     large = np.abs(Vt[-1]) > 0.3 * np.max(np.abs(Vt[-1]))
     which = ", ".join(x for x, big in zip(names, large, strict=True) if big)
     yield (
-        f"the data do not tell {which} apart (condition number {s[0] / max(s[-1], 1e-300):.1e}): their values are "
+        f"the data do not distinguish {which} (condition number {s[0] / max(s[-1], 1e-300):.1e}): their values are "
         "arbitrary along one direction. Lower the orders, or excite more"
     )
 
@@ -248,8 +248,8 @@ def _at_border(model: PolynomialModel, o: int, covariance: Array, fit: Minimum) 
         if (size > _OUTER and size + _SDS * sd >= 1.0) or (fit.at_border and size > 0.999):
             name = f"F.{i}" if letter == "F" and several else letter
             yield (
-                f"a root of {name} of magnitude {size:.6g} (sd {sd:.1g}) is at the border of stability: its standard "
-                "deviation is not to be trusted. "
+                f"a root of {name} of magnitude {size:.6g} (sd {sd:.1g}) is at the stability limit: its standard "
+                "deviation is unreliable. "
                 + ("Lower nc" if letter == "C" else "If the plant integrates or is unstable, use armax or arx")
             )
 
@@ -278,9 +278,9 @@ def not_at_rest(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: Scal
         p = rest_probability(layout, fit, scaled.y[o], scaled.u)
         if p < _LEVEL:
             found.append(
-                f"{f'output {o}: ' if len(fits) > 1 else ''}the record does not begin at rest at zero (initial state "
-                f"and constant, set free, explain more than chance would: p = {p:.1g}): coefficients are biased. Leave "
-                "at_rest (--at-rest) out"
+                f"{f'output {o}: ' if len(fits) > 1 else ''}the record does not start at rest at zero (initial "
+                f"state and constant, estimated freely, are significant: {p_text(p)}): coefficients are biased. "
+                "Omit at_rest (--at-rest)"
             )
     return found
 
@@ -318,9 +318,9 @@ def missed_minimum(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: S
         p, less = _longer_model(layout, fit, scaled.y[o], scaled.u)
         if p < _LEVEL:
             found.append(
-                f"{f'output {o}: ' if len(fits) > 1 else ''}a longer model explains significantly more ({less:.1%} of "
-                f"the squared residual, p = {p:.0g}) and the search was hard: it may have missed a better minimum, or "
-                "the orders are too low. Try pbsid or sspem, or raise the orders"
+                f"{f'output {o}: ' if len(fits) > 1 else ''}a longer model fits significantly better ({less:.1%} "
+                f"of the squared residual, {p_text(p)}) and the search was hard: it may have missed a better "
+                "minimum, or the orders are too low. Try pbsid or sspem, or raise the orders"
             )
     return found
 
@@ -475,8 +475,8 @@ def fit_output(
     need = layout.first_row + 2 * (p.n_nuisance + layout.free.size) + 1
     if y.size < need:
         raise EstimationError(
-            f"{name}: {y.size} samples for {layout.free.size} coefficients; at least {need} are needed. "
-            "Lower the orders, or take a longer part of the record"
+            f"{name}: {y.size} samples for {layout.free.size} coefficients; at least {need} are needed. Lower the "
+            "orders, or use a longer part of the record"
         )
     worth = coefficient_units(layout, scaled, o)
     found: list[Minimum] = []

@@ -174,7 +174,7 @@ def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = Fals
         at_rest=at_rest,
     )
     if not layout.free.size:
-        raise EstimationError(f"{name}: all orders are 0; there is nothing to estimate. Raise one")
+        raise EstimationError(f"{name}: all orders are 0, and nothing is left to estimate. Raise one")
     return layout, free_delay
 
 
@@ -221,7 +221,7 @@ def _check_inputs(name: str, data: IOData) -> None:
         raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
     if not wants and data.n_inputs:
         raise EstimationError(
-            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Leave them out, or "
+            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Omit them, or "
             "use armax"
         )
 
@@ -249,8 +249,8 @@ def scale_data(name: str, data: IOData, *, at_rest: bool = False) -> ScaledData:
         for k, channel in enumerate(names):
             if not scale[k] > 1e-13 * abs(mean[k]):
                 raise EstimationError(
-                    f"{name}: {channel!r} does not move (constant at {values[0, k]:g}); nothing can be learnt from it. "
-                    "Excite it, or leave it out"
+                    f"{name}: {channel!r} is constant at {values[0, k]:g} and carries no information. Excite it, "
+                    "or omit it"
                 )
         centred /= scale[:, None]
         out.append((centred, mean, scale))

@@ -253,13 +253,13 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
     """
     if abs(data.dt / fit.dt - 1) > 1e-6:
         raise EstimationError(
-            f"the record is sampled at {1 / data.dt:g} Hz, the fit at {1 / fit.dt:g} Hz; they have to agree. "
+            f"the record is sampled at {1 / data.dt:g} Hz, the fit at {1 / fit.dt:g} Hz; they must agree. "
             "Resample the record, or fit it"
         )
     if (data.n_inputs, data.n_outputs) != (len(fit.inputs), len(fit.outputs)):
         raise EstimationError(
             f"the data have {data.n_inputs} inputs and {data.n_outputs} outputs, the fit {len(fit.inputs)} and "
-            f"{len(fit.outputs)}; they have to agree. Name the same channels"
+            f"{len(fit.outputs)}; they must agree. Name the same channels"
         )
     model, plant = innovations_form(fit), plant_form(fit)
     claims_noise = bool(np.any(model.K)) or not model.n_inputs

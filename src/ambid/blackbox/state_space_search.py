@@ -321,8 +321,8 @@ def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
         numbers = n * (u.shape[1] + 2 * y.shape[1] + 1) + y.shape[1] * (1 + first.plan.feedthrough * u.shape[1])
         if y.size < 2 * numbers:
             raise EstimationError(
-                f"sspem: {y.shape[0]} samples for {numbers} numbers; it wants at least {2 * numbers} values. "
-                "Lower n, or take a longer record"
+                f"sspem: {y.shape[0]} samples for {numbers} parameters; it needs at least {2 * numbers} values. "
+                "Lower n, or use a longer record"
             )
         method, start = _start(data, first, orders, u, y, tick)
         problem = Likelihood(start, u, y, feedthrough=first.plan.feedthrough)
@@ -374,13 +374,12 @@ def _result(
     warnings = []
     if found.point.exact:
         warnings.append(
-            "the record shows no noise: the errors are rounding, and so are the standard deviations. The noise model K "
-            "means nothing"
+            "the record has no noise: errors and standard deviations are rounding, and the noise model K is meaningless"
         )
     elif condition > _LOOSE:
         warnings.append(
-            f"the record does not tell all {m.order} states apart (condition {condition:.1g}): standard deviations "
-            "along what it does not show mean little. Lower n"
+            f"the data do not identify all {m.order} states (condition {condition:.1g}): standard deviations along "
+            "unidentifiable directions mean little. Lower n"
         )
     return build_subspace_fit(
         "sspem",

@@ -43,7 +43,7 @@ from ambid.blackbox.subspace_projection import (
     state_criterion,
     triangular_factor,
 )
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.linear import one_thread
 
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
@@ -90,7 +90,7 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
     """
     horizon, feedthrough = asked.horizon, asked.feedthrough
     check_order_names(method, orders, ("n",))
-    n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or say 'auto'")
+    n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or give 'auto'")
     given = channels(data)
     largest = n or n_max or _AUTO_MAX
     longest = _longest(method, data, given.n_samples, largest, horizon)
@@ -131,15 +131,15 @@ def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int 
         raise EstimationError(f"{method}: horizon = {horizon} samples; it must be at least 2. Raise it")
     if horizon is not None and (horizon - 1) * data.n_outputs < n:
         raise EstimationError(
-            f"{method}: a horizon of {horizon} samples shows at most {(horizon - 1) * data.n_outputs} states of "
-            f"{data.n_outputs} output(s), not {n}. Raise it, or lower n"
+            f"{method}: a horizon of {horizon} samples identifies at most {(horizon - 1) * data.n_outputs} states "
+            f"of {counted(data.n_outputs, 'output')}, not {n}. Raise it, or lower n"
         )
     needed = _shortest(data, n, strict=False)
     asked = max(horizon or 0, needed)
     if carried < asked:
         raise EstimationError(
-            f"{method}: {n_samples} samples carry horizons of {max(carried, 0)}; order {n} needs {asked}. "
-            "Lower the order, or take a longer record"
+            f"{method}: {n_samples} samples allow horizons of {max(carried, 0)}; order {n} needs {asked}. Lower "
+            "the order, or use a longer record"
         )
     return horizon or min(carried, max(min(_LONGEST[method], _WIDEST[method] // n_z), needed + 5))
 
@@ -346,7 +346,9 @@ def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
     shown = found.values.size
     if n > shown:
         states = "1 state" if shown == 1 else f"{shown} states"
-        raise EstimationError(f"{plan.method}: the record shows {states}, not {n}. Lower n, or excite the plant more")
+        raise EstimationError(
+            f"{plan.method}: the record identifies {states}, not {n}. Lower n, or excite the plant more"
+        )
     if isinstance(found, Prediction):
         return regress_states(found, n, feedthrough=plan.feedthrough)
     return realise(found, n, feedthrough=plan.feedthrough)
@@ -374,12 +376,12 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
     y = plan.channels.scale_y
     warnings = []
     if covariance is None:
-        warnings.append("no standard deviations: parts of the record do not show the same states. Lower n")
+        warnings.append("no standard deviations: parts of the record do not identify the same states. Lower n")
     if not full.stable_predictor:
-        warnings.append("no gain was found with which the predictor is stable: its predictions run away. Change n")
+        warnings.append("no gain gives a stable predictor: its predictions diverge. Change n")
     related = input_relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
     if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
-        warnings.append(f"{related}: pbsid may share their effects out wrongly. Use cva or n4sid, or leave one out")
+        warnings.append(f"{related}: pbsid may attribute their effects wrongly. Use cva or n4sid, or omit one")
     return build_subspace_fit(
         method,
         data,
@@ -485,7 +487,7 @@ orders : Mapping
 horizon : int, optional
     Samples of future and of past; chosen by an autoregression if missing.
 feedthrough : bool, optional
-    Whether to estimate D. Missing: only where the record is said to be open loop and shows one, because a
+    Whether to estimate D. Missing: only where the record is declared open loop and shows one, because a
     controller that acts within the sample cannot be told from a feedthrough.
 tick : callable, optional
     Called between steps.

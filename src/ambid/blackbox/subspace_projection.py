@@ -84,7 +84,7 @@ def channels(data: IOData) -> Channels:
     for values, names, what in ((u, data.inputs, "input"), (y, data.outputs, "output")):
         for name, column in zip(names, values.T, strict=True):
             if not np.ptp(column) > 1e-12 * np.max(np.abs(column)):
-                raise EstimationError(f"{what} {name!r} is constant; it shows no dynamics. Leave it out, or excite it")
+                raise EstimationError(f"{what} {name!r} is constant; it excites no dynamics. Omit it, or excite it")
     return Channels(u=u, y=y, mean_u=u.mean(0), scale_u=u.std(0), mean_y=y.mean(0), scale_y=y.std(0))
 
 
@@ -161,7 +161,7 @@ def check_inputs_differ(factors: Factors, total: Array, names: Sequence[str], wi
     for length in sorted({1, window}):
         found = input_relation(factors, total, names, length)
         if found is not None:
-            raise EstimationError(f"{found}: their effects cannot be told apart. Leave one out")
+            raise EstimationError(f"{found}: their effects cannot be distinguished. Omit one")
 
 
 def input_relation(factors: Factors, total: Array, names: Sequence[str], window: int) -> str | None:

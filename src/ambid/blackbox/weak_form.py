@@ -373,9 +373,8 @@ def _contradictions(found: Sequence[float]) -> list[str]:
     if worst < _CONTRADICTED:
         return []
     return [
-        f"over the whole band the weak form leaves {worst:.2g} times the noise that its own test functions show: "
-        "they are too long to see the plant, or the model or the whiteness of the noise is wrong. Give a "
-        "shorter half_width_s"
+        f"over the whole band the weak form leaves {worst:.2g} times the noise of its own test functions: they are "
+        "too long for the plant, or the model or the whiteness of the noise is wrong. Give a shorter half_width_s"
     ]
 
 

@@ -58,7 +58,7 @@ def fixed_of(given: Mapping[str, float] | Sequence[str] | str | None) -> dict[st
     """Return known coefficients by name, from ``a1=-1.5`` and so on."""
     if isinstance(given, Mapping):
         return dict(given)
-    said, remedy = "--fix {} is not NAME=NUMBER", "Write, for example, --fix a1=-1"
+    said, remedy = "--fix {} is not NAME=NUMBER", "Give --fix a1=-1, for example"
     pairs = _pairs(given.split(",") if isinstance(given, str) else given or (), "--fix", said, remedy)
     found = {name: _read_first(value, float) for name, value in pairs.items()}
     for name, number in found.items():
@@ -75,7 +75,7 @@ def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str
         if not (name and value):
             raise EstimationError(f"{said.format(repr(part.strip()))}. {remedy}")
         if name in found:
-            raise EstimationError(f"{where}: {name} stands twice. Leave one out")
+            raise EstimationError(f"{where}: {name} is given twice. Omit one")
         found[name] = value
     return found
 

@@ -121,7 +121,7 @@ def run(arguments: Sequence[str]) -> int:
                 f"the output cannot be written: {error.strerror}. Make room, or write elsewhere", 2, trace=trace
             )
         if isinstance(error, MemoryError):
-            return _refuse("there is not enough memory. Close other programs, or take a shorter record", 2, trace=trace)
+            return _refuse("out of memory. Close other programs, or use a shorter record", 2, trace=trace)
         where = f"{type(error).__name__}: {' '.join(str(error).split())}"
         advice = "" if trace else ". Run with --traceback, and report it"
         return _refuse(f"a defect of ambid: {where}{advice}", 1, trace=trace)

@@ -19,7 +19,7 @@ from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
 from ambid.cli.terminal import painter, watching
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, counted
 
 if TYPE_CHECKING:
     from ambid.acquisition.device import Device
@@ -40,23 +40,25 @@ def command(
     excitation: Annotated[
         str | None,
         option(
-            "--excitation NAME", "What the controller adds to its output: multisine, schroeder, prbs or steps.", "none"
+            "--excitation NAME",
+            "Excitation that the controller adds to its output: multisine, schroeder, prbs or steps.",
+            "none",
         ),
     ] = None,
     amplitude: Annotated[
-        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, small first")
+        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, smallest first")
     ] = None,
     band: opt.BandHz = None,
     mode: Annotated[
         Literal["sample", "drive", "levitate"] | None,
         option(
             "--mode",
-            "Output off; excitation without feedback; position loop on the controller.",
-            "levitate where the rig has a loop; sample a replay",
+            "sample: output off; drive: excitation without feedback; levitate: position loop on the controller.",
+            "levitate if the rig has a loop; sample for a replay",
         ),
     ] = None,
     settle: Annotated[
-        float | None, option("--settle S", "Time after the start that is not recorded, in s.", "1 to levitate")
+        float | None, option("--settle S", "Time after the start that is not recorded, in s.", "1 when levitating")
     ] = None,
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
@@ -65,11 +67,11 @@ def command(
         str | None,
         option(
             "--track ESTIMATE.json|auto",
-            "Follow the parameters meanwhile, from this estimate, or from one of the first seconds.",
+            "Track the parameters during the run, starting from this estimate, or from one of the first seconds.",
         ),
     ] = None,
     json: Annotated[
-        str | None, option("--json FILE", "With --track: the track as lines of JSON; - for standard output.")
+        str | None, option("--json FILE", "With --track: write the track as lines of JSON; - for standard output.")
     ] = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view of the track.")] = False,
     force: opt.ForceLoop = False,
@@ -87,7 +89,7 @@ def command(
     from ambid.rig import load_rig
 
     if json is not None and track is None:
-        raise AmbidError("--json writes a track, and none is wanted. Give --track too, or leave it out")
+        raise AmbidError("--json writes a track, and none was requested. Give --track too, or omit it")
     between = opt.band_of(band)
     replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
     with Outputs(rig, None if track in (None, "auto") else Path(str(track)), replayed) as outputs:
@@ -111,7 +113,7 @@ def command(
 
             def stage(name: str, _: float | None = None) -> None:
                 if name == "amplitude":
-                    watch.show(name, 0.0, "trials, small first")
+                    watch.show(name, 0.0, "trials, smallest first")
 
             def show(now: Progress) -> None:
                 watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
@@ -158,7 +160,7 @@ class Recording:
 
         def lost(what: AmbidError) -> None:
             failures.append(what)
-            typer.echo(f"ambid: tracking ended, the recording goes on: {what}", err=True)
+            typer.echo(f"ambid: tracking ended, recording continues: {what}", err=True)
 
         def job() -> Track:
             made = track_live(
@@ -167,8 +169,8 @@ class Recording:
             )  # fmt: skip
             if made.overruns:
                 typer.echo(
-                    f"ambid: {made.overruns} blocks came faster than the tracker takes them, and are missing in the"
-                    " track. Lower daq.rate_hz, or free the machine",
+                    f"ambid: {counted(made.overruns, 'block')} came faster than the tracker could process and are "
+                    "missing in the track. Lower daq.rate_hz, or free the machine",
                     err=True,
                 )
             return made.track
@@ -212,7 +214,7 @@ class Recording:
         if done.recorded.keep_journal:
             journal, again = _journal(self.path), done.recorded.survey.misplaced
             if again:
-                what = f"holds {again} samples that are not in {self.path}, as their numbers had come before"
+                what = f"holds {again} samples that are not in {self.path}, because their numbers had occurred before"
             else:
                 what = f"was damaged while it was written, and {self.path} lacks what could not be read"
             remedy = f"Look at it with 'ambid recover {journal} -o NAME', or remove it"
@@ -243,7 +245,7 @@ class Recording:
                 f" {self.settle_s:g} s of --settle: nothing was recorded. Give a smaller --settle"
             )
         if done.recorded is None:
-            raise AmbidError(f"{self.port}: no sample came. Look at cable and supply")
+            raise AmbidError(f"{self.port}: no sample came. Check cable and supply")
         if not done.run.complete and not done.run.lost:
             ended = f"{self.port} ended after {done.run.samples} of {done.run.wanted} samples"
             typer.echo(f"ambid: note: {ended}", err=True)
@@ -253,11 +255,11 @@ class Recording:
         """Say what is not in the record, and where the rest is; why was told when it happened."""
         journal, text = _journal(self.path), f"{done.not_stored} samples are not in {self.path}"
         if done.recorded is None:
-            return f"{text}: nothing could be written. Make room, and record again"
+            return f"{text}: nothing could be written. Free some space, and record again"
         text += f", which holds {done.run.samples - done.not_stored}"
         if not journal.exists():
-            return f"{text}, with gaps. End what else uses the disk, and record again"
-        return f"{text}; {journal} is kept: 'ambid recover {journal} -o NAME' makes the record again"
+            return f"{text}, with gaps. Stop what else uses the disk, and record again"
+        return f"{text}; {journal} is kept: 'ambid recover {journal} -o NAME' writes the record again"
 
 
 def _changed(record: Path) -> int | None:
@@ -278,8 +280,8 @@ def start_of_track(track: str | None) -> Estimate | None:
 
     return read_linear_estimate(
         str(track),
-        f"--track {track} is a black-box fit or a nonlinear estimate; tracking follows linear physical parameters."
-        " Give an estimate of 'ambid identify --json' without --nonlinear",
+        f"--track {track} is a black-box fit or a nonlinear estimate; tracking needs linear physical parameters. "
+        "Give an estimate of 'ambid identify --json' without --nonlinear",
     )
 
 
@@ -292,4 +294,4 @@ def _left(record: Path, changed: bool) -> str:
     journal = _journal(record)
     if changed:
         return f"; {record} holds what came before it"
-    return f"; get what came with 'ambid recover {journal}'" if journal.exists() else "; nothing was recorded"
+    return f"; recover what came with 'ambid recover {journal}'" if journal.exists() else "; nothing was recorded"

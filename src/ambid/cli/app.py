@@ -34,27 +34,29 @@ app = typer.Typer(
     " position.",
     epilog="Start with 'ambid demo', then 'ambid info RECORD' and 'ambid init RECORD -o RIG' for a record of your own.",
 )
-app.command("demo", short_help="the main job on the embedded record, beside the truth")(demo.command)
-app.command("identify", short_help="physical parameters with uncertainty from a record")(identify.command)
-app.command("fit", short_help="a black-box model from a record")(fit.command)
-app.command("frf", short_help="a frequency response, and models from it")(frf.command)
-app.command("compare", short_help="several black-box structures side by side")(compare.command)
-app.command("acquire", short_help="a record from a controller, real or emulated")(acquire.command)
-app.command("commission", short_help="guided: from a controller to tracked parameters")(commission.command)
-app.command("track", short_help="parameters followed through a record, as on-line")(track.command)
-app.command("recover", short_help="the record of a recording that was cut off")(recover.command)
-app.command("init", short_help="a first rig file, guessed from a record")(init.command)
-app.command("simulate", short_help="a record from the physics")(simulate.command)
-app.command("validate", short_help="the checks of an estimate on another record")(validate.command)
-app.command("info", short_help="what a record holds")(info.info)
-app.command("models", short_help="models, parameters, units, excitations, presets")(info.models)
+app.command("demo", short_help="identify the embedded record, and compare with the true parameters")(demo.command)
+app.command("identify", short_help="identify physical parameters, with uncertainty, from a record")(identify.command)
+app.command("fit", short_help="fit a black-box model to a record")(fit.command)
+app.command("frf", short_help="measure a frequency response, and fit models to it")(frf.command)
+app.command("compare", short_help="compare several black-box structures")(compare.command)
+app.command("acquire", short_help="take a record from a controller, real or emulated")(acquire.command)
+app.command("commission", short_help="go from a controller to tracked parameters, step by step")(commission.command)
+app.command("track", short_help="track parameters through a record, as on-line")(track.command)
+app.command("recover", short_help="recover a recording that was cut off")(recover.command)
+app.command("init", short_help="draft a rig file from a record")(init.command)
+app.command("simulate", short_help="simulate a record from the physics")(simulate.command)
+app.command("validate", short_help="check an estimate or a fit on another record")(validate.command)
+app.command("info", short_help="show what a record contains")(info.info)
+app.command("models", short_help="list models, parameters, units, excitations, presets")(info.models)
 
 
 @app.callback(invoke_without_command=True)
 def _global(
     context: typer.Context,
-    version: Annotated[bool, typer.Option("--version", help="Print the version and end.")] = False,
-    traceback: Annotated[bool, typer.Option("--traceback", help="Show where an error arose (after any verb).")] = False,
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
+    traceback: Annotated[
+        bool, typer.Option("--traceback", help="Show where an error arose (before or after the verb).")
+    ] = False,
 ) -> None:
     del traceback  # taken out of the words before they come here
     if version:

@@ -25,17 +25,17 @@ if TYPE_CHECKING:
 def command(
     port: opt.Port,
     rig: opt.RigOfDevice,
-    folder: Annotated[Path, option("--output -o FOLDER", "Where records, estimate and report go.")],
+    folder: Annotated[Path, option("--output -o FOLDER", "Folder for records, estimate and report.")],
     seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 20.0,
     track_seconds: Annotated[
-        float, option("--track-seconds S", "Length of live tracking in the end, in s.", True)
+        float, option("--track-seconds S", "Length of live tracking at the end, in s.", True)
     ] = 5.0,
     amplitude: Annotated[
-        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, small first")
+        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, smallest first")
     ] = None,
     band: opt.BandHz = None,
     widest: Annotated[
-        float, option("--widest X", "Largest half width of a 95 % interval that is good enough.", True)
+        float, option("--widest X", "Largest acceptable half width of a 95 % interval, relative to the value.", True)
     ] = 0.10,
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
@@ -98,7 +98,7 @@ def command(
             return (
                 yes
                 or device.info.kind != "serial"  # a real bench alone moves
-                or typer.confirm(f"{asked} Is the bench clear, the emergency stop at hand?")
+                or typer.confirm(f"{asked} Is the bench clear, and the emergency stop within reach?")
             )
 
         def alive(stage: str, done: float | None = None, /) -> None:
@@ -133,11 +133,11 @@ def _second_s(seconds: float) -> float:
 def _check_port(port: str, *, yes: bool) -> None:
     """Refuse what cannot be commissioned, before it is opened."""
     if port.startswith("replay:"):
-        raise AmbidError(f"{port} is a record that is replayed: nothing can be levitated. Give a bench")
+        raise AmbidError(f"{port} is a replayed record: nothing can be levitated. Give a bench")
     if port not in ("emulated", "simulated") and not yes and not sys.stdin.isatty():
         raise AmbidError(
-            f"{port}: the controller is to switch its output on, and nobody can be asked. Clear the bench, and give"
-            " --yes"
+            f"{port}: the controller would switch its output on, and nobody can be asked. Clear the bench, and "
+            "give --yes"
         )
 
 
@@ -145,9 +145,9 @@ def _check_place(folder: Path) -> None:
     try:
         exists = folder.exists()
     except OSError as failure:  # a name that no folder can have
-        raise AmbidError(f"-o {folder} cannot be: {failure.strerror or failure}. Give another name") from None
+        raise AmbidError(f"-o {folder} cannot be used: {failure.strerror or failure}. Give another name") from None
     if exists and not folder.is_dir():
-        raise AmbidError(f"-o {folder} is a file; a folder is wanted. Name one")
+        raise AmbidError(f"-o {folder} is a file; it must be a folder. Name one")
     if not folder.parent.is_dir():
         raise AmbidError(f"-o {folder}: there is no folder {folder.parent}. Make it first, or correct the path")
 

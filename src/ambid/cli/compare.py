@@ -15,7 +15,7 @@ def command(
         list[str],
         opt.argument(
             "STRUCTURE:ORDERS...",
-            "What to compare: arx:na=2,nb=2,nk=1 or bj:auto; 'ambid models' lists the structures.",
+            "Structure and orders to compare: arx:na=2,nb=2,nk=1 or bj:auto; 'ambid models' lists the structures.",
         ),
     ],
     output: opt.OutputColumns = None,
@@ -28,7 +28,7 @@ def command(
     gaps: opt.Gaps = None,
     second: opt.SecondRecord = None,
     holdout: Annotated[
-        float, opt.switch("--holdout", "Part of the record held back to judge on, where there is no second.")
+        float, opt.switch("--holdout", "Fraction of the record held out for validation, without a second record.")
     ] = 0.3,
     json: opt.JsonFile = None,
     plot: opt.Plot = None,

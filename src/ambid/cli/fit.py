@@ -36,7 +36,7 @@ def command(
         str,
         option(
             "--orders na=2,nb=2,nk=1",
-            "Orders; nb=2/3 for two inputs that differ, nk=auto to find a delay, auto to choose all.",
+            "Orders; nb=2/3 for two inputs with different orders, nk=auto to find the delay, auto to choose all.",
             True,
         ),
     ] = "auto",
@@ -47,11 +47,11 @@ def command(
             "Settings of a nonlinear structure (--orders does the same); 'ambid models' lists them.",
         ),
     ] = None,
-    seed: Annotated[int | None, option("--seed N", "Of all that is random in a nonlinear structure.", "0")] = None,
+    seed: Annotated[int | None, option("--seed N", "Seed of all randomness in a nonlinear structure.", "0")] = None,
     criterion: Annotated[
-        str, switch("--criterion", "What chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")
+        str, switch("--criterion", "Criterion that chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")
     ] = "bic",
-    fix: Annotated[list[str] | None, option("--fix NAME=NUMBER", "A coefficient that is known; repeat.")] = None,
+    fix: Annotated[list[str] | None, option("--fix NAME=NUMBER", "Fix a coefficient; repeatable.")] = None,
     rig: opt.RigFile = None,
     reference: opt.References = None,
     open_loop: opt.OpenLoop = False,
@@ -59,7 +59,8 @@ def command(
         bool,
         switch(
             "--at-rest",
-            "Say that all was zero before the first sample: estimate no offsets and initial states (polynomial).",
+            "All signals are zero before the first sample: estimate no offsets and initial states (polynomial "
+            "structures).",
         ),
     ] = False,
     from_s: opt.From = None,
@@ -76,8 +77,8 @@ def command(
         Path | None,
         option(
             "--plot FILE.png",
-            "Draw signals, residuals, Bode and poles; of a nonlinear structure signals, errors, coefficients and"
-            " learning curves.",
+            "Draw signals, residuals, Bode and poles; for a nonlinear structure signals, errors, coefficients and "
+            "learning curves.",
         ),
     ] = None,
     report: opt.Report = None,
@@ -85,11 +86,11 @@ def command(
         Path | None,
         option(
             "--stabilisation FILE.png",
-            "Draw the poles of models of order 1 to 20 (n4sid, moesp or cva where --structure names them, else pbsid).",
+            "Draw the poles of models of order 1 to 20 (by n4sid, moesp or cva if --structure names it, else pbsid).",
         ),
     ] = None,
     sensitivity: Annotated[
-        bool, switch("--sensitivity", "Show how much each coefficient matters, and which belong together.")
+        bool, switch("--sensitivity", "Show how much each coefficient matters, and which are correlated.")
     ] = False,
     strict: opt.Strict = False,
 ) -> None:
@@ -107,7 +108,7 @@ def command(
     if nonlinear:
         refuse_given(
             {"--stabilisation": stabilisation, "--sensitivity": sensitivity},
-            f"{{}} is for linear structures; {structure} has no use for it. Leave it out",
+            f"{{}} is for linear structures; {structure} does not use it. Omit it",
         )
     stop = Stop()
     with Outputs(*records, second, rig, json=json, plot=plot, report=report) as outputs:
@@ -149,8 +150,8 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
     begin, last = max(a or -inf, c or -inf), min(inf if b is None else b, inf if d is None else d)
     if not begin >= last:
         raise EstimationError(
-            f"--validate {second} is fitted to as well: errors there say nothing about other records. Give another, or "
-            "parts that do not overlap (--from, --to, --validate-from, --validate-to)"
+            f"--validate {second} is used for fitting too, so it cannot validate. Give another record, or parts "
+            "that do not overlap (--from, --to, --validate-from, --validate-to)"
         )
 
 

@@ -20,29 +20,35 @@ def command(
     open_loop: opt.OpenLoop = False,
     method: Annotated[
         Literal["auto", "periodic", "random", "local"],
-        switch("--method", "How to measure: averages over periods, averaged spectra, local polynomials, or what fits."),
+        switch(
+            "--method", "Method: averages over periods, averaged spectra, local polynomials, or what suits the record."
+        ),
     ] = "auto",
-    band: Annotated[str | None, option("--band LO:HI", "Lines that are used, in Hz.", "all")] = None,
+    band: Annotated[str | None, option("--band LO:HI", "Frequency band to use, in Hz.", "all")] = None,
     hold: Annotated[
         Literal["zoh", "band-limited"],
-        switch("--hold", "What the input does between samples: held, or without power above half the rate."),
+        switch("--hold", "Input between samples: held constant, or band-limited to half the rate."),
     ] = "zoh",
     orders: Annotated[
         str | None,
         option(
             "--orders nf=2,nb=1",
-            "Fit transfer functions by maximum likelihood: degree of the denominator, numerator coefficients.",
+            "Fit transfer functions by maximum likelihood: degree of the denominator, number of numerator "
+            "coefficients.",
         ),
     ] = None,
     state_space: Annotated[
-        str | None, option("--state-space n=3|auto", "Fit a state space by subspace with the Laguerre operator.")
+        str | None,
+        option("--state-space n=3|auto", "Fit a state space by subspace identification with the Laguerre operator."),
     ] = None,
     feedthrough: Annotated[
-        bool, switch("--feedthrough", "With --state-space: a direct path from input to output (D).")
+        bool, switch("--feedthrough", "With --state-space: include a direct path from input to output (D).")
     ] = False,
     domain: Annotated[
         Literal["s", "z"] | None,
-        option("--domain", "Of that model: continuous or discrete time.", "z for --orders of a held input, else s"),
+        option(
+            "--domain", "Domain of the model: continuous or discrete time.", "z for --orders with a held input, else s"
+        ),
     ] = None,
     delay: Annotated[
         str | None,
@@ -83,7 +89,7 @@ def _order(text: str | None) -> int | Literal["auto"] | None:
         return None if text is None else "auto"
     number = text.strip().removeprefix("n=")
     if not number.isdecimal() or len(number) > 3:
-        raise AmbidError(f"--state-space is {text!r}; it is an order, or auto. Give n=3 and so on")
+        raise AmbidError(f"--state-space is {text!r}; it must be an order, or auto. Give n=3, for example")
     return int(number)
 
 
@@ -93,4 +99,6 @@ def _delay(text: str | None) -> float | Literal["auto"] | None:
     try:
         return float(text)
     except ValueError:
-        raise AmbidError(f"--delay is {text!r}; it is a time in s, or auto. Give e.g. --delay 1e-4") from None
+        raise AmbidError(
+            f"--delay is {text!r}; it must be a time in s, or auto. Give --delay 1e-4, for example"
+        ) from None

@@ -31,33 +31,39 @@ def command(
     ],
     rig: opt.RigFile = None,
     nonlinear: Annotated[
-        bool, switch("--nonlinear", "The nonlinear magnet: k_i, k_x and L as curves over position and current.")
+        bool,
+        switch("--nonlinear", "Identify the nonlinear magnet: k_i, k_x and L as curves over position and current."),
     ] = False,
     held: Annotated[
         list[Path] | None,
-        option("--held RECORD", "Nonlinear: a record with the rotor held at rest, which shows the coil; repeat."),
+        option(
+            "--held RECORD",
+            "With --nonlinear: a record with the rotor held at rest, which identifies the coil; repeatable.",
+        ),
     ] = None,
     magnet: Annotated[
         Literal["auto", "single", "pair"] | None,
         option(
             "--magnet",
-            "Nonlinear: one magnet, or two that oppose each other; auto looks at the sign of the current.",
+            "With --nonlinear: one magnet, or two opposing ones; auto looks at the sign of the current.",
             "as the rig says, or auto",
         ),
     ] = None,
-    eddy: Annotated[bool, switch("--eddy", "Nonlinear: the force follows the current with a pole a/(s + a).")] = False,
+    eddy: Annotated[
+        bool, switch("--eddy", "With --nonlinear: the force follows the current with a pole a/(s + a).")
+    ] = False,
     drift: Annotated[
-        bool, switch("--drift", "Nonlinear: let a slowly walking force take up what the law leaves over.")
+        bool, switch("--drift", "With --nonlinear: let a random-walk force absorb what the force law does not explain.")
     ] = False,
     off_below: Annotated[
         float | None,
         option(
             "--off-below V",
-            "Nonlinear: at or below this voltage the power stage is off, and the coil's voltage not known.",
+            "With --nonlinear: at or below this voltage the power stage is off, and the coil voltage unknown.",
             "as the rig says",
         ),
     ] = None,
-    second: Annotated[Path | None, option("--validate RECORD2", "Judge the estimate on this second record.")] = None,
+    second: Annotated[Path | None, option("--validate RECORD2", "Validate the estimate on this second record.")] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
     rate: opt.Rate = None,
@@ -87,7 +93,7 @@ def command(
     with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
         if nonlinear:
             if off_below is not None and not isfinite(off_below):
-                raise AmbidError(f"--off-below is {off_below}; it is a voltage in V. Give a number")
+                raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
             opt.refuse_twice([*records, *kept])
         else:
             _check_linear(records, {"held": kept, **own})
@@ -110,7 +116,7 @@ def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
     """Refuse what only the nonlinear magnet has."""
     refuse_given(
         {f"--{name.replace('_', '-')}": x for name, x in given.items()},
-        "{} is for the nonlinear magnet. Give --nonlinear too, or leave {} out",
+        "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
     )
     if len(records) > 1:
         raise AmbidError(

@@ -55,14 +55,14 @@ def models() -> None:
             for p in of.parameters
         ]
         typer.echo("\n".join(columns(rows)) + "\n")
-    use = "  one-axis with 'ambid identify --nonlinear', beside m, R and c; what is known stands in [magnet.parameters]"
+    use = "  one-axis with 'ambid identify --nonlinear', with m, R and c; known values belong in [magnet.parameters]"
     typer.echo(textwrap.fill(f"{paint('nonlinear magnet', 'strong')}{use}", 80, subsequent_indent="  "))
     left = columns([(f"  {p.name}", f"[{p.unit}]") for p in BEARING_NUMBERS])
     _entries(zip(left, (p.meaning for p in BEARING_NUMBERS), strict=True))
-    typer.echo(f"\n{paint('structures', 'strong')}  black-box models for 'ambid fit'; * is biased under feedback")
+    typer.echo(f"\n{paint('structures', 'strong')}  black-box models for 'ambid fit'; * biased by feedback")
     left = columns([(f"  {x.name}{'*' * (x.feedback == 'biased')}", " ".join(x.orders)) for x in STRUCTURES.values()])
     _entries(zip(left, (x.summary for x in STRUCTURES.values()), strict=True))
-    typer.echo(f"\n{paint('nonlinear structures', 'strong')}  for 'ambid fit', with settings (what they are; default)")
+    typer.echo(f"\n{paint('nonlinear structures', 'strong')}  for 'ambid fit', with settings (meaning; default)")
     for n in NONLINEAR_STRUCTURES.values():
         _entries([(f"  {n.name}{'*' * (n.feedback == 'biased')}", n.summary)])
         _entries((f"    {name}", meaning) for name, meaning in n.settings.items())
@@ -70,7 +70,7 @@ def models() -> None:
     for x in RESPONSE_STRUCTURES.values():
         _entries([(f"  {x.name.ljust(14)}{' '.join(x.orders)}", x.summary)])
     typer.echo(f"\n{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
-    typer.echo(f"{paint('scenarios', 'strong')}  courses of known truth for 'ambid simulate --scenario'")
+    typer.echo(f"{paint('scenarios', 'strong')}  changes with known truth for 'ambid simulate --scenario'")
     _entries((f"  {name}", scenario(name).summary) for name in scenario_names())
     typer.echo(f"\n{paint('presets', 'strong')}  benches for 'ambid simulate'")
     _entries((f"  {name}", preset(name).summary) for name in preset_names())

@@ -11,7 +11,7 @@ import typer
 
 from ambid.cli.options import Gaps, Rate, argument, option, switch
 from ambid.cli.output import Outputs
-from ambid.errors import AmbidError, nearest
+from ambid.errors import AmbidError, counted, nearest
 
 if TYPE_CHECKING:
     from ambid.rig.roles import Candidate
@@ -32,19 +32,21 @@ def command(
     plot: Annotated[
         Path | None, option("--plot FILE.png", "Draw the columns that may be a role: signals, coherences, scores.")
     ] = None,
-    yes: Annotated[bool, switch("--yes", "Take the most likely columns, and ask nothing.")] = False,
+    yes: Annotated[bool, switch("--yes", "Choose the most likely columns without asking.")] = False,
     rate: Rate = None,
     gaps: Gaps = None,
-    force: Annotated[bool, switch("--force", "Write over a rig file that exists.")] = False,
+    force: Annotated[bool, switch("--force", "Overwrite an existing rig file.")] = False,
 ) -> None:
     """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
     if (record is None) == (preset is None):
-        given = "both a record and --preset were given" if record is not None else "neither a record nor --preset given"
-        raise AmbidError(f"{given}; a rig file comes from one of them. Give RECORD, or --preset {_WIRED[0]}")
+        given = (
+            "both a record and --preset were given" if record is not None else "neither a record nor --preset was given"
+        )
+        raise AmbidError(f"{given}; a rig file comes from exactly one. Give RECORD, or --preset {_WIRED[0]}")
     if preset is not None and (rate is not None or gaps is not None):
-        raise AmbidError("--rate and --gaps are for reading a record; with --preset none is read. Leave them out")
+        raise AmbidError("--rate and --gaps are for reading a record; --preset reads none. Omit them")
     if preset is not None and plot is not None:
-        raise AmbidError("--plot draws the columns of a record; with --preset there are none. Leave it out")
+        raise AmbidError("--plot draws the columns of a record; --preset reads none. Omit it")
     with Outputs(record, plot=plot) as outputs:
         outputs.claim(rig, "-o", force=force)
         text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps, outputs, plot, ask=not yes)
@@ -53,16 +55,17 @@ def command(
     if rig is None:
         typer.echo(text, nl=False)
     elif preset in _WIRED:
-        typer.echo(f"{rig} written; change what differs on your bench. Then: ambid commission --rig {rig} --port PORT")
+        typer.echo(f"{rig} written; edit what differs on your bench. Then: ambid commission --rig {rig} --port PORT")
     elif record is None:
         law = " --nonlinear" if "\n[magnet]" in text else ""
-        typer.echo(f"{rig} written; change what differs on your bench. Then: ambid simulate {rig} -o RECORD{law}")
+        typer.echo(f"{rig} written; edit what differs on your bench. Then: ambid simulate {rig} -o RECORD{law}")
     else:
         open_points = [
             line for line in text.splitlines() if "CHECK" in line.partition("#")[2] and not line.startswith("# G")
         ]
         typer.echo(
-            f"{rig} written; {len(open_points)} lines are marked CHECK. Then: ambid identify {record} --rig {rig}"
+            f"{rig} written; {counted(len(open_points), 'line')} marked CHECK. Then: ambid identify {record} --rig "
+            f"{rig}"
         )
 
 
@@ -108,8 +111,8 @@ def _of_preset(name: str) -> str:
 
     if name not in preset_names():
         raise AmbidError(
-            f"--preset {name!r} is no bench; there are {', '.join(preset_names())}.{nearest(name, preset_names())}"
-            " Give one of them, or RECORD"
+            f"--preset {name!r} is unknown; known: {', '.join(preset_names())}.{nearest(name, preset_names())} "
+            "Give one of them, or RECORD"
         )
     if name not in _WIRED:
         return preset_text(preset(name))

@@ -142,7 +142,7 @@ class Follower:
                 print("ambid: interrupted before the first line of the track", file=sys.stderr)
                 raise typer.Exit(self.code)
             raise AmbidError(
-                "the record ends before the first reporting interval. Take a longer one, or a shorter --every"
+                "the record ends before the first reporting interval. Use a longer one, or a shorter --every"
             )
         if self.table:
             outputs.show(self.track)
@@ -154,7 +154,7 @@ class Follower:
             raise typer.Exit(self.code)
         for t, flag in flags:
             if t > end_s:
-                said = f"the last line is at {end_s:.6g} s, so it was never set. Give a time in the record"
+                said = f"the last line is at {end_s:.6g} s. Give a time in the record"
                 print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
         end(failed=strict and not self.track.passed)
 

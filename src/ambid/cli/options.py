@@ -36,37 +36,37 @@ def argument(metavar: str, about: str) -> Any:
 
 
 RecordFile = Annotated[Path, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")]
-RigFile = Annotated[Path | None, option("--rig RIG", "Rig file (TOML), which says what is known of the bench.")]
-From = Annotated[float | None, option("--from S", "Use the record from this time on, in s.")]
-To = Annotated[float | None, option("--to S", "Use the record up to this time, in s.")]
+RigFile = Annotated[Path | None, option("--rig RIG", "Rig file (TOML): what is known about the bench.")]
+From = Annotated[float | None, option("--from S", "Start time in the record, in s.")]
+To = Annotated[float | None, option("--to S", "End time in the record, in s.")]
 Rate = Annotated[float | None, option("--rate HZ", "Sampling rate in Hz, for a record without time.")]
 Gaps = Annotated[
     Literal["error", "interpolate", "cut"] | None,
     option(
         "--gaps",
-        "What to do about missing values: refuse them, interpolate, or cut the longest part without any out.",
+        "Missing values: refuse them, interpolate, or use the longest part without any.",
         "error, or as the rig says",
     ),
 ]
 JsonFile = Annotated[str | None, option("--json FILE", "Write the result as JSON; - for standard output.")]
 TrackFile = Annotated[
-    str | None, option("--json FILE", "Write the track as lines of JSON while it comes; - for standard output.")
+    str | None, option("--json FILE", "Write the track as lines of JSON as it is computed; - for standard output.")
 ]
 Plot = Annotated[Path | None, option("--plot FILE.png", "Draw the result.")]
-Report = Annotated[Path | None, option("--report FILE.html", "Write a report, all in one file.")]
+Report = Annotated[Path | None, option("--report FILE.html", "Write a report in one self-contained file.")]
 Strict = Annotated[bool, switch("--strict", "End with exit code 3 if the search did not converge or a check failed.")]
-Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeat for several.")]
-OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeat for several.")]
+Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeatable.")]
+OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeatable.")]
 References = Annotated[
     list[str] | None,
-    option("--reference COL", "Column of the loop's outer excitation, for methods that use it; repeat for several."),
+    option("--reference COL", "Column of the loop's external excitation, for methods that use it; repeatable."),
 ]
-OpenLoop = Annotated[bool, switch("--open-loop", "Say that no feedback was at work in this record.")]
-Force = Annotated[bool, switch("--force", "Write over a record that exists.")]
+OpenLoop = Annotated[bool, switch("--open-loop", "The record was taken without feedback.")]
+Force = Annotated[bool, switch("--force", "Overwrite an existing record.")]
 ForceLoop = Annotated[
     bool, switch("--force", "Write over a record that exists; go on with a loop that is predicted unstable.")
 ]
-SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Judge on this record too, all of it.")]
+SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Validate on this record too, on all of it.")]
 
 
 Port = Annotated[str, option("--port PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
@@ -76,7 +76,7 @@ BandHz = Annotated[
     option(
         "--band LO:HI",
         "Band of the excitation in Hz.",
-        "of a multisine to levitate, where the rotor moves; else what the controller can play",
+        "that of a multisine for levitation, where the rotor moves; else what the controller can play",
     ),
 ]
 BenchName = Annotated[
@@ -105,7 +105,8 @@ def band_of(text: str | None) -> tuple[float, float] | None:
         found = (0.0, 0.0)
     if not 0.0 <= found[0] < found[1] < float("inf"):
         raise AmbidError(
-            f"--band is {text!r}; it is two frequencies in Hz with a colon between. Give e.g. --band 1:2000"
+            f"--band is {text!r}; it must be two frequencies in Hz with a colon between. Give --band 1:2000, for "
+            "example"
         )
     return found
 
@@ -124,5 +125,5 @@ def refuse_twice(records: Sequence[Path]) -> None:
     seen = set[Path]()
     for path in records:
         if path.resolve() in seen:
-            raise AmbidError(f"record {path} is given twice; it would count twice. Leave one out")
+            raise AmbidError(f"record {path} is given twice and would count twice. Omit one")
         seen.add(path.resolve())

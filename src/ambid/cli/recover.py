@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def command(
-    journals: Annotated[list[Path], argument("JOURNAL", "What is left of a recording: NAME.journal.")],
+    journals: Annotated[list[Path], argument("JOURNAL", "Journal of a recording that was cut off: NAME.journal.")],
     output: Annotated[
         Path | None, option("--output -o FILE", "Record to write: .h5, .hdf5, .csv or .csv.gz.", "NAME")
     ] = None,
@@ -58,20 +58,20 @@ def _recover(journal: Path, output: Path | None, *, delete: bool, force: bool) -
     from ambid.errors import DeviceError
 
     if not journal.name:
-        raise AmbidError(f"journal {str(journal)!r} is a folder; a file is wanted. Name the file inside it")
+        raise AmbidError(f"journal {str(journal)!r} is a folder; it must be a file. Name the file inside it")
     path = record_path(journal) if output is None else output
     Outputs(journal).claim(path, "-o", force=True)
     with JournalReader.open(journal) as reader, progress("recover"):
         there = recorded_already(reader, path) if path.exists() and not force else None
         made = there or recorded_from(reader, path, force=force)
         if made is None:
-            raise DeviceError(f"journal {journal} holds no sound block: nothing was acknowledged. Remove it")
+            raise DeviceError(f"journal {journal} holds no intact block. Remove it")
         gone = delete and not made.keep_journal
         if gone:
             journal.unlink()
             sync_folder(journal)
     typer.echo(f"{journal}: {_found(made)}")
-    done = f"written{_lacks(made)}" if there is None else f"holds that already{_lacks(made)}: nothing is to be done"
+    done = f"written{_lacks(made)}" if there is None else f"holds that already{_lacks(made)}: nothing to do"
     typer.echo(f"{path} {done}.{_fate(journal, delete=delete, gone=gone)}")
     return not made.keep_journal
 
@@ -82,7 +82,9 @@ def _found(made: Recorded) -> str:
     if found.damage.closed:
         return f"{text}; complete"
     tail = (
-        f"; {_many(found.damage.tail_bytes, 'byte')} at its end not of a whole block" if found.damage.tail_bytes else ""
+        f"; {_many(found.damage.tail_bytes, 'byte')} at its end are not a whole block"
+        if found.damage.tail_bytes
+        else ""
     )
     return f"{text}; cut off while recording{tail}"
 
@@ -102,7 +104,7 @@ def _lacks(made: Recorded) -> str:
             f"{_many(found.gap_samples, 'sample')} missing in {_many(found.gaps, 'place')} (read it with --gaps)"
         )
     if found.misplaced:
-        parts.append(f"{_many(found.misplaced, 'sample')} left out whose number had come before")
+        parts.append(f"{_many(found.misplaced, 'sample')} left out whose number had occurred before")
     return f" with {'; '.join(parts)}" if parts else ""
 
 
@@ -114,5 +116,5 @@ def _fate(journal: Path, *, delete: bool, gone: bool) -> str:
     if gone:
         return f" {journal.name} removed"
     if delete:
-        return f" {journal.name} is kept: not all of it is in the record"
+        return f" {journal.name} is kept: the record does not hold all of it"
     return f" {journal.name} is kept; --delete removes it"

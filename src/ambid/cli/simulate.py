@@ -11,7 +11,7 @@ import typer
 from ambid.cli.options import ForceLoop, argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
-from ambid.errors import refuse_given
+from ambid.errors import counted, refuse_given
 
 if TYPE_CHECKING:
     from ambid.physics.presets import Preset
@@ -29,14 +29,12 @@ def command(
         str | None,
         option(
             "--scenario NAME",
-            "A course of known truth, as 'ambid models' lists them: the record has columns true_... beside it.",
+            "A change with known truth, as 'ambid models' lists them; the truth goes into columns true_....",
             "nothing changes",
         ),
     ] = None,
-    at: Annotated[float | None, option("--at S", "When the scenario begins, in s.", "the scenario's")] = None,
-    size: Annotated[
-        float | None, option("--size X", "How much the scenario changes, e.g. -0.15.", "the scenario's")
-    ] = None,
+    at: Annotated[float | None, option("--at S", "Start of the scenario, in s.", "the scenario's")] = None,
+    size: Annotated[float | None, option("--size X", "Size of the change, e.g. -0.15.", "the scenario's")] = None,
     excitation: Annotated[
         str | None, option("--excitation NAME", "Excitation, as 'ambid models' lists them.", "multisine")
     ] = None,
@@ -47,10 +45,10 @@ def command(
         str | None, option("--band LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
     ] = None,
     periods: Annotated[
-        int, option("--periods N", "How often the excitation repeats, for 'ambid frf'.", True, min=1)
+        int, option("--periods N", "Number of repetitions of the excitation, for 'ambid frf'.", True, min=1)
     ] = 1,
     log_excitation: Annotated[
-        bool, switch("--log-excitation", "A column 'excitation' too: the reference that 'ambid frf' wants.")
+        bool, switch("--log-excitation", "Add a column 'excitation': the reference for 'ambid frf'.")
     ] = False,
     seed: Annotated[int, option("--seed N", "Seed of excitation and noise.", True, min=0)] = 0,
     loop: Annotated[
@@ -58,11 +56,15 @@ def command(
         option("--loop", "With or without the controller.", "as the bench usually works"),
     ] = None,
     nonlinear: Annotated[
-        bool, switch("--nonlinear", "The nonlinear magnet, of a rig its [magnet], instead of its linearisation.")
+        bool, switch("--nonlinear", "Simulate the nonlinear magnet ([magnet] of a rig) instead of its linearisation.")
     ] = False,
     position: Annotated[
         float | None,
-        option("--position M", "With --nonlinear: where the loop holds the rotor, in m.", "the operating point's"),
+        option(
+            "--position M",
+            "With --nonlinear: position at which the loop holds the rotor, in m.",
+            "the operating point's",
+        ),
     ] = None,
     force: ForceLoop = False,
 ) -> None:
@@ -78,14 +80,14 @@ def command(
     if scenario is not None:
         of_excitation = {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear,
                          "--position": position, "--periods": periods != 1}  # fmt: skip
-        refuse_given(of_excitation, "--scenario has no {}. Leave {} out")
+        refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
                  "closed": closed, "log_excitation": log_excitation, "force": force}  # fmt: skip
         _run_scenario(scenario, preset, rig, record, seed, words, force=force)
         return
-    refuse_given({"--at": at, "--size": size}, "a simulation without --scenario has no {}. Leave {} out")
+    refuse_given({"--at": at, "--size": size}, "{} is for --scenario. Omit {}")
     if not nonlinear:
-        refuse_given({"--position": position}, "a simulation without --nonlinear has no {}. Leave {} out")
+        refuse_given({"--position": position}, "{} is for --nonlinear. Omit {}")
     with Outputs(source) as outputs, progress("simulate"):
         outputs.claim(record, "-o", _ENDINGS, force=force)
         done, told = simulate_used(
@@ -104,7 +106,7 @@ def command(
         outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
     warn(done)
     n, rate_hz = done.record.n_samples, done.record.rate_hz
-    typer.echo(f"{record}: {n} samples at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} V, seed {seed}")
+    typer.echo(f"{record}: {counted(n, 'sample')} at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} V, seed {seed}")
     typer.echo("truth: " + truth_words(done))
 
 
@@ -150,7 +152,9 @@ def _run_scenario(
     warn(done)
     n, rate = done.record.n_samples, done.record.rate_hz
     short = f", {lost} of them lost or without a value" if lost else ""
-    typer.echo(f"{record}: {n} samples at {rate:g} Hz{short}, excitation of {told['amplitude']:.4g} V, seed {seed}")
+    typer.echo(
+        f"{record}: {counted(n, 'sample')} at {rate:g} Hz{short}, excitation of {told['amplitude']:.4g} V, seed {seed}"
+    )
     for line in lines:
         typer.echo(line)
 

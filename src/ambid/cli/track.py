@@ -31,41 +31,45 @@ def command(
         str,
         option(
             "--method NAME",
-            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to"
-            " --output: rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
+            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to --output "
+            "by rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
             True,
         ),
     ] = "rpem",
     inputs: opt.Inputs = None,
     output: opt.OutputColumns = None,
-    orders: Annotated[str | None, option("--orders na=2,nb=2,nk=1", "Orders of coefficients.")] = None,
+    orders: Annotated[str | None, option("--orders na=2,nb=2,nk=1", "Orders of the tracked coefficients.")] = None,
     reference: opt.References = None,
     open_loop: opt.OpenLoop = False,
-    step: Annotated[float | None, option("--step X", "Step of lms and nlms, for signals of size one.")] = None,
+    step: Annotated[float | None, option("--step X", "Step size of lms and nlms, for signals of size one.")] = None,
     start: Annotated[
         Path | None,
         option(
             "--start ESTIMATE.json",
-            "Begin with this estimate; by default one is identified from the beginning of the record.",
+            "Start from this estimate instead of one from the beginning of the record.",
         ),
     ] = None,
     start_seconds: Annotated[
-        float | None, option("--start-seconds S", "Identify the start from that much of the record.")
+        float | None, option("--start-seconds S", "Identify the start from this much of the record.")
     ] = None,
-    every: Annotated[float, option("--every S", "Reporting interval, s of record.", True)] = 0.01,
-    limit: Annotated[float, option("--limit X", "Acceptable model error; 1 is that at identification.", True)] = 1.5,
+    every: Annotated[float, option("--every S", "Reporting interval, in s of record.", True)] = 0.01,
+    limit: Annotated[
+        float, option("--limit X", "Acceptable model error, relative to that at identification.", True)
+    ] = 1.5,
     memory: Annotated[
         str,
         option(
-            "--memory auto|all|S", "How long data count: found from the data, for ever, or a time constant in s.", True
+            "--memory auto|all|S",
+            "Memory of the estimator: found from the data, infinite, or a time constant in s.",
+            True,
         ),
     ] = "auto",
     pace: Annotated[
-        Literal["fastest", "real-time"], switch("--pace", "Replay as fast as possible, or as it was taken.")
+        Literal["fastest", "real-time"], switch("--pace", "Replay as fast as possible, or in real time.")
     ] = "fastest",
     flag: Annotated[
         list[str] | None,
-        option("--flag T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeat."),
+        option("--flag T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeatable."),
     ] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
@@ -73,10 +77,10 @@ def command(
     json: opt.TrackFile = None,
     plot: Annotated[
         Path | None,
-        option("--plot FILE.png", "Draw the tracks, beside the truth where the record has columns true_NAME."),
+        option("--plot FILE.png", "Draw the tracks, with the truth if the record has columns true_NAME."),
     ] = None,
     report: opt.Report = None,
-    quiet: Annotated[bool, switch("--no-live --quiet", "No live view, also on a terminal.")] = False,
+    quiet: Annotated[bool, switch("--no-live --quiet", "No live view, even on a terminal.")] = False,
     strict: opt.Strict = False,
 ) -> None:
     """Follow the physical parameters of a bench through a record, as the tracker does beside a running machine.
@@ -100,7 +104,7 @@ def command(
     }  # fmt: skip
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:
-        raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or leave it out")
+        raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or omit it")
     with Outputs(record, rig, start, plot=plot, report=report) as outputs:
         outputs.claim(json_path(json), "--json")
         bench = None if rig is None else load_rig(rig)
@@ -142,8 +146,7 @@ def _check_interval(every: float, rate_hz: float) -> None:
     """Refuse an interval that holds no sample, now that the rate is known."""
     if every * rate_hz < 1.0 - 1e-9:
         raise AmbidError(
-            f"--every {every:g} s is less than one sample at {rate_hz:g} Hz; a line needs a sample."
-            f" Give {1.0 / rate_hz:g} or more"
+            f"--every {every:g} s is shorter than one sample at {rate_hz:g} Hz. Give {1.0 / rate_hz:g} or more"
         )
 
 

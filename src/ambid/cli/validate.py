@@ -11,9 +11,7 @@ from ambid.cli.terminal import progress
 
 
 def command(
-    estimate: Annotated[
-        Path, opt.argument("ESTIMATE.json", "What 'ambid identify --json' or 'ambid fit --json' wrote.")
-    ],
+    estimate: Annotated[Path, opt.argument("ESTIMATE.json", "JSON file written by 'ambid identify' or 'ambid fit'.")],
     record: opt.RecordFile,
     rig: opt.RigFile = None,
     from_s: opt.From = None,

@@ -110,7 +110,7 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
     if criterion == "lilc":
         return 2.0 * k * log(max(log(n), 1.0))
     raise EstimationError(
-        f"criterion {criterion!r} is not known; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
+        f"criterion {criterion!r} is unknown; known: {', '.join(CRITERIA)}.{nearest(criterion, list(CRITERIA))}"
     )
 
 

@@ -17,7 +17,7 @@ from ambid.acquisition.recording import acquire as record_course
 from ambid.acquisition.review import refuse_unstable, review
 from ambid.acquisition.session import Course
 from ambid.acquisition.settings import controller_settings
-from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, refuse_given
+from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, counted, refuse_given
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
 from ambid.job.simulation import bearer_of
@@ -71,8 +71,8 @@ class Wish:
         samples = max(1, round(trial.seconds * rate_hz))
         if samples < MIN_SAMPLES:
             raise AmbidError(
-                f"--seconds is {trial.seconds:g}: {samples} samples at {rate_hz:g} Hz; a record has {MIN_SAMPLES} at"
-                f" least. Give {MIN_SAMPLES / rate_hz:.3g} or more"
+                f"--seconds is {trial.seconds:g}: {counted(samples, 'sample')} at {rate_hz:g} Hz; a record needs "
+                f"at least {MIN_SAMPLES}. Give {MIN_SAMPLES / rate_hz:.3g} or more"
             )
         if self.excitation is None:
             return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
@@ -253,12 +253,12 @@ def _usual_mode(port: str, rig: Rig, excitation: str | None) -> Mode:
 def _check_excitation(port: str, mode: Mode, name: str | None, given: Mapping[str, object]) -> None:
     """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
     if name is None:
-        refuse_given(given, "{} is of an excitation, and none is named. Give --excitation, or leave it out")
+        refuse_given(given, "{} is for an excitation, and none was named. Give --excitation, or omit it")
     elif port.startswith("replay:"):
-        raise AmbidError("--excitation cannot be played to a record that is replayed. Leave it out")
+        raise AmbidError("--excitation cannot act on a replayed record. Omit it")
     elif mode == "sample":
         raise AmbidError(
-            "--mode sample has its output off: nothing can be excited. Leave --excitation out, or --mode drive"
+            "--mode sample keeps the output off: nothing can be excited. Omit --excitation, or give --mode drive"
         )
 
 
@@ -269,6 +269,6 @@ def _replay_notes(device: Device, rig: Rig) -> tuple[str, ...]:
     if device.info.kind != "replay" or wanted is None or math.isclose(rate, wanted, rel_tol=_SAME_RATE):
         return ()
     return (
-        f"{device.info.port} was taken at {rate:.6g} Hz, which it keeps; the rig says {wanted:g} Hz. Make sure that it"
-        " is of this bench",
+        f"{device.info.port} was recorded at {rate:.6g} Hz, which is kept; the rig says {wanted:g} Hz. Make sure "
+        "that both are of the same bench",
     )

@@ -13,7 +13,7 @@ from typing import Literal, TypedDict, Unpack
 import numpy as np
 
 from ambid.bearing.magnet_problem import BearingRecord, touching
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.progress import Tick
 from ambid.job.data import Reading, Source, known_rig, load_bench, origin
 from ambid.physics.coenergy_law import MagnetLaw
@@ -57,7 +57,8 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> 
     bench, off_below = known_rig(rig), words.get("off_below")
     if bench.model != "one-axis":
         raise EstimationError(
-            f"the rig's model is {bench.model!r}; a nonlinear bearing wants 'one-axis'. Correct model, or take another"
+            f"the rig's model is {bench.model!r}; a nonlinear bearing needs 'one-axis'. Correct model, or use "
+            "another rig"
         )
     known = bench.magnet or RigMagnet()
     known = replace(
@@ -116,7 +117,8 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
         if beyond:
             u = np.clip(u, low, high)
             warnings.append(
-                f"{name}: {beyond} samples of the voltage lie beyond loop.limits.voltage; the limit was taken"
+                f"{name}: {counted(int(beyond), 'sample')} of the voltage beyond loop.limits.voltage; replaced by "
+                "the limit"
             )
     y = np.column_stack([bench["position"].values, bench["current"].values])
     loose = np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0)
@@ -135,19 +137,19 @@ def _stops(record: BearingRecord) -> list[str]:
     found = list[str]()
     if record.knock is not None and record.knock.any():
         found.append(
-            f"{record.name}: the rotor is at a stop (loop.limits.position) for {np.count_nonzero(record.knock)} "
-            "samples; the force there counts as unknown"
+            f"{record.name}: the rotor touches a stop (loop.limits.position) in {np.count_nonzero(record.knock)} "
+            "samples; the force there is treated as unknown"
         )
     if record.cut is not None:
         lies, left = float(np.mean(record.cut)), int(np.count_nonzero(~record.cut))
         if max((end - first for first, end in record.parts), default=0) < _LEAST:
             raise EstimationError(
-                f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.0%} of the record, and is "
-                f"nowhere free for {_LEAST} samples. Correct the limits, or record with the rotor levitated"
+                f"{record.name}: the rotor rests on a stop (loop.limits.position) in {lies:.0%} of the record and "
+                f"is nowhere free for {_LEAST} samples. Correct the limits, or record with the rotor levitated"
             )
         found.append(
-            f"{record.name}: the rotor lies on a stop (loop.limits.position) in {lies:.1%} of the record; that was cut "
-            f"out, and {left} samples in {len(record.parts)} stretches remain"
+            f"{record.name}: the rotor rests on a stop (loop.limits.position) in {lies:.1%} of the record; that "
+            f"part was cut out, and {left} samples in {counted(len(record.parts), 'part')} remain"
         )
     return found
 
@@ -156,15 +158,15 @@ def _check_moves(record: BearingRecord) -> None:
     """Refuse what no number can come from."""
     if record.u.size < _LEAST:
         raise EstimationError(
-            f"{record.name} has {record.u.size} samples; a nonlinear bearing wants {_LEAST} of each record. "
-            "Give a longer one, or leave it out"
+            f"{record.name} has {counted(record.u.size, 'sample')}; a nonlinear bearing needs {_LEAST}. Give a "
+            "longer record, or omit it"
         )
     channels = {"voltage": record.u, "current": record.y[:, 1]} | ({} if record.held else {"position": record.y[:, 0]})
     for role, x in channels.items():
         if not np.ptp(x) > 0.0:
             raise EstimationError(
-                f"{record.name}: channel {role!r} is constant over the whole record; nothing can be estimated from it. "
-                "Check column and units, or leave it out"
+                f"{record.name}: channel {role!r} is constant in the whole record. Check its column and unit, or "
+                "omit the record"
             )
 
 
@@ -179,7 +181,9 @@ def take_all(
     """Read the records of one identification: those to identify from, and the one to validate on."""
     how: Reading = {k: words[k] for k in Reading.__annotations__ if k in words}  # type: ignore[assignment, literal-required]
     if not records:
-        raise EstimationError("no record, or every one holds the rotor; forces want one in which it moves. Give one")
+        raise EstimationError(
+            "no record with a moving rotor was given; forces cannot be estimated without one. Give one"
+        )
     taken: list[TakenRecord] = []
     for source, is_held in [*((r, False) for r in records), *((r, True) for r in held)]:
         say("read")
@@ -189,8 +193,8 @@ def take_all(
     if second is not None and second.record.rate_hz not in rates:  # the predictor could not judge it: say so now
         known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
         raise EstimationError(
-            f"{second.record.name}, to judge on, is sampled at {second.record.rate_hz:g} Hz, the records at {known}; "
-            "they have to agree. Resample it, or leave --validate out"
+            f"{second.record.name}, for validation, is sampled at {second.record.rate_hz:g} Hz, the records at "
+            f"{known}; the rates must agree. Resample it, or omit --validate"
         )
     return check_together(taken, second), second
 
@@ -205,14 +209,13 @@ def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> 
         for other in taken[:j]:
             if _overlap(one, other):
                 raise EstimationError(
-                    f"{other.record.name} and {one.record.name} hold the same samples; they would count twice. "
-                    "Leave one out"
+                    f"{other.record.name} and {one.record.name} hold the same samples and would count twice. Omit one"
                 )
     for one in taken:
         if second is not None and _overlap(one, second):
             raise EstimationError(
-                f"{second.record.name}, to judge on, holds samples that the estimate is fitted to; errors there say "
-                "nothing about others. Give another record, or leave --validate out"
+                f"{second.record.name}, for validation, holds samples that the estimate is fitted to. Give another "
+                "record, or omit --validate"
             )
     moving = max((float(t.record.y[:, 0].std()) for t in taken if not t.record.held), default=0.0)
     return tuple(_warn_moving(t, moving) for t in taken)
@@ -221,8 +224,8 @@ def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> 
 def _refuse_senseless(record: BearingRecord) -> None:
     if np.all(record.loose > 0.0):
         raise EstimationError(
-            f"{record.name}: every voltage is at or below off_below, where the stage is off; none would be known. "
-            "Correct --off-below or magnet.off_below (in V)"
+            f"{record.name}: every voltage is at or below off_below, where the stage is off, so none would be "
+            "known. Correct --off-below or magnet.off_below (in V)"
         )
     channels = {"voltage": record.u, "position": record.y[:, 0], "current": record.y[:, 1]}
     if record.held:
@@ -234,8 +237,8 @@ def _refuse_senseless(record: BearingRecord) -> None:
             a, b = unit[one], unit[other]
             if np.std(a - np.sign(a @ b) * b) <= _SAME:
                 raise EstimationError(
-                    f"{record.name}: {other} and {one} are one signal but for scale and offset; nothing can be told "
-                    f"from that. Correct channels.{other}.column or channels.{one}.column"
+                    f"{record.name}: {other} and {one} are the same signal up to scale and offset. Correct "
+                    f"channels.{other}.column or channels.{one}.column"
                 )
 
 
@@ -253,7 +256,7 @@ def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
     if not one.record.held or rocks <= _ROCKS * moving:
         return one
     said = (
-        f"{one.record.name}: the rotor is said to be held, but its position scatters by {1e6 * rocks:.3g} um, "
-        f"{rocks / moving:.0%} of what it does where it moves; R and L are biased if that is motion"
+        f"{one.record.name}: the rotor is declared held, but its position scatters by {1e6 * rocks:.3g} um, "
+        f"{rocks / moving:.0%} of its motion in the other records; R and L are biased if it moved"
     )
     return replace(one, warnings=(*one.warnings, said))

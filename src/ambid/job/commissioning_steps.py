@@ -138,7 +138,7 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
         if math.isfinite(width) and sd > _SD_AT_REST * width:
             reasons.append(
                 f"the {role} sensor's noise is {sized(sd, unit)} rms with the output off, {100 * sd / width:.0f} %"
-                " of the way between the trips: look at wiring, ground and the filter at the input"
+                " of the way between the trips: check wiring, ground and the filter at the input"
             )
         if sd == 0.0:
             cautions.append(f"{role} does not move by one count: a quiet sensor, or none")
@@ -174,7 +174,7 @@ def polarity(look: Look, room: Room, rig: Rig, device: Device) -> Step:
     reasons = [*found.troubles, *_reversed(found, rig)]
     if not found.current and not reasons:
         reasons.append(
-            f"no current is shown for {_pulse_words(largest)}: look at the coil's cable, the current sensor and the"
+            f"no current is shown for {_pulse_words(largest)}: check the coil's cable, the current sensor and the"
             " power stage"
         )
     cautions = []
@@ -248,8 +248,7 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     for role, (_, sd) in shown.items():
         if role != "voltage" and sd == 0.0:
             reasons.append(
-                f"{role} does not move by one count while the rotor hovers: no sensor there? Look at its cable and"
-                " supply"
+                f"{role} does not move by one count while the rotor hovers: no sensor there? Check its cable and supply"
             )
     low, high = room.trips["position"]
     stray = float(np.ptp(seen["position"]))
@@ -326,7 +325,7 @@ def record(name: str, done: Acquired) -> Step:
         if column.role in ("position", "current") and column.saturated > _SATURATED
     ]
     reasons += [
-        f"{column.name} does not move by one count in the {name}: no sensor there? Look at its cable and supply"
+        f"{column.name} does not move by one count in the {name}: no sensor there? Check its cable and supply"
         for column in done.quality.columns
         if column.role in ("position", "current") and column.sd == 0.0
     ]
@@ -345,7 +344,7 @@ def identification(estimate: Estimate, wishes: Wishes) -> Step:
     cautions: list[str] = []
     numbers: dict[str, float] = {}
     if estimate.status != "converged":
-        reasons.append(f"the search ended {estimate.status}: look at columns, signs and calibrations")
+        reasons.append(f"the search ended {estimate.status}: check columns, signs and calibrations")
     for p in estimate.parameters:
         if p.role == "fixed":
             continue

@@ -225,8 +225,8 @@ def _role(name: str, rig: Rig, roles: tuple[str, ...], what: str) -> str:
     found = next((c.role for c in rig.channels if name in (c.role, c.column) and c.role in roles), None)
     if found is None:
         raise EstimationError(
-            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or leave "
-            f"--{what} out for all"
+            f"--{what} {name}: the rig's {what}s are {', '.join(roles)}. Name one of them or its column, or omit "
+            f"--{what} for all"
         )
     return found
 
@@ -259,13 +259,13 @@ def check_same_bench(units: Mapping[str, str], dt: float, second: IOData) -> Non
     """Refuse a second record whose rate (interval `dt` in s) or units are not those of the first."""
     if abs(second.dt / dt - 1) > 1e-6:
         raise EstimationError(
-            f"the second record is sampled at {1 / second.dt:g} Hz, the first at {1 / dt:g} Hz; they have to agree. "
-            "Resample one of them"
+            f"the second record is sampled at {1 / second.dt:g} Hz, the first at {1 / dt:g} Hz; the rates must "
+            "agree. Resample one of them"
         )
     for name in (*second.inputs, *second.outputs):
         one, other = units.get(name, UNKNOWN), second.units[name]
         if one != other and UNKNOWN not in (one, other):
             raise EstimationError(
-                f"channel {name!r} is in {other} in the second record, in {one} in the first; they have to agree. "
-                "Check that it is the same channel, and its unit"
+                f"channel {name!r} is in {other} in the second record, in {one} in the first; the units must "
+                "agree. Check that it is the same channel, and its unit"
             )

@@ -46,28 +46,28 @@ class Files:
             self._check(path, option, suffixes)
             if path.is_file() and not force and not (suffixes in _DRAWN or _made_here(path)):
                 remedy = "Choose another name" + ("" if force is None else ", or give --force")
-                raise AmbidError(f"{option} {path} exists already, and is no result of ambid. {remedy}")
+                raise AmbidError(f"{option} {path} exists, and is not a result of ambid. {remedy}")
         except (OSError, RuntimeError) as failure:  # a name that no file can have, a link to itself
             words = getattr(failure, "strerror", None) or failure
-            raise AmbidError(f"{option} {path} cannot be: {words}. Give another name") from None
+            raise AmbidError(f"{option} {path} cannot be used: {words}. Give another name") from None
         self._claimed.append(path)
 
     def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
         folder = (path.resolve() if path.is_symlink() else path).parent
         if path.exists() and not path.is_file() and not path.is_dir():
             remedy = "Use - for standard output" if option in _STREAMED else "Name one"
-            raise AmbidError(f"{option} {path} is a device or a pipe; a file is wanted. {remedy}")
+            raise AmbidError(f"{option} {path} is a device or a pipe; it must be a file. {remedy}")
         if path.is_dir():
-            raise AmbidError(f"{option} {path} is a folder; a file is wanted. Name a file inside it")
+            raise AmbidError(f"{option} {path} is a folder; it must be a file. Name a file inside it")
         if suffixes and not path.name.lower().endswith(tuple(suffixes)):
-            raise AmbidError(f"{option} {path} has to end in {' or '.join(suffixes)}. Rename it")
+            raise AmbidError(f"{option} {path} must end in {' or '.join(suffixes)}. Rename it")
         if not folder.is_dir():
             raise AmbidError(f"{option} {path}: there is no folder {folder}. Make it first, or correct the path")
         if not os.access(folder, os.W_OK):
             raise AmbidError(f"{option} {path}: folder {folder} may not be written. Choose another folder")
         for other in self._inputs:
             if _same(path, other):
-                raise AmbidError(f"{option} {path} is also read; writing would destroy it. Choose another file")
+                raise AmbidError(f"{option} {path} is also an input, which would be overwritten. Choose another file")
         for other in self._claimed:
             if _same(path, other):
                 raise AmbidError(f"{option} {path} is named by two options. Choose another file for one of them")

@@ -127,11 +127,13 @@ def fit(
     if nonlinear:
         if orders is not None and orders != "auto":
             if settings is not None:
-                raise EstimationError("--orders and --settings say the same of a nonlinear structure. Give one of them")
+                raise EstimationError(
+                    "--orders and --settings mean the same for a nonlinear structure. Give one of them"
+                )
             chosen = settings_of(orders)
         linear_only = {"--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
                        "--criterion": criterion != "bic"}  # fmt: skip
-        refuse_given(linear_only, f"{{}} is for linear structures; {structure} has no use for it. Leave it out")
+        refuse_given(linear_only, f"{{}} is for linear structures; {structure} does not use it. Omit it")
         _check_settings(structure, sources, chosen, seed or 0)
     else:
         _check_linear(structure, sources, {"--settings": settings, "--seed": seed is not None})
@@ -139,9 +141,7 @@ def fit(
         taken = channels.inputs if channels.rig is None else channels.inputs or model(channels.rig.model).inputs
         _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
     if validate is None and (validate_from_s, validate_to_s) != (None, None):
-        raise EstimationError(
-            "--validate-from and --validate-to cut a second record; none is given. Give --validate, or leave them out"
-        )
+        raise EstimationError("--validate-from and --validate-to need a second record. Give --validate, or omit them")
     clock, data = Clock(), list[Any]()
     for record in sources:
         (say if nonlinear else silent)("read")
@@ -310,7 +310,7 @@ def _check_criterion(criterion: str, orders: Orders | None) -> None:
         raise EstimationError(f"criterion {criterion!r} is not one of {', '.join(known)}.{nearest(criterion, known)}")
     if orders is not None and criterion != "bic":
         raise EstimationError(
-            f"criterion {criterion} chooses orders, but orders are given. Leave one of them out, or give --orders auto"
+            f"criterion {criterion} chooses orders, but orders are given. Omit one, or give --orders auto"
         )
 
 
@@ -319,7 +319,7 @@ def _check_use(
 ) -> None:
     if inputs and not of.inputs:
         raise EstimationError(
-            f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Leave --input out"
+            f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Omit --input"
         )
     if not inputs and of.inputs is True and of.kind != "state space":
         raise EstimationError(f"structure {of.name} needs an input. Give --input COLUMN, or use arma")
@@ -327,9 +327,7 @@ def _check_use(
         raise EstimationError(f"structure {of.name} has no coefficients that can be fixed. Use a polynomial structure")
     if at_rest and not of.prediction_error:
         some = ", ".join(x.name for x in STRUCTURES.values() if x.prediction_error)
-        raise EstimationError(
-            f"structure {of.name} cannot be told that a record begins at rest; {some} can. Leave --at-rest out"
-        )
+        raise EstimationError(f"structure {of.name} cannot start at rest; {some} can. Omit --at-rest")
 
 
 def _check_linear(name: str, records: Sequence[object], given: Mapping[str, object]) -> None:
@@ -338,19 +336,19 @@ def _check_linear(name: str, records: Sequence[object], given: Mapping[str, obje
         structure_named(name)  # says where those are fitted
     every = [*STRUCTURES, *NONLINEAR_STRUCTURES]
     if name not in STRUCTURES:
-        raise EstimationError(f"structure {name!r} is not known; known: {', '.join(every)}.{nearest(name, every)}")
+        raise EstimationError(f"structure {name!r} is unknown; known: {', '.join(every)}.{nearest(name, every)}")
     if len(records) > 1:
         several = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(f"structure {name} takes one record; {several} take several. Give one")
-    refuse_given(given, f"{{}} is for nonlinear structures; {name} has --orders. Leave it out")
+    refuse_given(given, f"{{}} is for nonlinear structures; {name} has --orders. Omit it")
 
 
 def _check_settings(name: str, records: Sequence[object], settings: Settings, seed: int) -> None:
     known = list(nonlinear_structure(name).settings)
     if not records:
-        raise EstimationError("there is no record to fit. Give one at least")
+        raise EstimationError("no record was given. Give at least one")
     if seed < 0:
-        raise EstimationError(f"the seed is {seed}; it is 0 or more. Give another one")
+        raise EstimationError(f"seed {seed} is negative; a seed is 0 or more. Give another one")
     for x in settings:
         if x not in known:
             raise EstimationError(

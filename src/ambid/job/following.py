@@ -98,16 +98,16 @@ def check_settings(said: Mapping[str, Any], names: Mapping[str, str] = MappingPr
         _positive(name, memory, other="'auto', 'all' or ")
         if not _SHORTEST_S <= _number(memory) <= _LONGEST_S:
             raise EstimationError(
-                f"{name} is {_short(memory)} s; it must lie between {_SHORTEST_S:g} and {_LONGEST_S:g}. Give 'all'"
-                " where nothing is to be forgotten"
+                f"{name} is {_short(memory)} s; it must be {_SHORTEST_S:g} to {_LONGEST_S:g} s. Give 'all' to "
+                "forget nothing"
             )
     pace = said.get("pace", _PACES[0])
     if pace not in _PACES:
         raise EstimationError(f"pace is {pace!r}; known: {', '.join(_PACES)}. Correct it")
     if said.get("start") is not None and said.get("start_s") is not None:
         raise EstimationError(
-            f"{names.get('start_s', 'start_s')} is for a start identified from the record; "
-            f"{names.get('start', 'start')} gives one. Leave one of them out"
+            f"{names.get('start_s', 'start_s')} is for a start identified from the record, but "
+            f"{names.get('start', 'start')} gives one. Omit one of them"
         )
     for flag in said.get("flags", ()):
         _check_flag(flag)
@@ -130,7 +130,7 @@ def _number(x: object) -> float:
 def _check_flag(flag: object) -> None:
     """Refuse a flag that is not a pair of a finite time and a known name."""
     if isinstance(flag, str) or not isinstance(flag, Sequence) or len(flag) != 2:
-        raise EstimationError(f"flag {_short(flag)} is no pair of a time in s and a name, such as (12.5, 'hold')")
+        raise EstimationError(f"flag {_short(flag)} is not a pair of a time in s and a name, such as (12.5, 'hold')")
     t, name = flag
     if isinstance(t, (str, bool)) or not isinstance(t, (int, float)) or not math.isfinite(t):
         raise EstimationError(f"flag {_short(flag)}: its time is {_short(t)}; it must be finite, in s. Correct it")

@@ -95,7 +95,9 @@ def identify(
     delay = rig.channel(plant.inputs[0]).delay
     fit = greybox(plant, signals_of(bench, plant), rig.parameters, delay=delay, tick=lambda: say("identify"))
     if fit.status == "failed":
-        raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
+        raise EstimationError(
+            "the search found no stable predictor for this record. Check columns, signs and fixed values"
+        )
     clock.lap("fit")
     clock.split("fit", "initial", fit.start_s)
     if fit.global_search is not None:
@@ -130,7 +132,9 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     problem = fit.problem
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
     if e is None:
-        raise EstimationError("the search found no predictor for this record. Check columns, signs and fixed values")
+        raise EstimationError(
+            "the search found no stable predictor for this record. Check columns, signs and fixed values"
+        )
     found = physical.innovation_products(fit, e)
     known, moved = uncertainty(fit, found.scores), physical.agreement(fit)
     checks = physical.innovation_checks(fit, found, known, moved)
@@ -180,14 +184,14 @@ def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[s
     """What a reader has to know before using the numbers, most important first."""
     from ambid.bearing.rescue import describe_search
 
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the numbers as a first guess"]
+    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
     if fit.global_search is not None:
         found.append(describe_search(fit.global_search))
     found += [c.detail for c in checks.values() if not c.passed]
     if robust:
         found.append(
-            "the model explains the record only in part: standard deviations are robust ones (scatter over the record "
-            "and disagreement of refits included), and still cannot cover a bias that is the same everywhere"
+            "the model does not fully fit; standard errors are inflated (scatter over the record, disagreement of "
+            "refits) but cannot cover a systematic bias"
         )
     return tuple(found)
 
@@ -267,8 +271,8 @@ def identify_nonlinear(
     )  # fmt: skip
     if fit.status == "failed":
         raise EstimationError(
-            "the search led to numbers without a predictor for these records; no law explains them. Check columns, "
-            "signs and units"
+            "the search ended without a stable predictor for these records: no force law explains them. Check "
+            "columns, signs and units"
         )
     clock.lap("fit")
     say("check")

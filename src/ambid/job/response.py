@@ -110,7 +110,7 @@ def frf(
         raise EstimationError("--orders auto: a transfer function wants its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)
     if bench is None and not channels.inputs:
-        raise EstimationError("no input is named; a response needs at least one. Give --input COLUMN")
+        raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
     say("measure")
@@ -138,22 +138,22 @@ def _check(
     """Refuse what contradicts itself before the record is read."""
     if orders is not None and state_space is not None:
         raise EstimationError(
-            "a transfer function and a state space are both asked for. Give --orders or --state-space"
+            "both a transfer function and a state space were requested. Give --orders or --state-space"
         )
     if state_space is not None and state_space != "auto" and (not isinstance(state_space, int) or state_space < 1):
-        raise EstimationError(f"a state space of order {state_space}; it must be at least 1, or 'auto'. Correct it")
+        raise EstimationError(f"the state-space order is {state_space}; it must be at least 1, or 'auto'. Correct it")
     if orders is None and state_space is None and domain is not None:
-        raise EstimationError("--domain is for --orders and --state-space; neither is given. Leave it out")
+        raise EstimationError("--domain is for --orders and --state-space; neither was given. Omit it")
     if feedthrough and state_space is None:
-        raise EstimationError("--feedthrough is for --state-space (--orders has it with nb = nf + 1). Leave it out")
+        raise EstimationError("--feedthrough is for --state-space (--orders has it with nb = nf + 1). Omit it")
     if state_space is not None and delay == "auto":
         raise EstimationError(
-            "a state space takes a delay that is known, not 'auto'. Give --delay S; --orders or --rig can find it"
+            "a state space needs a known delay, not 'auto'. Give --delay S; --orders or --rig can find it"
         )
     if delay is not None and orders is None and state_space is None and rig is None:
-        raise EstimationError("--delay is for a model; none is asked for. Give --orders, --state-space or --rig too")
+        raise EstimationError("--delay is for a model; none was requested. Give --orders, --state-space or --rig too")
     if isinstance(delay, float | int) and not (np.isfinite(delay) and delay >= 0):
-        raise EstimationError(f"a delay of {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
+        raise EstimationError(f"the delay is {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
 
 
 def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
@@ -196,7 +196,7 @@ def _fit_model(
         found,
         offsets=Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0)),
         record={**data.record, **found.record},
-        details={**found.details, "offsets": "means of the record: a frequency response does not show them"},
+        details={**found.details, "offsets": "means of the record; a frequency response does not contain them"},
     )
 
 

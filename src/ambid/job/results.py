@@ -57,8 +57,8 @@ def load(path: str | Path) -> AnyEstimate | AnyFit:
         ) from None
     except (RecursionError, ValueError):
         raise EstimationError(
-            f"estimate {path} is nested too deep, or holds a number that is too long. "
-            "Give what 'ambid identify --json' wrote"
+            f"estimate {path} is nested too deeply, or holds a number that is too long. Give what 'ambid identify "
+            "--json' wrote"
         ) from None
     schema = document.get("schema") if isinstance(document, dict) else None
     if schema == FIT_SCHEMA:
@@ -87,7 +87,7 @@ def data_of(
     """
     if isinstance(known, BlackBoxFit | NonlinearFit):
         if rig is not None:
-            raise EstimationError(f"{where} is a black-box fit, which knows no rig. Leave --rig out")
+            raise EstimationError(f"{where} is a black-box fit, which has no rig. Omit --rig")
         channels = Channels(
             inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps"),
             units=reading.get("units"),

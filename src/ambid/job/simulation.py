@@ -135,7 +135,9 @@ def simulate_used(
         lambda part: make_excitation(excitation, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods
     )
     if amplitude is None and bench.rig is not None and bench.rig.limits is None:
-        raise AmbidError("no amplitude is given, and the rig has no limits to find one from. Give --amplitude A in V")
+        raise AmbidError(
+            "no amplitude was given, and the rig has no limits to derive one from. Give --amplitude A in V"
+        )
     peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
     if log_excitation:
@@ -166,8 +168,8 @@ def _bench(given: Bearer, rate: float | None, closed: bool | None, nonlinear: bo
         source = replace(source, operating_point={**source.operating_point, "position": position})
     if rate is None and source.record.rate_hz is None:
         raise AmbidError(
-            f"rig {source.source or source.name} names no rate; a simulation needs one. Give --rate HZ, or"
-            " record.rate_hz"
+            f"rig {source.source or source.name} gives no rate; a simulation needs one. Give --rate HZ, or "
+            "record.rate_hz"
         )
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
@@ -197,5 +199,7 @@ def _samples(duration: float, rate_hz: float) -> int:
 def _repeat(make: Callable[[int], Array], n: int, periods: int) -> Array:
     """Lay equal periods one behind the other."""
     if n % periods:
-        raise AmbidError(f"--periods {periods}: {n} samples are no whole number each. Change --duration or --periods")
+        raise AmbidError(
+            f"--periods {periods}: {n} samples do not divide into that many periods. Change --duration or --periods"
+        )
     return np.tile(make(n // periods), periods)

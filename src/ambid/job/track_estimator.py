@@ -80,7 +80,7 @@ def track_estimator(
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
     inputs, outputs, references = (names_of(settings.get(x)) for x in ("input", "output", "reference"))  # type: ignore[arg-type]
     orders = orders_of(settings.get("orders"))
-    refusal = f"--method {method} takes no {{}}. Leave it out"
+    refusal = f"--method {method} takes no {{}}. Omit it"
     if method in JOINT:
         columns = {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders}
         refuse_given(columns, refusal)
@@ -92,7 +92,7 @@ def track_estimator(
         used = whole if span == WHOLE else cut(whole, *span)
         data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
-            raise EstimationError(f"{method} follows one output; {data.y.shape[1]} are named. Name one with --output")
+            raise EstimationError(f"{method} tracks one output; {data.y.shape[1]} were named. Name one with --output")
         made = _coefficients(method, data, orders, how.memory, settings.get("step"), used.start_s)
     label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
     return _follow(made, label, how)
@@ -112,9 +112,9 @@ def _coefficients(
         label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
     else:
         if step is not None or orders is None:
-            raise EstimationError(f"--method {method} wants --orders as numbers, and takes no --step. Correct that")
+            raise EstimationError(f"--method {method} needs --orders as numbers, and takes no --step. Correct that")
         if samples is not None and samples <= 1.0:
-            raise EstimationError(f"--memory {memory:g} s is no longer than a sample. Give a longer one")
+            raise EstimationError(f"--memory {memory:g} s is not longer than one sample. Give a longer one")
         estimator = RecursivePolynomial(  # stores the first samples and fits them off-line
             method, orders, dt=data.dt, n_inputs=data.u.shape[1], open_loop=data.open_loop,
             forgetting=1.0 if samples is None else 1.0 - 1.0 / samples,
@@ -147,8 +147,8 @@ def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]
     means, sizes = zip(*((x[first].mean(axis=0), x[first].std(axis=0)) for x in (u, y)), strict=True)
     if not all((size > 0).all() for size in sizes):
         raise EstimationError(
-            f"{method}: a signal stands still over the first {first.stop * data.dt:.3g} s; its size is taken from"
-            " there. Begin where the signals move, with --from"
+            f"{method}: a signal is constant in the first {first.stop * data.dt:.3g} s, which set its scale. Begin "
+            "where the signals move, with --from"
         )
     return (u - means[0]) / sizes[0], (y - means[1]) / sizes[1], sizes
 
@@ -158,8 +158,7 @@ def _arx_orders(who: str, data: IOData, orders: Orders | None) -> tuple[int, tup
     names = ("na", "nb", "nk")
     if orders is None or not data.inputs:
         raise EstimationError(
-            f"{who} wants --input, --output and --orders na=2,nb=2,nk=1 as numbers: on-line nothing is chosen. Give"
-            " them"
+            f"{who} needs --input, --output and --orders na=2,nb=2,nk=1 as numbers: none is chosen on-line. Give them"
         )
     check_order_names(who, orders, names, names)
     nb, nk = (order_per_input(who, orders, name, least, data.n_inputs) for name, least in (("nb", 1), ("nk", 0)))
@@ -175,14 +174,14 @@ def _arx(
 ) -> RecursiveArx | RecursiveIvArx:
     na, nb, nk = orders
     if step is not None and method not in _STEP:
-        raise EstimationError(f"--method {method} takes no --step. Leave it out")
+        raise EstimationError(f"--method {method} takes no --step. Omit it")
     if memory is not None and method in _STEP:
-        raise EstimationError(f"--method {method} forgets by its --step and takes no --memory. Leave it out")
+        raise EstimationError(f"--method {method} forgets by its --step and takes no --memory. Omit it")
     if method == "iv":
         if len(nb) != 1 or not (data.references or data.open_loop):
             raise EstimationError(
-                "--method iv wants one input, and the loop's outer excitation as its instrument. Name it with"
-                " --reference, or say --open-loop where there is no feedback"
+                "--method iv needs one input, and the loop's external excitation as instrument. Name it with "
+                "--reference, or give --open-loop if there is no feedback"
             )
         instruments: Literal["reference", "auxiliary model"] = "reference" if data.references else "auxiliary model"
         return RecursiveIvArx(
@@ -201,8 +200,8 @@ def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
     """Return what is to be mistrusted before the first sample: bias under feedback, above all."""
     if method in ("rls", "lms", "nlms") and not data.open_loop:
         return (
-            f"{method} is biased where a controller is at work or the noise is coloured, and nothing says that this"
-            " loop is open: use armax, or iv with --reference, or say --open-loop if there is no feedback",
+            f"{method} is biased by feedback and by coloured noise. Use armax, or iv with --reference, or give "
+            "--open-loop if there is no feedback",
         )
     return tuple(w for w in getattr(estimator, "warnings", ()) if "first window" not in w)
 
@@ -266,7 +265,7 @@ def _line(run: _Run, part: slice) -> TrackLine:
     events: tuple[Event, ...] = ()
     rejected = estimator.n_rejected - before
     if rejected:
-        why = f"{rejected} samples not used: not finite, beyond all noise, or without the past that the model needs"
+        why = f"{rejected} samples not used: not finite, far beyond the noise, or too early for the model's lags"
         events = (Event(kind="rejected", t=t, why=why, samples=rejected),)
     return TrackLine(
         t=t,

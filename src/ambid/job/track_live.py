@@ -86,7 +86,7 @@ def track_live(
         wanted_s = lead_s = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start_s is None else start_s
     if course.seconds <= wanted_s:
         raise DeviceError(
-            f"tracking wants {wanted_s:g} s to begin with, and the run has {course.seconds:g} s. Run longer"
+            f"tracking needs {wanted_s:g} s for its start, and the run lasts {course.seconds:g} s. Run longer"
             + ("" if start is not None else ", or give a start")
         )
     slots = max(64, ceil(_QUEUE_S * (_BLOCKS_PER_S + view.rate_hz / _BLOCK_SAMPLES)))
@@ -153,8 +153,8 @@ def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
         return DeviceError(f"the run was interrupted after {report.samples / rate_hz:.3g} s, before tracking began")
     why = "" if report.fault is None else f" ({fault_words(report.fault)})"
     return DeviceError(
-        f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking wants {wanted_s:g} s to begin with."
-        " Run longer, or see to what ended it"
+        f"the stream ended after {report.samples / rate_hz:.3g} s{why}; tracking needs {wanted_s:g} s for its "
+        "start. Run longer, or correct what ended it"
     )
 
 

@@ -11,7 +11,7 @@ from typing import Unpack
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, RecordError
+from ambid.errors import EstimationError, RecordError, counted
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, known_rig, load_bench
 from ambid.job.identification import identify
@@ -64,8 +64,8 @@ class BenchRows:
         sound = np.asarray(np.isfinite(self.replay.values).all(axis=1))
         if not sound.any():
             raise RecordError(
-                "no row of the record holds a finite value in every channel that is tracked; tracking has to start from"
-                " a clean part. Check the columns, or give an estimate"
+                "no row of the record has finite values in every tracked channel; tracking must start from a clean "
+                "part. Check the columns, or give an estimate"
             )
         joined = np.concatenate([[False], sound[1:] & sound[:-1] & (np.diff(numbers) == 1)])
         begins = np.flatnonzero(sound & ~joined)
@@ -79,8 +79,8 @@ class BenchRows:
             at, length = int(begins[best]), int(lengths[best])
         else:
             raise RecordError(
-                f"the first {n / self.replay.rate_hz:g} s of the record are damaged; tracking has to start from a clean"
-                " part. Give a shorter one, or an estimate"
+                f"the first {n / self.replay.rate_hz:g} s of the record are damaged; tracking must start from a "
+                "clean part. Give a shorter start, or an estimate"
             )
         channels = tuple(replace(c, values=c.values[at : at + length].copy()) for c in self.record.channels)
         part = replace(self.record, channels=channels, start_s=self.t0 + float(numbers[at]) / self.replay.rate_hz)
@@ -132,9 +132,9 @@ def _part(bench: Record, time_s: Array | None, from_s: float | None, to_s: float
     kept = (t >= (-np.inf if from_s is None else from_s)) & (t < (np.inf if to_s is None else to_s))
     if not kept.any():
         raise RecordError(
-            f"the record spans {np.nanmin(stamps):g} to {np.nanmax(stamps):g} s; nothing of it is between"
-            f" {from_s if from_s is not None else 'its start'} and {to_s if to_s is not None else 'its end'} s. Give"
-            " times inside it"
+            f"the record spans {np.nanmin(stamps):g} to {np.nanmax(stamps):g} s and has nothing between "
+            f"{from_s if from_s is not None else 'its start'} and {to_s if to_s is not None else 'its end'} s. "
+            "Give times inside it"
         )
     channels = tuple(replace(c, values=c.values[kept]) for c in bench.channels)
     first = float(t[kept][0])
@@ -186,8 +186,8 @@ def start_of(
             numbers = _numbers(estimate, source)
         except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
             raise EstimationError(
-                f"the start estimate is not whole ({type(error).__name__}: {error}). Write it again with"
-                " 'ambid identify --json'"
+                f"the start estimate is incomplete ({type(error).__name__}: {error}). Write it again with 'ambid "
+                "identify --json'"
             ) from error
     failed = [c.detail for c in estimate.checks.values() if not c.passed and c.detail not in estimate.warnings]
     return Start(
@@ -209,8 +209,8 @@ def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:
     most_s = min(_SETTLED_S, _SETTLED_PART * duration_s)
     if settling_s > most_s:
         raise EstimationError(
-            f"the predictor of the start needs {settling_s:.3g} s to settle, of {left_s:.3g} s to track; at most"
-            f" {most_s:.3g} s make sense. Check the values of the start, or take a longer record"
+            f"the predictor of the start needs {settling_s:.3g} s to settle, of {left_s:.3g} s to track; the limit "
+            f"is {most_s:.3g} s. Check the values of the start, or use a longer record"
         )
 
 
@@ -248,7 +248,7 @@ def _identify_beginning(source: BenchRows, rig: Rig, start_s: float | None) -> t
     n = round(wanted * rate)
     if not 0 < n < length * rate:
         raise EstimationError(
-            f"a start of {wanted:g} s leaves nothing of {length:g} s to track. Give a shorter one, or an estimate"
+            f"a start of {wanted:g} s leaves nothing of the {length:g} s to track. Give a shorter one, or an estimate"
         )
     part, first = source.clean_part(n, begin_anywhere=start_s is None)
     return identify(part, rig), first
@@ -269,8 +269,8 @@ def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
     known, rate = float(str(estimate.record["rate_hz"])), source.replay.rate_hz
     if estimate.model != rig.model or abs(known / rate - 1.0) > 1e-6:
         raise EstimationError(
-            f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at"
-            f" {rate:g} Hz; they have to agree. Identify a start from this bench at this rate"
+            f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at "
+            f"{rate:g} Hz; they must agree. Identify a start from this bench at this rate"
         )
     plant, point = model(estimate.model), estimate.operating_point
     for role in (*plant.inputs, *plant.outputs):
@@ -289,14 +289,14 @@ def _contradictions(estimate: Estimate, rig: Rig) -> list[str]:
         wanted, known = rig.channel(role).delay, estimate.delay[role]
         if wanted != "auto" and abs(known.samples + known.fraction - wanted) > _SAME:
             raise EstimationError(
-                f"the rig gives channels.{role}.delay = {wanted}, the start estimate has"
-                f" {known.samples + known.fraction:.4g} samples; tracking keeps the start's. Identify a start with this"
-                " rig, or leave the delay out of it"
+                f"the rig gives channels.{role}.delay = {wanted}, the start estimate has "
+                f"{counted(known.samples + known.fraction, 'sample')}; tracking uses the latter. Identify a start "
+                "with this rig, or omit the delay there"
             )
         if wanted == "auto" and known.how == "given":
             found.append(
-                f"the start estimate was made with a given delay of {role}, {known.samples} samples; the rig leaves it"
-                " open, and tracking keeps it. Identify a start with this rig"
+                f"the start estimate was made with a given delay of {role}, {counted(known.samples, 'sample')}; "
+                "the rig leaves it open, and tracking keeps it. Identify a start with this rig"
             )
     return found
 
@@ -304,12 +304,12 @@ def _contradictions(estimate: Estimate, rig: Rig) -> list[str]:
 def _parameter(p: Parameter, estimate: Estimate) -> str | None:
     """What a rig says of one parameter beside what the estimate knows: refused, warned of, or no contradiction."""
     e = estimate.parameter(p.name)
-    remedy = "Identify a start with this rig, or let both say the same"
+    remedy = "Identify a start with this rig, or make both agree"
     if p.role == "fixed" and p.value is not None:
         if e.role != "fixed" or not np.isclose(e.value, p.value, rtol=_SAME, atol=0.0):
             raise EstimationError(
-                f"the rig fixes {p.name} at {p.value:g} {p.unit}, the start estimate has it {e.role} at {e.value:.6g}"
-                f" {e.unit}; tracking would follow the start. {remedy}"
+                f"the rig fixes {p.name} at {p.value:g} {p.unit}, the start estimate has it {e.role} at "
+                f"{e.value:.6g} {e.unit}; tracking would use the latter. {remedy}"
             )
         return None
     if e.role == "fixed":
@@ -321,10 +321,9 @@ def _parameter(p: Parameter, estimate: Estimate) -> str | None:
         apart = abs(e.value - p.value) / math.hypot(p.sd, e.sd)
         if apart > _FAR:
             raise EstimationError(
-                f"the rig's prior of {p.name} is {p.value:g} +- {p.sd:g} {p.unit}, the start estimate has"
-                f" {e.value:.6g} +- {e.sd:.2g}, {apart:.3g} standard deviations apart; at most {_FAR:g} are chance."
-                f" {remedy}"
+                f"the rig's prior of {p.name} is {p.value:g} ± {p.sd:g} {p.unit}, the start estimate has "
+                f"{e.value:.6g} ± {e.sd:.2g}: {apart:.3g} standard deviations apart (limit {_FAR:g}). {remedy}"
             )
     if p.role != e.role:
-        return f"the rig has {p.name} {p.role}, the start estimate {e.role}: tracking follows the start. {remedy}"
+        return f"the rig has {p.name} {p.role}, the start estimate {e.role}: tracking uses the latter. {remedy}"
     return None

@@ -145,7 +145,7 @@ def track(
         from ambid.job.track_estimator import track_estimator
 
         if how.pace != "fastest" or how.flags:
-            raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Leave them out")
+            raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Omit them")
         found = track_estimator(record, given, method, start, start_s, part, how, settings)
         return replace(found, used=Followed(record=record, rate_hz=rate_hz))
     source = rows_of(record, given, **part)

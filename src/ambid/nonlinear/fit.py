@@ -218,7 +218,7 @@ class NonlinearFit(FittedModel):
     curves: tuple[LearningCurve, ...] = ()
 
 
-NO_WEIGHTS = "no finite weights were found: the columns differ too much in size from sample to sample; check them"
+NO_WEIGHTS = "no finite weights were found: the columns vary too much in size from sample to sample; check them"
 """Why the weights of a network that looks at measured signals alone come to nothing."""
 
 

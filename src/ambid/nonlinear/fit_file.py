@@ -107,7 +107,5 @@ def model_from_json(found: Mapping[str, Any]) -> NonlinearModel:
 def _home(kind: str) -> str:
     if kind not in MODEL_KINDS:
         known = ", ".join(MODEL_KINDS)
-        raise EstimationError(
-            f"models of kind {kind!r} are not known; known: {known}.{nearest(kind, list(MODEL_KINDS))}"
-        )
+        raise EstimationError(f"model kind {kind!r} is unknown; known: {known}.{nearest(kind, list(MODEL_KINDS))}")
     return MODEL_KINDS[kind]

@@ -45,7 +45,7 @@ class HammersteinSettings:
     degree: int = whole("of the static polynomial of each input; 3", 1, 9, 3)
     iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
     focus: str = choice(
-        "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
+        "prediction or simulation: errors that are minimised in the end; prediction", "prediction", "simulation"
     )
 
 

@@ -91,12 +91,8 @@ class HybridSettings:
     degree: int = whole("of the polynomial; 2", 1, 9, 2)
     neurons: int | None = whole("hidden units, 0 for none; chosen by held-out error, 8 at most", 0, 60)
     starts: int = whole("random starts of the network; 3", 1, 50, 3)
-    held_out: float = number(
-        "part at the end of each record by which the number of neurons is chosen; 0.2", 0.05, 0.5, 0.2
-    )
-    prior: float = number(
-        "standard deviation of the network's weights before the data, scaled signals; 3", 0.01, 1e6, 3.0
-    )
+    held_out: float = number("part at the end of each record that chooses the number of neurons; 0.2", 0.05, 0.5, 0.2)
+    prior: float = number("prior standard deviation of the network's weights, scaled signals; 3", 0.01, 1e6, 3.0)
     iterations: int = whole("of each training, at most; 60", 1, 2000, 60)
 
     @property
@@ -259,12 +255,12 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     starts; `tick` is called with the stage and the share that is over and may raise KeyboardInterrupt.
     """
     if not records:
-        raise EstimationError("hybrid: no record is given. Pass one at least")
+        raise EstimationError("hybrid: no record was given. Pass at least one")
     s = read_settings(HybridSettings, "hybrid", settings)
     if not records[0].n_inputs:
         s = replace(s, nu=0, nk=1)
     if not s.ny and not s.nu:
-        raise EstimationError("hybrid: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+        raise EstimationError("hybrid: ny and nu are both 0, and nothing is left to predict from. Raise one of them")
     data = scaled_records("hybrid", records, lag=s.lag, levels="auto", fewest=10)
     h = float(s.neurons if s.neurons is not None else 4)
     choice, order = 100.0 * (s.neurons is None), 3.0 * (s.ne is None)
@@ -282,7 +278,7 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
             raise KeyboardInterrupt
         _identify(s, data, draft, seed, ticks[1:])
         if draft.status == "stalled":
-            draft.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+            draft.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
     failed = guarded(identify, draft, lambda why: failed_fit("hybrid", records, asdict(s), seed, why, draft.timing_s))
     return failed or _finish(s, records, data, draft, seed)
@@ -324,7 +320,7 @@ def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks:
     if neurons is None:
         neurons = _choose_neurons(s, full, start, data.parts, draft, seed, ticks[1])
         if not neurons:
-            few, as_well = "is all that so few samples carry", "predicts held-out data as well as with a network"
+            few, as_well = "is all that so few samples allow", "predicts held-out data as well as with a network"
             draft.warnings.append(
                 f"the polynomial alone {as_well if draft.details['tried'] else few}: no neurons were added"
             )
@@ -539,8 +535,8 @@ def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _
         terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in named]
     draft.details |= {"terms": terms, "levels": data.levels(records[0])}
     why_not = (
-        f"no standard deviations: {spare} of {of.neurons} units explain less than their numbers cost, and intervals "
-        f"beside units to spare are too narrow. Say neurons = {of.neurons - spare}"
+        f"no standard deviations: {spare} of {of.neurons} units improve the fit by less than their parameters "
+        f"cost, and intervals would be too narrow. Give neurons = {of.neurons - spare}"
     )
     return finish(
         "hybrid", records, used, data, draft, problem, found, units="neurons or terms", how="laplace",
@@ -570,16 +566,16 @@ def _cautions(draft: _Hybrid, found: Laplace) -> list[str]:
     radius = of.noise_radius(draft.theta)
     if radius > _NEAR:
         out.append(
-            f"C has a root at {radius:.4g}, nearly on the unit circle, where the search must not cross: its standard "
-            "deviation is not to be trusted, and the predictor forgets its beginning slowly. A differenced or "
-            "detrended output does this"
+            f"C has a root at {radius:.4g}, close to the unit circle, which the search must not cross: its "
+            "standard deviation is unreliable, and the predictor forgets its start slowly. A differenced or "
+            "detrended output causes this"
         )
     if found.covariance is not None:
         inflated = _inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
         names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > _SHARED)
         if names:
             out.append(
-                f"the network can take over these terms, so that their values are not theirs alone: {names}. Fewer "
+                f"the network can replace these terms, so that their values are not unique: {names}. Use fewer "
                 "neurons or a smaller prior"
             )
     return out

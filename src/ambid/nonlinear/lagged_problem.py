@@ -382,7 +382,7 @@ def guarded(identify: Callable[[], None], draft: Attempt, failed: Callable[[str]
         draft.interrupt()
     except (np.linalg.LinAlgError, FloatingPointError) as error:
         draft.timing_s["all"] = perf_counter() - began
-        return failed(f"the training broke down: {error}")
+        return failed(f"the training failed: {error}")
     return None
 
 
@@ -434,7 +434,8 @@ def refine(
     if not np.isfinite(problem.cost(draft.theta)):
         draft.status = "stalled"
         draft.warnings.append(
-            f"the free run diverges, so that the weights are those of the one-step errors: fewer {units} or other lags"
+            f"the simulation diverges, so that the weights are those of the one-step errors: use fewer {units} or "
+            "other lags"
         )
         return
 
@@ -456,17 +457,17 @@ def _cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) 
     out, taken = [], found.effective / problem.n_errors
     if taken > _CROWDED:
         out.append(
-            f"the data determine {taken:.0%} as many numbers as there are errors: the model follows the noise, and "
-            f"standard deviations are not to be trusted. Fewer {units}, or a longer record"
+            f"the data determine {taken:.0%} as many parameters as there are errors: the model overfits, and "
+            f"standard deviations are unreliable. Use fewer {units}, or a longer record"
         )
     if draft.stopped_early:
         out.append(
-            f"training was stopped where the held-out error was least: more {units.split()[0]} than the data carry; "
+            f"training was stopped at the smallest held-out error: more {units.split()[0]} than the data support; "
             "standard deviations are those of a linearisation there"
         )
     if not draft.free and not np.isfinite(rms_error(draft.function, draft.theta, problem.parts, free=True)):
         out.append(
-            "the free run diverges on the records that the model was trained on: it predicts, but does not simulate"
+            "the simulation diverges on the training records: the model is fit for prediction, not for simulation"
         )
     return out
 
@@ -475,10 +476,10 @@ def _bias_caution(structure: str, records: Sequence[IOData], draft: Draft, inste
     """Return what a reader must be told of a model without a noise model, unless there is no feedback."""
     if not records[0].n_inputs or all(x.open_loop for x in records):
         return []
-    what = "the free run" if draft.free else "one-step errors"
+    what = "simulation" if draft.free else "one-step errors"
     return [
-        f"{structure} has no noise model: trained on {what}, it is biased under feedback unless its errors are white, "
-        f"and nothing says that these records are open loop. {instead}, or say --open-loop"
+        f"{structure} has no noise model: trained on {what}, it is biased by feedback unless its errors are white. "
+        f"{instead}, or give --open-loop if the records are open loop"
     ]
 
 
@@ -514,16 +515,16 @@ def finish(
     if sampled is not None:
         covariance, origin = sampled, "bootstrap"
     if how == "none":
-        why_not = "no covariance was asked for, and so there are no standard deviations"
+        why_not = "no standard deviations: no covariance was requested"
     elif draft.free and origin == "laplace" and not why_not:
         why_not = (
-            "no standard deviations: simulation errors are coloured, and Laplace's approximation takes them as white. "
-            "Say uncertainty = sandwich"
+            "no standard deviations: simulation errors are coloured, and Laplace's approximation assumes white "
+            "ones. Give uncertainty = sandwich"
         )
     elif covariance is None and not why_not:
         why_not = (
-            "no standard deviations: data and prior do not determine the numbers (condition number "
-            f"{found.condition:.1e}). Fewer {units}, or more excitation"
+            "no standard deviations: data and prior do not determine the parameters (condition number "
+            f"{found.condition:.1e}). Use fewer {units}, or more excitation"
         )
     if why_not:
         draft.warnings.append(why_not)

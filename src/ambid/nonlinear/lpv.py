@@ -45,10 +45,10 @@ from ambid.nonlinear.lpv_model import (
 from ambid.nonlinear.records import Scaled, scaled_records
 from ambid.nonlinear.settings import choice, number, read_settings, text, whole
 
-DIVERGED = "no one-step predictor that stays finite was found; lower degree, order or error_order, or check the columns"
+DIVERGED = "no finite one-step predictor was found; lower degree, order or error_order, or check the columns"
 UNSTABLE = (
-    "the output form cannot be fitted: its process part diverges over the records, as that of an unstable plant does. "
-    "Say form = equation"
+    "the output form cannot be fitted: its process part diverges over the records, as for an unstable plant. Give "
+    "form = equation"
 )
 _CRITERION = "aicc"  # what chooses the degree
 _SLOWER = 5.0  # times the slowest time constant of the linear model: what is frozen may be taken as standing still
@@ -93,14 +93,14 @@ def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule,
     s = read_settings(LpvSettings, "lpv", given)
     if first.n_outputs != 1:
         raise EstimationError(
-            f"lpv takes one output, not {', '.join(first.outputs)}; fit them one after the other, with the same "
-            "schedule. Name one"
+            f"lpv takes one output, not {', '.join(first.outputs)}; fit them separately, with the same schedule. "
+            "Name one"
         )
     column = _schedule_column(s.schedule, first)
     if s.time_constant and s.schedule != LEVEL:
         raise EstimationError(
-            f"lpv: time_constant is that of schedule = level; with schedule = {s.schedule} the column is taken as it "
-            "is. Leave it out"
+            f"lpv: time_constant is for schedule = level; with schedule = {s.schedule} the column is used "
+            "unfiltered. Omit it"
         )
     tau = s.time_constant if s.schedule == LEVEL else 0.0
     s = replace(s, nb=s.order if s.nb is None else s.nb, time_constant=tau)
@@ -121,7 +121,7 @@ def _schedule_column(name: str, first: IOData) -> int:
     if name not in columns:
         raise EstimationError(
             f"lpv: schedule is {name!r}; it must be an input, the output or level: {', '.join((*columns, LEVEL))}. "
-            f"Name the column as an input too; it does not excite.{nearest(name, list(columns))}"
+            f"Name the column as an input too; it need not excite.{nearest(name, list(columns))}"
         )
     return first.inputs.index(name) if name in first.inputs else -1
 
@@ -137,7 +137,7 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     about 92 times in 100 on a few hundred samples. Nothing here is random: `seed` is there for the contract's sake.
     """
     if not records:
-        raise EstimationError("lpv: no record is given. Pass one at least")
+        raise EstimationError("lpv: no record was given. Pass at least one")
     s, schedule, columns = lpv_settings(settings, records[0])
     fitting, began = _begin(s, records, schedule, columns), perf_counter()
 
@@ -147,7 +147,7 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     def identify() -> None:
         _identify(s, fitting, tick)
         if fitting.status == "stalled":
-            fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+            fitting.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
     failed = guarded(identify, fitting, fail)
     fitting.timed("all", began)
@@ -176,7 +176,7 @@ def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, column
     n, k = sum(x.n_samples - first for x in records), shape.n_theta + s.error_order * (1 + (s.error_form == "arma"))
     if n <= k + 1:  # these fit anything
         raise EstimationError(
-            f"lpv: {n} samples are left after lags for {k} numbers. Give longer records, or lower "
+            f"lpv: {n} samples remain after lags for {k} parameters. Give longer records, or lower "
             f"{'order or error_order' if s.degree is None else 'degree, order or error_order'}"
         )
     fitting = Fitting(
@@ -579,8 +579,8 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
     covariance = None
     if inverse is None:
         warnings.append(
-            "no covariance, and so no standard deviations: the data do not determine the coefficients (condition "
-            f"number {condition:.1e}). Lower degree or error_order, or give records at more set points"
+            "no standard deviations: the data do not determine the coefficients (condition number "
+            f"{condition:.1e}). Lower degree or error_order, or give records at more set points"
         )
     else:
         covariance = (
@@ -629,12 +629,12 @@ def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
     if of.columns and not (of.ar or of.ma) and not all(x.open_loop for x in records):
         what = "noise is white" if of.form == "output" else "equation errors are white"
         found.append(
-            f"without an error model (error_order = 0) lpv is biased under feedback unless its {what}, and nothing "
-            "says that these records are open loop: raise error_order, or say --open-loop if there was no feedback"
+            f"without an error model (error_order = 0) lpv is biased by feedback unless its {what}. Raise "
+            "error_order, or give --open-loop if the records are open loop"
         )
     if not of.columns and records[0].n_inputs:
         found.append(
-            f"no input acts on the output: {fitting.schedule.name!r}, the only one, moves coefficients alone. "
+            f"no input acts on the output: {fitting.schedule.name!r}, the only one, changes coefficients only. "
             "Name the input that does"
         )
     if of.degree == 0:
@@ -645,8 +645,8 @@ def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
     close = [str(x.shape.degree) for x, worse in _other_degrees(fitting) if abs(worse) < _CLOSE]
     if close:
         found.append(
-            f"degree {of.degree} is a close call: degree {' and '.join(close)} would explain the data about as well. "
-            "The standard deviations count what these differ by. Name the degree if you know it"
+            f"the choice of degree {of.degree} is not clear: degree {' and '.join(close)} fits about as well. The "
+            "standard deviations include their difference. Give the degree if you know it"
         )
     return found
 

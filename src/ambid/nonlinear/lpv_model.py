@@ -95,9 +95,9 @@ class Schedule:
         low, high = float(whole.min()), float(whole.max())
         if not high - low > 1e-12 * max(abs(low), abs(high)):
             raise EstimationError(
-                f"lpv: the scheduling signal {self.name!r} is constant at {low:g}; a model that is scheduled by it "
-                "cannot be told from a linear one. Give records at several set points, or fit a linear structure (bj, "
-                "ararmax)"
+                f"lpv: the scheduling signal {self.name!r} is constant at {low:g}; the model cannot be "
+                "distinguished from a linear one. Give records at several set points, or fit a linear structure "
+                "(bj, ararmax)"
             )
         return replace(of, low=low, high=high)
 
@@ -610,10 +610,10 @@ class LpvModel(ScaledModel):
         schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
         words = shape.form in ("equation", "output") and shape.offset in ("scheduled", "constant")
         if not words or not schedule.high > schedule.low:
-            raise ValueError("form, offset or range of the schedule make no sense")
+            raise ValueError("form, offset or range of the schedule are invalid")
         sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
         if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
-            raise ValueError("columns or orders make no sense")
+            raise ValueError("columns or orders are invalid")
         numbers = read_numbers(found, shape.n_theta, m, 1, shape.n_process)
         return cls(dt=float(found["dt_s"]), shape=shape, schedule=schedule, **numbers)
 

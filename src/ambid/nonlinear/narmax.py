@@ -43,7 +43,7 @@ _MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more tak
 _PRUNINGS = 6
 _ITERATIONS, _ROUGHLY = 60, 12  # of a search at most; of one between, with terms too many, which creeps
 _NEAR_ZERO = 0.05  # part of a denominator's largest value
-DIVERGED = "no one-step predictor that stays finite was found; lower ne, degree or terms, or check the columns"
+DIVERGED = "no finite one-step predictor was found; lower ne, degree or terms, or check the columns"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -63,7 +63,7 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``; not random.
     """
     if not records:
-        raise EstimationError("narmax: no record is given. Pass one at least")
+        raise EstimationError("narmax: no record was given. Pass at least one")
     s = narmax_settings(settings, n_inputs=records[0].n_inputs)
     data = scaled_records("narmax", records, lag=s.lag, levels="auto" if s.output == "signed" else "zero", fewest=10)
     _check_magnitude(s, records)
@@ -74,7 +74,7 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     def identify() -> None:
         _fit_terms(s, data.parts, fitting, tick)
         if fitting.status == "stalled":
-            fitting.warnings.insert(0, "the search did not converge: treat the numbers as a first guess")
+            fitting.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
     def fail(why: str) -> NonlinearFit:
         return failed_fit("narmax", records, asdict(s), seed, why, fitting.timing_s)
@@ -117,9 +117,9 @@ def _fit_terms(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick | 
     gained = _value(s, parts, one, weight) - _value(s, parts, fitting.choice, weight)
     if gained > _CLEAR and fitting.free == free:
         fitting.warnings.append(
-            "sampled so fast that the last output takes nearly all of an error reduction ratio and hides what drives "
-            "the plant: terms are what is left of all candidates (selection = all), which predict better than those "
-            "chosen by the ratios"
+            "sampled so fast that the last output takes nearly all of an error reduction ratio and hides what "
+            "drives the plant: terms were selected from all candidates (selection = all), which predicts better "
+            "than selection by ratios"
         )
         return
     fitting.take(one, free=free)
@@ -160,7 +160,7 @@ def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick |
         else:
             fitting.status = "stalled"
             fitting.warnings.append(
-                "the free run of the chosen terms diverges, so that their coefficients are those of the one-step "
+                "the simulation of the chosen terms diverges, so that their coefficients are those of the one-step "
                 "errors: choose terms by simulation (selection or pruning), or lower degree"
             )
         fitting.timed("simulation errors", began)
@@ -258,12 +258,10 @@ def _finish(records: Sequence[IOData], s: NarmaxSettings, data: Scaled, fitting:
     }  # fmt: skip
     used = {**asdict(s), "focus": "simulation" if fitting.free else "prediction"}
     if of.is_rational and any(_vanishes(of.terms_block, theta, of.predict(theta, r)[1]) for r in problem.rows()):
-        fitting.warnings.append(
-            "a denominator comes near zero on the training data: predictions there are not to be trusted"
-        )
+        fitting.warnings.append("a denominator comes near zero on the training data: predictions there are unreliable")
     return finish(
         "narmax", records, used, data, fitting, problem, found, units="terms", noise=s.ne > 0 and not fitting.free,
-        instead="Say focus = prediction" if fitting.free else "Raise ne", seed=seed,
+        instead="Give focus = prediction" if fitting.free else "Raise ne", seed=seed,
     )  # fmt: skip
 
 

@@ -63,29 +63,27 @@ class NarmaxSettings:
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
     ne: int = whole("largest lag of the innovations, 0 for NARX; 2", 0, 100, 2)
     degree: int = whole("of the polynomial; 2", 1, 9, 2)
-    terms: int = whole(
-        "process terms that are looked at for each output, at most; 30, fewer on a short record", 1, 2000, 30
-    )
+    terms: int = whole("largest number of process terms for each output; 30, fewer on a short record", 1, 2000, 30)
     constant: int = whole("1 to let a constant be chosen, 0 for none; 1", 0, 1, 1)
-    criterion: str = choice("what ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic", *CRITERIA)
+    criterion: str = choice(
+        "criterion that ends the choice of terms: ebic, bic, mdl, aic, aicc, fpe, lilc; ebic", *CRITERIA
+    )
     pruning: str = choice(
-        "what decides on terms to leave out again: prediction, simulation, none; prediction",
+        "criterion that removes terms again: prediction, simulation, none; prediction",
         *("prediction", "simulation", "none"),
     )
     kind: str = choice("polynomial or rational; polynomial", "polynomial", "rational")
     selection: str = choice(
-        "frols (by ratios), simulation (by the free run), all (every candidate), auto (frols; all if a"
-        " plant is sampled so fast that the ratios say little, and all predict better); auto",
+        "frols (by ratios), simulation (by simulation errors), all (every candidate), auto (frols; all if a plant "
+        "is sampled so fast that the ratios say little, and all predict better); auto",
         *("auto", "frols", "simulation", "all"),
     )
     focus: str = choice(
-        "prediction or simulation: which errors the coefficients make small at last; prediction",
+        "prediction or simulation: errors that are minimised in the end; prediction",
         *("prediction", "simulation"),
     )
-    output: str = choice("magnitude, where the sensor sees no sign; signed", *OUTPUTS)
-    symmetry: str = choice(
-        "odd where the plant is the same the other way round: terms of odd degree alone; none", "none", "odd"
-    )
+    output: str = choice("magnitude, if the sensor sees no sign; signed", *OUTPUTS)
+    symmetry: str = choice("odd for a plant with odd symmetry: terms of odd degree only; none", "none", "odd")
 
     @property
     def lag(self) -> int:
@@ -113,7 +111,7 @@ def narmax_settings(given: Mapping[str, object], *, n_inputs: int) -> NarmaxSett
     if not n_inputs:
         s = replace(s, nu=0, nk=1)
     if not s.ny and not s.nu:
-        raise EstimationError("narmax: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+        raise EstimationError("narmax: ny and nu are both 0, and nothing is left to predict from. Raise one of them")
     return s
 
 

@@ -67,13 +67,11 @@ class NarxSettings:
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
     neurons: int | None = whole("hidden units; chosen by held-out error", 0, 60)
     starts: int = whole("random starts; 3", 1, 50, 3)
-    held_out: float = number("part at the end of each record that training is watched on; 0.2", 0.0, 0.5, 0.2)
-    prior: float = number(
-        "standard deviation of the hidden layer's weights before the data, scaled signals; 10", 0.01, 1e6, 10.0
-    )
+    held_out: float = number("part at the end of each record on which training is monitored; 0.2", 0.0, 0.5, 0.2)
+    prior: float = number("prior standard deviation of the hidden layer's weights, scaled signals; 10", 0.01, 1e6, 10.0)
     iterations: int = whole("of each training, at most; 60", 1, 2000, 60)
     focus: str = choice(
-        "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
+        "prediction or simulation: errors that are minimised in the end; prediction", "prediction", "simulation"
     )
     uncertainty: str = choice(
         "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich for simulation); auto",
@@ -145,7 +143,7 @@ def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: 
     """
     s = read_settings(NarxSettings, "narx", settings)
     if s.ny == 0 and s.nu == 0:
-        raise EstimationError("narx: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+        raise EstimationError("narx: ny and nu are both 0, and nothing is left to predict from. Raise one of them")
     data = scaled_records("narx", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
     function = _function(data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, s.nk, 0)
     draft = Draft(
@@ -258,9 +256,8 @@ def _train_all(
     if not found.converged and len(found.costs) > s.iterations:  # a valley of networks that differ little
         lately = 50.0 * (1.0 - found.costs[-1] / found.costs[-min(11, len(found.costs))])
         draft.warnings.append(
-            f"the training was still improving at its limit of {s.iterations} iterations, the errors by {lately:.1g} % "
-            "over the last ten: raise iterations if that matters. Standard deviations are those of a linearisation "
-            "there"
+            f"training was still improving at its limit of {s.iterations} iterations, by {lately:.1g} % over the "
+            "last ten: raise iterations if that matters. Standard deviations are those of a linearisation there"
         )
 
 

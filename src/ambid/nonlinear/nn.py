@@ -80,24 +80,26 @@ class NnSettings:
     )
     states: int | None = whole("of the form free; chosen by Bayes' criterion. one-axis has 3", 1, 20)
     delay: int | None = whole(
-        "samples by which inputs act late; auto (0 to 20, by the errors of short trainings)", 0, 1000
+        "delay of the inputs in samples; auto (0 to 20, by the errors of short trainings)", 0, 1000
     )
     output: str = choice(
-        "magnitude where the sensor sees no sign (free, no gain, up to four states, odd units); signed",
+        "magnitude if the sensor sees no sign (free, no gain, up to four states, odd units); signed",
         *("signed", "magnitude"),
     )
     neurons: int | None = whole(
-        "hidden units of G(x, u); 0; with output=magnitude chosen by how runs go on behind training", 0, 40
+        "hidden units of G(x, u); 0; with output=magnitude chosen by simulation beyond the training", 0, 40
     )
     starts: int | None = whole("random starts of G; 3, with output=magnitude 20", 1, 20)
     noise: str = choice(
         "output, innovations (predictor gain), auto (gain where errors are not white); auto",
         *("auto", "output", "innovations"),
     )
-    descent: int = whole("iterations of the thesis's steepest descent, shown beside; 10", 0, 10_000, 10)
+    descent: int = whole("iterations of the thesis's steepest descent, for comparison; 10", 0, 10_000, 10)
     iterations: int = whole("of each training, at most; 50", 1, 2000, 50)
     evaluations: int | None = whole(
-        "of a global search (one-axis) where starts fail; given, where errors are suspect too; 2000", 0, 1_000_000
+        "evaluations of a global search (one-axis) where starts fail; given, where errors are suspect too; 2000",
+        0,
+        1_000_000,
     )
     uncertainty: str = choice(
         "laplace, sandwich (coloured errors), bootstrap, none, auto (sandwich if not white); auto",
@@ -135,7 +137,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         if reason in ("", NO_START):
             reason = "interrupted before there was a network"
     except np.linalg.LinAlgError as error:
-        reason = f"the training broke down: {error}"
+        reason = f"the training failed: {error}"
         fitting.state = None
     state = fitting.state
     if state is not None and not unsigned and s["form"] == "free":
@@ -154,7 +156,7 @@ def _choose_form(asked: str, first: IOData) -> str:
     )
     if asked == "one-axis" and not fits:
         raise EstimationError(
-            "nn: form one-axis wants one input in V and outputs in m and A (and m/s); here "
+            "nn: form one-axis needs one input in V and outputs in m and A (and m/s); here "
             f"{', '.join(f'{x} [{first.units.get(x)}]' for x in (*first.inputs, *first.outputs))}. Choose form free"
         )
     return "one-axis" if fits and asked != "free" else "free"
@@ -307,15 +309,15 @@ def _check_magnitude(records: Sequence[IOData], given: Mapping[str, object]) -> 
     for name, value in given.items():
         if name not in used and value not in ("auto", _MAGNITUDE[name]):
             raise EstimationError(
-                f"nn: {name} = {value!r} means nothing with output = magnitude; what does: {', '.join(used)}. Leave "
-                "it out"
+                f"nn: {name} = {value!r} does not apply with output = magnitude; known there: {', '.join(used)}. "
+                "Omit it"
             )
     states = given.get("states")
     if isinstance(states, int) and states > MOST_STATES:
         raise EstimationError(f"nn: states = {states} with output = magnitude; at most {MOST_STATES}. Lower it")
     for r, x in enumerate(records):
         if x.n_outputs != 1 or not x.n_inputs:
-            raise EstimationError("nn: output = magnitude is for one output and one input or more. Choose them")
+            raise EstimationError("nn: output = magnitude is for one output and at least one input. Choose them")
         if np.min(x.y) < 0:
             raise EstimationError(
                 f"nn: output {x.outputs[0]!r} of record {r + 1} is negative at sample {int(np.argmin(x.y))}; a "
@@ -421,12 +423,15 @@ def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, asked: bool) ->
         "log_det_errors_before": None if before is None else before.score,
         "log_det_errors_after": None if after is None else after.score, "taken": better,
     }  # fmt: skip
-    said = f"{1 + len(_LONG)} ordinary starts failed ({why}): differential evolution, {found.evaluations} evaluations, "
+    said = (
+        f"{1 + len(_LONG)} ordinary starts failed ({why}): a global search (differential evolution, "
+        f"{found.evaluations} evaluations) "
+    )
     if not better or after is None:
         fitting.warnings.append(said + "found nothing better. Check channels, their signs and units, and the delay")
         return reason
     gained = f"improved the errors from {before.size:.3g} to" if before else "found a network whose errors have"
-    fitting.warnings.append(said + f"{gained} {after.size:.3g} of the outputs' deviations")
+    fitting.warnings.append(said + f"{gained} {after.size:.3g} of the outputs' standard deviations")
     for name in ("state", "status", "data", "delay", "rivals"):
         setattr(fitting, name, getattr(second, name))
     fitting.curves += second.curves
@@ -443,7 +448,7 @@ def _caution(fitting: Fitting) -> None:
     if left is None or not left.suspect:
         return
     searchable = fitting.settings["form"] == "one-axis" and "global_search" not in fitting.details
-    more = ". Say evaluations=2000 for a global search" if searchable else ""
+    more = ". Give evaluations=2000 for a global search" if searchable else ""
     fitting.warnings.append(
-        f"{left}: the training ended in a wrong minimum, or the plant has more to it than this network{more}"
+        f"{left}: the training ended in a local minimum, or the plant is more complex than this network{more}"
     )

@@ -88,7 +88,7 @@ def terms_from_json(found: Any, n_outputs: int, n_inputs: int) -> tuple[tuple[Te
         kind, channel, lag = f
         whole = all(isinstance(x, int) and not isinstance(x, bool) and x >= 0 for x in (channel, lag))
         if kind not in channels or not whole or (kind != "u" and lag < 1):
-            raise EstimationError(f"{f!r} is no factor of a term; a factor is [y, u or e, channel, lag]")
+            raise EstimationError(f"{f!r} is not a factor of a term; a factor is [y, u or e, channel, lag]")
         if channel >= channels[kind]:
             raise ValueError("terms name channels that the model does not have")
         return Factor(kind, channel, lag)

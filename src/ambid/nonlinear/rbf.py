@@ -80,15 +80,15 @@ class RbfSettings:
     ny: int | None = whole("lags of the outputs; chosen by held-out error", 0, 50)
     nu: int | None = whole("lags of each input; chosen by held-out error", 0, 50)
     nk: int = whole("smallest lag of the inputs; 1", 0, 1000, 1)
-    linear: int = whole("1 for a linear part beside the units, 0 for none; 1", 0, 1, 1)
+    linear: int = whole("1 for a linear part with the units, 0 for none; 1", 0, 1, 1)
     neurons: int | None = whole("units; chosen by held-out error", 0, 200)
     centres: str = choice("ols (orthogonal least squares among the data) or kmeans; ols", "ols", "kmeans")
     width: float | None = number(
         "in sizes of the data, with centres=kmeans in distances of neighbours; chosen by held-out error", 0.01, 100.0
     )
-    held_out: float = number("part at the end of each record that is held out for it; 0.2", 0.0, 0.5, 0.2)
+    held_out: float = number("part at the end of each record that is held out for validation; 0.2", 0.0, 0.5, 0.2)
     prior: float | None = number(
-        "standard deviation of the units' weights before the data, scaled; by restricted likelihood", 1e-6, 1e9
+        "prior standard deviation of the units' weights, scaled; by restricted likelihood", 1e-6, 1e9
     )
     training: str = choice(
         "linear (least squares), recursive (Gauss-Newton by sample), descent (3.22); linear",
@@ -101,10 +101,10 @@ class RbfSettings:
     rate: float = number("of the steps of the descent, bounded so that no sample's error grows; 0.02", 1e-9, 1e6, 0.02)
     iterations: int = whole("of Levenberg-Marquardt, at most; 60", 1, 2000, 60)
     focus: str = choice(
-        "prediction or simulation: which errors are made small at last; prediction", "prediction", "simulation"
+        "prediction or simulation: errors that are minimised in the end; prediction", "prediction", "simulation"
     )
     uncertainty: str = choice(
-        "laplace, sandwich (errors not taken as white), none; auto: sandwich for simulation errors",
+        "laplace, sandwich (errors may be coloured), none; auto: sandwich for simulation errors",
         "auto", "laplace", "sandwich", "none",
     )  # fmt: skip
 
@@ -247,14 +247,14 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     """
     s = read_settings(RbfSettings, "rbf", settings)
     if s.ny == 0 and s.nu == 0:
-        raise EstimationError("rbf: ny and nu are both 0; nothing is left to predict from. Raise one of them")
+        raise EstimationError("rbf: ny and nu are both 0, and nothing is left to predict from. Raise one of them")
     if s.training != "linear" and s.trained == "all":
         raise EstimationError(
-            f"rbf: training = {s.training} goes for the output weights alone, but trained = all. Leave one out"
+            f"rbf: training = {s.training} is for the output weights only, but trained = all. Omit one"
         )
     if None in (s.ny, s.nu, s.neurons, s.width) and not s.held_out > 0:
         raise EstimationError(
-            "rbf: held_out is 0, and what is left open is to be chosen by held-out errors. Raise it, or give ny, nu, "
+            "rbf: held_out is 0, but open settings are chosen by held-out errors. Raise it, or give ny, nu, "
             "neurons and width"
         )
     data = scaled_records("rbf", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
@@ -301,8 +301,8 @@ def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick |
     function, start = _choose(s, data.parts, work, seed, ticks[0])
     if s.neurons is not None and function.neurons < s.neurons:
         work.warnings.append(
-            f"{function.neurons} units instead of {s.neurons}: more have no place of their own in the data, or there "
-            "are fewer than two samples for each"
+            f"{function.neurons} units instead of {s.neurons}: the others would coincide in the data, or there are "
+            "fewer than two samples for each"
         )
     began = work.timed("choice", began)
     if ticks[1] is not None:
@@ -573,8 +573,8 @@ def _recur(s: RbfSettings, data: Scaled, work: _Work, noise: Array, tick: Tick |
     if not left < _NEAR:
         work.status, work.at_optimum = "stalled", False
         work.warnings.append(
-            f"{curve.method} has not converged: a batch step would still lower the sum of squares by {left:.3g} times "
-            "the errors' variance, and so there are no standard deviations. Say training = linear"
+            f"{curve.method} has not converged: a batch step would still lower the sum of squares by {left:.3g} "
+            "times the error variance, so there are no standard deviations. Give training = linear"
         )
 
 
@@ -606,7 +606,7 @@ def train_by_sample(
             else:
                 descent_pass(F[part], y[part], rate, W)
             if not np.all(np.isfinite(W)):
-                raise FloatingPointError(f"{method} diverged in pass {k + 1} near sample {first}: say a lower rate")
+                raise FloatingPointError(f"{method} diverged in pass {k + 1} near sample {first}: give a lower rate")
             seconds.append(perf_counter() - began)
             errors.append(_rms(y - F @ W.T))
     curve = LearningCurve(method=method, seconds=np.array(seconds), training=np.array(errors))
@@ -632,11 +632,11 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
     why_not = ""
     if of.neurons and not work.all_numbers:
         why_not = (
-            "no standard deviations: what the choice of the units adds is not known, and without it intervals of 95 % "
-            "for the function hold in half to nine tenths of places. Say trained = all"
+            "no standard deviations: the choice of the units is not covered, and 95 % intervals without it hold in "
+            "half to nine tenths of places. Give trained = all"
         )
     elif not work.at_optimum:
-        why_not = "no standard deviations: the training has not come to an optimum"
+        why_not = "no standard deviations: training has not reached an optimum"
     work.warnings += _open(problem, None if why_not else found.covariance)
     work.details = {
         "condition": found.condition,
@@ -662,6 +662,6 @@ def _open(problem: LaggedProblem, covariance: Array | None) -> list[str]:
     if not names:
         return []
     return [
-        f"the data do not tell these numbers apart, their values mean nothing: {', '.join(names)}. Fewer lags, or a "
-        "richer excitation"
+        f"the data do not distinguish these parameters, whose values are meaningless: {', '.join(names)}. Use "
+        "fewer lags, or a richer excitation"
     ]

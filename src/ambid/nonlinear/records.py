@@ -53,7 +53,7 @@ def scaled_records(
     change what the terms of a polynomial mean.
     """
     if not records:
-        raise EstimationError(f"{structure}: no record is given. Pass one at least")
+        raise EstimationError(f"{structure}: no record was given. Pass at least one")
     first = records[0]
     for r, x in enumerate(records):
         if (x.inputs, x.outputs) != (first.inputs, first.outputs):
@@ -63,8 +63,8 @@ def scaled_records(
             )
         if abs(x.dt - first.dt) > 1e-6 * first.dt:
             raise EstimationError(
-                f"{structure}: record {r + 1} has {1 / x.dt:g} Hz, the first {1 / first.dt:g} Hz; one model has one "
-                "rate. Resample one of them"
+                f"{structure}: record {r + 1} is sampled at {1 / x.dt:g} Hz, the first at {1 / first.dt:g} Hz; the "
+                "rates must agree. Resample one of them"
             )
         if x.n_samples < lag + fewest:
             raise EstimationError(
@@ -86,8 +86,8 @@ def _group(
     for k, channel in enumerate(names):
         if not sd[k] > 1e-13 * max(abs(mean[k]), 1e-300):
             raise EstimationError(
-                f"{structure}: {channel!r} does not move (constant at {whole[0, k]:g}); nothing can be learnt from it. "
-                "Excite it, or leave it out"
+                f"{structure}: {channel!r} is constant at {whole[0, k]:g} and carries no information. Excite it, "
+                "or omit it"
             )
     off = np.abs(mean) > _FAR * sd if levels == "auto" else np.full(mean.shape, levels == "mean")
     level, scale = np.where(off, mean, 0.0), np.where(off, sd, np.hypot(mean, sd))
@@ -162,7 +162,7 @@ def with_head(model: ScaledModel, u: Array, y: Array) -> tuple[Array, int]:
     u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
     head = min(model.lag, u.shape[0])
     if y.ndim != 2 or y.shape[0] < head:
-        raise EstimationError(f"{y.shape[0]} samples of the outputs; a free run begins from {head}. Give more")
+        raise EstimationError(f"{y.shape[0]} samples of the outputs; a simulation starts from {head}. Give more")
     whole = np.zeros((u.shape[0], y.shape[1]))
     whole[:head] = y[:head]
     return whole, head

@@ -78,7 +78,7 @@ def read_settings(settings: type[S], structure: str, given: Mapping[str, object]
     for name, value in given.items():
         if name not in known:
             raise EstimationError(
-                f"{structure}: setting {name!r} is not known; known: {', '.join(known)}.{nearest(name, list(known))}"
+                f"{structure}: setting {name!r} is unknown; known: {', '.join(known)}.{nearest(name, list(known))}"
             )
         if value == "auto" and default[name] is None:
             continue

@@ -494,7 +494,7 @@ class StateNetwork(ScaledModel):
         inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
         inside = inside and max(columns) <= layout.n + layout.n_inputs and max(layout.heads) < layout.width
         if layout.form not in ("one-axis", "free") or not inside:
-            raise EstimationError("no state network: its states are not those of one. Write the file again")
+            raise EstimationError("this is not a state network: its states are not those of one. Write the file again")
         n_cloud = layout.width + layout.n_inputs
         numbers = read_numbers(found, layout.n_theta, layout.n_inputs, layout.p, n_cloud)
         return cls(layout=layout, delay=int(found["delay"]), **numbers)

@@ -18,7 +18,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.global_search import STAGE, GlobalFound, global_search
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.predictor import noise_floor
@@ -29,7 +29,7 @@ from ambid.nonlinear.state_network import ONE_AXIS, Layout
 from ambid.nonlinear.state_training import State, add_gain, best_of, shift_inputs, train
 from ambid.signals.delay import find_delay as delay
 
-NO_START = "no first network stays finite on these records: check the columns for their size and for jumps"
+NO_START = "no starting network stays finite on these records: check the columns for their size and for jumps"
 SHORT = 6  # samples of past that a subspace model looks back: enough where the plant is stable and sampled well
 
 LARGEST = 20  # samples of delay that are looked for
@@ -62,7 +62,9 @@ def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), 
     """
     p = data.n_outputs
     if n < p:
-        raise EstimationError(f"nn: {n} state(s) for {p} outputs; each output is a state. Raise states")
+        raise EstimationError(
+            f"nn: {counted(n, 'state')} for {counted(p, 'output')}; each output is a state. Raise states"
+        )
     found = _subspace(data, n, past)
     if isinstance(found, str):
         return found
@@ -87,9 +89,9 @@ def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), 
                 row = row / (steps[j] or 1.0)
     if not np.linalg.cond(T) < 1e10:
         return (
-            "position, velocity and current cannot be told apart in the record: excite more"
+            "position, velocity and current cannot be distinguished in the record: excite more"
             if heads
-            else "the outputs do not show all states: lower states, or excite more"
+            else "not all states are observable from the outputs: lower states, or excite more"
         )
     M = np.hstack([T @ A @ np.linalg.inv(T), T @ B, np.zeros((n, 1))])
     if heads:
@@ -130,10 +132,10 @@ def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Arr
         io = IOData(u=u, y=y, dt=1.0, inputs=names[0], outputs=names[1], units=dict.fromkeys(names[0] + names[1], "1"))
         model = pbsid(io, {"n": n}, horizon=past, feedthrough=False).model
     except (EstimationError, np.linalg.LinAlgError) as error:
-        return f"no first model: {error}"
+        return f"no starting model: {error}"
     found = tuple(np.asarray(getattr(model, k), dtype=np.float64) for k in "ABCK")
     if not all(np.all(np.isfinite(x)) for x in found):
-        return "no first model: its matrices are not finite"
+        return "no starting model: its matrices are not finite"
     return found  # type: ignore[return-value]
 
 

@@ -342,17 +342,17 @@ def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple
     P, fitting.details["condition"] = information_inverse(problem.triangle(v)[:, :-1])
     reason = ""
     if how == "none":
-        reason = "no covariance was asked for, and so there are no standard deviations"
+        reason = "no standard deviations: no covariance was requested"
     elif state.layout.form == "one-axis" and state.layout.neurons:
         reason = (
-            "no standard deviations: A and B are the slope that the network gives at the operating point, and what its "
-            "units cannot follow of the plant is not known; without it intervals of 95 % hold in half of the cases. "
-            "Compare fits with more neurons, or with a smaller swing, or say neurons = 0"
+            "no standard deviations: A and B are the slope of the network at the operating point, and the error of "
+            "its units there is unknown; 95 % intervals without it hold in half of the cases. Compare fits with "
+            "more neurons or smaller motion, or give neurons = 0"
         )
     elif P is None:
         reason = (
             "no standard deviations: the data do not determine all weights (condition number "
-            f"{fitting.details['condition']:.1e}). Fewer states or neurons, or more excitation"
+            f"{fitting.details['condition']:.1e}). Use fewer states or neurons, or more excitation"
         )
     if reason:
         fitting.warnings.append(reason)
@@ -370,8 +370,8 @@ def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple
     extra, warnings = disagreement(state, fitting.rivals, covariance)
     if state.layout.neurons and state.layout.anchored:
         fitting.warnings.append(
-            "A and B are the slope that the network gives at the operating point; what its units cannot follow of the "
-            "plant is not in their standard deviations. Compare a fit with more neurons, or with a smaller swing"
+            "A and B are the slope of the network at the operating point; their standard deviations do not include "
+            "the error of its units there. Compare a fit with more neurons, or with smaller motion"
         )
     fitting.warnings += warnings
     return covariance + extra, origin
@@ -395,9 +395,9 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
         return extra, ()
     worst = int(np.argmax(ratio))
     return extra, (
-        f"starts of the hidden layer that fit about as well disagree about {state.layout.names[worst]} by "
-        f"{ratio[worst]:.1f} of the deviations that the likelihood gives; standard deviations count that. More neurons "
-        "or starts, or a smaller swing, settle it",
+        f"starts of the hidden layer that fit about equally well disagree about {state.layout.names[worst]} by "
+        f"{ratio[worst]:.1f} of the standard deviations of the likelihood; the standard deviations include that. "
+        "Use more neurons or starts, or smaller motion",
     )
 
 
@@ -417,13 +417,13 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
     state = state.at(state.problem(data), state.vector)
     model = None if state is None else _make_model(records, data, state, fitting.delay)
     if state is None or model is None:
-        reason = "the network does not stay finite on the records that it was trained on: check the columns"
+        reason = "the network does not stay finite on its training records: check the columns"
         return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
     if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
-        way_out = "say " if state.layout.sensor else "say noise = innovations, or "
+        way_out = "say " if state.layout.sensor else "give noise = innovations, or "
         fitting.warnings.append(
-            "trained on simulation errors, nn is biased where a controller was at work, and nothing says that these "
-            f"records are open loop: {way_out}--open-loop if there was no feedback"
+            f"trained on simulation errors, nn is biased by feedback: {way_out}give --open-loop if the records are "
+            "open loop"
         )
     with fitting.stage("standard deviations"):
         covariance, origin = _estimate_spread(fitting, state, tick)

@@ -60,7 +60,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     ),
     NonlinearStructure(
         name="nn",
-        summary="state-space network whose weights are A and B (thesis fig. 5.9), beside a network G(x, u)",
+        summary="state-space network whose weights are A and B (thesis fig. 5.9), with a network G(x, u)",
         options="ambid.nonlinear.nn:NnSettings",
         home="ambid.nonlinear.nn:nn",
         feedback="with noise model",
@@ -81,7 +81,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     ),
     NonlinearStructure(
         name="hybrid",
-        summary="polynomial, network for what it leaves, noise model C (thesis eqs 3.23-3.24)",
+        summary="polynomial, network for its residual, noise model C (thesis eqs 3.23-3.24)",
         options="ambid.nonlinear.hybrid:HybridSettings",
         home="ambid.nonlinear.hybrid:hybrid",
         feedback="with noise model",
@@ -95,7 +95,7 @@ _ENTRIES: tuple[NonlinearStructure, ...] = (
     ),
     NonlinearStructure(
         name="rbf",
-        summary="radial basis functions of lagged outputs and inputs, beside a linear part (thesis eqs 1.13-1.14)",
+        summary="radial basis functions of lagged outputs and inputs, with a linear part (thesis eqs 1.13-1.14)",
         options="ambid.nonlinear.rbf:RbfSettings",
         home="ambid.nonlinear.rbf:rbf",
         feedback="with noise model",
@@ -110,6 +110,6 @@ def nonlinear_structure(name: str) -> NonlinearStructure:
     if name not in NONLINEAR_STRUCTURES:
         known = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(
-            f"structure {name!r} is not known; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
+            f"structure {name!r} is unknown; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
         )
     return NONLINEAR_STRUCTURES[name]

@@ -26,10 +26,10 @@ BEARING_NUMBERS: tuple[ParameterSpec, ...] = (
     ParameterSpec(name="a", unit="rad/s", meaning="pole of the eddy currents between current and force", positive=True),
     ParameterSpec(name="k_asym", unit="1", meaning="unequal pair: strengths are k (1 + k_asym) and k (1 - k_asym)"),
     ParameterSpec(name="i0_asym", unit="A", meaning="unequal pair: bias currents are i0 + i0_asym and i0 - i0_asym"),
-    ParameterSpec(name="x_offset", unit="m", meaning="what the position sensor shows at the law's zero"),
-    ParameterSpec(name="i_offset", unit="A", meaning="what the current sensor shows without current"),
-    ParameterSpec(name="v_offset", unit="V", meaning="voltage that acts beside the one that is logged"),
-    ParameterSpec(name="v_drop", unit="V", meaning="voltage that the power stage takes, against the current"),
+    ParameterSpec(name="x_offset", unit="m", meaning="reading of the position sensor at the law's zero"),
+    ParameterSpec(name="i_offset", unit="A", meaning="reading of the current sensor without current"),
+    ParameterSpec(name="v_offset", unit="V", meaning="voltage in addition to the logged one"),
+    ParameterSpec(name="v_drop", unit="V", meaning="voltage drop of the power stage, against the current"),
     ParameterSpec(name="i_drop", unit="A", meaning="current over which that drop changes its sign", positive=True),
 )  # fmt: skip
 """Every number that a rig may give of a nonlinear magnet, beside m, R and c."""

@@ -132,9 +132,11 @@ class MagnetLaw:
 
     def __post_init__(self) -> None:
         if self.asymmetric and not self.pair:
-            raise ModelError("one magnet has no other to differ from: asymmetric=True wants pair=True")
+            raise ModelError("one magnet has no other to differ from: asymmetric=True needs pair=True. Correct one")
         if self.pair and self.gap == "exponential":
-            raise ModelError("a differential pair wants the hyperbolic gap law; its gap is not open to one side")
+            raise ModelError(
+                "a differential pair needs the hyperbolic gap law; its gap is bounded on both sides. Correct gap"
+            )
 
     @property
     def names(self) -> tuple[str, ...]:

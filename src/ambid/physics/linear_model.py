@@ -73,8 +73,8 @@ UNITS = {  # of inputs, outputs, states and disturbances
 }
 
 MASS = ParameterSpec(name="m", unit="kg", meaning="mass of the rotor on this axis", positive=True)
-K_X = ParameterSpec(name="k_x", unit="N/m", meaning="displacement coefficient, f = k_i i - k_x x")
-K_I = ParameterSpec(name="k_i", unit="N/A", meaning="force per current; also the motional voltage in V s/m")
+K_X = ParameterSpec(name="k_x", unit="N/m", meaning="position stiffness (negative for a magnet), f = k_i i - k_x x")
+K_I = ParameterSpec(name="k_i", unit="N/A", meaning="force–current factor; also the back-EMF in V s/m")
 R = ParameterSpec(name="R", unit="ohm", meaning="coil resistance", positive=True)
 L = ParameterSpec(name="L", unit="H", meaning="coil inductance at the operating point", positive=True)
 C = ParameterSpec(name="c", unit="N s/m", meaning="mechanical damping", default=0.0)
@@ -279,7 +279,7 @@ class Rotor:
     """
 
     name: str = "rotor"  # as in `LinearModel`
-    summary: str = "magnet + mass, current-driven: current in, position out (shows ratios to m only)"
+    summary: str = "magnet + mass, current-driven: current in, position out (identifies ratios to m only)"
     parameters: tuple[ParameterSpec, ...] = (MASS, K_X, K_I, C)
     inputs: tuple[str, ...] = ("current",)
     outputs: tuple[str, ...] = ("position",)
@@ -368,8 +368,7 @@ def model(name: str) -> LinearModel:
     """
     if name not in _MODELS:
         raise ModelError(
-            f"there is no model {name!r}; there are {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} "
-            "See 'ambid models'"
+            f"model {name!r} is unknown; known: {', '.join(_MODELS)}.{nearest(name, list(_MODELS))} See 'ambid models'"
         )
     return _MODELS[name]
 

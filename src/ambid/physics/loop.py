@@ -180,9 +180,11 @@ def placed_loop(
     m, k_x, k_i, r, ell, c = (parameters[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
     wanted = np.poly(np.asarray(poles, dtype=np.complex128))
     if wanted.size != 5 or np.abs(wanted.imag).max() > 1e-9 * np.abs(wanted).max():
-        raise ModelError(f"{len(poles)} poles given; a placed loop wants four, in conjugate pairs. Correct the poles")
+        raise ModelError(
+            f"{len(poles)} poles were given; a placed loop needs four, in conjugate pairs. Correct the poles"
+        )
     if k_i == 0.0:
-        raise ModelError("k_i is 0 N/A; without force per current no loop can act. Give k_i")
+        raise ModelError("k_i is 0 N/A; no loop can act without a force–current factor. Give k_i")
     a3, a2, a1, a0 = (m * ell * wanted.real[1:]).tolist()
     total = (a3 - c * ell) / m
     return Loop(

@@ -229,6 +229,6 @@ def preset(name: str) -> Preset:
     if name not in _MAKERS:
         known = list(_MAKERS)
         raise ModelError(
-            f"there is no preset {name!r}; there are {', '.join(known)}.{nearest(name, known)} Give one of them"
+            f"preset {name!r} is unknown; known: {', '.join(known)}.{nearest(name, known)} Give one of them"
         )
     return _MAKERS[name]()

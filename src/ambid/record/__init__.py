@@ -74,7 +74,7 @@ def read_record(
         If the format is not known or the source breaks one of its rules.
     """
     if units and isinstance(source, (str, Path, Record)):
-        raise RecordError("units= is for tables in memory; a file says its units in the header row. Leave it out")
+        raise RecordError("units= is for tables in memory; a file says its units in the header row. Omit it")
     if isinstance(source, Record):
         return source if rate_hz is None and gaps == "error" else checked(source, "the record", rate_hz, gaps)
     if not isinstance(source, (str, Path)):
@@ -84,7 +84,7 @@ def read_record(
     path = Path(source)
     kind = _format_of(path)
     if variables is not None and kind != "mat":
-        raise RecordError(f"{path}: a mapping of variables is for .mat files. Leave it out")
+        raise RecordError(f"{path}: a mapping of variables is for .mat files. Omit it")
     if kind == "csv":
         return read_csv(path, rate_hz=rate_hz, gaps=gaps)
     if kind == "mat":
@@ -160,7 +160,7 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
     if kind == "mat":
         raise RecordError(f"{path}: .mat files are read, not written. Write .csv, .csv.gz or .h5")
     if comments:
-        raise RecordError(f"{path}: comment lines go into CSV only. Leave them out, or write .csv")
+        raise RecordError(f"{path}: comment lines go into CSV only. Omit them, or write .csv")
     from ambid.record.hdf5_format import write_hdf5
 
     write_hdf5(record, path)
@@ -174,5 +174,5 @@ def _format_of(path: Path) -> str:
         if path.name.lower().endswith(suffix):
             return kind
     if path.is_dir():
-        raise RecordError(f"record {path} is a folder; a file is wanted. Name the file inside it")
+        raise RecordError(f"record {path} is a folder; it must be a file. Name the file inside it")
     raise RecordError(f"record {path}: its format is not known by its name; known: {', '.join(_SUFFIXES)}. Rename it")

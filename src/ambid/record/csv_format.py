@@ -149,8 +149,8 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
     cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
     if all(np.isfinite(_number(cell)) for cell in cells):
         raise RecordError(
-            f"{path}, row {row}: numbers stand where the header row is wanted. Write one row of 'name [unit]' before"
-            " them, without '#'"
+            f"{path}, row {row}: numbers instead of the header row. Write one row of 'name [unit]' before them, "
+            "without '#'"
         )
     names, units = [], []
     for j, cell in enumerate(cells, start=1):
@@ -161,7 +161,7 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
                 f"{path}, row {row}: column {j} has no name. Write 'name [unit]', or remove the delimiter"
             )
         if name in names:
-            raise RecordError(f"{path}, row {row}: column {name!r} stands twice; names must differ. Rename one")
+            raise RecordError(f"{path}, row {row}: column {name!r} occurs twice; names must differ. Rename one")
         names.append(name)
         units.append(match["unit"].strip() if match else None)
     return Header(row=row, delimiter=delimiter, names=tuple(names), unit_texts=tuple(units), comments=tuple(comments))
@@ -264,7 +264,7 @@ def _faulty_cell(text: str, gaps: GapPolicy) -> str:
     if gaps != "error":
         return ""
     what = f"{text!r} is not a finite number" if text else "the value is missing"
-    return f"{what}; every cell must be one. Correct it, or say how to treat gaps: --gaps interpolate or --gaps cut"
+    return f"{what}; every cell must be one. Correct it, or give --gaps interpolate or --gaps cut"
 
 
 def _ragged(line: str, got: int, wanted: int, delimiter: str) -> str:

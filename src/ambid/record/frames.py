@@ -240,7 +240,7 @@ def _named(what: str, column: _Column, units: dict[str, str]) -> tuple[str, str 
     said |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
     if len(said) > 1:
         one, other = sorted(said)[:2]
-        raise RecordError(f"column {name!r} of {what} is said to be in [{one}] and in [{other}]. Leave one of them out")
+        raise RecordError(f"column {name!r} of {what} is said to be in [{one}] and in [{other}]. Omit one of them")
     return name, next(iter(said), None)
 
 
@@ -262,7 +262,7 @@ def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
         raise RecordError(f"{place} has shape {values.shape}; a channel is one column (n_samples,). Pass one column")
     if kind in "mM":
         if not time:
-            raise RecordError(f"{place} holds times; a channel holds numbers. Call it 'time', or leave it out")
+            raise RecordError(f"{place} holds times; a channel holds numbers. Call it 'time', or omit it")
         known = values[~np.isnat(values)]
         begin = known[0] if kind == "M" and known.size else np.timedelta64(0, "s")
         return np.asarray((values - begin) / np.timedelta64(1, "s"), dtype=np.float64)
@@ -272,7 +272,7 @@ def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
         )
     if kind not in "iufb":
         example = next((x for x in values.ravel() if not isinstance(x, (int, float))), "")
-        raise RecordError(f"{place} holds no numbers (such as {str(example)[:20]!r}). Convert it, or leave it out")
+        raise RecordError(f"{place} holds no numbers (such as {str(example)[:20]!r}). Convert it, or omit it")
     found = np.asarray(values, dtype=np.float64)
     if kind in "iu" and found.size and np.abs(found).max() > _EXACT:
         raise RecordError(

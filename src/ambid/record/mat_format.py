@@ -70,7 +70,7 @@ def _content(path: Path, data: bytes) -> dict[str, Any]:
         content = loadmat(path, struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True)
     except Exception as failure:  # loadmat raises whatever its parser meets in a damaged file
         raise RecordError(
-            f"record {path} is not a sound MATLAB file ({type(failure).__name__}: {failure}). Save it again from MATLAB"
+            f"record {path} is not a valid MATLAB file ({type(failure).__name__}: {failure}). Save it again from MATLAB"
         ) from None
     return {name: _fields(value) for name, value in content.items() if not name.startswith("__")}
 
@@ -100,7 +100,7 @@ def _content_v73(path: Path) -> dict[str, Any]:
             return content
     except (OSError, RuntimeError, KeyError, ValueError, TypeError) as failure:
         raise RecordError(
-            f"record {path} is not a sound MATLAB 7.3 file ({failure}). Save it again from MATLAB"
+            f"record {path} is not a valid MATLAB 7.3 file ({failure}). Save it again from MATLAB"
         ) from None
 
 
@@ -137,7 +137,7 @@ def _vector(content: Mapping[str, Any], expression: str, path: Path) -> Array:
         value = value[name]
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":
         raise RecordError(
-            f"record {path}: variable {expression!r} is {_shape(value)}; real numbers are wanted. Correct it"
+            f"record {path}: variable {expression!r} is {_shape(value)}; it must be real numbers. Correct it"
         )
     if match["column"] is not None:
         k = int(match["column"])

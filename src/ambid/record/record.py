@@ -152,7 +152,7 @@ class Record:
         names = [c.name for c in self.channels]
         twice = sorted({n for n in names if names.count(n) > 1})
         if twice:
-            raise RecordError(f"channel {twice[0]!r} stands twice in the record; names must differ. Rename one column")
+            raise RecordError(f"channel {twice[0]!r} occurs twice in the record; names must differ. Rename one column")
         lengths = {c.values.size for c in self.channels}
         if len(lengths) > 1:
             listing = ", ".join(f"{c.name} {c.values.size}" for c in self.channels)
@@ -350,7 +350,7 @@ def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "r
     except FileNotFoundError:
         raise error(f"{what} {path} does not exist{_similar(path)}. Check the path") from None
     except IsADirectoryError:
-        raise error(f"{what} {path} is a folder; a file is wanted. Name the file inside it") from None
+        raise error(f"{what} {path} is a folder; it must be a file. Name the file inside it") from None
     except PermissionError:
         raise error(f"{what} {path} may not be read (permission denied). Change its permissions") from None
     except OSError as failure:
@@ -390,7 +390,7 @@ def gunzipped(data: bytes, path: Path) -> bytes:
     except EOFError:
         raise RecordError(f"record {path} is a truncated gzip file: its end is missing. Copy it again") from None
     except (gzip.BadGzipFile, zlib.error) as failure:
-        raise RecordError(f"record {path} is not a sound gzip file ({failure}). Copy it again, or rename it") from None
+        raise RecordError(f"record {path} is not a valid gzip file ({failure}). Copy it again, or rename it") from None
 
 
 def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> str:
@@ -408,5 +408,5 @@ def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, wh
         byte = data[failure.start]
         raise error(f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8") from None
     if "\0" in text:
-        raise error(f"{what} {path} holds binary data (a zero byte); text is wanted. Check that it is the right file")
+        raise error(f"{what} {path} holds binary data (a zero byte); it must be text. Check that it is the right file")
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text

@@ -65,7 +65,7 @@ def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) 
     check_gap_policy(gaps)
     if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
         raise RecordError(
-            f"{where} was sampled at {record.rate_hz:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz. Leave it out"
+            f"{where} was sampled at {record.rate_hz:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz. Omit it"
         )
     values = np.column_stack([c.values for c in record.channels])
     table = Table(where=where, names=record.names, values=values, first_row=0, time=None)
@@ -125,7 +125,7 @@ def seconds(time: Array, name: str, text: str | None, where: str) -> Array:
         unit = parse_unit(text)
     except UnitError:
         raise RecordError(
-            f"{where}: column {name!r} is in [{text}], which is no known unit (nearest: {nearest_unit(text)})."
+            f"{where}: column {name!r} is in [{text}], which is not a known unit (nearest: {nearest_unit(text)})."
             " Time must be in [s], [ms] or [us]"
         ) from None
     if unit.si != "s":
@@ -142,7 +142,7 @@ def refuse_gaps(table: Table) -> None:
         row, j = np.argwhere(bad)[0]
         raise RecordError(
             f"{table.where}, row {table.first_row + row}, column {table.names[j]!r}: {table.values[row, j]} is not a"
-            " finite number; every value must be one. Correct it, or say how to treat gaps: --gaps interpolate or"
+            " finite number; every value must be one. Correct it, or give --gaps interpolate or"
             " --gaps cut"
         )
 

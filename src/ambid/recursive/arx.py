@@ -241,8 +241,8 @@ class RecursiveIvArx(_OnSignals):
         if self._kind == "reference" or self._open_loop:
             return ()
         return (
-            f"instruments are made of the input ({self._kind}): biased where a controller is at work, and nothing says "
-            "that this loop is open. Take the reference of the loop, or say open_loop if there is no feedback",
+            f"instruments are made of the input ({self._kind}): biased by feedback. Use the reference of the loop, "
+            "or give open_loop if there is no feedback",
         )
 
     def _renew(self) -> None:
@@ -306,7 +306,7 @@ def columns_of(
     """
     if na < 0 or len(nb) != len(nk) or any(n < 0 for n in (*nb, *nk)) or na + sum(nb) == 0:
         raise EstimationError(
-            f"na={na}, nb={list(nb)}, nk={list(nk)}: give orders that are not negative, and not all 0"
+            f"na={na}, nb={list(nb)}, nk={list(nk)}: orders must be at least 0, and not all 0. Correct them"
         )
     columns, names = [(output, lag, -1) for lag in range(1, na + 1)], [f"a{lag}" for lag in range(1, na + 1)]
     for i, (order, delay) in enumerate(zip(nb, nk, strict=True), start=1):

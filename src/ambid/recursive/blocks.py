@@ -24,6 +24,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.bearing.blocks import ThreeBlocks, blocks_of, three_blocks
 from ambid.errors import EstimationError
+from ambid.estimation.uncertainty import p_text
 from ambid.recursive.estimator import check_channels, kernels
 from ambid.recursive.streaming import ScalarKalman, StreamingFilter
 
@@ -110,8 +111,8 @@ class OnlineThreeBlocks:
         check_channels("three blocks", rate_hz, 1)
         if memory_s is not None and not memory_s * rate_hz >= 4 * _BATCH:
             raise EstimationError(
-                f"three blocks: a memory of {memory_s} s is {memory_s * rate_hz:.3g} samples; at least {4 * _BATCH} "
-                "are wanted. Give a longer one, or None"
+                f"three blocks: a memory of {memory_s} s is {memory_s * rate_hz:.3g} samples; at least "
+                f"{4 * _BATCH} are needed. Give a longer one, or None"
             )
         if isinstance(warm_up, bool) or not isinstance(warm_up, int) or warm_up < 200:
             raise EstimationError(f"three blocks: a warm-up of {warm_up!r} samples; give a whole number from 200 up")
@@ -151,7 +152,7 @@ class OnlineThreeBlocks:
         """
         if (reference is not None) != self._with_reference:
             raise EstimationError(
-                "three blocks: a reference is given exactly where with_reference=True was said. Say so, or leave it out"
+                "three blocks: a reference needs with_reference=True, and the other way round. Give both or neither"
             )
         if self._at is not None and isinstance(voltage, float) and isinstance(current, float):
             found = self._update_one(voltage, current, position, voltage if reference is None else reference)
@@ -221,18 +222,18 @@ class OnlineThreeBlocks:
         out = []
         if not self._instruments:
             out.append(
-                "recursive least squares: noise of current and position is in the regressors and biases the blocks. "
-                "Use instruments where no feedback is at work or a reference is known"
+                "recursive least squares: noise of current and position biases the blocks. Use instruments if "
+                "there is no feedback or a reference is known"
             )
         if self._quiet:
             out.append(
-                f"too little moved the blocks for {self._quiet * self._dt:.3g} s: nothing is forgotten meanwhile, and "
-                "the numbers are mostly from before"
+                f"the blocks were hardly excited for {self._quiet * self._dt:.3g} s: nothing is forgotten "
+                "meanwhile, and the values are mostly from before"
             )
         if self._start_doubt < _DOUBT:
             out.append(
-                f"where the start comes from, no blocks of first order were seen (p = {self._start_doubt:.2g}): "
-                "take the numbers as a rough guide, and the grey-box model for the parameters"
+                f"at the start the blocks were not of first order ({p_text(self._start_doubt)}): use the values as "
+                "a rough guide only, and the grey-box model for the parameters"
             )
         out += [
             f"the blocks explain little of the {name} (fit {part:.2g}): do not use them"
@@ -306,9 +307,9 @@ class OnlineThreeBlocks:
             blocks = [start.blocks[name] for name in "abc"]
             self._start_doubt = min(start.first_order.values(), default=1.0)
             if not (scale > 0).all() or min(blocks[0].pole, blocks[1].pole) <= 0:
-                raise EstimationError("a signal stands still, or the coil is not stable")
+                raise EstimationError("a signal is constant, or the coil is not stable")
         except EstimationError as why:
-            self._why = f"the first {seen.shape[0]} samples do not tell a start ({why})"
+            self._why = f"the first {seen.shape[0]} samples give no starting values ({why})"
             return
         drive = 3 if self._with_reference else 0
         self._mean, self._scale = (np.append(x[:3], x[drive]) for x in (mean, scale))

@@ -97,8 +97,8 @@ def as_blocks(
     if not (_fits(y, n, n_outputs) and _fits(u, n, n_inputs)):
         raise EstimationError(
             f"{name}: inputs of shape {u.shape} and outputs of shape {y.shape}; a sample is ({n_inputs},) and "
-            f"({n_outputs},), a block (n, {n_inputs}) and (n, {n_outputs}), and where there is one, its axis may be "
-            "left out. Reshape them"
+            f"({n_outputs},), a block (n, {n_inputs}) and (n, {n_outputs}), where an axis of length 1 may be "
+            "omitted. Reshape them"
         )
     return _rows(u, n, n_inputs), _rows(y, n, n_outputs), y.shape
 
@@ -170,9 +170,9 @@ def prior_of(name: str, value: ArrayLike, p: int) -> Array:
 def forgetting_factor(factor: float | None, memory: float | None) -> float:
     """Return the factor of forgetting, or that of a time constant in samples; 1 where neither is given."""
     if factor is not None and memory is not None:
-        raise EstimationError("factor and memory say the same thing. Give one of them")
+        raise EstimationError("factor and memory mean the same. Give one of them")
     if factor is not None and not 0 < factor < 1:
-        raise EstimationError(f"factor is {factor!r}; it must lie between 0 and 1. Leave it out to forget nothing")
+        raise EstimationError(f"factor is {factor!r}; it must lie between 0 and 1. Omit it to forget nothing")
     if memory is not None and not memory > 1:
         raise EstimationError(f"memory is {memory!r}; it must be longer than one sample")
     return 1.0 - 1.0 / memory if memory is not None else 1.0 if factor is None else float(factor)

@@ -87,7 +87,7 @@ class FusedSensor:
             value = getattr(self, name)
             wrong = value <= 0.0 if rule == "positive" else value < 0.0 if rule == "at least 0" else False
             if not isfinite(value) or wrong or (name == "gain" and value == 0.0):
-                raise EstimationError(f"sensor {self.name!r}: {name} is {value}; it must be {rule}. Mend it")
+                raise EstimationError(f"sensor {self.name!r}: {name} is {value}; it must be {rule}. Correct it")
         if not (len(self.limits) == 2 and self.limits[0] < self.limits[1]):
             raise EstimationError(f"sensor {self.name!r}: limits {self.limits}; give (low, high) with low < high")
 
@@ -274,7 +274,7 @@ class SensorFusion:
             elif railed >= at.GONE_N:
                 found.append((i, now - railed + 1.0, f"at its rail, {value['value']:.4g}", "rail", value))
             elif same >= self._table[i, at.STUCK] > 0.0:
-                found.append((i, now - same, f"stands still at {value['value']:.4g}", "stuck", value))
+                found.append((i, now - same, f"is constant at {value['value']:.4g}", "stuck", value))
         for i, onset, *_ in found:
             self._exclude(i, onset)
         for i, onset, why, cause, values in found:
@@ -305,11 +305,9 @@ class SensorFusion:
         if now >= self._held and (moved or not disputed):
             both = self.working
             if moved:
-                why = (
-                    f"the rotor moved as the motion model does not allow, or {' and '.join(both)} are at fault together"
-                )
+                why = f"the motion contradicts the motion model, or {' and '.join(both)} are faulty together"
             else:
-                why = f"one of {', '.join(both)} is at fault, which cannot be told: both are used, sd covers either"
+                why = f"one of {', '.join(both)} is faulty, which one is unknown: both are used, and sd covers either"
             self._tell("disturbed", onset, why, "motion" if moved else "one_of", shift=shift)
             self._held = now + self.rate_hz
         if not (moved or disputed):
@@ -331,7 +329,7 @@ class SensorFusion:
         if cause == "noise":
             return cause, "noisier than it should be", {}
         words = "it stepped" if cause == "step" else "its gain fell"
-        why = f"{words}: {shift * 1e6:+.3g} um off the others at {x * 1e6:.3g} um"
+        why = f"{words}: {shift * 1e6:+.3g} um from the others at {x * 1e6:.3g} um"
         return cause, why, {"shift": shift, "position": x}
 
     def _exclude(self, i: int, onset: float) -> None:
@@ -485,12 +483,12 @@ def _check(
 ) -> None:
     if len(names) < 2 or len(set(names)) < len(names):
         raise EstimationError(
-            f"sensor fusion: sensors {names}; it wants two or more with distinct names. Mend the list"
+            f"sensor fusion: sensors {names}; two or more with distinct names are needed. Correct the list"
         )
     if not (0.0 < alarms < np.inf and isfinite(restore_s) and restore_s > 0.0 and 0.0 <= temperature_rate < np.inf):
         raise EstimationError(
             f"sensor fusion: false_alarms_per_hour {alarms}, restore_s {restore_s}, temperature_rate "
-            f"{temperature_rate}; the first two must be positive, the last at least 0. Mend them"
+            f"{temperature_rate}; the first two must be positive, the last at least 0. Correct them"
         )
     if len(start_sd) != 2 or not all(0.0 < sd < np.inf for sd in start_sd):
         raise EstimationError(f"sensor fusion: start_sd {start_sd}; give two positive numbers, in m and m/s")

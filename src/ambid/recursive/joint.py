@@ -130,16 +130,16 @@ def _named(
             )
     lacking = [name for name in known if complete and name not in table]
     if lacking:
-        raise EstimationError(f"{what} lacks {', '.join(lacking)}; each wants a number. Give it")
+        raise EstimationError(f"{what} lacks {', '.join(lacking)}; each needs a number. Give it")
 
 
 def _check_covariance(start: JointStart) -> None:
     p = len(start.free)
     if p == 0:
-        raise EstimationError("no parameter is free; nothing can be followed. Free at least one")
+        raise EstimationError("no parameter is free, and none can be tracked. Free at least one")
     if np.shape(start.covariance) != (p, p):
         raise EstimationError(
-            f"the covariance has shape {np.shape(start.covariance)}; {p} free parameters want ({p}, {p}). Reshape it"
+            f"the covariance has shape {np.shape(start.covariance)}; {p} free parameters need ({p}, {p}). Reshape it"
         )
     spread = np.sqrt(np.maximum(np.diag(start.covariance), 0.0))
     try:
@@ -152,8 +152,8 @@ def _check_covariance(start: JointStart) -> None:
     for name, sd, one in zip(start.free, spread, size, strict=True):
         if sd > one:
             raise EstimationError(
-                f"parameter {name!r} starts with a standard deviation of {sd:.3g}, more than its size {one:.3g}; a "
-                "filter that is linear around its start cannot follow that. Fix it, give it a prior, or identify longer"
+                f"parameter {name!r} starts with a standard deviation of {sd:.3g}, more than its size {one:.3g}, "
+                "which a linearised filter cannot track. Fix it, give it a prior, or identify longer"
             )
 
 
@@ -232,7 +232,7 @@ class JointFilter:
     def from_estimate(cls, estimate: Estimate, rate_hz: float, *, rates: Mapping[str, float] | None = None) -> Self:
         """Return a filter that starts from an off-line estimate of the same rate; `rates` as in `JointStart`."""
         if estimate.status == "failed":
-            raise EstimationError("the estimate has failed; a filter cannot start from it. Identify again")
+            raise EstimationError("the estimate failed; a filter cannot start from it. Identify again")
         rate = estimate.record.get("rate_hz")
         if isinstance(rate, int | float) and abs(rate / rate_hz - 1.0) > 1e-6:
             raise EstimationError(
@@ -242,8 +242,8 @@ class JointFilter:
         of, noise = model_named(estimate.model), estimate.noise
         if not noise.sensor_sd or not noise.disturbance_sd:
             raise EstimationError(
-                f"the estimate describes its noise as a {noise.form}; a joint filter wants levels. Identify with noise "
-                "levels, or give a JointStart"
+                f"the estimate describes its noise as a {noise.form}; a joint filter needs levels. Identify with "
+                "noise levels, or give a JointStart"
             )
         delay = estimate.delay[of.inputs[0]]
         start = JointStart(
@@ -317,8 +317,8 @@ class JointFilter:
             return ()
         kind = "small" if error > 1.0 else "large"
         return (
-            f"innovations are {error:.2f} times what the filter expects: its noise levels are too {kind}, and its "
-            "standard deviations with them; where the plant is hardly excited, its parameters are moved too",
+            f"innovations are {error:.2f} times as large as the filter expects: its noise levels are too {kind}, "
+            "and so are its standard deviations; poorly excited parameters are biased too",
         )
 
     @property
@@ -400,9 +400,9 @@ class JointEkf(JointFilter):
         if lost[worst] <= 1.0:
             return super().warnings
         return (
-            f"{self.start.free[worst]} began with a standard deviation of {self._begun[worst]:.2%} and is claimed to "
-            f"{now[worst]:.2%}: linearising about the start may have left an error of {lost[worst] * now[worst]:.2%}. "
-            "Start from an off-line estimate, or use JointUkf",
+            f"{self.start.free[worst]} started with a standard deviation of {self._begun[worst]:.2%} and is now "
+            f"claimed to {now[worst]:.2%}: linearisation about the start may have caused an error of "
+            f"{lost[worst] * now[worst]:.2%}. Start from an off-line estimate, or use JointUkf",
             *super().warnings,
         )
 
@@ -500,8 +500,8 @@ class JointUkf(JointFilter):
             if order > norm and term < _REST:
                 return order
         raise EstimationError(
-            f"at {self.start.rate_hz:g} Hz the plant moves too far in a sample (|A| T = {norm / 2:.3g}) for the "
-            "unscented filter's series. Use JointEkf, or sample faster"
+            f"at {self.start.rate_hz:g} Hz the plant moves too far per sample (|A| T = {norm / 2:.3g}) for the "
+            "series of the unscented filter. Use JointEkf, or sample faster"
         )
 
     def _run(self, u: Array, y: Array, e: Array) -> None:
@@ -529,8 +529,8 @@ def powers_of(model: LinearModel, at: Mapping[str, float], free: Sequence[str]) 
         found[rows, columns] = entries * np.prod(ratio ** power.astype(float), axis=1)
         if not np.allclose(found, exact, rtol=1e-12, atol=0.0):
             raise EstimationError(
-                f"the matrices of model {model.name!r} are not products of powers of its parameters; the unscented "
-                "filter wants that. Use JointEkf"
+                f"the matrices of model {model.name!r} are not products of powers of its parameters, which the "
+                "unscented filter needs. Use JointEkf"
             )
     return np.column_stack([rows, columns]).astype(np.int64), entries, power
 

@@ -68,7 +68,9 @@ def linear_state(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, *, B: A
     shapes = {"A": (a, (n, n)), "C": (c, (m, n)), "Q": (q, (n, n)), "R": (r, (m, m))}
     for name, (M, shape) in shapes.items():
         if M.shape != shape or not np.isfinite(M).all():
-            raise EstimationError(f"linear state: {name} has shape {M.shape}; it must be {shape} and finite. Mend it")
+            raise EstimationError(
+                f"linear state: {name} has shape {M.shape}; it must be {shape} and finite. Correct it"
+            )
     for name, M, least in (("Q", q, -1e-12), ("R", r, 0.0)):
         values = np.linalg.eigvalsh((M + M.T) / 2)
         bad = values[0] < least * max(values[-1], 0.0) or (name == "R" and values[0] <= 0)
@@ -227,8 +229,8 @@ class KalmanFilter:
         given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
         if given.size != n * self._n_u or not np.isfinite(given).all():
             raise EstimationError(
-                f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are wanted. "
-                "Give all of them"
+                f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are "
+                "needed. Give all of them"
             )
         return as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
 
@@ -243,8 +245,8 @@ def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
             np.linalg.cholesky(P)
         except np.linalg.LinAlgError:
             raise EstimationError(
-                "Kalman filter: there is no stationary filter with a covariance that is positive definite: a state is "
-                "not seen by the outputs, or not moved by the noise. Give start_covariance, or another model"
+                "Kalman filter: no stationary filter has a positive definite covariance: a state is not "
+                "observable, or not driven by noise. Give start_covariance, or another model"
             ) from None
         return np.asarray(P)
     n = model.A.shape[0]
@@ -256,7 +258,7 @@ def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
         np.linalg.cholesky(P)
     except np.linalg.LinAlgError:
         raise EstimationError(
-            "Kalman filter: start_covariance is not positive definite. Give every state a variance over 0"
+            "Kalman filter: start_covariance is not positive definite. Give every state a positive variance"
         ) from None
     return P
 

@@ -175,7 +175,7 @@ class Track(Result):
     def reasons(self) -> tuple[Reason, ...]:
         """What is wrong at its end: values that the data contradict are not to be used."""
         if not self.lines:
-            text = "the record ends before the first reporting interval. Take a longer one, or a shorter --every"
+            text = "the record ends before the first reporting interval. Use a longer one, or a shorter --every"
             return (Reason(check="lines", text=text, grave=True),)
         last, header, found = self.lines[-1], self.header, list[Reason]()
         if not self.totals.samples:

@@ -97,7 +97,7 @@ class RecursivePolynomial:
     ) -> None:
         found = structure_named(structure)
         if not found.prediction_error:
-            raise EstimationError(f"{structure} is no polynomial structure. Use armax, oe or bj")
+            raise EstimationError(f"{structure} is not a polynomial structure. Use armax, oe or bj")
         n_u = int(found.inputs) if n_inputs is None else n_inputs
         u, y = np.zeros((1, n_u)), np.zeros((1, 1))
         inputs = tuple(f"u{i}" for i in range(n_u)) if n_u != 1 else ("u",)
@@ -105,7 +105,9 @@ class RecursivePolynomial:
         data = IOData(u=u, y=y, dt=dt, inputs=inputs, outputs=("y",), units=units)
         layout, free_delay = read_orders(structure, data, orders)
         if free_delay:
-            raise EstimationError(f"{structure}: nk is not given; a delay is not looked for on-line. Give nk=1, say")
+            raise EstimationError(
+                f"{structure}: nk is missing; a delay is not searched on-line. Give nk=1, for example"
+            )
         who = Identity(structure=structure, layout=layout, dt=dt, inputs=inputs, outputs=("y",), units=units)
         self._prepare(who, forgetting, open_loop=open_loop)
         need = 10 * (layout.n_theta + layout.first_row)
@@ -457,40 +459,36 @@ def _warnings_of(
         found.append(f"{name}: the first window is not full: there is no estimate yet")
     if doubtful:
         found.append(
-            f"{name}: the search for the first estimate did not converge: coefficients may be wrong by as much as "
-            "they are large, and standard deviations say so. "
-            "Lower the orders, or begin with a fit that did"
+            f"{name}: the search for the first estimate did not converge: coefficients may be wrong by their own "
+            "size, which the standard deviations include. Lower the orders, or start from a fit that converged"
         )
     x, least = who.layout, _FEW * (who.layout.free.size + 1)
     if memory < least and (x.nc or x.nd or any(x.nf)):
         found.append(
             f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
-            "estimate may lock at the border after a standstill, and standard deviations are too small. Remember "
-            f"{least} samples or more, or use arx"
+            "estimate may stick at the stability limit after a standstill, and standard deviations are too small. "
+            f"Remember {least} samples or more, or use arx"
         )
     if structure_named(name).feedback == "biased" and not open_loop:
-        found.append(
-            f"{name} is biased where a controller is at work, and nothing says that this loop is open: use bj or "
-            "armax, or say open_loop if there is no feedback"
-        )
+        found.append(f"{name} is biased by feedback: use bj or armax, or give open_loop if there is no feedback")
     if state is None:
         return tuple(found)
     if state.at_border:
         found.append(
-            f"{name}: the data ask, or often asked, for an unstable C or F; stable coefficients are shown and their "
-            "standard deviations are not to be trusted. If the plant integrates or is unstable, use armax or arx"
+            f"{name}: the data often require an unstable C or F; stable coefficients are shown, and their standard "
+            "deviations are unreliable. If the plant integrates or is unstable, use armax or arx"
         )
     if state.worse > _WORSE:
         found.append(
-            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has grown, or the "
-            "structure does not hold what the data show. Raise the orders, or forget faster"
+            f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has grown, or "
+            "the structure no longer fits. Raise the orders, or forget faster"
         )
     if state.worse < 1.0 / _WORSE:
         found.append(
-            f"{name}: errors of prediction are {state.worse:.2g} times those at the start: the noise has fallen, or "
-            "the signals stand still and tell nothing; without forgetting, standard deviations are too small then. "
-            "Look at the signals"
+            f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has fallen, or "
+            "the signals are constant; without forgetting, standard deviations are then too small. Check the "
+            "signals"
         )
     if state.waits:
-        found.append(f"{name}: nothing is learnt at present: the filters wait for history after the start or a gap")
+        found.append(f"{name}: learning is suspended: the filters need history after the start or a gap")
     return tuple(found)

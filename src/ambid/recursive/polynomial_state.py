@@ -252,11 +252,12 @@ def identity_of(fit: BlackBoxFit) -> Identity:
     known = any_structure(fit.structure).prediction_error
     if not known or not isinstance(model, PolynomialModel):
         raise EstimationError(
-            f"{fit.structure} is no prediction error fit of a polynomial model; it cannot be followed. Fit armax, say"
+            f"{fit.structure} is not a prediction-error fit of a polynomial model and cannot be tracked. Fit "
+            "armax, for example"
         )
     if model.n_outputs != 1:
         raise EstimationError(
-            f"the fit has {model.n_outputs} outputs; the recursion follows one. Fit and track each output by itself"
+            f"the fit has {model.n_outputs} outputs; the recursion tracks one. Fit and track each output by itself"
         )
     p = model.outputs[0]
     nk = tuple(int(x) for x in _per_input(fit.orders.get("nk", 0), len(p.B)))

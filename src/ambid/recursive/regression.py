@@ -219,9 +219,9 @@ class RecursiveLeastSquares(_Factored):
         if forgetting not in (None, "none", "exponential", "directional"):
             raise EstimationError(f"forgetting is {forgetting!r}; it is none, exponential or directional")
         if forgets and forgetting == "none":
-            raise EstimationError("forgetting is none; leave factor and memory out")
+            raise EstimationError("forgetting is none; omit factor and memory")
         if not forgets and forgetting in ("exponential", "directional"):
-            raise EstimationError(f"forgetting is {forgetting}; say how fast, by factor or memory")
+            raise EstimationError(f"forgetting is {forgetting}; it needs a factor or a memory. Give one")
         super().__init__(names, start, noise_sd)
         s, p, at = self._s, len(self._names), self._at
         s[at.KIND] = at.DIRECTIONAL if forgetting == "directional" else at.LEAST_SQUARES

@@ -275,8 +275,8 @@ class SynchronousFilter:
         n = memory_s * rate_hz
         if not (isfinite(n) and n >= 2 * _BATCHES):
             raise EstimationError(
-                f"synchronous filter: a memory of {memory_s} s is {n:.3g} samples; at least {2 * _BATCHES} are wanted. "
-                "Give a longer one"
+                f"synchronous filter: a memory of {memory_s} s is {n:.3g} samples; at least {2 * _BATCHES} are "
+                "needed. Give a longer one"
             )
         self.channels, self.memory_s = channels, memory_s
         self.n_samples = self.n_missing = 0

@@ -7,8 +7,8 @@ import textwrap
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from ambid.errors import counted
 from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain, wrapped
-from ambid.units import counted
 
 if TYPE_CHECKING:
     from pathlib import Path

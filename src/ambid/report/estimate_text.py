@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
+from ambid.errors import counted
 from ambid.estimation.estimate import Estimate, Judged
 from ambid.physics.linear_model import model
 from ambid.report.numbers import prefixed, sized
@@ -32,7 +33,6 @@ from ambid.report.text import (
     title_line,
     warning_lines,
 )
-from ambid.units import counted
 
 if TYPE_CHECKING:
     from ambid.bearing.frequency import FrequencyEstimate

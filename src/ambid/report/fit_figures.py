@@ -17,6 +17,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import TransferModel, pole_covariance, zero_covariance
 from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, innovations_form, one_step, plant_form, simulation
+from ambid.errors import counted
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
@@ -47,7 +48,6 @@ from ambid.report.signal_panels import (
     worst_stretch,
 )
 from ambid.report.text import coefficient_text
-from ambid.units import counted
 from ambid.validation.fits import beyond, leaves_colour_open, model_of, nonlinear_residuals, run
 from ambid.validation.residuals import P_LEAST, Correlation, correlations
 

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, counted
 from ambid.record import Channel, Record
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WIDTH, Paint, columns, fraction, joined, plain, pure, wrapped
 from ambid.rig.roles import rank_roles
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
-from ambid.units import UNKNOWN, counted
+from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from ambid.validation.comparison import Comparison, Entry

@@ -11,10 +11,10 @@ from typing import Any, Literal, cast
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.errors import counted
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.result import Verdict
 from ambid.report.numbers import Quantity, quantity, sized
-from ambid.units import counted
 
 Style = Literal["good", "doubt", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]

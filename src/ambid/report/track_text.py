@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
+from ambid.errors import counted
 from ambid.estimation.result import Verdict
 from ambid.recursive.lines import NORMAL_95, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
@@ -24,7 +25,6 @@ from ambid.report.text import (
     verdict_table,
     word_for_all,
 )
-from ambid.units import counted
 
 if TYPE_CHECKING:
     from rich.console import Group

@@ -90,7 +90,7 @@ def _channel_lines(role: str, ranked: Sequence[Candidate], unit: str, record: Re
         lines.append(f'unit   = "{unit}"   # CHECK: the record names no unit for it')
     elif c.unit != unit:
         lines += [
-            f"# CHECK: the column is in [{c.source_unit}], the model wants [{unit}]. Give a table (two columns,"
+            f"# CHECK: the column is in [{c.source_unit}], the model needs [{unit}]. Give a table (two columns,"
             f" '{c.name} [{c.source_unit}],{role} [{unit}]') or a gain:",
             f'# table  = "{c.name}_to_{role}.csv"',
             f"# gain   = 1.0      # {unit} per {'unit' if c.unit == '1' else parse_unit(c.source_unit).si}",

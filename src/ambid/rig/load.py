@@ -465,7 +465,7 @@ def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"]
     told += ["exponential"] if any(n in entry.parameters for n in _EXPONENTIAL) else []
     if len(told) == 2:
         raise RigError(
-            f"{where}: [magnet.parameters] names numbers of both gap laws (k, s and L_g, zeta). Leave one pair out"
+            f"{where}: [magnet.parameters] names parameters of both gap laws (k, s and L_g, zeta). Omit one pair"
         )
     return entry.gap or (told[0] if told else None)
 
@@ -580,7 +580,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     for c in rig.channels:
         if c.column not in record.names:
             raise RecordError(
-                f"the record has no column {c.column!r} (wanted by channels.{c.role}); it has"
+                f"the record has no column {c.column!r} (needed by channels.{c.role}); it has"
                 f" {', '.join(record.names)}."
                 f"{nearest(c.column, record.names)} Correct channels.{c.role}.column"
             )
@@ -639,7 +639,7 @@ def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
         unknown = channel.source_unit != UNKNOWN
         what = f"is in [{channel.source_unit}], an unknown unit" if unknown else "has no unit"
         raise UnitError(
-            f"column {channel.name!r} {what} (wanted by channels.{c.role}). Write '{channel.name} [unit]' in the header"
+            f"column {channel.name!r} {what} (needed by channels.{c.role}). Write '{channel.name} [unit]' in the header"
             f" ([1] for a plain number), or give channels.{c.role}.unit"
         )
     return channel
@@ -662,7 +662,7 @@ def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, St
     if c.calibration is None:
         if channel.unit != unit:
             raise UnitError(
-                f"column {channel.name!r} is in [{channel.source_unit}]; the rig wants a {c.role} in [{unit}]."
+                f"column {channel.name!r} is in [{channel.source_unit}]; the rig needs a {c.role} in [{unit}]."
                 f" Fix the header, or give channels.{c.role}.gain or table"
             )
         return channel, None

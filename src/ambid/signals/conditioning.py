@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import RecordError
+from ambid.errors import RecordError, counted
 from ambid.record.record import Record, Step
 
 
@@ -32,8 +32,8 @@ def finite(record: Record, name: str) -> Array:
     if bad.any():
         first = int(np.argmax(bad))
         raise RecordError(
-            f"channel {name!r} is not finite at sample {first} ({values[first]}), {int(bad.sum())} samples in all; "
-            "numbers are needed. Repair them with replace_samples, or cut them off"
+            f"channel {name!r} is not finite at sample {first} ({values[first]}), "
+            f"{counted(int(bad.sum()), 'sample')} in all. Repair them with replace_samples, or cut them off"
         )
     return values
 
@@ -319,8 +319,8 @@ def resample(record: Record, rate_hz: float) -> Record:
     ratio = Fraction(rate_hz / record.rate_hz).limit_denominator(1000)
     if ratio == 0 or ratio.numerator > 1000 or abs(float(ratio) * record.rate_hz / rate_hz - 1.0) > 1e-9:
         raise RecordError(
-            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz is no fraction with terms up to 1000. "
-            f"Give {float(ratio) * record.rate_hz:.10g} Hz or another multiple"
+            f"resample from {record.rate_hz:g} to {rate_hz:g} Hz is not a fraction with terms up to 1000. Give "
+            f"{float(ratio) * record.rate_hz:.10g} Hz or another multiple"
         )
     if record.n_samples * ratio < 2:
         raise RecordError(f"resample to {rate_hz:g} Hz leaves less than two samples. Give a higher rate")

@@ -13,7 +13,7 @@ from math import erf, sqrt
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 
 _ROWS = 2048  # at once: some hundred columns of them stay in the cache
 _NARROW = 16  # columns up to which NumPy's QR serves as well; SciPy's update takes a tenth of a second to load
@@ -121,7 +121,7 @@ class Delay:
         if self.samples is None:
             return f"delay not found among {self.lags[0]} to {self.lags[-1]} samples: no lag is significant"
         at = self.samples - int(self.lags[0])
-        return f"delay {self.samples} samples (z = {self.z[at]:.3g}, confidence {self.confidence:.3f})"
+        return f"delay {counted(self.samples, 'sample')} (z = {self.z[at]:.3g}, confidence {self.confidence:.3f})"
 
 
 def find_delay(u: Array, y: Array, *, max_delay: int = 10, order: int = 20, feedthrough: bool = False) -> Delay:
@@ -175,7 +175,7 @@ def find_delay(u: Array, y: Array, *, max_delay: int = 10, order: int = 20, feed
             raise EstimationError(f"the {label} of the delay search is not finite everywhere. Repair or cut it first")
         if np.ptp(x) == 0.0:
             raise EstimationError(
-                f"the {label} of the delay search is constant; it shows no delay. Use an excited record"
+                f"the {label} of the delay search is constant and reveals no delay. Use an excited record"
             )
     first_lag = 0 if feedthrough else 1
     scaled_u, scaled_y = (u - u.mean()) / u.std(), (y - y.mean()) / y.std()

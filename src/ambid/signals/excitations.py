@@ -520,12 +520,12 @@ def excitation(
     for option in options:
         if option not in known:
             near = get_close_matches(option, known, n=1, cutoff=0.4)
-            hint = f"Did you mean {near[0]!r}?" if near else "Leave it out"
+            hint = f"Did you mean {near[0]!r}?" if near else "Omit it"
             raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {', '.join(known)}. {hint}")
     settings: dict[str, object] = {"amplitude": amplitude, **options}
     if name == "steps":
         if band is not None:
-            raise AmbidError("excitation 'steps' has no band. Leave the band out, or choose 'prbs' for steps in a band")
+            raise AmbidError("excitation 'steps' has no band. Omit the band, or choose 'prbs' for steps in a band")
         settings.setdefault("hold_s", n_samples / rate_hz / 8.0)
     elif band is not None:
         settings["band"] = band

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import RecordError
+from ambid.errors import RecordError, counted
 from ambid.record.record import Record
 from ambid.signals.conditioning import equal_runs, finite, runs
 from ambid.signals.delay import lagged_triangle
@@ -67,9 +67,9 @@ class Dropouts:
         if self.count == self.n_samples:
             return f"{self.channel}: never changes over its {self.n_samples} samples (dead or unused)"
         return (
-            f"{self.channel}: {self.count} samples ({100 * self.fraction:.2g} %) in {len(self.spans)} drop-out"
-            f"{'s' if len(self.spans) > 1 else ''}, the first at sample {self.first_index} ({self.first_s:.6g} s), "
-            f"the longest {max(n for _, n in self.spans)} samples"
+            f"{self.channel}: {counted(self.count, 'sample')} ({100 * self.fraction:.2g} %) in "
+            f"{counted(len(self.spans), 'drop-out')}, the first at sample {self.first_index} ({self.first_s:.6g} "
+            f"s), the longest {counted(max(n for _, n in self.spans), 'sample')}"
         )
 
 
@@ -204,8 +204,7 @@ class Outliers:
         if not self.count:
             return f"{self.channel}: no outliers"
         return (
-            f"{self.channel}: {self.count} outlier{'s' if self.count > 1 else ''}, the first at sample "
-            f"{self.first_index} "
+            f"{self.channel}: {counted(self.count, 'outlier')}, the first at sample {self.first_index} "
             f"({self.first_s:.6g} s), up to {self.largest_sd:.3g} sd of the innovations"
         )
 
@@ -235,9 +234,11 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0) -> Outli
     """
     x = finite(record, name)
     if not threshold >= 3.0:
-        raise RecordError(f"find_outliers got threshold {threshold:g}; it is at least 3. Give another")
+        raise RecordError(f"find_outliers got threshold {threshold:g}; it must be at least 3. Give another")
     if x.size < 50:
-        raise RecordError(f"channel {name!r} has {x.size} samples; outliers need at least 50. Use a longer record")
+        raise RecordError(
+            f"channel {name!r} has {counted(x.size, 'sample')}; outliers need at least 50. Use a longer record"
+        )
     sizes = outlier_sizes(x, threshold)
     indices = np.flatnonzero(sizes)
     first = record.start_s + int(indices[0]) / record.rate_hz if indices.size else None

@@ -230,6 +230,6 @@ def _refuse_smooth(condition: Array, frequency: Array) -> None:
     if bad.any():
         raise EstimationError(
             f"at {int(bad.sum())} of {bad.size} lines, {frequency[bad][0]:g} to {frequency[bad][-1]:g} Hz, the "
-            "excitation is absent or too smooth for its response to be told apart from leakage. Give a band without "
-            "them, or excite with noise or a multisine"
+            "excitation is absent or too smooth to separate its response from leakage. Give a band without them, "
+            "or excite with noise or a multisine"
         )

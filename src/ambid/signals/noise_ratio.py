@@ -78,7 +78,7 @@ def snr(
     y = finite(record, name)
     driving = (inputs,) if isinstance(inputs, str) else tuple(inputs)
     if name in driving:
-        raise RecordError(f"snr of {name!r} lists the channel among its own inputs. Take it out")
+        raise RecordError(f"snr of {name!r} lists the channel among its own inputs. Omit it there")
     noise, spread = 0.0, float(np.std(y))
     if spread > 0.0:
         u = [finite(record, n) for n in driving]

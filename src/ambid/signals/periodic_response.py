@@ -90,7 +90,7 @@ def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
     if not clear and noise is not None:
         lines = lines[power[lines] > 10.0 * noise[lines]]
         if not lines.size:
-            raise EstimationError("no line of the excitation stands 10 dB above its noise. Average more periods")
+            raise EstimationError("no line of the excitation is 10 dB above its noise. Average more periods")
     return lines, clear
 
 
@@ -396,7 +396,7 @@ def frf_periodic(
     found = over_realisations(spectra, excited, n_y, n_u)
     warnings = tuple(w for s in spectra for w in s.warnings) + doubts + found.warnings
     if found.noise is None and r is None and not open_loop:
-        warnings += (f"one period does not show noise at the input: {FEEDBACK}",)
+        warnings += (f"one period cannot reveal noise at the input: {FEEDBACK}",)
     spacing = rate_hz / period
     details: dict[str, object] = {
         "period": period,
@@ -460,7 +460,7 @@ def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int
     warnings: tuple[str, ...] = ()
     if n % period:
         warnings += (
-            f"experiment {k + 1}: the first {n % period} samples lead the {count} whole periods and are not used",
+            f"experiment {k + 1}: the first {n % period} samples precede the {count} whole periods and are not used",
         )
     n_z = u.shape[1] + y.shape[1]
     all_z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)[n % period :].reshape(count, period, -1)
@@ -512,10 +512,10 @@ def _lines(spectra: list[Spectra], lines: Sequence[int] | None, n_y: int, period
     excited, strays = without_strays(excited)
     doubts: tuple[str, ...] = ()
     if not clear:
-        doubts += ("the excited lines do not stand out clearly from the others; check them, or give lines",)
+        doubts += ("the excited lines are not clearly separated from the others; check them, or give lines",)
     if strays.size:
         listed = ", ".join(str(k + 1) for k in strays)
-        doubts += (f"even lines {listed} are excited among odd ones: taken for hum and left out. Else give lines",)
+        doubts += (f"even lines {listed} are excited among odd ones: treated as hum and omitted. Otherwise give lines",)
     return excited, doubts
 
 
@@ -538,8 +538,8 @@ def _total(
     known = None if detection is None else at_excited(detection, excited)
     if known is None and found.noise is None:
         raise EstimationError(
-            "one period of one realisation without free lines gives no variance. Measure more periods or realisations, "
-            "leave out lines, or use the local method (--method local)"
+            "one period of one realisation without free lines gives no variance. Measure more periods or "
+            "realisations, omit lines, or use the local method (--method local)"
         )
     if known is None and found.noise is not None:
         return (

@@ -105,7 +105,7 @@ def frf_random(
     if r is None:
         warnings += () if open_loop else (f"{kind.upper()}: {FEEDBACK}",)
         if kind == "hv" and noise_ratio is None:
-            warnings += ("Hv takes the noise for the same share of input and output at every line. Give noise_ratio",)
+            warnings += ("Hv assumes the same noise share of input and output at every line. Give noise_ratio",)
     length = round(rate_hz / spectra.frequency_hz[1])
     if length % 2 == 0 and length >= _LEAKAGE_FROM:
         half = cross_spectra(z, rate_hz, segment=length // 2)
@@ -133,7 +133,7 @@ def _options_agree(kind: str, noise_ratio: float | None, reference: bool) -> Non
     if kind not in ("h1", "h2", "hv"):
         raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
     if reference and kind != "h1":
-        raise EstimationError(f"kind {kind!r} with a reference, which takes its place. Leave out one of the two")
+        raise EstimationError(f"kind {kind!r} with a reference, which replaces it. Omit one of the two")
     if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
         raise EstimationError(
             f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
@@ -165,8 +165,8 @@ def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
         return ()
     worst = float(np.sqrt(np.max(share)))
     return (
-        f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which is "
-        "not in the variance. Give longer segments, or use the local method (--method local)",
+        f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which "
+        "the variance does not include. Give longer segments, or use the local method (--method local)",
     )
 
 
@@ -263,8 +263,8 @@ def _told_apart(S: Complex) -> None:
     worst = float(np.max(np.linalg.cond(S / scale[:, :, None] / scale[:, None, :])))
     if worst > 1e10:
         raise EstimationError(
-            f"the spectra of the inputs (or outputs, for H2) are dependent, condition {worst:.1e}; under 1e10 is "
-            "needed. Excite each input on its own account, or leave one out"
+            f"the spectra of the inputs (or outputs, for H2) are dependent, condition {worst:.1e}; below 1e10 is "
+            "needed. Excite each input independently, or omit one"
         )
 
 

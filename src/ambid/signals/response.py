@@ -82,10 +82,10 @@ class FrequencyResponse:
             if values is not None and np.shape(values) != shape:
                 raise EstimationError(
                     f"frequency response: {what} has shape {np.shape(values)}; {n} frequencies, {n_y} outputs and "
-                    f"{n_u} inputs want {shape}. Correct the arrays"
+                    f"{n_u} inputs need {shape}. Correct the arrays"
                 )
         if n < 1 or np.any(np.diff(self.frequency_hz) <= 0):
-            raise EstimationError("frequency response: frequencies must be at least one, and rise. Sort them")
+            raise EstimationError("frequency response: at least one frequency is needed, in rising order. Sort them")
         if self.hold not in ("zoh", "band-limited"):
             raise EstimationError(f"frequency response: hold {self.hold!r}; it must be 'zoh' or 'band-limited'")
 
@@ -196,8 +196,8 @@ class FrequencyResponse:
 
 
 FEEDBACK = (
-    "without a reference the response is biased towards -1/controller where feedback carries the noise to the input; "
-    "give the reference r (--reference), or open_loop=True (--open-loop) if there was no feedback"
+    "without a reference the response is biased towards -1/controller where feedback carries the noise to the "
+    "input; give the reference r (--reference), or open_loop=True (--open-loop) if there is no feedback"
 )
 
 
@@ -219,8 +219,8 @@ def checked(
             raise EstimationError(f"{x.shape[0]} samples of the {what}, {u.shape[0]} of the inputs. Cut one")
     if r is not None and r.shape[1] < u.shape[1]:
         raise EstimationError(
-            f"{r.shape[1]} references for {u.shape[1]} inputs; each input needs a reference of its own to be told "
-            "apart from the others. Excite the loop at as many places"
+            f"{r.shape[1]} references for {u.shape[1]} inputs; each input needs a reference of its own. Excite the "
+            "loop at as many places"
         )
     return u, y, r
 
@@ -235,10 +235,12 @@ def columns(x: Array, what: str, names: Sequence[str] | None = None) -> Array:
     called = [f"{what} {names[k]!r}" if names and named else f"{what} {k + 1}" for k in range(x.shape[1])]
     if not np.isfinite(x).all():
         row, column = np.argwhere(~np.isfinite(x))[0]
-        raise EstimationError(f"{called[column]} is not finite at sample {row}. Mend the record, or cut that part off")
+        raise EstimationError(
+            f"{called[column]} is not finite at sample {row}. Repair the record, or cut that part off"
+        )
     for k in range(x.shape[1]):
         if np.all(x[:, k] == x[0, k]):
-            raise EstimationError(f"{called[k]} is constant; it has no frequency response. Leave it out")
+            raise EstimationError(f"{called[k]} is constant; it has no frequency response. Omit it")
     return x
 
 
@@ -289,8 +291,8 @@ def weak_inputs(Z: Complex, covariance: Complex, n_y: int) -> tuple[str, ...]:
     if not bad:
         return ()
     return (
-        f"at {bad} of {n} lines the excitation of the inputs is under 10 dB above their noise: G is biased there and "
-        "its deviation underestimated. Average longer, or excite more",
+        f"at {bad} of {n} lines the excitation of the inputs is less than 10 dB above their noise: G is biased "
+        "there and its standard deviation too small. Average longer, or excite more",
     )
 
 
@@ -321,8 +323,8 @@ def right_inverse(U: Complex, weight: Complex | None = None) -> Complex:
     worst = int(np.argmin(s[:, -1] / np.maximum(s[:, 0], np.finfo(float).tiny)))
     if s[worst, -1] <= 1e-10 * s[worst, 0]:
         raise EstimationError(
-            f"the {n_u} inputs move together at line {worst + 1} of the estimate; their effects cannot be told apart. "
-            "Use experiments or references that are linearly independent at every line"
+            f"the {n_u} inputs move together at line {worst + 1} of the estimate; their effects cannot be "
+            "distinguished. Use experiments or references that are linearly independent at every line"
         )
     if m == n_u:
         return np.asarray(np.linalg.inv(U))

@@ -80,7 +80,7 @@ class Simulation:
         """One sentence for each thing that a user should know: an unstable loop, each limit that was met."""
         rate, found = self.record.rate_hz, []
         if self.largest_pole > 1.0 + 1e-9:
-            found.append(f"the loop is unstable: its largest pole has the modulus {self.largest_pole:.6g}")
+            found.append(f"the loop is unstable: its largest pole has magnitude {self.largest_pole:.6g}")
         if self.first_contact is not None:
             found.append(f"the rotor touched a stop at sample {self.first_contact} ({self.first_contact / rate:.6g} s)")
         if self.first_saturated is not None:
@@ -215,7 +215,7 @@ class VaryingLoop:
             self.tables = Tables(of, plant.parameters, v.parameters, v.gains, rate_hz, fraction, grid)
         else:
             if self._told:
-                raise ModelError("a nonlinear plant does not vary. Give a LinearPlant, or leave the variation out")
+                raise ModelError("a nonlinear plant does not vary. Give a LinearPlant, or omit the variation")
             self._equations = self.standing.equations(period, fraction, substeps)
         self._run: Callable[..., int] = run
         self._rng, self.current_offset = np.random.default_rng(seed), current_offset
@@ -287,12 +287,12 @@ class VaryingLoop:
         at = f"at sample {sample} ({sample / self.rate_hz:.6g} s); an unstable plant needs a loop"
         if self._told:
             return (
-                f"the simulation leaves the finite numbers {at} that holds it while it changes, and stops. Give"
-                " limits.position, another loop, or a smaller change"
+                f"the simulation diverges {at} that holds it while it changes, and stops. Give limits.position, "
+                "another loop, or a smaller change"
             )
         return (
-            f"the simulation leaves the air gap or the finite numbers {at}, and stops in the gap. Give limits.position,"
-            " another loop, or more substeps"
+            f"the simulation leaves the air gap or diverges {at}, and stops in the gap. Give limits.position, "
+            "another loop, or more substeps"
         )
 
     def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None, dict[str, Array]]:
@@ -478,15 +478,15 @@ def largest_amplitude(
 
     if not allowed(0.0):
         raise ModelError(
-            f"the bench exceeds {fraction:g} of its limits without any excitation; nothing may be added. Lower the"
-            " noise, or correct the loop or the limits"
+            f"the bench exceeds {fraction:g} of its limits without any excitation. Reduce the noise, or correct "
+            "the loop or the limits"
         )
     low, high = 0.0, _first_guess(unit, limits, point)
     while allowed(high):
         low, high = high, 4.0 * high
         if not math.isfinite(high):
             raise ModelError(
-                "no limit is met by any amplitude; the excitation moves nothing that is limited. Limit the voltage"
+                "no amplitude reaches a limit: the excitation moves nothing that is limited. Limit the voltage"
             )
     while high - low > accuracy * high:
         middle = 0.5 * (low + high)

@@ -44,8 +44,8 @@ class LinearPlant:
             if value is None or not math.isfinite(value) or (spec.positive and value <= 0.0):
                 rule = "a positive number" if spec.positive else "a number"
                 raise ModelError(
-                    f"parameter {spec.name!r} of model {self.model.name!r} is {value}; a simulation wants {rule} in"
-                    f" {spec.unit}. Give {spec.name}"
+                    f"parameter {spec.name!r} of model {self.model.name!r} is {value}; a simulation needs {rule} "
+                    f"in {spec.unit}. Give {spec.name}"
                 )
         full = {s.name: float(self.parameters.get(s.name, s.default or 0.0)) for s in self.model.parameters}
         object.__setattr__(self, "parameters", MappingProxyType(full))
@@ -225,7 +225,7 @@ def closed_loop_poles(
         z = closed_loop_matrix(parameters, loop, rate_hz, of=of)
     if not np.isfinite(z).all():
         given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
-        raise ModelError(f"the loop at {rate_hz:g} Hz is beyond all numbers ({given}). Correct the parameters")
+        raise ModelError(f"the loop at {rate_hz:g} Hz diverges ({given}). Correct the parameters")
     if loop.ki == 0.0:
         keep = np.arange(z.shape[0]) != z.shape[0] - 3
         z = z[np.ix_(keep, keep)]

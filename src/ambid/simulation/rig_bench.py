@@ -44,14 +44,14 @@ def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
     known = rig.magnet
     if known is None:
         raise RigError(
-            f"rig {rig.name!r} has no [magnet]; a nonlinear simulation needs one. Add it with kind and numbers, or"
-            " leave nonlinear out"
+            f"rig {rig.name!r} has no [magnet]; a nonlinear simulation needs one. Add it with kind and parameters, "
+            "or omit nonlinear"
         )
     kind = "single" if known.kind == "auto" and known.gap == "exponential" else known.kind
     if kind == "auto":
         raise RigError(
-            f"rig {rig.name!r}: magnet.kind is 'auto'; a simulation has no record to tell it by. Give kind = 'single'"
-            " or 'pair'"
+            f"rig {rig.name!r}: magnet.kind is 'auto', which a simulation cannot resolve without a record. Give "
+            "kind = 'single' or 'pair'"
         )
     law = MagnetLaw(
         gap=known.gap or "hyperbolic", pair=kind == "pair", saturation=known.saturation,
@@ -311,7 +311,7 @@ class Bench:
         rate = source.record.rate_hz if rate_hz is None else rate_hz
         if rate is None:
             raise RigError(
-                f"rig {source.name!r} names no rate; a simulation needs one. Give the rate, or record.rate_hz"
+                f"rig {source.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz"
             )
         return cls(
             name=source.name, plant=plant, loop=found or Loop(), limits=source.limits or Limits(),
@@ -439,8 +439,8 @@ def _raw(channel: Channel, c: RigChannel) -> Channel:
         slopes = np.diff(calibration.out)
         if not (np.all(slopes >= 0.0) or np.all(slopes <= 0.0)):
             raise RigError(
-                f"channels.{c.role}.table rises and falls; a simulated {c.role} cannot be put back through it."
-                " Simulate with a rig without that table"
+                f"channels.{c.role}.table is not monotonic; a simulated {c.role} cannot be inverted through it. "
+                "Simulate with a rig without that table"
             )
         rising = slice(None) if slopes.sum() > 0.0 else slice(None, None, -1)
         out, raw = calibration.out[rising], calibration.raw[rising]

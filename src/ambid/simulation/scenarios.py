@@ -82,7 +82,7 @@ def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[
     """
     begin, end = max(first, 8), n_samples - 8
     if not 0.0 < share <= 0.5:
-        raise RecordError(f"the share of lost samples is {share}; it is above 0 and at most 0.5. Correct it")
+        raise RecordError(f"the share of lost samples is {share}; it must be above 0 and at most 0.5. Correct it")
     if end - begin < 64:
         raise RecordError(
             f"{max(0, end - begin)} samples can be lost from sample {first} on; losses need 64. Record for longer"
@@ -175,7 +175,7 @@ def amplitude_for(bench: Bench, shape: Array, seed: int) -> float:
     """Return the amplitude that uses 0.4 of the limits, to three digits."""
     if not any(math.isfinite(e) for pair in (bench.limits.voltage, bench.limits.current) for e in pair):
         raise ModelError(
-            f"bench {bench.name!r} limits neither voltage nor current; no amplitude can be chosen. Give one"
+            f"bench {bench.name!r} limits neither voltage nor current, so no amplitude can be derived. Give one"
         )
     return bench.largest(np.tile(shape, 2), seed, _FRACTION)
 
@@ -261,7 +261,7 @@ class Scenario:
             If a size is given that is not finite, or the scenario has none.
         """
         if given is not None and not self.size_is:
-            raise ModelError(f"scenario {self.name!r} has no size. Leave the size out")
+            raise ModelError(f"scenario {self.name!r} has no size. Omit the size")
         if given is not None and not math.isfinite(given):
             raise ModelError(f"the size of scenario {self.name!r} is {given}; it must be finite. Give {self.size_is}")
         found = self.size if given is None else given
@@ -304,7 +304,7 @@ def scenario(name: str) -> Scenario:
     if name not in SCENARIOS:
         known = list(SCENARIOS)
         raise ModelError(
-            f"there is no scenario {name!r}; there are {', '.join(known)}.{nearest(name, known)} Give one of them"
+            f"scenario {name!r} is unknown; known: {', '.join(known)}.{nearest(name, known)} Give one of them"
         )
     return SCENARIOS[name]
 
@@ -381,7 +381,7 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 name="change",
-                summary="k_i jumps by -15 %, in the force and in the motional voltage",
+                summary="k_i drops by 15 %, in the force and in the back-EMF",
                 duration_s=4.0, size=-0.15, size_is=f"{_PART} of k_i", vary=_jump("k_i"),
             ),
             Scenario(
@@ -391,28 +391,28 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             ),
             Scenario(
                 name="sensor-gain",
-                summary="the position sensor loses 20 % of its gain, and the controller does not know",
+                summary="the position sensor loses 20 % of its gain, unknown to the controller",
                 duration_s=4.0, size=-0.2, size_is=f"{_PART} of the position sensor's gain", vary=_sensor,
             ),
-            Scenario(name="quiet", summary="nothing changes and nothing excites", duration_s=60.0, excited=False),
+            Scenario(name="quiet", summary="nothing changes, no excitation", duration_s=60.0, excited=False),
             Scenario(
                 name="spin-up",
-                summary="the rotor spins up to 15 000 rpm, out of balance (G 2.5 there)",
+                summary="the rotor spins up to 15 000 rpm with unbalance (G 2.5 there)",
                 duration_s=20.0, begins=0.05, size_is="unbalance in kg m", vary=_spin_up, own_size=_unbalance_of,
             ),
             Scenario(
                 name="saturation",
-                summary="a fast excitation is added that meets the limits of the voltage",
-                duration_s=4.0, size=1.5, size_is="its peak over the room of the voltage", driven=True,
+                summary="a fast excitation that reaches the voltage limits",
+                duration_s=4.0, size=1.5, size_is="its peak over the available voltage", driven=True,
             ),
             Scenario(
                 name="dropped",
                 summary="samples are lost: empty cells, empty rows, missing rows",
-                duration_s=4.0, begins=0.1, size=0.01, size_is="share of the samples that is lost", dropped=True,
+                duration_s=4.0, begins=0.1, size=0.01, size_is="share of lost samples", dropped=True,
             ),
             Scenario(
                 name="offset",
-                summary="a constant load comes on: a tenth of what the current's limit can hold",
+                summary="a constant load of a tenth of what the current limit can hold",
                 duration_s=4.0, size_is="force in N", vary=_load, own_size=_load_of,
             ),
         )
@@ -601,7 +601,7 @@ class _Run:
         if not force:
             b.refuse_unstable()
         if at_s is not None and not self.scenario.size_is:
-            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Leave the time out")
+            raise ModelError(f"scenario {self.scenario.name!r} has no beginning: nothing changes. Omit the time")
         self.at_s = self.scenario.begins * self.duration_s if at_s is None else at_s
         if not 0.0 <= self.at_s < self.duration_s:
             raise ModelError(
@@ -611,7 +611,7 @@ class _Run:
         if amplitude is not None and not (math.isfinite(amplitude) and amplitude >= 0.0):
             raise ModelError(f"amplitude is {amplitude}; it must be zero or positive. Correct it")
         if amplitude and not self.scenario.excited:
-            raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Leave the amplitude out")
+            raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Omit the amplitude")
         self.size = self.scenario.size_for(b, size)
         self.amplitude, self._period, self._extra = 0.0, np.zeros(1), np.zeros(1)
         self._prepare_excitation(amplitude)

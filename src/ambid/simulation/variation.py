@@ -42,8 +42,8 @@ class Schedule:
         t, v = np.asarray(self.times_s, dtype=np.float64), np.asarray(self.values, dtype=np.float64)
         if t.size == 0 or t.shape != v.shape or not (np.isfinite(t).all() and np.isfinite(v).all()):
             raise ModelError(
-                f"a schedule has {t.size} times and {v.size} values; it wants as many finite numbers of each, at least"
-                " one. Correct them"
+                f"a schedule has {t.size} times and {v.size} values; it needs as many finite values as times, at "
+                "least one. Correct them"
             )
         if (np.diff(t) < 0.0).any():
             raise ModelError("the times of a schedule fall; they must rise or stay (a jump). Sort them")

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, counted, nearest
 from ambid.tracking.evidence import Evidence
 from ambid.tracking.supervise_kernels import watch
 
@@ -63,13 +63,16 @@ class Alarm:
     @property
     def why(self) -> str:
         """The alarm in one line."""
-        seen = f"{self.blocks} block{'s' if self.blocks > 1 else ''} from sample {self.onset}"
+        seen = f"{counted(self.blocks, 'block')} from sample {self.onset}"
         if self.parameter is None:
-            what = f"noise at {self.noise:.2f} of its usual level, all numbers together at {self.joint:.0f}"
-            return f"no one number explains {seen}: {what} (statistic {self.statistic:.0f} over {self.threshold:.0f})"
+            what = f"noise at {self.noise:.2f} of its usual level, all parameters together at {self.joint:.0f}"
+            return (
+                f"no single parameter explains {seen}: {what} (statistic {self.statistic:.0f} above "
+                f"{self.threshold:.0f})"
+            )
         doubt = f"; {', '.join(n for n, _ in self.rivals)} would explain it nearly as well" if self.rivals else ""
-        move = f"{self.parameter} moved by {self.size:+.3g} (sd {self.sd:.2g})"
-        return f"{move} in {seen}: statistic {self.statistic:.0f} over {self.threshold:.0f}{doubt}"
+        move = f"{self.parameter} changed by {self.size:+.3g} (sd {self.sd:.2g})"
+        return f"{move} in {seen}: statistic {self.statistic:.0f} above {self.threshold:.0f}{doubt}"
 
 
 class ChangeDetector:
@@ -115,10 +118,10 @@ class ChangeDetector:
         self.hypotheses = self.names if hypotheses is None else tuple(hypotheses)
         for name in self.hypotheses:
             if name not in self.names:
-                raise EstimationError(f"hypothesis {name!r} is none of the tracked numbers.{nearest(name, self.names)}")
+                raise EstimationError(f"hypothesis {name!r} is not a tracked parameter.{nearest(name, self.names)}")
         if not (block_s > 0 and false_alarms_per_hour > 0 and overdispersion >= 1):
             raise EstimationError(
-                "block_s and false_alarms_per_hour are positive, overdispersion at least 1. Mend them"
+                "block_s and false_alarms_per_hour must be positive, overdispersion at least 1. Correct them"
             )
         self._margin = margin
         p, tests, longest = len(self.names), len(self.hypotheses) + 2, max(_FEWEST, round(longest_s / block_s))
@@ -165,7 +168,7 @@ class ChangeDetector:
         p = len(self.names)
         if evidence.r.size != p:
             raise EstimationError(
-                f"the evidence has {evidence.r.size} numbers; the detector watches {p}. Give the same"
+                f"the evidence has {evidence.r.size} parameters; the detector watches {p}. Give the same"
             )
         if not self._blocks:
             self._point = evidence.at
@@ -176,9 +179,7 @@ class ChangeDetector:
         note = self._notes[slot]
         note[:] = evidence.rest, evidence.freedom, evidence.first, self._blocks
         if not math.isfinite(base.sum() + before.sum() + note[0]):
-            raise EstimationError(
-                f"a number of the block at sample {evidence.first} is not finite. Leave the block out"
-            )
+            raise EstimationError(f"a value of the block at sample {evidence.first} is not finite. Omit the block")
         self._counts[0] += 1
         self._blocks += 1
         settling, calm = self._seen < self._settle, self._wait <= 0

@@ -331,7 +331,7 @@ class Diagnosis:
         if all(self._kind(name) in _DISTURBED for name in found.moved):
             self.settling = True
             return
-        why = f"{names} found anew from the samples after the change in {found.computing_s * 1e3:.1f} ms"
+        why = f"{names} estimated again from the samples after the change"
         self._publication.propose(t, why)
         self._publication.unconfirmed = self.renewed = True
 
@@ -346,7 +346,7 @@ class Diagnosis:
         if told.kind == "change" and told.parameter == name:
             return
         disturbed = self._kind(name) in _DISTURBED
-        what = f"the data after it are explained by {', '.join(found.moved)}"
+        what = f"a change of {', '.join(found.moved)} explains the data after it"
         event = Event(
             kind="disturbed" if disturbed else "change",
             t=told.t,
@@ -365,22 +365,24 @@ class Diagnosis:
     def _no_change(self, t: float) -> None:
         """No change explains wild innovations: they are noise as long as that can be believed."""
         level, deaf = self.unexplained.level, self.unexplained.deaf
-        seen = f"the innovations' variance is {level:.3g} times that at identification"
+        seen = f"the innovation variance is {level:.3g} times that at identification"
         self._fresh_start()
         if self.unexplained.believable and not deaf:
             self.unexplained.over()
             self._take_as_noise(level)
-            self._log.add(Event(kind="disturbed", t=t, why=f"{seen}, and no change explains it: taken as noise"))
+            self._log.add(
+                Event(kind="disturbed", t=t, why=f"{seen}, and no change of a parameter explains it: treated as noise")
+            )
             return
         if not deaf:
-            self._log.add(Event(kind="frozen", t=t, why=f"{seen}: the model fails, and nothing is learned meanwhile"))
+            self._log.add(Event(kind="frozen", t=t, why=f"{seen}: the model does not fit, and learning is suspended"))
         self.unexplained.close_ears(t)
 
     def _give_up(self, t: float) -> None:
         """Let the recursion find what no search has found: all parameters are unknown again."""
         for place in self._rpem.numbers.places("parameter"):
             self._rpem.filter.widen(int(place), _UNKNOWN)
-        why = "nothing explains the data after the change; all parameters are found anew"
+        why = "nothing explains the data after the change; all parameters are estimated again"
         self._log.add(Event(kind="disturbed", t=t, why=why))
         self._fresh_start()
         self._publication.unconfirmed = True

@@ -175,7 +175,7 @@ class _Producer:
             self._process.join()
         if dead:
             return EstimationError(
-                f"the process of the source died with exit code {self._process.exitcode} before its end. Start it again"
+                f"the source process ended early with exit code {self._process.exitcode}. Start it again"
             )
         return told
 
@@ -208,7 +208,7 @@ def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connectio
         except BrokenPipeError:
             raise
         except Exception:
-            tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Mend the source"))
+            tell.send(EstimationError(f"the source of blocks failed: {outcome!r}. Correct the source"))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

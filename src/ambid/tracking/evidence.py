@@ -116,8 +116,8 @@ def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forc
     if u is None or y is None or len(lengths) > 1 or (forcing is None and numbers.synchronous):
         more = " and the unbalance its forcing" if numbers.synchronous else ""
         raise EstimationError(
-            f"inputs have shape {np.shape(inputs)}, outputs {np.shape(outputs)}; the model wants {len(model.inputs)}"
-            f" and {len(model.outputs)} columns of one length{more}. Check the block"
+            f"inputs have shape {np.shape(inputs)}, outputs {np.shape(outputs)}; the model needs "
+            f"{len(model.inputs)} and {len(model.outputs)} columns of one length{more}. Check the block"
         )
     return Samples(u=u, y=y, forcing=extra if numbers.synchronous else None)
 

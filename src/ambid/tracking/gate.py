@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 from scipy.linalg.lapack import dposv
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.recursive.lines import Event
 from ambid.tracking.evidence import Evidence, EvidenceSum
 
@@ -53,8 +53,8 @@ class Comparison:
     def text(self) -> str:
         """The reason in numbers, one line."""
         return (
-            f"over {self.blocks} blocks gain {self.gain:.3g}, expected {self.separation:.3g} with sd {self.sd:.2g}, "
-            f"misfit {self.misfit:.3g}"
+            f"over {counted(self.blocks, 'block')}: gain {self.gain:.3g}, expected {self.separation:.3g} with sd "
+            f"{self.sd:.2g}, lack of fit {self.misfit:.3g}"
         )
 
     @property
@@ -108,7 +108,7 @@ class Gate:
         from scipy.special import chdtri, ndtri
 
         if not (kept >= 2 and 1 <= blocks <= longest and probation >= 0 and 0 < level < 0.5 and 0 < back < 0.5):
-            raise EstimationError("gate: kept >= 2, 1 <= blocks <= longest, levels between 0 and 0.5. Mend them")
+            raise EstimationError("gate: kept >= 2, 1 <= blocks <= longest, levels between 0 and 0.5. Correct them")
         self.names, self.overdispersion = tuple(names), overdispersion
         self.last: Comparison | None = None
         self._apart, self._blocks, self._longest, self._probation = apart_s, blocks, longest, probation
@@ -154,7 +154,9 @@ class Gate:
         self._trial.clear(values)
         if earlier is None:
             return None
-        return Event(kind="refused", t=t, why=f"a newer candidate takes its place after {n} blocks: {earlier.why}")
+        return Event(
+            kind="refused", t=t, why=f"replaced by a newer candidate after {counted(n, 'block')}: {earlier.why}"
+        )
 
     def restart(self) -> None:
         """Drop the candidate and end the probation: data from before a change say nothing of what holds now."""
@@ -184,13 +186,13 @@ class Gate:
         if claims and seen.separation < (2 * z) ** 2:
             if self._trial.blocks < self._longest:
                 return None
-            return self._refuse(t, seen, "the later data cannot tell it from the accepted numbers")
+            return self._refuse(t, seen, "later data do not distinguish it from the accepted values")
         if seen.misfit > self._misfit * seen.scale:
-            return self._refuse(t, seen, f"its own misfit is larger than {self._misfit * seen.scale:.3g}")
+            return self._refuse(t, seen, f"its own lack of fit exceeds {self._misfit * seen.scale:.3g}")
         # what claims nothing new comes every few blocks: it is refused only where chance is out of the question
         allowance = max(0.0, (1 if claims else 2) * self._z * seen.sd - seen.separation)
         if seen.gain < -allowance:
-            return self._refuse(t, seen, f"the accepted numbers predict better; chance allows {allowance:.3g}")
+            return self._refuse(t, seen, f"the accepted values predict better, by more than {allowance:.3g}")
         return self._accept(new, t, f"{new.why}: {seen.text}", seen)
 
     def accept(self, t: float) -> Event:
@@ -199,8 +201,10 @@ class Gate:
         `t`: s of record. Returns ``accepted``, or ``refused`` if none waits.
         """
         if self._candidate is None:
-            return Event(kind="refused", t=t, why="no candidate waits that could be accepted")
-        return self._accept(self._candidate, t, f"{self._candidate.why}: unjudged, by order", None)
+            return Event(kind="refused", t=t, why="no candidate is waiting for acceptance")
+        return self._accept(
+            self._candidate, t, f"{self._candidate.why}: accepted without validation, by operator order", None
+        )
 
     def revert(self, t: float | None = None, why: str = "by order") -> Event:
         """Go back to the numbers accepted before; a waiting candidate is dropped.
@@ -211,7 +215,7 @@ class Gate:
         left = self.accepted
         t = left.t if t is None else t
         if len(self._history) < 2:
-            return Event(kind="refused", t=t, why="there are no earlier numbers to go back to")
+            return Event(kind="refused", t=t, why="there are no earlier values to return to")
         return self._return(self._history[-2], t, why)
 
     def _return(self, goal: Accepted, t: float, why: str) -> Event:
@@ -225,7 +229,7 @@ class Gate:
         return Event(
             kind="reverted",
             t=t,
-            why=f"{why}: from the numbers of {left.t:.3f} s back to those of {self.accepted.t:.3f} s",
+            why=f"{why}: from the values of {left.t:.3f} s back to those of {self.accepted.t:.3f} s",
             values=dict(zip(self.names, self.accepted.values.tolist(), strict=True)),
         )
 
@@ -241,7 +245,7 @@ class Gate:
         seen = self._compare(self._watched, self.accepted, self._before)
         if -seen.gain > self._z_back * seen.sd:
             self.last, goal = seen, self._before
-            return self._return(goal, t, f"the earlier numbers predict better ({seen.text})")
+            return self._return(goal, t, f"the earlier values predict better ({seen.text})")
         if n >= self._probation:
             self._before = None
         return None
@@ -291,7 +295,9 @@ class Gate:
         """Return copies, or refuse them."""
         q, P, p = np.array(values, dtype=float), np.array(covariance, dtype=float), len(self.names)
         if q.shape != (p,) or P.shape != (p, p) or not (np.isfinite(q).all() and np.isfinite(P).all()):
-            raise EstimationError(f"gate: {p} finite numbers and their ({p}, {p}) covariance are wanted, got {q.shape}")
+            raise EstimationError(
+                f"gate: {p} finite values and their ({p}, {p}) covariance are needed, got {q.shape}. Correct them"
+            )
         return q, P
 
 

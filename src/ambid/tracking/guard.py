@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.tracking.blocks import Block, Ledger, Part, Passed, RejectionKind, RowKind, Stretch
 from ambid.tracking.order import BlockOrder, SampleClock
 
@@ -208,10 +208,10 @@ _LARGEST = 2**62  # of a sample number
 _TOLERANCE = 0.75  # of a sample: a stamp rounded to samples lies within half of one
 _WHY: Mapping[RowKind, str] = MappingProxyType(
     {
-        "nan": "hold a value that is not finite",
-        "range": "are beyond the credible limits",
-        "saturated": "lie at a rail",
-        "stuck": "repeat the last value of a channel: it is frozen",
+        "nan": "not finite",
+        "range": "beyond the credible limits",
+        "saturated": "at a rail",
+        "stuck": "repeating the last value of a channel, which is frozen",
     }
 )
 
@@ -335,7 +335,7 @@ class StreamGuard:
         self.n_received += size
         number = self._number(block.first)
         if number is None:
-            why = f"the block says that it begins at sample {str(block.first)[:40]}"
+            why = f"the block claims to start at sample {str(block.first)[:40]}"
             self._ledger.reject("number", size, self._order.next, why)
             return None
         try:
@@ -391,7 +391,7 @@ class StreamGuard:
         """Refuse rows that repeat the last value of a channel when nothing follows to tell whether it was frozen."""
         part, self._undecided = self._undecided, None
         if part is not None:
-            why = f"{part.size} samples from {part.first} on repeat the last value of a channel up to a gap"
+            why = f"{counted(part.size, 'sample')} from {part.first} on repeat the last value of a channel up to a gap"
             self._ledger.reject("stuck", part.size, part.first, why)
 
     def _break(self) -> None:
@@ -407,7 +407,7 @@ class StreamGuard:
             if count:
                 sound &= ~rows
                 at = first + int(np.argmax(rows))
-                self._ledger.reject(kind, count, at, f"{count} samples from {at} on {_WHY[kind]}")
+                self._ledger.reject(kind, count, at, f"{counted(count, 'sample')} from {at} on: {_WHY[kind]}")
         for start, stop in [(0, values.shape[0])] if not found else _runs(sound):
             restart = self._restart or first + start != self._given_to
             self._ledger.give(Stretch(values=values[start:stop], first=first + start, restart=restart))

@@ -288,7 +288,7 @@ def read_track(path: str | Path) -> Track:
     tally, lines, summary = Tally(header), list[TrackLine](), None
     for k, row in numbered[1:]:
         if summary is not None:
-            raise RecordError(f"track {path}, line {k}: it stands behind the summary, which is the last. Remove it")
+            raise RecordError(f"track {path}, line {k}: it follows the summary, which must be last. Remove it")
         line = _parsed(path, k, row, _line_or_summary)
         if isinstance(line, TrackSummary):
             summary = line
@@ -296,8 +296,8 @@ def read_track(path: str | Path) -> Track:
         others = line.parameters.keys() ^ (lines[0].parameters if lines else header.start or line.parameters).keys()
         if others:
             raise RecordError(
-                f"track {path}, line {k}: parameter {min(others)!r} stands here or in the lines before, not in both."
-                " Restore the file"
+                f"track {path}, line {k}: parameter {min(others)!r} is either here or in the lines before, not in "
+                "both. Restore the file"
             )
         if lines and not line.t > lines[-1].t:
             raise RecordError(
@@ -324,14 +324,14 @@ def _loaded(row: bytes) -> Any:
 
 
 def _no_number(word: str) -> float:
-    raise ValueError(f"{word} is no number of JSON")
+    raise ValueError(f"{word} is not a JSON number")
 
 
 def _parsed(path: Path, number: int, row: bytes, read: Callable[[Mapping[str, Any]], T]) -> T:
     try:
         document = _loaded(row)
     except ValueError:
-        raise RecordError(f"track {path}, line {number}: it is no JSON. Restore the file") from None
+        raise RecordError(f"track {path}, line {number}: it is not JSON. Restore the file") from None
     try:
         return read(document)
     except KeyError as missing:

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, counted, nearest
 from ambid.recursive.lines import Event
 from ambid.recursive.square_root_kernels import deviations
 from ambid.tracking.evidence import Evidence
@@ -34,8 +34,8 @@ class ErrorLevel:
     def __init__(self, limit: float, release: float, window_blocks: int) -> None:
         if not (0 < release <= limit and window_blocks >= 1):
             raise EstimationError(
-                f"error level: 0 < release <= limit, a window of a block or more; got release "
-                f"{release:g}, limit {limit:g}, {window_blocks} blocks. Mend them"
+                f"error level: 0 < release <= limit, a window of a block or more; got release {release:g}, limit "
+                f"{limit:g}, {counted(window_blocks, 'block')}. Correct them"
             )
         self.limit, self.release = limit, release
         self.above, self.n_blocks = False, 0
@@ -119,7 +119,7 @@ class ExcitationMonitor:
                     f"reference_rate of {name} is {value:g}; it is an information rate. Give 0 or more"
                 )
         if not (0 < block_s < window_s and 0 < freeze <= thaw and enough >= 0):
-            raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Mend them")
+            raise EstimationError("excitation: 0 < block_s < window_s, 0 < freeze <= thaw, enough >= 0. Correct them")
         self._judged = tuple(name for name in self.names if name in reference_rate)
         self._held = np.array([self.names.index(name) for name in held], dtype=np.int64)
         self._at = tuple(self.names.index(name) for name in self._judged)
@@ -151,7 +151,7 @@ class ExcitationMonitor:
         J, duration = evidence.J, self.duration_s * self._decay + self._block
         if J.shape != self._R.shape or not math.isfinite(J.sum()):
             raise EstimationError(
-                f"the block at sample {evidence.first} is not finite or of other numbers. Leave it out"
+                f"the block at sample {evidence.first} is not finite or has other parameters. Omit it"
             )
         self._rows[:] = J.T
         if self._held.size:
@@ -177,9 +177,9 @@ class ExcitationMonitor:
             sd, reference = float(self.sd[j]), float(self._reference[j])
             rate = 1.0 / (sd * sd * self.duration_s)
             part = rate / reference if reference > 0 else math.inf
-            seen = f"the last {self._window:g} s alone would give {name} to {100 * sd:.3g} %"
+            seen = f"the last {self._window:g} s alone determine {name} to {100 * sd:.3g} %"
             if sd > 0.5 / _RIDGE:
-                seen = f"the last {self._window:g} s tell nothing of {name}"
+                seen = f"the last {self._window:g} s contain no information on {name}"
             events.append(
                 Event(
                     kind="thawed" if thawed else "frozen",

@@ -114,7 +114,9 @@ def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
             continue
         if _memory(A - gain @ C) <= longest:
             return gain
-    raise EstimationError("no predictor of this estimate forgets its start. Give a model whose states the outputs show")
+    raise EstimationError(
+        "every predictor of this estimate is too slow to forget its start. Give a model whose states are observable"
+    )
 
 
 _PARTS, _PART_RAD = 25, 10.0  # parts of a record in which speed and angle are compared, each at least so long
@@ -181,8 +183,8 @@ def _check_agreement(speed: Array, angle: Array, period: float) -> None:
     ratio = float(np.median(along / np.add.reduceat(np.abs(expected), begins)))  # gaps spoil few of the parts
     if abs(ratio - 1.0) > _AGREE:
         raise EstimationError(
-            f"the angle turns at {ratio:.4g} times the speed; they have to agree within {_AGREE:.0%}. Check the units"
-            " of both (rpm or rad/s, deg or rad) and their signs, or leave one of them out"
+            f"the angle turns at {ratio:.4g} times the speed; they must agree within {_AGREE:.0%}. Check the units"
+            " of both (rpm or rad/s, deg or rad) and their signs, or omit one of them"
         )
 
 
@@ -320,7 +322,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         warnings=_poorly_known(estimate),
     )
     if assemble(problem, found.vector(found.start), with_derivatives=False) is None:
-        raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+        raise EstimationError("the start estimate gives no stable predictor. Identify the bench again")
     return found
 
 
@@ -415,8 +417,8 @@ def _poorly_known(estimate: Estimate) -> tuple[str, ...]:
     if not wide:
         return ()
     return (
-        f"the start knows {', '.join(wide)} only: what is tracked of them may claim too narrow an interval. Start from"
-        " a longer or better excited record",
+        f"the start determines {', '.join(wide)} only: their tracked intervals may be too narrow. Start from a "
+        "longer or better excited record",
     )
 
 

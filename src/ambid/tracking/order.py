@@ -15,7 +15,7 @@ from math import isfinite, sqrt
 
 import numpy as np
 
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.tracking.blocks import Ledger, Part, RejectionKind
 
 DRIFT_SD = 1e-4  # of a crystal against its stated rate, before anything is known
@@ -233,7 +233,7 @@ class BlockOrder:
         if before is not None and follows and (self._runs_on(before) or self._old_samples >= self._patience):
             self._count_anew([part])
         else:
-            self._reject("repeated", part, f"came again or too late: {self.next} is wanted")
+            self._reject("repeated", part, f"came again or too late: expected {self.next}")
 
     def _count_anew(self, parts: Sequence[Part]) -> None:
         """Follow a counter that jumped, under numbers that go on."""
@@ -275,7 +275,7 @@ class BlockOrder:
     def _jump(self, part: Part) -> str:
         assert self._clock is not None
         off = self._clock.deviation(part.first, part.time_s)
-        return f"{'forward' if off > 0 else 'back'} by {abs(off):.4g} s" if isfinite(off) else "beyond reason"
+        return f"{'forward' if off > 0 else 'back'} by {abs(off):.4g} s" if isfinite(off) else "by an implausible time"
 
     def _dismiss(self) -> None:
         """Refuse the doubtful block: nothing confirmed it."""
@@ -321,7 +321,9 @@ class BlockOrder:
         part = self._waiting.pop(0)
         missing = self._missing_before(part)
         if missing:
-            self._ledger.reject("gap", missing, self.next, f"{missing} samples before {part.first} never came")
+            self._ledger.reject(
+                "gap", missing, self.next, f"{counted(missing, 'sample')} before {part.first} never came"
+            )
         self._place(part)
 
     def _release_all(self) -> None:

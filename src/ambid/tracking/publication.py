@@ -94,11 +94,13 @@ class Operator:
         `t`: time of the stream, s; `why`: the operator's reason, for the log. Returns for the log.
         """
         if flag not in _FLAGS:
-            raise EstimationError(f"operator flag {flag!r} is none of {', '.join(_FLAGS)}.{nearest(flag, _FLAGS)}")
+            raise EstimationError(
+                f"operator flag {flag!r} is unknown; known: {', '.join(_FLAGS)}.{nearest(flag, _FLAGS)}"
+            )
         with self._lock:
             if flag == "accept" or flag == "revert":
                 if self._order not in (None, flag):
-                    raise EstimationError(f"operator: {self._order!r} waits to be done. Give {flag!r} after that")
+                    raise EstimationError(f"operator: {self._order!r} is still pending. Give {flag!r} after that")
                 self._order = "accept" if flag == "accept" else "revert"
                 what = f"operator orders {flag}"
             else:
@@ -225,7 +227,7 @@ class Publication:
             if event is not None:
                 confirmed = self._decided(event, before)
         if not self.gate.pending:
-            self.propose(t, "the recursion went on")
+            self.propose(t, "the recursion continued")
         return confirmed
 
     def _decided(self, event: Event, before: Accepted) -> bool:
@@ -253,7 +255,7 @@ class Publication:
             return False
         before = self.accepted
         if order == "accept" and searching:
-            why = "a change has been found and its new value has not; there is nothing to accept"
+            why = "a change was found but not its new value; there is nothing to accept"
             self._log.add(Event(kind="refused", t=t, why=why))
         elif order == "accept":
             self.gate.restart()

@@ -118,8 +118,8 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
     coarse = int((values[equal] != values[equal - 1]).any(axis=1).sum())
     if coarse > _COARSE * rows.size:
         raise RecordError(
-            f"{coarse} of {time_s.size} rows have the time stamp of the row before them, but other values; at"
-            f" {rate_hz:g} Hz they are no samples of their own. Print time with more digits, or correct the rate"
+            f"{coarse} of {time_s.size} rows repeat the time stamp of the row before with other values; at "
+            f"{rate_hz:g} Hz they are not separate samples. Print time with more digits, or correct the rate"
         )
     longest = max(_LONGEST_GAP_S * rate_hz, 10.0 * time_s.size)
     whole = np.rint(np.clip(advance, -(2.0**53), 2.0**53)).astype(np.int64)

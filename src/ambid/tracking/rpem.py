@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Estimate
 from ambid.recursive.square_root import covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk
@@ -248,7 +248,7 @@ class PhysicalEstimator:
         self.numbers = numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
         at = linearise(numbers, numbers.start)
         if at is None:
-            raise EstimationError("the start estimate makes no predictor. Identify the bench anew")
+            raise EstimationError("the start estimate gives no stable predictor. Identify the bench again")
         self.filter = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
         self.stream = EvidenceStream(numbers, at, 1)
         self.n_used = self.n_rejected = 0
@@ -315,7 +315,7 @@ class PhysicalRpem(PhysicalEstimator):
         fewest = -(-_ROWS_PER_NUMBER * numbers.start.size // len(numbers.problem.model.outputs))
         size = max(round(BLOCK_S * numbers.rate_hz), fewest) if block is None else block
         if size < 1:
-            raise EstimationError(f"a block has {size} samples; it needs at least 1. Give a larger block")
+            raise EstimationError(f"a block has {counted(size, 'sample')}; it needs at least 1. Give a larger block")
         self.block_samples, self.block_s = size, size / numbers.rate_hz
         self.filter.active[numbers.places("gain")] = False
         self.stream = EvidenceStream(numbers, self.stream.at, size)

@@ -150,7 +150,9 @@ class Supervisor:
             if evidence is not None:
                 self._take(evidence)
             elif used == 0:
-                raise ValueError(f"sample {first + k} is not finite; the guard of the stream leaves such samples out")
+                raise ValueError(
+                    f"sample {first + k} is not finite; the guard of the stream omits such samples. Omit it"
+                )
         return np.asarray(errors * self.rpem.numbers.problem.scales.output)
 
     def wait(self, sample: int) -> None:
@@ -198,7 +200,7 @@ class Supervisor:
         if self._silent:
             self._silent = False
             without_s = (evidence.first - self._heard) / self._rate
-            self.log.add(Event(kind="thawed", t=t, why=f"the data speak again after {without_s:.3g} s"))
+            self.log.add(Event(kind="thawed", t=t, why=f"the data are informative again after {without_s:.3g} s"))
         self._heard, self._deaf_s, self._spoken = evidence.last, 0.0, True
         events = self._excitation.update(evidence, t)
         for event in events:
@@ -234,7 +236,7 @@ class Supervisor:
         error = self.level.update(evidence, self.publication.accepted.values)
         told = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
         if self.level.above and not (before or told):
-            why = f"the error is {error:.2f} times that at identification, over the limit of {self.level.limit:g}"
+            why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
             self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
 
     def _activate(self) -> None:

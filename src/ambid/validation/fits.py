@@ -20,13 +20,12 @@ from ambid.blackbox.cancellation import orders_supported
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit, structure
 from ambid.blackbox.prediction import Errors, Gradient, errors, errors_elsewhere, gradient
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import criteria, p_text, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
 from ambid.nonlinear.structures import nonlinear_structure
-from ambid.units import counted
 from ambid.validation.residuals import (
     LEAST,
     MOST,

@@ -11,11 +11,10 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, run, sweep
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import p_text
-from ambid.units import counted
 from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validation.second_record import conclude, consistency_check
 

@@ -86,9 +86,7 @@ def select(
     by = _criterion(criterion)
     for key in ranges or {}:
         if key not in (*of.orders, "nk"):
-            raise EstimationError(
-                f"{of.name} has no order {key!r}.{nearest(key, of.orders)} Leave it out of the ranges"
-            )
+            raise EstimationError(f"{of.name} has no order {key!r}.{nearest(key, of.orders)} Omit it from the ranges")
     part = data if data.n_samples <= _LONGEST else data.part(0, _LONGEST)
     trial = _Trial(of, part, by, tick)
     start = first_size(of, part, ranges or {})

@@ -22,6 +22,7 @@ from ambid.arrays import Array
 from ambid.bearing.linear import carry, free_delay
 from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import STRETCHES, Uncertainty, experiment_hint
+from ambid.errors import counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, extend, free_one, search, sparse_gain, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
@@ -30,7 +31,6 @@ from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation
-from ambid.units import counted
 from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error

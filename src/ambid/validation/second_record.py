@@ -9,7 +9,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.likelihood import (
     Fit,
@@ -23,7 +23,6 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
 from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.linear_model import model
-from ambid.units import counted
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 

@@ -159,8 +159,8 @@ def test_garbage_full_of_sync_words_is_passed_over(tmp_path, data):
         (b"", "is empty"),
         (b"time [s],x [m]\n0,1\n", "is not a journal"),
         (os.urandom(5000), "is not a journal"),
-        (preamble(), "no sound header"),
-        (preamble() + bytes(4096), "no sound header"),
+        (preamble(), "no intact header"),
+        (preamble() + bytes(4096), "no intact header"),
     ],
 )
 def test_what_is_no_journal_is_refused(tmp_path, content, says):

@@ -134,7 +134,7 @@ def test_a_second_recorder_is_refused(tmp_path):
     with Recorder(tmp_path / "run.h5", header()) as recorder:
         recorder.append(block(0))
         with (
-            pytest.raises(DeviceError, match=r"exists already.*ambid recover"),
+            pytest.raises(DeviceError, match=r"already exists.*ambid recover"),
             Recorder(tmp_path / "run.h5", header()),
         ):
             pass
@@ -184,7 +184,7 @@ def test_a_record_that_could_not_be_written_is_refused_before(tmp_path, name):
 
 def test_a_record_that_exists_is_refused_without_force(tmp_path):
     (tmp_path / "run.h5").write_text("precious")
-    with pytest.raises(DeviceError, match="exists already"), Recorder(tmp_path / "run.h5", header()):
+    with pytest.raises(DeviceError, match="already exists"), Recorder(tmp_path / "run.h5", header()):
         pass
     assert (tmp_path / "run.h5").read_text() == "precious"
     recorded(tmp_path / "run.h5", force=True)
@@ -193,7 +193,7 @@ def test_a_record_that_exists_is_refused_without_force(tmp_path):
 
 def test_a_record_that_comes_into_being_meanwhile_is_not_replaced(tmp_path):
     path = tmp_path / "run.h5"
-    recorder = refused_at_the_end(path, DeviceError, "exists already", before_close=lambda: path.write_text("precious"))
+    recorder = refused_at_the_end(path, DeviceError, "already exists", before_close=lambda: path.write_text("precious"))
     assert path.read_text() == "precious"
     assert len(contents(recorder.journal)[0]) == 10
     assert sorted(p.name for p in tmp_path.iterdir()) == ["run.h5", "run.h5.journal"]

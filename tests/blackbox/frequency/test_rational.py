@@ -200,7 +200,7 @@ def broken(what):
         ("", {"nf": 200}, {}, "too few"),
         ("", {"nf": -1}, {}, "order nf"),
         ("", {"nf": 2, "nb": 4}, {}, "order nb"),
-        ("", {"n": 2}, {}, "order 'n' is not known; it takes nb, nf"),
+        ("", {"n": 2}, {}, "order 'n' is unknown; it takes nb, nf"),
         ("", {"nf": 2}, {"domain": "w"}, "domain"),
         ("", {"nf": 2}, {"domain": "z"}, "held"),
         ("", {"nf": 2}, {"delay": -1.0}, "delay"),

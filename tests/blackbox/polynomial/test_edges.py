@@ -60,7 +60,7 @@ def test_delay_under_feedback() -> None:
     ("name", "orders", "words"),
     [
         ("oe", {"nb": 2, "nk": 1}, "order nf is missing"),
-        ("oe", {"nb": 2, "nf": 2, "na": 2, "nk": 1}, "order 'na' is not known; it takes nb, nf, nk"),
+        ("oe", {"nb": 2, "nf": 2, "na": 2, "nk": 1}, "order 'na' is unknown; it takes nb, nf, nk"),
         ("arx", {"na": -1, "nb": 2, "nk": 1}, "na = -1; it must be a whole number of at least 0"),
         ("arx", {"na": 1.5, "nb": 2, "nk": 1}, "na = 1.5; it must be a whole number"),
         ("arx", {"na": True, "nb": 2, "nk": 1}, "na = True; it must be a whole number"),

@@ -34,7 +34,7 @@ def signals(seed: int, n: int = 1000) -> tuple[np.ndarray, np.ndarray, np.ndarra
 
 def test_inputs_that_differ_by_rounding_are_refused(method):
     u, _, y = signals(0)
-    with pytest.raises(EstimationError, match=r"inputs 'u' and 'v' move together \(.*\): .* Leave one out"):
+    with pytest.raises(EstimationError, match=r"inputs 'u' and 'v' move together \(.*\): .* Omit one"):
         method(given(y, u=u, v=np.round(2 * u + 1, 9)), {"n": 1})
 
 

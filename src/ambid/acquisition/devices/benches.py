@@ -131,13 +131,13 @@ def _plant(bench: Bench) -> Iterator[str]:
         pair = isinstance(plant.magnet, DifferentialPair)
         if not isinstance(w, CoEnergy):
             raise DeviceError(
-                f"bench {bench.name!r} has a magnet with another law; the emulated one knows ideal ones. Simulate it"
-                " with ambid.simulation"
+                f"bench {bench.name!r} has a magnet with another law; the emulated bench has ideal magnets only. "
+                "Simulate it with ambid.simulation"
             )
         if (pair and (w.k_a != w.k_b or w.i0_asym != 0.0)) or plant.stage != IDEAL or math.isfinite(plant.eddy_pole):
             raise DeviceError(
-                f"bench {bench.name!r} has unequal magnets, an eddy pole or a lossy stage; the emulated one knows none"
-                " of them. Simulate it with ambid.simulation"
+                f"bench {bench.name!r} has unequal magnets, an eddy pole or a lossy stage; the emulated bench has "
+                "none of them. Simulate it with ambid.simulation"
             )
         yield f"kind {'differential' if pair else 'single'}"
         yield from _numbers({"m": plant.m, "R": plant.R, "c": plant.c, "k": w.k_b, "leakage": w.leakage})
@@ -149,8 +149,8 @@ def _plant(bench: Bench) -> Iterator[str]:
         yield from _numbers({f"rest_{name}": value for name, value in rest.items()})
     else:
         raise DeviceError(
-            f"bench {bench.name!r} is of model {plant.model.name!r}; the emulated bench knows coil, one-axis and its"
-            " magnets. Give a bench of those"
+            f"bench {bench.name!r} is of model {plant.model.name!r}; the emulated bench supports coil, one-axis "
+            "and its magnets. Give a bench of those"
         )
     low, high = bench.limits.position
     floor, ceiling = (-math.inf, math.inf) if not isinstance(plant, NonlinearPlant) else plant.magnet.range

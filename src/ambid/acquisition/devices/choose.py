@@ -26,9 +26,7 @@ def open_device(
     of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
     """
     if bench is not None and port not in ("emulated", "simulated"):
-        raise DeviceError(
-            f"a bench is chosen for ports emulated and simulated; behind {port!r} stands its own. Leave it out"
-        )
+        raise DeviceError(f"a bench is chosen for ports emulated and simulated only; {port!r} has its own. Omit it")
     if not port.strip():
         raise DeviceError("the port has no name. Give a serial port, or emulated, simulated, or replay:FILE")
     if port == "emulated":

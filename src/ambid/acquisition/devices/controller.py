@@ -354,7 +354,7 @@ class Controller:
         if seen.frames:
             return (
                 f"port {name}: sound frames come, but no answer to 'identify'; the controller does not hear the host."
-                " Look at its receive line, and reset the board"
+                " Check its receive line, and reset the board"
             )
         if seen.discarded_bytes or seen.empty or seen.damaged:
             total = seen.discarded_bytes + seen.empty

@@ -256,7 +256,7 @@ class SampleStream:
                 self.fail(
                     DeviceError(
                         "the controller is idle though it was started: it was reset on the way, by its watchdog or a"
-                        " dip of its supply. Look at the supply, and start again"
+                        " dip of its supply. Check the supply, and start again"
                     )
                 )
 

@@ -197,7 +197,7 @@ class PlayedDevice(ABC):
         with self._lock:
             self._ready("clear")
             if self._state != "fault":
-                self._refuse("clear", "there is no fault to clear. Leave it out")
+                self._refuse("clear", "there is no fault to clear. Omit it")
             self._clears()
             self._flowing = False
             self._enter_state("idle")

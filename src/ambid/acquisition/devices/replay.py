@@ -37,7 +37,7 @@ class ReplayDevice(PlayedDevice):
         missing = [c.column for c in rig.channels if c.column not in record.names]
         if missing:
             raise DeviceError(
-                f"record {path} has no column {missing[0]!r}, which the rig wants; it has {', '.join(record.names)}."
+                f"record {path} has no column {missing[0]!r}, which the rig needs; it has {', '.join(record.names)}."
                 " Correct the rig, or take another record"
             )
         _check_units(record, rig, f"record {path}")

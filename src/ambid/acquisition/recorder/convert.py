@@ -56,11 +56,11 @@ def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
     if not path.name.lower().endswith(FORMATS):
         raise DeviceError(f"{path}: a recording is written as {', '.join(FORMATS)}. Name it so")
     if path.is_dir():
-        raise DeviceError(f"{path} is a folder; a file is wanted. Name a file inside it")
+        raise DeviceError(f"{path} is a folder; it must be a file. Name a file inside it")
     if not path.parent.is_dir():
         raise DeviceError(f"{path}: there is no folder {path.parent}. Make it first, or correct the path")
     if path.exists() and not force:
-        raise DeviceError(f"{path} exists already. Choose another name, remove it, or give --force")
+        raise DeviceError(f"{path} already exists. Choose another name, remove it, or give --force")
     if ".csv" in path.name.lower():
         try:
             head_lines(_record(header, Survey(), {}))

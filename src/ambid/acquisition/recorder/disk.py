@@ -169,6 +169,6 @@ def free_bytes(folder: Path) -> int:
 
 def _occupied(path: Path) -> str:
     return (
-        f"{path} exists already: another recorder writes it, or one was ended before it could finish."
+        f"{path} already exists: another recorder writes it, or one was ended before it could finish."
         f" Wait for it, or: ambid recover {path} --delete"
     )

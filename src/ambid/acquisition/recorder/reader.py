@@ -75,7 +75,7 @@ class JournalReader:
         lock(fd, path)
         try:
             if path.is_dir():
-                raise DeviceError(f"journal {path} is a folder; a file is wanted. Name the file inside it")
+                raise DeviceError(f"journal {path} is a folder; it must be a file. Name the file inside it")
             reader = cls(lambda at, n: os.pread(fd, n, at), os.fstat(fd).st_size, path)
         except BaseException:
             os.close(fd)
@@ -140,8 +140,10 @@ class JournalReader:
                 f"journal {self.path} holds {blocks} sound blocks, but every header, which says what they are, is"
                 " damaged. Keep it, and copy it once more from where it was recorded"
             )
-        raise DeviceError(f"journal {self.path} holds no sound header: it was cut off before anything was acknowledged,"
-                          " or is damaged throughout. There is nothing to recover: remove it")  # fmt: skip
+        raise DeviceError(
+            f"journal {self.path} holds no intact header: it was cut off before anything was acknowledged, or is "
+            "damaged throughout. There is nothing to recover: remove it"
+        )
 
     def _frames(self, journal: int | None) -> Iterator[tuple[int, Head, bytes]]:
         """Yield place, head and bytes of every sound frame, of one journal if its number is given."""
