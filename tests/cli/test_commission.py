@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import signal
 
 import pytest
@@ -19,7 +20,7 @@ QUICK = ("--seconds", "4", "--track-seconds", "2", "--amplitude", "1.4")
 @pytest.fixture
 def place(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("ambid.job.commissioning.page", lambda estimate: "<html>2001</html>")
+    monkeypatch.setattr("ambid.job.commissioning.page", lambda found: "<html>2001</html>")
     (tmp_path / "rig.toml").write_text(PROTOTYPE_FILE.read_text(encoding="utf-8"), encoding="utf-8")
     (tmp_path / "coil.toml").write_text(COIL, encoding="utf-8")
     return tmp_path
@@ -50,17 +51,22 @@ def words_of(text):
     return " ".join(text.split())
 
 
-def test_a_good_bench_ends_with_0_and_what_to_do_next(commission):
+def test_a_good_bench_ends_with_0_and_a_line_that_runs_next(commission, ambid):
     done = commission(*QUICK)
     assert done.code == 0
     for number, name in enumerate(
-        ("self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "report", "track"), 1
+        ("self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "track"), 1
     ):
-        assert f"{number}/10 {name}" in done.out
+        assert f"{number}/9 {name}" in done.out
     assert "commissioned; out holds rig, records, estimate, report and track" in words_of(done.out)
-    assert "--track out/estimate.json" in words_of(done.out)
     assert files() == set(FILES)
     assert told()["passed"] is True
+    assert told()["verdict"]["word"] in ("usable", "caution")
+    following = shlex.split(done.out.splitlines()[-1])  # pasted into a shell
+    assert following[:2] == ["ambid", "acquire"]
+    done = ambid(*following[1:])
+    assert done.code == 0, done.err
+    assert "out/next.h5: 20000 samples" in done.out
 
 
 @pytest.mark.usefixtures("bench_program", "firmware_elf")
@@ -75,16 +81,18 @@ def test_the_firmware_on_the_emulated_bench_is_commissioned(commission):
         assert abs(found[name]["value"] / value - 1.0) < 0.05
 
 
-def test_one_that_is_not_good_enough_ends_with_3_where_why_and_what_next(commission):
+def test_one_that_is_not_good_enough_ends_with_3_where_why_and_what_next(commission, ambid):
     done = commission("--seconds", "4", "--amplitude", "0.05")
     assert done.code == 3
     text = words_of(done.out)
     assert "stopped: m is" in text
-    assert "stopped at identify, step 7 of 10; the output is off, and out holds what was found." in text
+    assert "stopped at identify, step 7 of 9; the output is off, and out holds what was found, out/report.html" in text
+    tried = ambid(*shlex.split(done.out.splitlines()[-1])[1:])
+    assert tried.out.startswith("verdict: "), tried.err
     assert "Next: record longer (--seconds)" in text
     assert "Then commission again, into another folder." in text
     assert told()["passed"] is False
-    assert files() == {"rig.toml", "record.h5", "second.h5", "estimate.json", "commission.json"}
+    assert files() == {"rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "commission.json"}
 
 
 def test_the_folder_of_an_earlier_one_is_refused_before_the_bench_is_opened(commission, place, monkeypatch):
@@ -195,7 +203,7 @@ def test_the_help_says_what_it_does_and_how_it_ends(ambid):
     assert done.code == 0
     text = words_of(done.out)
     for word in (
-        "self-test, rest, polarity, levitate, excite, record, identify, validate, report",
+        "self-test, rest, polarity, levitate, excite, record, identify, validate, track",
         "exit code 3",
         "--yes",
     ):

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -55,10 +56,10 @@ def files(folder):
     return {p.name for p in folder.iterdir()}
 
 
-@pytest.fixture
+@pytest.fixture(autouse=True)
 def plain_report(monkeypatch):
-    """A report without its figures, which take seconds."""
-    monkeypatch.setattr("ambid.job.commissioning.page", lambda estimate: "<html>2001</html>")
+    """A report without its figures, which take seconds; the bench that came to its end has them."""
+    monkeypatch.setattr("ambid.job.commissioning.page", lambda found: "<html>2001</html>")
 
 
 # The way to the end.
@@ -116,11 +117,25 @@ def test_what_it_leaves_can_be_read(finished):
     assert len(read_record(folder / "record.h5").channels[0].values) == 8000
     assert len(read_record(folder / "second.h5").channels[0].values) == 4000
     assert json.loads((folder / "estimate.json").read_text())["status"] == "converged"
-    assert "</html>" in (folder / "report.html").read_text()
     lines = [json.loads(line) for line in (folder / "track.jsonl").read_text().splitlines()]
     assert lines[0]["schema"] == "ambid.track/1"
     assert lines[-1]["summary"]["samples"] == 4000
     assert json.loads((folder / "commission.json").read_text())["device"]["kind"] == "simulated"
+
+
+def test_the_report_shows_what_each_step_saw(finished):
+    folder, done, _, _ = finished
+    text = (folder / "report.html").read_text()
+    for k, name in enumerate(STEPS, 1):
+        assert f"✓ {k}. {name}" in text
+    assert len(done.steps) == len(STEPS)
+    seen = {s.name: len(s.pictures) for s in done.steps}
+    assert seen == dict.fromkeys(STEPS, 1) | {"self-test": 0, "record": 2, "validate": 0, "track": 0}
+    # the steps', those of the estimate, the track's
+    assert text.count("data:image/png") == sum(seen.values()) + 4 + 1
+    assert text.index("verdict: <") < text.index("1. self-test")
+    assert "sensitivity peak" in text
+    assert done.verdict.word == json.loads((folder / "commission.json").read_text())["verdict"]["word"]
 
 
 def test_the_two_records_are_excited_differently(finished):
@@ -205,7 +220,7 @@ def test_a_zero_that_is_a_little_off_is_only_a_caution(tmp_path):
     device = Spoiled(prototype(), spoil=at_rest(CURRENT, lambda x: x + 40))
     with device:
         look = room.make_look(device, prototype(), lambda: False)
-        step = judge.rest(look, room.Room.of(prototype()), SHORT)
+        step = judge.rest(look, room.Room.of(prototype()), SHORT, device.info.rate_hz)
     assert step.passed
     assert "with the output off" in step.cautions[0]
 
@@ -259,6 +274,20 @@ REVERSED = {
 }
 
 
+def test_one_that_ended_early_has_its_page_with_reason_and_picture(tmp_path, monkeypatch):
+    from ambid.job.presentation import page
+
+    monkeypatch.setattr("ambid.job.commissioning.page", page)
+    rig = prototype(*REVERSED["position"][0])
+    done = ran(tmp_path, SimulatedDevice(rig), rig=rig)
+    text = (tmp_path / "report.html").read_text()
+    assert "✗ 3. polarity" in text
+    assert text.count("data:image/png") == 2  # rest, and the pulses
+    assert "channels.position.gain" in text[: text.index("<h2>Steps")]  # the verdict says why
+    assert text.count("not reached") == len(STEPS) - 3
+    assert (done.verdict.word, done.verdict.reasons[0].check) == ("unusable", "polarity")
+
+
 @pytest.mark.usefixtures("bench_program", "firmware_elf")
 @pytest.mark.parametrize("of", [SimulatedDevice, EmulatedDevice])
 @pytest.mark.parametrize("what", REVERSED)
@@ -279,7 +308,7 @@ def test_bad_gains_stop_it_when_it_lifts(tmp_path):
     rig = prototype(("kd = 92.57", "kd = 0.0"))
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig, force=True)
     stopped_at("levitate", done, "safe state during levitation", "out_of_gap, position outside limits", "gains")
-    assert files(tmp_path) == {"rig.toml", "commission.json"}
+    assert files(tmp_path) == {"rig.toml", "commission.json", "report.html"}
 
 
 def test_a_rotor_that_strays_stops_it(tmp_path):
@@ -312,13 +341,13 @@ def test_lost_samples_stop_it_at_the_record(tmp_path):
     wishes = replace(SHORT, amplitude_v=1.4)  # hover, one trial: the record is the third time that it levitates
     done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(3)), wishes=wishes)
     stopped_at("record", done, "20 of 8000 samples were lost during the record")
-    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5"}
+    assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5"}
 
 
 def test_lost_samples_of_the_second_record_stop_it_too(tmp_path):
     done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("record", done, "20 of 4000 samples were lost during the second record")
-    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+    assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
 
 
 def test_a_sensor_at_its_end_stops_it_at_the_record(tmp_path):
@@ -352,7 +381,7 @@ def test_too_little_excitation_stops_it_by_the_width_of_the_intervals(tmp_path):
     assert any("signal over noise" in c for s in done.steps for c in s.cautions)
 
 
-def test_a_marginal_signal_is_a_caution_where_the_intervals_are_narrow(tmp_path, plain_report):
+def test_a_marginal_signal_is_a_caution_where_the_intervals_are_narrow(tmp_path):
     with SimulatedDevice(prototype()) as device:
         done = commission(device, prototype(), tmp_path, wishes=replace(SHORT, amplitude_v=0.6))
     snr = [c for s in done.steps if s.name == "record" for c in s.cautions if "signal over noise" in c]
@@ -372,7 +401,7 @@ def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
     monkeypatch.setattr("ambid.job.commissioning.identify", refuse)
     done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "the record says nothing. Take another")
-    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+    assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
 
 
 def change_before(lift, *changes):
@@ -383,10 +412,9 @@ def test_another_bench_in_the_second_record_stops_it_at_validation(tmp_path):
     device = Spoiled(prototype(), before=change_before(4, ("R", 2.0), ("m", 1.3)))
     done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
     stopped_at("validate", done, "innovations")
-    assert "report.html" not in files(tmp_path)
 
 
-def test_another_bench_when_it_tracks_stops_it_there(tmp_path, plain_report):
+def test_another_bench_when_it_tracks_stops_it_there(tmp_path):
     device = Spoiled(prototype(), before=change_before(5, ("R", 1.4), ("m", 1.2)))
     done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
     assert done.steps[-1].name == "track"
@@ -451,7 +479,7 @@ def test_an_interruption_while_numbers_are_worked_out(tmp_path):
         stopped=lambda: begun[-1:] == ["identify"],
     )  # fmt: skip
     stopped_at("identify", done, "interrupted while working it out")
-    assert files(tmp_path) == {"rig.toml", "commission.json", "record.h5", "second.h5"}
+    assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
 
 
 def test_a_disk_that_failed_is_the_reason(finished):
@@ -464,8 +492,8 @@ def test_a_disk_that_failed_is_the_reason(finished):
         info=info, run=WHOLE, quality=Quality(info).report(), counters=SimulatedDevice(prototype()).counters(),
         recorded=None, troubles=(DeviceError("the disk is full"),), not_stored=40,
     )  # fmt: skip
-    step = judged_record("record", done)
+    step = judged_record("record", done, Path("a.h5"))
     assert step.reasons == ("40 samples of the record are not stored: the disk is full",)
-    slow = judged_record("record", replace(done, not_stored=0))
+    slow = judged_record("record", replace(done, not_stored=0), Path("a.h5"))
     assert slow.passed
     assert "the disk is full" in slow.cautions

@@ -9,6 +9,7 @@ from ambid.acquisition.device import Counters, DeviceInfo
 from ambid.acquisition.quality import ColumnQuality, QualityReport
 from ambid.acquisition.session import RunReport
 from ambid.job.commissioning_steps import STEPS
+from ambid.report.commission_page import Step
 from ambid.report.device_text import acquired_text, next_text, progress_line, step_text
 
 COLUMN = ColumnQuality(
@@ -79,7 +80,7 @@ def test_the_line_of_progress_tells_the_rate_as_it_comes(measured, words):
 
 
 def test_a_step_shows_findings_cautions_and_reasons():
-    text = step_text("rest", "2/9", findings=("found",), cautions=("beware",), reasons=("broken",))
+    text = step_text(Step(name="rest", findings=("found",), cautions=("beware",), reasons=("broken",)), "2/9")
     assert "2/9 rest" in text
     assert [line.strip() for line in text.splitlines()[1:]] == ["found", "note: beware", "stopped: broken"]
 

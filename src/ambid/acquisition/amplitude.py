@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import numpy as np
@@ -89,22 +89,28 @@ def make_look(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
     def look(course: Course) -> tuple[RunReport, dict[str, Array]]:
         kept = Kept(view)
         report = run(device, course, taps=[kept], stopped=stopped)
-        values = np.concatenate([np.empty((0, len(view.units))), *kept.values])
-        return report, {role: values[:, k] for k, role in enumerate(view.units)}
+        return report, kept.roles()
 
     return look
 
 
 class Kept:
-    """Keeps what a run passes on, seen through a view."""
+    """Keeps what a run passes on, seen through a view; at most `most` samples, and the rest of a block."""
 
-    def __init__(self, view: BenchView) -> None:
-        self._view = view
+    def __init__(self, view: BenchView, *, most: float = math.inf) -> None:
+        self._view, self._left = view, most
         self.values: list[Array] = []
 
     def take(self, frame: Frame) -> None:
         """Take a block as it came."""
-        self.values.append(self._view.block(frame.block).values)
+        if self._left > 0:
+            self.values.append(self._view.block(frame.block).values)
+            self._left -= len(frame.block.values)
+
+    def roles(self) -> dict[str, Array]:
+        """Return what was kept by role, (n_samples,) each, SI."""
+        values = np.concatenate([np.empty((0, len(self._view.units))), *self.values])
+        return {role: values[:, k] for k, role in enumerate(self._view.units)}
 
 
 def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
@@ -142,7 +148,7 @@ class Trial:
         return Course(mode=self.mode, seconds=self.seconds, settle_s=self.settle_s, program=wave)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Size:
     """What trials found."""
 
@@ -150,6 +156,8 @@ class Size:
     used: float  # part of the room that it used, 0 to 1 and beyond
     findings: tuple[str, ...]  # what each trial showed; why the size is not good
     reasons: tuple[str, ...] = ()
+    trials: tuple[tuple[float, float], ...] = ()  # peak in V and part of the room of each that was whole
+    last: Mapping[str, Array] = field(default_factory=dict)  # what the last trial showed, by role, SI
 
 
 def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
@@ -195,7 +203,10 @@ def find_amplitude(
         report, seen = look(trial.course(size, rate_hz))
         reasons = why_incomplete(report, f"excitation of {size:.3g} V")
         if reasons:
-            return Size(amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons)
+            return Size(
+                amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons, trials=tuple(tried),
+                last=seen,
+            )  # fmt: skip
         worst, used = _used(seen, room, resting, use)
         tried.append((size, used))
         findings.append(f"{size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range")
@@ -204,7 +215,7 @@ def find_amplitude(
             break
         size = larger_or_smaller
     return Size(
-        amplitude_v=size, used=used, findings=tuple(findings),
+        amplitude_v=size, used=used, findings=tuple(findings), trials=tuple(tried), last=seen,
         reasons=_too_much(tried, worst, _TOO_MUCH * use if given is None else _NEAR),
     )  # fmt: skip
 

@@ -129,7 +129,7 @@ def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, 
         return [whose]
     if not found.stable:
         try:
-            _refuse(found, whose, settings)
+            _refuse(found, whose, settings.rate_hz)
         except ModelError as failure:
             return [str(failure)]
     if found.largest_pole > 1.0 - 1.0 / _SLOW_PERIODS:
@@ -165,19 +165,28 @@ def predicted(
         raise RigError(f"{who(rig)}: on {whose} {failure}") from None
 
 
-def refuse_unstable(rig: Rig, info: DeviceInfo) -> tuple[LoopMargins | None, str]:
+def loop_on(rig: Rig, info: DeviceInfo, parameters: Mapping[str, float] = _NOBODY) -> tuple[LoopMargins | None, str]:
+    """Predict the loop that a device will close, on a plant of these parameters, or on the one that the rig expects.
+
+    `rig`: with a loop; `info`: of the device; `parameters`: all of the model's, SI. Returns as `predicted`.
+    """
+    full = with_default_daq(rig) if info.kind in ("emulated", "simulated") else rig
+    settings = controller_settings(full)
+    if parameters:
+        return loop_margins(parameters, realised(settings, full), settings.rate_hz, of=rig.model), ""
+    return predicted(full, settings, info.plant)
+
+
+def refuse_unstable(rig: Rig, info: DeviceInfo) -> None:
     """Refuse to let a device close a loop that is predicted unstable.
 
-    `rig`: with a loop; `info`: of the device. Returns as `predicted`.
+    `rig`: with a loop; `info`: of the device.
     """
-    invented = info.kind in ("emulated", "simulated")
-    settings = controller_settings(with_default_daq(rig) if invented else rig)
-    found, whose = predicted(with_default_daq(rig) if invented else rig, settings, info.plant)
+    found, whose = loop_on(rig, info)
     if found is not None:
-        _refuse(found, whose, settings)
-    return found, whose
+        _refuse(found, whose, info.rate_hz)
 
 
-def _refuse(found: LoopMargins, whose: str, settings: ControllerSettings) -> None:
-    where = f"{whose} at {settings.rate_hz:g} Hz with the controller's delay of {LAG_S * settings.rate_hz:.2g} samples"
+def _refuse(found: LoopMargins, whose: str, rate_hz: float) -> None:
+    where = f"{whose} at {rate_hz:g} Hz with the controller's delay of {LAG_S * rate_hz:.2g} samples"
     found.refuse(where, remedy="Design [loop] for that rate and delay")

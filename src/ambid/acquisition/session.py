@@ -147,6 +147,7 @@ class _Run:
         """Pass blocks on until all wanted samples are there."""
         if not self.going:
             return
+        self.report.wanted = self.report.after - self.report.first + self._wanted
         for frame in self._frames(stopped):
             block = self._after_lead(frame.block)
             if block is not None and self._pass_on(frame, block):

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
+from collections.abc import Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -19,7 +21,8 @@ from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
     from ambid.acquisition.recording import Progress
-    from ambid.job.commissioning_steps import Step, StepName
+    from ambid.job.commissioning_steps import StepName
+    from ambid.report.commission_page import Step
 
 
 def command(
@@ -43,7 +46,7 @@ def command(
     force: Annotated[bool, switch("--force", "Go on with a loop that is predicted unstable.")] = False,
     yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
-    """Commission a bench: self-test, rest, polarity, levitate, excite, record, identify, validate, report, then track.
+    """Commission a bench: self-test, rest, polarity, levitate, excite, record, identify, validate, track; and report.
 
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
@@ -85,11 +88,7 @@ def command(
         def tell(step: Step) -> None:
             last.append(step)
             watch.clear()
-            place = f"{STEPS.index(step.name) + 1}/{len(STEPS)}"
-            said = step_text(
-                step.name, place, findings=step.findings, reasons=step.reasons, cautions=step.cautions, paint=paint
-            )
-            typer.echo(said)
+            typer.echo(step_text(step, f"{len(last)}/{len(STEPS)}", paint=paint))
 
         def agreed(name: StepName) -> bool:
             del name
@@ -120,9 +119,23 @@ def command(
     if stop.number is not None:
         typer.echo(f"ambid: interrupted; the output is off, and {folder} holds what was found before", err=True)
         raise typer.Exit(stop.code)
-    name = last[-1].name
-    typer.echo(next_text(passed, name, STEPS.index(name) + 1, len(STEPS), str(folder)))
+    name, command = last[-1].name, ""
+    if passed:
+        volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")
+        given = {"--port": port, "--rig": rig, "--bench": bench, "--excitation": "multisine", "--band": band,
+                 "--amplitude": f"{volts:.6g}", "--track": folder / "estimate.json", "-o": folder / "next.h5",
+                 }  # fmt: skip
+        command = _line("acquire", given) + (" --force" if force else "")
+    elif name == "identify":
+        command = _line("identify", {"": folder / "record.h5", "--rig": rig})
+    typer.echo(next_text(passed, name, len(last), len(STEPS), str(folder), command=command))
     end(failed=not passed)
+
+
+def _line(verb: str, given: Mapping[str, object]) -> str:
+    """Write a command as a shell takes it, with the options that are given."""
+    words = [w for name, value in given.items() if value is not None for w in (name, str(value)) if w]
+    return shlex.join(["ambid", verb, *words])
 
 
 def _second_s(seconds: float) -> float:

@@ -1,4 +1,4 @@
-"""Guided commissioning: self-test, rest, polarity, levitate, excite, record, identify, validate, report, then track.
+"""Guided commissioning: self-test, rest, polarity, levitate, excite, record, identify, validate, track; and its report.
 
 Each step is judged before the next begins; one that is not good enough ends it, with the reasons. All that was found up
 to there stays in the folder.
@@ -6,7 +6,6 @@ to there stays in the folder.
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,20 +13,27 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
-from ambid.acquisition.amplitude import Room, make_look
-from ambid.acquisition.device import Device
-from ambid.acquisition.recording import Acquired, Listeners, acquire
-from ambid.acquisition.review import refuse_unstable
+from ambid.acquisition.amplitude import Kept, Room, make_look
+from ambid.acquisition.device import Device, DeviceInfo
+from ambid.acquisition.recording import Listeners, acquire
+from ambid.acquisition.review import loop_on, refuse_unstable
 from ambid.acquisition.session import Course
+from ambid.acquisition.view import BenchView
 from ambid.errors import AmbidError
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.estimate import Estimate, json_text, plain_json
 from ambid.estimation.progress import Tick, silent
+from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
-from ambid.job.commissioning_steps import STEPS, Step, StepName, Wishes
+from ambid.job.commissioning_steps import STEPS, StepName, Wishes
 from ambid.job.identification import identify
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
+from ambid.physics.linear_model import model
+from ambid.recursive.lines import Track
+from ambid.report.commission_figures import trace_picture
+from ambid.report.commission_page import Step
 from ambid.rig import Rig, rig_text
+from ambid.simulation.margins import LoopMargins
 from ambid.tracking.lines_file import TrackWriter
 
 FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl", "commission.json")
@@ -35,20 +41,53 @@ FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "
 
 SCHEMA = "ambid.commission/1"
 _LIMIT = 1.5  # acceptable model error of tracking
+_SHOWN = 4000  # samples of a record that its picture shows
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Commissioned:
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Commissioned(Result):
     """What came of a commissioning."""
 
     steps: tuple[Step, ...]  # those that were done, the last one perhaps not passed
     estimate: Estimate | None  # where it came as far
+    track: Track | None  # of the running bench, where it came as far
     folder: Path  # where the files are
+    rig: Rig
+    device: DeviceInfo
+    wishes: Wishes
+    names: tuple[StepName, ...] = STEPS  # of all steps, those that were not reached too
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Why it ended early, and what is to be known although a step is good enough."""
+        graves = [Reason(check=s.name, text=text, grave=True) for s in self.steps for text in s.reasons]
+        if not graves and not _all_passed(self.steps):
+            graves = [Reason(check="steps", text="it ended before all steps were done. Commission again", grave=True)]
+        return (*graves, *(Reason(check=s.name, text=text) for s in self.steps for text in s.cautions))
 
     @property
     def passed(self) -> bool:
         """Whether every step was done and is good enough."""
         return _all_passed(self.steps)
+
+    def dumps(self) -> str:
+        """Return what ``commission.json`` holds."""
+        info = self.device
+        return json_text(
+            {
+                "schema": SCHEMA,
+                "verdict": plain_json(self.verdict),
+                "device": {
+                    "kind": info.kind,
+                    "port": info.port,
+                    "identity": dict(info.identity),
+                    "rate_hz": info.rate_hz,
+                },
+                "wishes": plain_json(self.wishes),
+                "steps": [s.as_json() for s in self.steps],
+                "passed": self.passed,
+            }
+        )
 
 
 class Declined(AmbidError):
@@ -112,21 +151,24 @@ def commission(
     check_folder(place)
     guide = _Guide(device, rig, place, wishes or Wishes(), listeners, stopped, tick or silent)
     guide.check()
-    if not force:
-        refuse_unstable(rig, device.info)
+    guide.predict(force=force)
     write_text(place / "rig.toml", rig_text(rig, place))
-    done: list[Step] = []
-    for name, do in guide.steps(confirm or (lambda _: True)):
-        if on_begin is not None:
-            on_begin(name)
-        step = _do(name, do)
-        done.append(step)
-        write_text(place / "commission.json", _summary(done, device, guide.wishes))
-        if on_step is not None:
-            on_step(step)
-        if not step.passed:
-            break
-    return Commissioned(steps=tuple(done), estimate=guide.estimate, folder=place)
+    try:
+        for name, do in guide.steps(confirm or (lambda _: True)):
+            if on_begin is not None:
+                on_begin(name)
+            step = _do(name, do)
+            guide.done.append(step)
+            write_text(place / "commission.json", guide.found().dumps())
+            if on_step is not None:
+                on_step(step)
+            if not step.passed:
+                break
+    finally:
+        if guide.done:
+            (tick or silent)("report")
+            write_text(place / "report.html", page(guide.found()))
+    return guide.found()
 
 
 def _do(name: StepName, do: Callable[[], Step]) -> Step:
@@ -161,6 +203,24 @@ class _Guide:
         self._room = Room.of(rig)
         self.wishes = wishes
         self.estimate: Estimate | None = None
+        self.track: Track | None = None
+        self.done: list[Step] = []
+        self._loops: dict[str, LoopMargins] = {}  # as it was predicted
+
+    def found(self) -> Commissioned:
+        """Return what came of it so far."""
+        return Commissioned(
+            steps=tuple(self.done), estimate=self.estimate, track=self.track, folder=self._place, rig=self._rig,
+            device=self._device.info, wishes=self.wishes,
+        )  # fmt: skip
+
+    def predict(self, *, force: bool) -> None:
+        """Predict the loop, and refuse one that is unstable unless that is wished."""
+        expected, whose = loop_on(self._rig, self._device.info)
+        if expected is not None:
+            self._loops = {f"expected: {whose}": expected}
+            if not force:
+                refuse_unstable(self._rig, self._device.info)
 
     def check(self) -> None:
         """Refuse what cannot be done, before anything moves."""
@@ -183,7 +243,7 @@ class _Guide:
     def steps(self, confirm: Callable[[StepName], bool]) -> Iterator[tuple[StepName, Callable[[], Step]]]:
         """Yield one step after the other; whoever iterates does it, and stops at one that is not passed."""
         device, room, wishes = self._device, self._room, self.wishes
-        look = make_look(device, self._rig, self._stopped)
+        look, rate_hz = make_look(device, self._rig, self._stopped), device.info.rate_hz
         found: dict[str, Step] = {}
 
         def keep(step: Step) -> Step:
@@ -194,34 +254,42 @@ class _Guide:
             return found["excite"].numbers["amplitude_v"]
 
         yield "self-test", lambda: judge.self_test(device)
-        yield "rest", lambda: judge.rest(look, room, wishes)
+        yield "rest", lambda: judge.rest(look, room, wishes, device.info.rate_hz)
         if not confirm("polarity"):
             raise Declined("pulses and levitation were not agreed to; the output stayed off. Clear the bench first")
         yield "polarity", lambda: judge.polarity(look, room, self._rig, device)
-        yield "levitate", lambda: keep(judge.levitate(look, room, wishes))
-        yield "excite", lambda: keep(judge.excite(look, room, wishes, device.info.rate_hz, found["levitate"]))
+        yield "levitate", lambda: keep(judge.levitate(look, room, wishes, rate_hz))
+        yield "excite", lambda: keep(judge.excite(look, room, wishes, rate_hz, found["levitate"]))
         yield "record", lambda: self._record(amplitude())
         yield "identify", self._identify
         yield "validate", self._validate
-        yield "report", self._report
         yield "track", lambda: self._track(amplitude())
 
     def _record(self, amplitude_v: float) -> Step:
         """Take the record, and a second one with another excitation."""
         wishes = self.wishes
-        first = judge.record("record", self._acquire("record.h5", amplitude_v, wishes.record_s, 0))
+        first = self._acquire("record", "record.h5", amplitude_v, wishes.record_s, 0)
         if not first.passed:
             return first
-        second = judge.record("second record", self._acquire("second.h5", 0.8 * amplitude_v, wishes.second_s, 1))
+        second = self._acquire("second record", "second.h5", 0.8 * amplitude_v, wishes.second_s, 1)
         return replace(
-            second, findings=(*first.findings, *second.findings), cautions=(*first.cautions, *second.cautions)
+            second,
+            findings=(*first.findings, *second.findings),
+            cautions=(*first.cautions, *second.cautions),
+            text=f"{first.text}\n\n{second.text}",
+            pictures=(*first.pictures, *second.pictures),
         )
 
-    def _acquire(self, name: str, amplitude_v: float, seconds: float, seed: int) -> Acquired:
-        return acquire(
-            self._device, self._rig, self._place / name, self._course(amplitude_v, seconds, seed),
+    def _acquire(self, name: str, file: str, amplitude_v: float, seconds: float, seed: int) -> Step:
+        plant, info, path = model(self._rig.model), self._device.info, self._place / file
+        kept = Kept(BenchView(info, self._rig, (*plant.inputs, *plant.outputs)), most=_SHOWN)
+        done = acquire(
+            self._device, self._rig, path, self._course(amplitude_v, seconds, seed), taps=[kept],
             stopped=self._stopped, **self._listeners,
         )  # fmt: skip
+        caption = f"The first {min(seconds, _SHOWN / info.rate_hz):.3g} s; dashed: the controller's trips."
+        picture = trace_picture(f"The {name}", caption, kept.roles(), info.rate_hz, self._room.trips)
+        return judge.record(name, done, path, (picture,) if kept.values else ())
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
         wishes, rate_hz = self.wishes, self._device.info.rate_hz
@@ -242,13 +310,9 @@ class _Guide:
             self._place / "record.h5", self._rig, validate=self._place / "second.h5", tick=self._tick
         )
         write_text(self._place / "estimate.json", self.estimate.dumps())
-        return judge.identification(self.estimate, self.wishes)
-
-    def _report(self) -> Step:
-        assert self.estimate is not None
-        self._tick("report")
-        write_text(self._place / "report.html", page(self.estimate))
-        return Step(name="report", findings=(f"{self._place / 'report.html'}",))
+        found = loop_on(self._rig, self._device.info, self.estimate.values)[0]
+        loops = {"identified": found} if found is not None else {}
+        return judge.identification(self.estimate, self.wishes, {**loops, **self._loops})
 
     def _track(self, amplitude_v: float) -> Step:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""
@@ -257,6 +321,7 @@ class _Guide:
             self._device, self._rig, course, start=self.estimate, limit=_LIMIT,
             on_event=self._listeners.get("on_event"), stopped=self._stopped,
         )  # fmt: skip
+        self.track = done.track if done.track.lines else None
         with whole_file(self._place / "track.jsonl") as beside, TrackWriter(beside) as writer:
             writer.header(done.track.header)
             for line in done.track.lines:
@@ -264,20 +329,6 @@ class _Guide:
             if done.track.totals is not None:
                 writer.summary(done.track.totals)
         return judge.tracking(done, _LIMIT)
-
-
-def _summary(done: list[Step], device: Device, wishes: Wishes) -> str:
-    info = device.info
-    return json.dumps(
-        {
-            "schema": SCHEMA,
-            "device": {"kind": info.kind, "port": info.port, "identity": dict(info.identity), "rate_hz": info.rate_hz},
-            "wishes": {name: getattr(wishes, name) for name in wishes.__slots__},
-            "steps": [s.as_json() for s in done],
-            "passed": _all_passed(done),
-        },
-        indent=1,
-    )
 
 
 def check_folder(folder: str | Path) -> None:

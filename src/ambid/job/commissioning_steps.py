@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -19,22 +20,29 @@ from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
 from ambid.acquisition.recording import Acquired
 from ambid.acquisition.session import Course
 from ambid.arrays import Array
-from ambid.estimation.estimate import Estimate, fields_json
+from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
+from ambid.report.commission_figures import (
+    Picture,
+    margins_picture,
+    pulses_picture,
+    rest_picture,
+    trace_picture,
+    trials_picture,
+)
+from ambid.report.commission_page import Step
+from ambid.report.device_text import acquired_text
 from ambid.report.numbers import quantity, sized
 from ambid.rig import Rig
+from ambid.simulation.margins import LoopMargins
 
-StepName = Literal[
-    "self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "report", "track"
-]
+StepName = Literal["self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "track"]
 
 STEPS: tuple[StepName, ...] = get_args(StepName)
 """In their order."""
 
 _EXCITATION = "multisine"
 _PERIODS = 4.0  # of the lowest line in a trial
-
-_NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
 
 _SD_AT_REST = 0.02  # of the trips' width: noise of a sensor with the output off
 _ZERO, _NEAR_ZERO = 0.10, 0.03  # of the trips' width: current that is shown with the output off
@@ -44,26 +52,6 @@ _UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
 _SATURATED = 1e-3  # of the samples at the end of a converter's range
 _RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree")
 """Checks that a model which explains the record only in part fails: the standard deviations then allow for it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Step:
-    """One step, done."""
-
-    name: StepName  # one of `STEPS`
-    findings: tuple[str, ...] = ()  # what was measured, one line each
-    reasons: tuple[str, ...] = ()  # why it is not good enough, and what to do, one line each; empty: it is
-    cautions: tuple[str, ...] = ()  # what a reader should know although the step is good enough
-    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
-
-    @property
-    def passed(self) -> bool:
-        """Whether commissioning may go on."""
-        return not self.reasons
-
-    def as_json(self) -> dict[str, object]:
-        """Return its fields and whether it ``passed``; what is not known is None."""
-        return {**fields_json(self), "passed": self.passed}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,11 +109,11 @@ def self_test(device: Device) -> Step:
     return Step(name="self-test", findings=findings, reasons=found.failed, numbers=found.numbers)
 
 
-def rest(look: Look, room: Room, wishes: Wishes) -> Step:
+def rest(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
     """Look at the sensors with the output off.
 
-    `look`: see `make_look`; `room`: limits; `wishes`: lengths. Returns not passed where a sensor is noisy,
-    or a current is shown that cannot be.
+    `look`: see `make_look`; `room`: limits; `wishes`: lengths; `rate_hz`: of the device, Hz. Returns not
+    passed where a sensor is noisy, or a current is shown that cannot be.
     """
     report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
     reasons = list(why_incomplete(report, "the look at rest"))
@@ -152,8 +140,9 @@ def rest(look: Look, room: Room, wishes: Wishes) -> Step:
         for role, (mean, sd) in shown.items()
     )
     return Step(
-        name="rest", findings=findings, reasons=tuple(reasons), cautions=tuple(cautions), numbers=_numbers(shown)
-    )
+        name="rest", findings=findings, reasons=tuple(reasons), cautions=tuple(cautions), numbers=_numbers(shown),
+        pictures=(rest_picture(seen, rate_hz),) if shown else (),
+    )  # fmt: skip
 
 
 def polarity(look: Look, room: Room, rig: Rig, device: Device) -> Step:
@@ -184,8 +173,9 @@ def polarity(look: Look, room: Room, rig: Rig, device: Device) -> Step:
             " of the position could not be checked. If it does not lift, look at that first"
         )
     return Step(
-        name="polarity", findings=tuple(told), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
-    )
+        name="polarity", findings=tuple(told), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
+        pictures=(pulses_picture(found.pulses),),
+    )  # fmt: skip
 
 
 def _pulse_words(pulse: Pulse) -> str:
@@ -234,16 +224,22 @@ def _reversed(found: Polarity, rig: Rig) -> list[str]:
     return []
 
 
-def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
+def levitate(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
     """Lift the rotor and let it hover without excitation.
 
-    `look`: see `make_look`; `room`: limits; `wishes`: lengths. Returns not passed where the controller
-    tripped, the rotor strays, or no room is left.
+    `look`: see `make_look`; `room`: limits; `wishes`: lengths; `rate_hz`: of the device, Hz. Returns not
+    passed where the controller tripped, the rotor strays, or no room is left.
     """
-    report, seen = look(Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s))
+    course = Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s, transient=True)
+    report, whole = look(course)
+    settled = max(round(wishes.settle_s * rate_hz), whole["position"].size - round(wishes.hover_s * rate_hz))
+    seen = {role: values[settled:] for role, values in whole.items()}
+    caption = "From the start on; dashed: the controller's trips. Shaded: lift-off, which is given time to settle."
+    pictures = (trace_picture("Lift-off", caption, whole, rate_hz, room.trips, from_s=settled / rate_hz),)
     reasons = list(why_incomplete(report, "levitation"))
     if not seen["position"].size:
-        return Step(name="levitate", reasons=tuple(reasons) or ("no sample came after lift-off",))
+        reasons = reasons or ["no sample came after lift-off"]
+        return Step(name="levitate", reasons=tuple(reasons), pictures=pictures if whole["position"].size else ())
     shown = {role: _mean_sd(seen[role]) for role in _UNITS}
     for role, (_, sd) in shown.items():
         if role != "voltage" and sd == 0.0:
@@ -267,7 +263,7 @@ def levitate(look: Look, room: Room, wishes: Wishes) -> Step:
     findings = tuple(
         f"{role} {sized(mean, _UNITS[role])}, {sized(sd, _UNITS[role])} rms" for role, (mean, sd) in shown.items()
     )
-    return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown))
+    return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown), pictures=pictures)
 
 
 def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
@@ -281,7 +277,8 @@ def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) 
     trial = wishes.trial(rate_hz, wishes.longest_trial_s(rate_hz))
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
-    return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers)
+    picture = trials_picture(found.trials, wishes.use, found.last, rate_hz, room.trips)
+    return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=(picture,))
 
 
 def _measured(numbers: Mapping[str, float]) -> str:
@@ -305,12 +302,12 @@ def _numbers(shown: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     return {f"{role}_{what}": x for role, pair in shown.items() for what, x in zip(("mean", "sd"), pair, strict=True)}
 
 
-def record(name: str, done: Acquired) -> Step:
+def record(name: str, done: Acquired, path: Path, pictures: tuple[Picture, ...] = ()) -> Step:
     """Judge a record as it was taken.
 
-    `name`: what it is for; `done`: from `acquire`. Returns not passed where samples were lost or not stored, or a
-    sensor saturates or stands still. Little signal over noise is a caution: whether it is enough is decided by the
-    intervals of what is identified.
+    `name`: what it is for; `done`: from `acquire`; `path`: of its file; `pictures`: of it.
+    Returns not passed where samples were lost or not stored, or a sensor saturates or stands still. Little signal over
+    noise is a caution: whether it is enough is decided by the intervals of what is identified.
     """
     reasons = list(why_incomplete(done.run, f"the {name}"))
     if done.not_stored:
@@ -330,14 +327,19 @@ def record(name: str, done: Acquired) -> Step:
         if column.role in ("position", "current") and column.sd == 0.0
     ]
     cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
-    return Step(name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions))
+    text = acquired_text(path, done.info, done.run, done.quality, done.counters, not_stored=done.not_stored)
+    return Step(
+        name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), text=text,
+        pictures=pictures,
+    )  # fmt: skip
 
 
-def identification(estimate: Estimate, wishes: Wishes) -> Step:
+def identification(estimate: Estimate, wishes: Wishes, loops: Mapping[str, LoopMargins]) -> Step:
     """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
 
-    `estimate`: of the record; `wishes`: how wide an interval may be. Returns tests of residuals that fail are cautions,
-    because the standard deviations allow for them; all else stops.
+    `estimate`: of the record; `wishes`: how wide an interval may be; `loops`: margins of the controller on the plant
+    that was identified, and that was expected, by name, the first one first. Returns tests of residuals that
+    fail are cautions, because the standard deviations allow for them; all else stops.
     """
     findings: list[str] = []
     reasons: list[str] = []
@@ -362,9 +364,12 @@ def identification(estimate: Estimate, wishes: Wishes) -> Step:
     for name, check in estimate.checks.items():
         if not check.passed:
             (cautions if name in _RESIDUAL else reasons).append(f"{name}: {check.detail}")
+    for loop in list(loops.values())[:1]:
+        (findings if loop.stable and loop.zone != "D" else cautions).append(f"the loop on this plant: {loop.words()}")
     return Step(
-        name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers
-    )
+        name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
+        pictures=(margins_picture(loops),) if loops else (),
+    )  # fmt: skip
 
 
 def validation(estimate: Estimate) -> Step:

@@ -327,6 +327,48 @@ def _comparison() -> View:
     )  # fmt: skip
 
 
+def _commissioned() -> View:
+    from ambid.report.commission_page import commission_page
+    from ambid.report.drawing import stacked
+    from ambid.report.page import Section
+
+    def title(c: Any) -> str:
+        return f"Commissioning: {c.rig.name}"
+
+    def drawn(c: Any, _: Any) -> Figure:
+        return stacked(title(c), [(p.height, p.draw) for step in c.steps for p in step.pictures])
+
+    def made(c: Any, _: Any) -> Page:
+        from ambid.report.track_figures import track_figure
+        from ambid.rig import rig_text
+
+        more: dict[str, list[Section]] = {}
+        if c.estimate is not None:
+            known = view(c.estimate)
+            assert known.page is not None
+            more["identify"] = [s for s in known.page(c.estimate, c.estimate.used).sections if s.title != "Rig"]
+        if c.track is not None:
+            caption = "Each parameter with its 95 % band while the bench runs, the model error against its limit."
+            more["track"] = [Section(title="Live track", caption=caption, figure=track_figure(c.track))]
+        where = f"{c.device.kind} {c.device.port}, {c.device.rate_hz:g} Hz"
+        return commission_page(
+            title(c), c.steps, c.names, subtitle=where, more=more, rig=rig_text(c.rig, c.folder),
+            provenance=[("rig", str(c.rig.source or c.rig.name)), ("device", where), ("folder", str(c.folder))],
+        )  # fmt: skip
+
+    def said(c: Any, *, width: int = WIDTH, paint: Paint = plain) -> str:
+        from ambid.report.device_text import step_text
+
+        of = len(c.names)
+        return "\n".join(step_text(s, f"{k}/{of}", width=width, paint=paint) for k, s in enumerate(c.steps, 1))
+
+    def table(c: Any) -> Table:
+        names = [s.name for s in c.steps]
+        return "step", {"step": names, "passed": [s.passed for s in c.steps]}
+
+    return View(text=said, figure=drawn, page=made, document=lambda c: str(c.dumps()), table=table, title=title)
+
+
 def _fields_of(schema: str) -> Callable[[Any], str]:
     """Return a writer of all fields of a result."""
 
@@ -358,5 +400,6 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Measured": _measured,
     "Track": _track,
     "Comparison": _comparison,
+    "Commissioned": _commissioned,
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

@@ -1,4 +1,4 @@
-"""What the steps of a commissioning saw, drawn: rest and its spectra, pulses, lift-off, trials of the amplitude, margins.
+"""What the steps of a commissioning saw, drawn: rest, pulses, lift-off, trials of the amplitude, records, margins.
 
 Each function returns a `Picture`, which keeps the few samples that it needs and is drawn when a page asks for it.
 """
@@ -6,9 +6,9 @@ Each function returns a `Picture`, which keeps the few samples that it needs and
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -23,13 +23,16 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure, SubFigure
 
+    from ambid.report.drawing import Draw
+
 Bounds = Mapping[str, tuple[float, float]]  # trips by role, SI
 
 UNITS = {"position": "m", "current": "A", "voltage": "V"}
-_MOST = 4000  # samples of a trace that are kept
+_MOST = 20_000  # samples of a trace that are kept
 _PULSES = 4  # beside each other
+_BEGIN_S = 0.25  # of lift-off that is drawn closer
 _ROW = 1.7  # inches
-_COLOURS = ("#0b6fb8", "#d55e00", "#009e73")
+_LOOPS = ((PREDICTED, "-"), (MEASURED, "--"))  # colour and style of each
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,7 +41,12 @@ class Picture:
 
     title: str
     caption: str
-    figure: Callable[[], Figure]
+    height: float  # inches
+    draw: Draw
+
+    def figure(self) -> Figure:
+        """Draw it alone."""
+        return single(self.height, self.draw)
 
 
 def rest_picture(seen: Mapping[str, Array], rate_hz: float) -> Picture:
@@ -61,8 +69,8 @@ def rest_picture(seen: Mapping[str, Array], rate_hz: float) -> Picture:
             grid(over_time, over_hz)
         _heads(axes, ("about the mean", "amplitude density of the noise"), ("time [s]", "frequency [Hz]"))
 
-    caption = "Output off: what the sensors show of themselves. A line in the spectrum is pick-up: mains, or a converter."
-    return Picture(title="Sensors at rest", caption=caption, figure=lambda: single(_ROW * len(roles), draw))
+    caption = "Output off: the noise of the sensors alone. A line in the spectrum is pick-up: mains, or a converter."
+    return Picture(title="Sensors at rest", caption=caption, height=_ROW * len(roles), draw=draw)
 
 
 def pulses_picture(pulses: Sequence[Pulse]) -> Picture:
@@ -86,10 +94,10 @@ def pulses_picture(pulses: Sequence[Pulse]) -> Picture:
             bottom.set_xlabel("time [ms]")
 
     caption = (
-        f"{len(shown)} of {len(pulses)} pulses without feedback, each about what was before it; shaded while the voltage"
-        " is ordered. They grow until the rotor leaves its stop."
+        f"{len(shown)} of {len(pulses)} pulses without feedback, each about what was before it; shaded while"
+        " the voltage is ordered. They grow until the rotor leaves its stop."
     )
-    return Picture(title="Polarity pulses", caption=caption, figure=lambda: single(_ROW * 3, draw))
+    return Picture(title="Polarity pulses", caption=caption, height=_ROW * 3, draw=draw)
 
 
 def _about_begin(pulse: Pulse, role: str) -> Array:
@@ -102,27 +110,26 @@ def _about_begin(pulse: Pulse, role: str) -> Array:
 def trace_picture(
     title: str, caption: str, seen: Mapping[str, Array], rate_hz: float, trips: Bounds, *, from_s: float | None = None
 ) -> Picture:
-    """Traces by role over time with the controller's trips; shaded before `from_s`, which is not judged."""
+    """Traces by role over time with the controller's trips; the beginning closer, and shaded, up to `from_s`."""
     roles = [role for role in UNITS if role in seen and seen[role].size]
     kept = {role: seen[role][-_MOST:] if from_s is None else seen[role][:_MOST] for role in roles}
 
     def draw(place: Figure | SubFigure) -> None:
-        axes = place.subplots(len(roles), 1, squeeze=False, sharex=True)[:, 0]
-        for role, a in zip(roles, axes, strict=True):
+        ratios = (3,) if from_s is None else (2, 3)
+        axes = place.subplots(len(roles), len(ratios), squeeze=False, sharex="col", sharey="row", width_ratios=ratios)
+        for role, row in zip(roles, axes, strict=True):
             values = kept[role]
             scale, unit = prefixed(float(np.max(np.abs(values))), UNITS[role])
-            curve(a, np.arange(values.size) / rate_hz, values / scale, MEASURED, None)
-            for end in trips.get(role, ()):
-                if math.isfinite(end):
-                    a.axhline(end / scale, color=BOUND, linestyle="--", linewidth=1.0)
+            row[0].set_ylabel(f"{role} [{unit}]")
+            for a in row:
+                shown = values[: round(_BEGIN_S * rate_hz)] if a is not row[-1] else values
+                _within(a, shown / scale, rate_hz, [end / scale for end in trips.get(role, ())])
             if from_s is not None:
-                a.axvspan(0.0, from_s, color="#eeeeee", zorder=0)
-            a.set_ylabel(f"{role} [{unit}]")
-            a.margins(x=0.0)
-            grid(a)
-        axes[-1].set_xlabel("time [s]")
+                row[-1].axvspan(0.0, from_s, color="#eeeeee", zorder=0)
+        for a in axes[-1]:
+            a.set_xlabel("time [s]")
 
-    return Picture(title=title, caption=caption, figure=lambda: single(_ROW * len(roles), draw))
+    return Picture(title=title, caption=caption, height=_ROW * len(roles), draw=draw)
 
 
 def trials_picture(
@@ -145,18 +152,24 @@ def trials_picture(
         values = last[role][:_MOST] if role in last else np.empty(0)
         if values.size:
             scale, unit = prefixed(float(np.max(np.abs(values))), UNITS[role])
-            curve(over_time, np.arange(values.size) / rate_hz, values / scale, MEASURED, None)
-            for end in trips.get(role, ()):
-                if math.isfinite(end):
-                    over_time.axhline(end / scale, color=BOUND, linestyle="--", linewidth=1.0)
+            _within(over_time, values / scale, rate_hz, [end / scale for end in trips.get(role, ())])
             over_time.set_ylabel(f"{role} [{unit}]")
-            over_time.margins(x=0.0)
         over_time.set_title("last trial, with the controller's trips", fontsize=10)
         over_time.set_xlabel("time [s]")
-        grid(over_size, over_time)
+        grid(over_size)
 
     caption = "The amplitude grows from trial to trial until it uses its part of the way to the nearest trip."
-    return Picture(title="Trials of the amplitude", caption=caption, figure=lambda: single(3.0, draw))
+    return Picture(title="Trials of the amplitude", caption=caption, height=3.0, draw=draw)
+
+
+def _within(axes: Axes, values: Array, rate_hz: float, ends: Sequence[float]) -> None:
+    """Draw a trace within its trips."""
+    curve(axes, np.arange(values.size) / rate_hz, values, MEASURED, None)
+    for end in ends:
+        if math.isfinite(end):
+            axes.axhline(end, color=BOUND, linestyle="--", linewidth=1.0)
+    axes.margins(x=0.0)
+    grid(axes)
 
 
 def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
@@ -164,11 +177,10 @@ def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
 
     def draw(place: Figure | SubFigure) -> None:
         nyquist, over_hz = place.subplots(1, 2, width_ratios=(2, 3))
-        for colour, (name, loop) in zip(_COLOURS, loops.items(), strict=False):
-            nyquist.plot(loop.open_loop.real, loop.open_loop.imag, color=colour, linewidth=1.2)
-            over_hz.semilogx(
-                loop.frequency_hz, 20.0 * np.log10(loop.sensitivity), color=colour, linewidth=1.2, label=name
-            )
+        for (colour, style), (name, loop) in zip(_LOOPS, loops.items(), strict=False):
+            how: dict[str, Any] = {"color": colour, "linestyle": style, "linewidth": 1.2}
+            nyquist.plot(loop.open_loop.real, loop.open_loop.imag, **how)
+            over_hz.semilogx(loop.frequency_hz, 20.0 * np.log10(loop.sensitivity), label=name, **how)
         worst = max(loop.peak[0] for loop in loops.values())
         _nyquist(nyquist, worst)
         low = -20.0
@@ -191,7 +203,7 @@ def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
         "The loop opened at the controller's output. Left: the farther the curve stays from -1, the more gain and phase"
         " may change; circle: the distance of zone A. Right: the sensitivity, with the zones of ISO 14839-3."
     )
-    return Picture(title="Margins of the loop", caption=caption, figure=lambda: single(3.6, draw))
+    return Picture(title="Margins of the loop", caption=caption, height=3.6, draw=draw)
 
 
 def _nyquist(axes: Axes, worst: float) -> None:
@@ -200,7 +212,7 @@ def _nyquist(axes: Axes, worst: float) -> None:
     axes.plot(np.cos(angle), np.sin(angle), color=MEASURED, linewidth=0.6, linestyle=":")
     axes.plot(-1.0 + np.cos(angle) / ZONES[0][0], np.sin(angle) / ZONES[0][0], color=BOUND, linewidth=0.9)
     axes.plot(-1.0, 0.0, "+", color=BOUND, markersize=10, markeredgewidth=1.6)
-    axes.set_aspect("equal", adjustable="datalim")
+    axes.set_aspect("equal")
     axes.set_xlim(-3.0, 1.5)
     axes.set_ylim(-2.0, 2.0)
     axes.set_xlabel("real part of L")

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import textwrap
-from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ambid.errors import counted
@@ -16,6 +15,7 @@ if TYPE_CHECKING:
     from ambid.acquisition.device import Counters, DeviceInfo
     from ambid.acquisition.quality import ColumnQuality, QualityReport
     from ambid.acquisition.session import RunReport
+    from ambid.report.commission_page import Step
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
 _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
@@ -27,14 +27,13 @@ _NEXT = {
     "excite": "give a smaller --amplitude or another --band, or correct the bench",
     "record": "remove what disturbed the record; {folder}/record.h5 holds what was recorded",
     "identify": (
-        "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig;"
-        " 'ambid identify {folder}/record.h5 --rig RIG' tries a corrected rig without the bench"
+        "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig; the last line"
+        " here tries a corrected rig without the bench"
     ),
     "validate": (
         "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
         "what changed between the two"
     ),
-    "report": "check the folder and its disk",
     "track": "look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when",
 }
 """What to do after a step that was not good enough."""
@@ -138,42 +137,37 @@ def _decibels(c: ColumnQuality) -> str:
     return f"{c.snr_db:.1f} dB" if math.isfinite(c.snr_db) else "no noise"
 
 
-def step_text(
-    name: str,
-    place: str,
-    *,
-    findings: Sequence[str] = (),
-    reasons: Sequence[str] = (),
-    cautions: Sequence[str] = (),
-    width: int = WIDTH,
-    paint: Paint = plain,
-) -> str:
+def step_text(step: Step, place: str, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a step that was done; `place` says which of how many it is, such as ``"2/9"``."""
-    mark = paint("✗", "bad") if reasons else paint("✓", "good")
-    lines = [f"{mark} {place} {paint(name, 'strong')}"]
-    said: list[tuple[str, Style | None]] = [(x, None) for x in findings if x]
-    said += [(f"note: {c}", "dim") for c in cautions] + [(f"stopped: {r}", "bad") for r in reasons]
+    mark = paint("✗", "bad") if step.reasons else paint("✓", "good")
+    lines = [f"{mark} {place} {paint(step.name, 'strong')}"]
+    said: list[tuple[str, Style | None]] = [(x, None) for x in step.findings if x]
+    said += [(f"note: {c}", "dim") for c in step.cautions] + [(f"stopped: {r}", "bad") for r in step.reasons]
     for text, style in said:
         lines += [line if style is None else paint(line, style) for line in hanging("  ", text, width, 4, 2)]
     return "\n".join(lines)
 
 
-def next_text(passed: bool, step: str, number: int, of: int, folder: str, *, width: int = WIDTH) -> str:
+def next_text(
+    passed: bool, step: str, number: int, of: int, folder: str, *, command: str = "", width: int = WIDTH
+) -> str:
     """Say where a commissioning ended, and what to do next.
 
     `passed`: whether it came to its end; `step`: the last one; `number`, `of`: which of how many it is; `folder`: where
-    the files are; `width`: columns of the terminal. Returns lines without the last line's end.
+    the files are; `command`: what is said to be run next, on a line of its own; `width`: columns of the terminal.
+    Returns lines without the last line's end.
     """
     if passed:
         said = [
             f"commissioned; {folder} holds rig, records, estimate, report and track.",
-            f"Next: read {folder}/report.html; follow the running bench with 'ambid acquire --track"
-            f" {folder}/estimate.json'.",
+            f"Next: read {folder}/report.html; follow the bench while it runs:",
         ]
     else:
         said = [
-            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found.",
+            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found,"
+            f" {folder}/report.html shows it.",
             f"Next: {_NEXT.get(step, 'see the reason above').format(folder=folder)}."
             " Then commission again, into another folder.",
         ]
-    return "\n".join(line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False))
+    lines = [line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False)]
+    return "\n".join([*lines, *([f"  {command}"] if command else [])])

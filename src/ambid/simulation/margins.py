@@ -78,17 +78,15 @@ class LoopMargins:
         return None if not passes.size else float(np.degrees(np.min(np.pi - np.abs(angle[passes]))))
 
     def words(self) -> str:
-        """Say the margins of a stable loop on one line."""
-        assert self.gain is not None
-        low, high = (f"{g:.2g}" for g in self.gain)
-        low, high = (
-            f"less than {1 / _REACH:g}" if self.gain[0] <= 1 / _REACH else low,
-            f"more than {_REACH:g}" if self.gain[1] >= _REACH else high,
-        )
+        """Say how stable the loop is, on one line."""
+        if not self.stable or self.gain is None:
+            return f"unstable, largest pole {self.largest_pole:.4f}"
+        low = f"less than {1 / _REACH:g}" if self.gain[0] <= 1 / _REACH else f"{self.gain[0]:.2g}"
+        high = f"more than {_REACH:g}" if self.gain[1] >= _REACH else f"{self.gain[1]:.2g}"
         phase = "" if self.phase_deg is None else f", phase margin {self.phase_deg:.0f}°"
         peak, hz = self.peak
         return (
-            f"largest pole {self.largest_pole:.4f}; stable for {low} to {high} times the gains{phase}, sensitivity peak"
+            f"largest pole {self.largest_pole:.4f}, stable for {low} to {high} times the gains{phase}, sensitivity peak"
             f" {20 * math.log10(peak):.1f} dB at {hz:.3g} Hz (ISO 14839-3 zone {self.zone})"
         )
 
