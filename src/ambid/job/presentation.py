@@ -336,7 +336,7 @@ def _commissioned() -> View:
         return f"Commissioning: {c.rig.name}"
 
     def drawn(c: Any, _: Any) -> Figure:
-        return stacked(title(c), [(p.height, p.draw) for step in c.steps for p in step.pictures])
+        return stacked(title(c), [p.block for step in c.steps for p in step.pictures])
 
     def made(c: Any, _: Any) -> Page:
         from ambid.report.track_figures import track_figure

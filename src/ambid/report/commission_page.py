@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ambid.estimation.estimate import fields_json
+from ambid.report.drawing import single
 from ambid.report.page import Page, Section
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def commission_page(
     sections = [Section(title="Steps", tables=[_overview(steps, names)])]
     for step in steps:
         sections.append(_section(step, f"{names.index(step.name) + 1}. {step.name}"))
-        sections += [Section(title=p.title, caption=p.caption, figure=p.figure()) for p in step.pictures[1:]]
+        sections += [Section(title=p.title, caption=p.caption, figure=single(p.block)) for p in step.pictures[1:]]
         sections += more.get(step.name, ())
     sections += [Section(title="Rig", text=rig, folded=True)] if rig else []
     return Page(title=title, subtitle=subtitle, sections=sections, provenance=provenance)
@@ -90,6 +91,6 @@ def _section(step: Step, title: str) -> Section:
         paragraphs=[text for text in step.findings if text],
         tables=[rows] if len(rows) > 1 else [],
         text=step.text,
-        figure=None if picture is None else picture.figure(),
+        figure=None if picture is None else single(picture.block),
         note="" if picture is None else picture.caption,
     )
