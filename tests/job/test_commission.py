@@ -281,7 +281,7 @@ def test_one_that_ended_early_has_its_page_with_reason_and_picture(tmp_path, mon
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig)
     text = (tmp_path / "report.html").read_text()
     assert "✗ 3. polarity" in text
-    assert text.count("data:image/png") == 2  # rest, and the pulses
+    assert text.count("data:image/png") == 4  # rest, and the pulses, each for a wide and a narrow screen
     assert "channels.position.gain" in text[: text.index("<h2>Steps")]  # the verdict says why
     assert text.count("not reached") == len(STEPS) - 3
     assert (done.verdict.word, done.verdict.reasons[0].check) == ("unusable", "polarity")
@@ -426,7 +426,7 @@ def followed(**changes):
     summary = SimpleNamespace(samples=4000, seconds_of_record=2.0, rejected_samples=0, changes=())
     line = SimpleNamespace(error=1.02, state="tracking")
     given = {"overruns": 0, "lines": (line,), "summary": summary, "run": WHOLE} | changes
-    track = SimpleNamespace(lines=given["lines"], summary=given["summary"])
+    track = SimpleNamespace(lines=given["lines"], totals=given["summary"])
     return SimpleNamespace(run=given["run"], overruns=given["overruns"], track=track)
 
 

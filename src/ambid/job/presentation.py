@@ -331,17 +331,16 @@ def _commissioned() -> View:
     from ambid.report.commission_page import commission_page
     from ambid.report.drawing import stacked
     from ambid.report.page import Section
+    from ambid.report.track_figures import track_figure
+    from ambid.rig import rig_text
 
     def title(c: Any) -> str:
         return f"Commissioning: {c.rig.name}"
 
-    def drawn(c: Any, _: Any) -> Figure:
-        return stacked(title(c), [p.block for step in c.steps for p in step.pictures])
+    def drawn(c: Any, _: Any, width: float) -> Figure:
+        return stacked(title(c), [p.block for step in c.steps for p in step.pictures], width)
 
     def made(c: Any, _: Any) -> Page:
-        from ambid.report.track_figures import track_figure
-        from ambid.rig import rig_text
-
         more: dict[str, list[Section]] = {}
         if c.estimate is not None:
             known = view(c.estimate)
@@ -349,7 +348,9 @@ def _commissioned() -> View:
             more["identify"] = [s for s in known.page(c.estimate, c.estimate.used).sections if s.title != "Rig"]
         if c.track is not None:
             caption = "Each parameter with its 95 % band while the bench runs, the model error against its limit."
-            more["track"] = [Section(title="Live track", caption=caption, figure=track_figure(c.track))]
+            more["track"] = [
+                Section(title="Live track", caption=caption, figure=lambda width: track_figure(c.track, width=width))
+            ]
         where = f"{c.device.kind} {c.device.port}, {c.device.rate_hz:g} Hz"
         return commission_page(
             title(c), c.steps, c.names, subtitle=where, more=more, rig=rig_text(c.rig, c.folder),

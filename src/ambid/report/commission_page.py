@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
@@ -58,7 +59,9 @@ def commission_page(
     sections = [Section(title="Steps", tables=[_overview(steps, names)])]
     for step in steps:
         sections.append(_section(step, f"{names.index(step.name) + 1}. {step.name}"))
-        sections += [Section(title=p.title, caption=p.caption, figure=single(p.block)) for p in step.pictures[1:]]
+        sections += [
+            Section(title=p.title, caption=p.caption, figure=partial(single, p.block)) for p in step.pictures[1:]
+        ]
         sections += more.get(step.name, ())
     sections += [Section(title="Rig", text=rig, folded=True)] if rig else []
     return Page(title=title, subtitle=subtitle, sections=sections, provenance=provenance)
@@ -91,6 +94,6 @@ def _section(step: Step, title: str) -> Section:
         paragraphs=[text for text in step.findings if text],
         tables=[rows] if len(rows) > 1 else [],
         text=step.text,
-        figure=None if picture is None else single(picture.block),
+        figure=None if picture is None else partial(single, picture.block),
         note="" if picture is None else picture.caption,
     )
