@@ -2,7 +2,9 @@
 
 import pytest
 
+from ambid.acquisition.recorder import Recorder
 from ambid.cli import run
+from tests.acquisition.recorder.signals import block, header
 
 MEASURED = "time [s],voltage [V],current [A],position [m]\n0,1,2,3\n"
 RECORD = ("simulate", "thesis", "--duration", "0.3", "-o")
@@ -43,8 +45,40 @@ def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
     done = ambid(*VERBS[verb], "measured.csv")
     assert done.code == 2, done.out
     assert len(done.err.splitlines()) == 1
-    assert "measured.csv already exists" in done.err
+    assert "measured.csv exists" in done.err
     assert target.read_text() == MEASURED
+
+
+def test_commission_writes_into_no_folder_of_a_record(made, ambid, monkeypatch):
+    monkeypatch.chdir(made)
+    (made / "bench").mkdir()
+    (made / "bench" / "record.h5").write_text(MEASURED)
+    done = ambid("commission", "--port", "simulated", "--rig", "rig.toml", "-o", "bench")
+    assert done.code == 2
+    assert "bench holds record.h5 of an earlier commissioning" in done.err
+    assert {path.name: path.read_text() for path in (made / "bench").iterdir()} == {"record.h5": MEASURED}
+
+
+def test_recover_writes_over_no_other_record(made, ambid, monkeypatch):
+    monkeypatch.chdir(made)
+    with Recorder(made / "cut.csv", header()) as recorder:
+        recorder.append(block(0))
+        assert recorder.flush()
+        (made / "kept.csv.journal").write_bytes(recorder.journal.read_bytes())
+    (made / "measured.csv").write_text(MEASURED)
+    done = ambid("recover", "kept.csv.journal", "-o", "measured.csv")
+    assert (done.code, done.out) == (2, "")
+    assert "measured.csv already exists" in done.err
+    assert (made / "measured.csv").read_text() == MEASURED
+    assert ambid("recover", "kept.csv.journal", "-o", "new.csv").code == 0
+
+
+def test_every_verb_that_writes_stands_here():
+    from ambid.cli.app import app
+
+    reads_only = {"info", "models", "demo"}
+    others = {verb.name for verb in app.registered_commands} - reads_only - {"commission", "recover"}
+    assert others == set(VERBS)
 
 
 def test_what_was_simulated_is_replaced_and_named(made, ambid, monkeypatch):

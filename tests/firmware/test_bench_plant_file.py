@@ -92,14 +92,25 @@ def test_a_table_goes_over_point_by_point(written, rig):
         unit_in="1",
         unit_out="m",
         raw=np.array([0.0, 400.0, 1023.0]),
-        out=np.array([2e-3, 1e-3, -1e-3]),
+        out=np.array([-2e-3, -1e-3, 1e-3]),
         extrapolate=True,
     )
     values, points = written(calibrated(rig, "position", table))
     assert "position_gain" not in values
     assert [row[0] for row in points] == ["position_point"] * len(points)
     assert [float(row[1]) for row in points] == pytest.approx([0.5 / 204.8, 400.5 / 204.8, 1023.5 / 204.8])
-    assert [float(row[2]) for row in points] == [2e-3, 1e-3, -1e-3]
+    assert [float(row[2]) for row in points] == [-2e-3, -1e-3, 1e-3]
+
+
+def test_the_instruments_rise_whatever_the_rig_claims_unless_the_bench_has_its_own(written, rig):
+    falls = Calibration(unit_in="1", unit_out="m", gain=-2e-6, offset=1.023e-3)
+    claimed, _ = written(calibrated(rig, "position", falls))
+    assert float(claimed["position_gain"]) == pytest.approx(5.0 / 1024.0 / 2e-6)
+    plant = preset("prototype").parameters
+    known = tuple(dataclasses.replace(p, value=plant[p.name]) for p in rig.parameters)
+    own = calibrated(dataclasses.replace(rig, parameters=known), "position", falls)
+    really, _ = written(bench=own)
+    assert float(really["position_gain"]) == pytest.approx(-5.0 / 1024.0 / 2e-6)
 
 
 def test_noise_is_the_bench_s_own(written):
