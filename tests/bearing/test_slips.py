@@ -219,11 +219,17 @@ def twice(s):
     return replace(s, y=np.column_stack([2.0 * s.y[:, 1], s.y[:, 1]]))
 
 
+def set_point(s):
+    n = len(s.u)
+    return replace(s, y=np.column_stack([1e-4 * np.sin(2 * np.pi * 7 * np.arange(n) / 2e4), s.y[:, 1]]))
+
+
 MISTAKEN = [
     (reversed_voltage, "channel 'voltage' is reversed"),
     (reversed_current, "reversed (or 'current' is)"),
     (twice, "channels 'position' and 'current' hold the same signal"),
     (swapped, "channels 'voltage' and 'current' are swapped"),
+    (set_point, "channel 'position' has no noise and is not moved by the others"),
     (swapped_outputs, "channels 'position' and 'current' are swapped"),
     (silent("current"), "channel 'current' is unrelated to voltage and position"),
     (silent("position"), "channel 'position' is unrelated to voltage and current"),

@@ -17,12 +17,13 @@ from ambid.arrays import Array
 from ambid.bearing.lag import lag_of, without_lag
 from ambid.bearing.multistart import Candidate, Delay, Signals, busiest, starts
 from ambid.bearing.rescue import reason
-from ambid.bearing.sizes import check_units
+from ambid.bearing.sizes import check_units, possible
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel, Parameter
 from ambid.rig.roles import Coil, coil_of
+from ambid.signals.delay import fit_arx
 
 Change = tuple[str, str, Signals]
 """What may be wrong, what to do about it, and the record with it changed."""
@@ -32,6 +33,9 @@ _LAGS = (0, 1, 2, 4, 8, 16, 40)  # before and after
 _RIDGE = 1e-9  # of the norm of a column: slow signals are nearly the same at neighbouring lags
 _CHANCE = 1e-4  # probability above which what the others explain of a column, and of its differences, is chance
 _FAR = 12.0  # median distances from the median at which values are held: about eight standard deviations
+_OWN = 4  # lags of its own from which a set point follows
+_NOISELESS = 1e-6  # of its spread: half of what its own past leaves of a column without noise
+_ROUNDING = 1e-9  # of its spread: below, comparisons are those of rounding
 _SAME = 1e-9  # from a correlation of one
 POOR = 2.5  # criterion per sample of a start that may be the wrong record's; good ones are below 2
 _GAIN = 0.7  # fall of the criterion per sample by which a change of the record must do better
@@ -51,6 +55,7 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
     reach[reach == 0.0] = np.inf  # of a signal that mostly stands still everything counts
     held = np.clip(columns - centre, -reach, reach)  # a glitch is no reason
     _refuse_twins(roles, held)
+    _refuse_set_points(model, replace(signals, u=signals.u[at], y=signals.y[at]))
     chance = [min(pair) for pair in zip(_by_chance(held), _by_chance(np.diff(held, axis=0)), strict=True)]
     most = int(np.argmax(chance))
     if chance[most] > _CHANCE:
@@ -59,6 +64,29 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
             f"channel {role!r} is unrelated to {others}: they explain none of it. Check channels.{role}.column in the "
             "rig, and the wiring"
         )
+
+
+def _refuse_set_points(model: LinearModel, signals: Signals) -> None:
+    """Raise where an output is computed, not measured: without noise, and nothing that the others do moves it."""
+    for j, role in enumerate(model.outputs):
+        y, others = signals.y[:, j], [*signals.u.T, *np.delete(signals.y, j, axis=1).T]
+        spread = float(np.std(y))
+        if spread == 0.0 or len(y) < 40 * (len(others) + 1):
+            continue
+        scaled = (y - y.mean()) / spread
+        own = fit_arx(scaled, (), _OWN, ())
+        past = np.column_stack([scaled[_OWN - k : len(scaled) - k] for k in range(1, _OWN + 1)])
+        left = scaled[_OWN:] - past @ own.coefficients[:_OWN] - own.coefficients[-1]
+        if min(float(np.median(np.abs(d))) for d in (left, np.diff(scaled))) > _NOISELESS:
+            continue
+        driven = fit_arx(scaled, [(x - x.mean()) / (np.std(x) or 1.0) for x in others], _OWN, range(_OWN + 1))
+        moved = own.variance * own.n_rows / max(driven.variance * driven.n_rows, 1e-300) - 1.0
+        degrees = len(others) * (_OWN + 1)
+        if own.variance < _ROUNDING**2 or chi_squared_tail(degrees, driven.n_rows * moved) > _CHANCE:
+            raise EstimationError(
+                f"channel {role!r} has no noise and is not moved by the others: it is a set point or a computed "
+                f"signal. Check channels.{role}.column in the rig"
+            )
 
 
 def _refuse_twins(roles: Sequence[str], columns: Array) -> None:
@@ -116,7 +144,7 @@ def refuse_mistaken(
     if model.name == "one-axis":
         _refuse_late(model, signals, parameters, delay, follow)
     better: list[tuple[float, str, str, list[Candidate]]] = []
-    likely, others = _likely(model, _changes(model, signals))
+    likely, others = _likely(model, _changes(model, signals), 0.0 if coil is None or turned else coil.share)
     for text, remedy, changed in likely:  # one start and one search, where a coil shows what is wrong
         _refuse_explained(text, remedy, _starts(model, changed, parameters, delay), follow)
     for text, remedy, changed in others:
@@ -133,7 +161,7 @@ def _refuse_explained(
 ) -> None:
     """Raise where a changed record, of which these are the start values, is explained."""
     fit = _try(follow, found) if found else None
-    if fit is not None and _positive(fit):
+    if fit is not None and _can_be(fit):
         raise EstimationError(
             f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
             f"{remedy}"
@@ -149,14 +177,17 @@ def _coil(model: LinearModel, signals: Signals) -> Coil | None:
     return coil_of(columns["voltage"], columns["current"], columns.get("position"), signals.rate_hz)
 
 
-def _likely(model: LinearModel, changes: Iterable[Change]) -> tuple[list[Change], list[Change]]:
-    """Changes after which there is a clear coil between voltage and current, the clearest first; and the others."""
+def _likely(model: LinearModel, changes: Iterable[Change], share: float) -> tuple[list[Change], list[Change]]:
+    """Changes after which there is a clear coil between voltage and current, the clearest first; and the others.
+
+    `share`: of the coil as it is; what makes it less clear is left out.
+    """
     found, others = [], []
     for change in changes:
         coil = _coil(model, change[2])
         if coil is not None and coil.share > _CLEAR and not coil.reversed:
             found.append((coil.share, change))
-        else:
+        elif coil is None or coil.share >= share:
             others.append(change)
     return [change for _, change in sorted(found, key=lambda f: -f[0])], others
 
@@ -221,9 +252,13 @@ def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate
     return fit if reason(fit) == "" else None
 
 
-def _positive(fit: Fit) -> bool:
-    theta = fit.problem.parameters(fit.vector)
-    return all(theta[p.name] > 0 for p in fit.problem.model.parameters if p.positive)
+def _can_be(fit: Fit) -> bool:
+    """Whether what was found is a bearing that could be built."""
+    theta, problem = fit.problem.parameters(fit.vector), fit.problem
+    seen = Signals(u=problem.u, y=problem.y, rate_hz=problem.rate_hz)
+    return possible(theta, seen, problem.model) and all(
+        theta[p.name] > 0 for p in problem.model.parameters if p.positive
+    )
 
 
 def _changes(model: LinearModel, signals: Signals) -> Iterator[Change]:

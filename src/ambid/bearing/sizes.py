@@ -135,11 +135,7 @@ def check_units(
     """
     plant = model("one-axis") if plant is None else plant
     of = _SYMMETRY | ({} if "voltage" in plant.inputs else _OF_MASS)
-    sizes = [*SIZES, *_said(parameters)]
-    columns = dict(zip((*plant.inputs, *plant.outputs), np.column_stack([signals.u, signals.y]).T, strict=True))
-    largest = {role: _largest(x) for role, x in columns.items()} | {"rate": signals.rate_hz}
-    if "position" in columns:
-        largest["position"] = 2.0 * _largest(columns["position"] - np.median(columns["position"]))
+    sizes, largest = [*SIZES, *_said(parameters)], _seen(signals, plant)
     logs = np.array([_log(size, {**values, **largest}) for size in sizes])
     low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
     far = (logs - (low + high) / 2) / ((high - low) / 2)
@@ -147,7 +143,7 @@ def check_units(
     if not odd:
         return Check(passed=True, values={"unusual": 0.0}, detail="all sizes are typical of magnetic bearings")
     symmetry = np.array([size.symmetry(of) for size in sizes])
-    slips = _slips(far, symmetry / ((high - low) / 2)[:, None], [c for c in CHANNELS if c in columns or c == "time"])
+    slips = _slips(far, symmetry / ((high - low) / 2)[:, None], [c for c in CHANNELS if c in largest or c == "time"])
     factors: dict[str, float] = {}
     for slip in slips:
         factors.setdefault(f"{slip.channel}_factor", slip.factor)
@@ -167,12 +163,31 @@ def check_units(
             detail=f"{what}. All sizes are typical if {words}. Correct the unit in the record's header, or give "
             + ("--rate" if slips[0].channel == "time" else f"channels.{slips[0].channel}.gain"),
         )
-    possible = all(s.possible[0] <= 10**x <= s.possible[1] for s, x in zip(sizes, logs, strict=True) if np.isfinite(x))
     return Check(
-        passed=possible,
+        passed=_inside(sizes, logs),
         values={"unusual": float(len(odd))},
         detail=f"{what}, and no wrong unit of one channel explains it. Check units, calibration and sampling rate",
     )
+
+
+def possible(values: Mapping[str, float], signals: Signals, plant: LinearModel) -> bool:
+    """Return whether a bench of these sizes can exist; arguments as of `check_units`."""
+    known = {**values, **_seen(signals, plant)}
+    return _inside(SIZES, [_log(size, known) for size in SIZES])
+
+
+def _inside(sizes: Sequence[Size], logs: Sequence[float] | Array) -> bool:
+    both = zip(sizes, logs, strict=True)
+    return all(s.possible[0] <= 10**x <= s.possible[1] for s, x in both if np.isfinite(x))
+
+
+def _seen(signals: Signals, plant: LinearModel) -> dict[str, float]:
+    """Largest voltage and current, travel, and rate, as far as the model has them."""
+    columns = dict(zip((*plant.inputs, *plant.outputs), np.column_stack([signals.u, signals.y]).T, strict=True))
+    found = {role: _largest(x) for role, x in columns.items()} | {"rate": signals.rate_hz}
+    if "position" in columns:
+        found["position"] = 2.0 * _largest(columns["position"] - np.median(columns["position"]))
+    return found
 
 
 def _mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:

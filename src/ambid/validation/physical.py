@@ -36,6 +36,12 @@ from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
 _ERRONEOUS = 5e-4  # part of the samples that may be outliers or drop-outs
 _SATURATED = 0.005  # part of the samples at a limit that a check lets pass
+_MISSING = {  # what a channel at its limits does to the parameters; measured on simulated benches, docs/checks.md
+    "voltage": "R and L come out too small if the coil's voltage went on, too large if the log is a command that the "
+    "amplifier did not follow; what it really limits does no harm",
+    "current": "without its peaks R, L and k_i come out too large",
+    "position": "without its peaks m comes out too large, and k_x wrong",
+}
 _WHITE_LAGS = (1, 2, 3, 5, 8, 13)
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither record nor priors see
 _SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
@@ -406,7 +412,7 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
 
 def _within_limits(found: Mapping[str, Saturation]) -> Check:
     bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
-    detail = "; ".join(str(s) for s in bad.values())
+    detail = ". ".join(f"{s}{': ' + _MISSING[name] if name in _MISSING else ''}" for name, s in bad.items())
     return Check(
         passed=not bad,
         values={f"{name}_fraction": s.fraction for name, s in found.items()},
