@@ -113,7 +113,7 @@ def track(
     on_header, on_line : callable, optional
         Called once before the first line, and with each line; flags that `on_line` returns are set.
     keep : bool, optional
-        Keep the lines for the result; without, memory stays constant.
+        Keep all lines for the result; without, the last one only, and memory stays constant.
     tick : callable, optional
 
     Returns

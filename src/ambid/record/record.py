@@ -12,6 +12,7 @@ import math
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from html import escape
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
@@ -27,6 +28,7 @@ from ambid.errors import AmbidError, RecordError, nearest
 if TYPE_CHECKING:
     import pandas
     import xarray
+    from matplotlib.figure import Figure
 
 
 def _tables(name: str) -> Any:
@@ -278,6 +280,29 @@ class Record:
             With rate, history and provenance as attributes.
         """
         return _tables("to_xarray")(self)
+
+    def plot(self) -> Figure:
+        """Draw every channel: over time with its faults, close, and over frequency.
+
+        Returns
+        -------
+        matplotlib.figure.Figure
+        """
+        title = f"{self.provenance.get('file', 'record')}: {self.duration_s:.4g} s at {self.rate_hz:.6g} Hz"
+        draw = import_module("ambid.report.record_figures").record_figure
+        return draw(self, title)  # type: ignore[no-any-return]
+
+    def _repr_html_(self) -> str:
+        """Return the table that a notebook shows."""
+        heads = "".join(f"<th>{x}</th>" for x in ("channel", "unit", "least", "mean", "largest"))
+        rows = "".join(
+            f"<tr><td>{escape(c.name)}</td><td>{escape(c.unit)}</td>"
+            + "".join(f"<td>{f(c.values):.4g}</td>" for f in (np.nanmin, np.nanmean, np.nanmax))
+            + "</tr>"
+            for c in self.channels
+        )
+        line = f"{self.n_samples} samples, {self.duration_s:.4g} s at {self.rate_hz:.6g} Hz"
+        return f"<div><b>Record</b>: {line}<table><tr>{heads}</tr>{rows}</table></div>"
 
     def __repr__(self) -> str:
         listed = ", ".join(f"{c.name} [{c.unit}]" for c in self.channels)
