@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 
 from table import Table
 
-PARTS = ("speed", "change", "quiet", "rest", "drift", "latency")
+PARTS = ("speed", "change", "coverage", "quiet", "rest", "drift", "latency")
 
 
 def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
@@ -23,6 +23,7 @@ def tracking_tables(wanted: tuple[str, ...] = PARTS) -> Iterator[Table]:
 
 def _part(part: str) -> Callable[[], Iterator[Table]]:
     from tracking_change import change_tables
+    from tracking_coverage import coverage_tables
     from tracking_drift import drift_tables
     from tracking_latency import latency_tables
     from tracking_quiet import quiet_tables
@@ -32,6 +33,7 @@ def _part(part: str) -> Callable[[], Iterator[Table]]:
     return {
         "speed": speed_tables,
         "change": change_tables,
+        "coverage": coverage_tables,
         "quiet": quiet_tables,
         "rest": rest_tables,
         "drift": drift_tables,
