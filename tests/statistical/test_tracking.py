@@ -9,8 +9,11 @@ from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.signals import multisine
 from ambid.simulation import scenario_blocks, simulate_preset
+from ambid.tracking.evidence import Samples
 from ambid.tracking.numbers import tracked_numbers
 from ambid.tracking.rpem import PhysicalRpem
+from ambid.tracking.supervisor import Supervisor
+from tests.tracking.runs import RATE, TRUE, arrays, simulated, step
 from tests.tracking.starts import BEARING, bearing, bearing_start, columns
 
 
@@ -49,18 +52,44 @@ def test_walks_do_not_loosen_ratios_that_are_known_well(seed):
             assert abs(found - known.value) < 0.6 * known.sd, name
 
 
-def test_intervals_hold_the_truth_as_often_as_they_say():
-    """Independent starts and records, memory "all"; the coverage is that of all parameters together."""
-    runs, n = 40, 4000
-    truth = np.array([preset(BEARING).parameters[k] for k in ("m", "k_x", "k_i", "R", "L")])
-    score = np.empty((runs, truth.size))
-    for seed in range(runs):
-        r = PhysicalRpem(bearing_start(2000, 100 + seed), memory="all")
-        r.update(*columns(bearing(n, 300 + seed)))
-        score[seed] = (r.estimate - truth) / np.sqrt(np.diag(r.covariance))
-    assert 0.89 < np.mean(np.abs(score) < 1.96) < 0.99
-    assert np.all(np.abs(score.mean(axis=0)) < 4.0 / np.sqrt(runs))
-    assert 0.8 < np.sqrt(np.mean(score**2)) < 1.25
+START_S, CHANGE_S, LENGTH_S = 0.2, 0.3, 0.5
+
+
+def published_scores(seed):
+    """Errors of the published values in their standard deviations, NaN where stale, every 10 ms of a record of its own.
+
+    k_i falls by 15 % at CHANGE_S; (n_lines,) times and (n_lines, n_parameters) scores.
+    """
+    record = simulated(step("k_i", 0.85, CHANGE_S), seconds=LENGTH_S, seed=300 + seed)
+    (u, y), first = arrays(record), round(START_S * RATE)
+    supervisor, t, z = Supervisor(PhysicalRpem(identify(record, to_s=START_S))), [], []
+    supervisor.begin(first)
+    for k in range(first, u.shape[0], 200):
+        supervisor.feed(Samples(u=u[k : k + 200], y=y[k : k + 200]), k)
+        t.append((k + 200) / RATE)
+        true = {**TRUE, "k_i": TRUE["k_i"] * (0.85 if t[-1] > CHANGE_S else 1.0)}
+        now = supervisor.parameters
+        z.append([np.nan if p.stale else (p.value - true[name]) / p.sd for name, p in now.items()])
+    return np.array(t), np.array(z)
+
+
+def test_published_bands_hold_the_truth_as_often_as_they_say_before_and_after_a_change():
+    """Independent starts and records. One record tells little: its lines share their data, and its start."""
+    runs = [published_scores(seed) for seed in range(24)]
+    t, z = runs[0][0], np.array([found for _, found in runs])
+    after = t > CHANGE_S + 0.1
+    for lines in (t <= CHANGE_S, after):
+        score = z[:, lines]
+        known = np.isfinite(score)
+        assert known.mean() > 0.97
+        assert 0.88 < np.mean(np.abs(score[known]) < 1.96) < 0.99
+    last = z[:, -1]
+    assert np.all(np.abs(last.mean(axis=0)) < 4.0 / np.sqrt(len(runs)))
+    assert np.all(np.sqrt(np.mean(last**2, axis=0)) < 1.5)
+    assert 0.75 < np.sqrt(np.mean(last**2)) < 1.25
+    # while the change is being found its parameter is marked: what is published is that before it
+    k_i = z[:, (t > CHANGE_S + 0.025) & (t <= CHANGE_S + 0.045), 2]
+    assert np.mean(np.isnan(k_i)) > 0.9
 
 
 def drifted(seed, duration_s, size):
