@@ -21,7 +21,7 @@ SEEDS, BAR_SEEDS, DRIFTS = 100, 40, 20
 AT_S, LENGTH_S = 2.0, 4.0
 SOON_S = 0.3  # after a change: what is published comes from few samples
 DRIFT_S, SLOPE = 10.0, 0.2 / 60.0  # of R, per second: a fifth in a minute
-GROUP = "Tracking: how often the 95 % bands hold the truth"
+GROUP = "Tracking: coverage of the 95 % bands"
 COLUMNS = ("scenario", "lines", *PHYSICAL)
 _Z = 1.959964
 
@@ -102,10 +102,10 @@ def coverage_tables() -> Iterator[Table]:
             print("; ".join(row), flush=True)
     before = (
         f"The unstable bearing at 20 kHz, start from its first {START_S:g} s, a line each 10 ms. `change` is the record"
-        f" of the README: k_i falls by 15 % at {AT_S:g} s. Share of the lines that are not stale whose band holds the"
-        f" truth, mean over {SEEDS} records ({DRIFTS} of the drift) ± its standard error. In `change`, k_i is outside"
-        " from the change to its detection, some 10 ms, and stale until its new value is accepted. In the last, R rises"
-        f" by {SLOPE:.2%} a second from {START_S:g} s on."
+        f" of the README: k_i falls by 15 % at {AT_S:g} s. Share of the lines that are not stale whose band contains"
+        f" the true value, mean over {SEEDS} records ({DRIFTS} of the drift) ± its standard error. In `change`, k_i is"
+        " outside from the change to its detection, some 10 ms, and stale until its new value is accepted. In the last,"
+        f" R rises by {SLOPE:.2%} a second from {START_S:g} s on."
     )
     yield Table(group=GROUP, columns=COLUMNS, rows=tuple(rows), before=before, remarks=tuple(remarks), data=data)
 

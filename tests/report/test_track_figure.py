@@ -140,7 +140,7 @@ def test_the_words_beside_the_truth_count_lines_that_are_not_stale():
     truth = (np.array([0.0, 101.0]), np.array([2.0, 2.0]))
     value = np.where(t <= 80, 2.01, 2.5)
     assert truth_words(t, value, np.full(100, 0.1), t > 90, truth).startswith("truth inside the band in 89 %")
-    assert "median distance 0.5 %" in truth_words(t, value, np.full(100, 0.1), t > 90, truth)
+    assert "median distance 0.5 % (0.1 sd)" in truth_words(t, value, np.full(100, 0.1), t > 90, truth)
     assert truth_words(t, value, np.full(100, 0.1), t > 0, truth) == ""
 
 

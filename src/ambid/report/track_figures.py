@@ -233,8 +233,10 @@ def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], tru
     true = np.interp(t[use], truth[0], truth[1])
     off = np.abs(value[use] - true)
     inside = 100 * float(np.mean(off <= NORMAL_95 * sd[use]))
-    size = float(np.median(np.abs(true)))
-    away = f", median distance {100 * float(np.median(off)) / size:.2g} %" if size else ""
+    size, usual = float(np.median(np.abs(true))), float(np.median(sd[use]))
+    # lines of one record share their data: its share says little without how far outside the truth lies
+    own = f" ({float(np.median(off)) / usual:.1f} sd)" if usual else ""
+    away = f", median distance {100 * float(np.median(off)) / size:.2g} %{own}" if size else ""
     return f"truth inside the band in {inside:.0f} % of the lines{away}"
 
 
