@@ -199,9 +199,10 @@ def test_info_reports_faults(bench, ambid, record_text):
     (bench / "bad.csv").write_text("\n".join([lines[1], *rows]) + "\n")
     found = ambid("info", "bad.csv")
     assert found.code == 0
-    assert "✗ position:" in found.out
-    assert "saturated" in found.out
-    assert "✗ current: never changes" in found.out
+    assert found.out.startswith("verdict: use with caution\n")
+    assert "✗ saturation: position: " in found.out
+    assert "✗ drop-outs: current: never changes" in found.out
+    assert ambid("info", "bad.csv", "--strict").code == 3
 
 
 def test_models_lists_everything_with_units(ambid):

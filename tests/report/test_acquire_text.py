@@ -7,10 +7,15 @@ import pytest
 
 from ambid.acquisition.device import Counters, DeviceInfo
 from ambid.acquisition.quality import ColumnQuality, QualityReport
+from ambid.acquisition.recorder.convert import Recorded
+from ambid.acquisition.recorder.reader import Survey
+from ambid.acquisition.recording import Acquired
 from ambid.acquisition.session import RunReport
+from ambid.estimation.result import Reason
 from ambid.job.commissioning_steps import STEPS
+from ambid.job.presentation import text as show
 from ambid.report.commission_page import Step
-from ambid.report.device_text import acquired_text, next_text, progress_line, step_text
+from ambid.report.device_text import next_text, progress_line, step_text
 
 COLUMN = ColumnQuality(
     name="gap", role="position", unit="1", mean=512.0, sd=20.0, rms=512.0, least=400.0, most=600.0, saturated=0.0,
@@ -29,12 +34,16 @@ INFO = DeviceInfo(kind="serial", port="/dev/ttyX", rate_hz=2000.0, columns=())
 
 
 def said(run=RUN, quality=QUALITY, counters=NOTHING, not_stored=0):
-    return " ".join(acquired_text(Path("o.h5"), INFO, run, quality, counters, not_stored=not_stored).split())
+    recorded = Recorded(path=Path("o.h5"), rate_hz=2000.0, survey=Survey())
+    done = Acquired(
+        info=INFO, run=run, quality=quality, counters=counters, recorded=recorded, troubles=(), not_stored=not_stored
+    )
+    return " ".join(show(done).split())
 
 
 def test_a_whole_record_is_told_with_its_columns():
     text = said()
-    assert text.startswith("o.h5: 1000 samples at 2000 Hz (0.5 s) from serial /dev/ttyX")
+    assert text.startswith("verdict: usable o.h5: 1000 samples at 2000 Hz (0.5 s) from serial /dev/ttyX")
     assert "gap 512 20 4 13.5 dB 20 % 0 %" in text
     assert "duty 512 20 - - 20 % 0 %" in text
     assert "what does not repeat with the excitation" in text
@@ -42,7 +51,10 @@ def test_a_whole_record_is_told_with_its_columns():
 
 def test_a_short_record_is_told_as_short():
     text = said(run=replace(RUN, samples=700), not_stored=100)
-    assert text.startswith("o.h5: 600 samples of 1000 wanted at 2000 Hz (0.3 s)")
+    assert text.startswith("verdict: use with caution")
+    assert "complete: 700 of 1000 samples came" in text
+    assert "stored: 100 samples are not in the record" in text
+    assert "o.h5: 600 samples of 1000 wanted at 2000 Hz (0.3 s)" in text
 
 
 def test_without_an_excitation_there_is_no_ratio():
@@ -57,10 +69,10 @@ def test_lost_samples_say_how_to_read_the_record():
     assert "3 samples lost, 0 frames damaged, 0 blocks overrun; read it with --gaps" in said(run=replace(RUN, lost=3))
 
 
-def test_what_is_poor_is_said_at_the_end():
-    assert said(quality=replace(QUALITY, verdict=("gap stands still. Look at it",))).endswith(
-        "gap stands still. Look at it"
-    )
+def test_what_is_poor_is_said_first():
+    dead = Reason(check="dead", text="gap stands still. Look at it", grave=True)
+    text = said(quality=replace(QUALITY, faults=(dead,)))
+    assert text.startswith("verdict: do not use ✗ dead: gap stands still. Look at it")
 
 
 def test_the_clock_of_the_controller_is_told_with_its_uncertainty():

@@ -2,8 +2,13 @@
 
 import numpy as np
 
+from ambid.job.presentation import text
 from ambid.record import Channel, Record
-from ambid.report.tables import record_text
+from ambid.validation.inspection import inspect
+
+
+def record_text(record, **how):
+    return text(inspect(record, **how))
 
 
 def record_of(**channels):

@@ -18,6 +18,7 @@ from ambid.acquisition.device import Column, DeviceInfo, Program
 from ambid.acquisition.program import period_ticks
 from ambid.arrays import Array
 from ambid.errors import counted
+from ambid.estimation.result import Reason
 from ambid.tracking.blocks import Frame
 
 _DIFFERENCES = np.array([1.0, -3.0, 3.0, -1.0])
@@ -35,6 +36,7 @@ _STILL_S = 0.5
 _SNR_DB = 10.0
 _RATE = 0.01
 _SURE = 5.0  # standard deviations
+_DEAD = "dead"  # a channel that shows nothing: what is recorded is not to be used
 
 
 class Moments:
@@ -206,7 +208,12 @@ class QualityReport:
     measured_sd: float
     excited: bool  # whether an excitation plays
     columns: tuple[ColumnQuality, ...]  # in the device's order
-    verdict: tuple[str, ...] = ()  # what is not good enough, one line each with its remedy; empty where all is well
+    faults: tuple[Reason, ...] = ()  # what is not good enough; empty where all is well
+
+    @property
+    def verdict(self) -> tuple[str, ...]:
+        """What is not good enough, one line each with its remedy."""
+        return tuple(r.text for r in self.faults)
 
 
 class Quality:
@@ -275,7 +282,7 @@ class Quality:
             excited=self._excited,
             columns=self._columns(),
         )
-        return replace(made, verdict=verdict(made, self._info))
+        return replace(made, faults=faults(made, self._info))
 
     def _take(self, first: int, x: Array) -> None:
         """Take sound consecutive samples."""
@@ -335,21 +342,22 @@ def _decibels(signal: float, noise: float) -> float | None:
     return math.inf if noise <= 0.0 else 10.0 * math.log10(signal / noise)
 
 
-def verdict(report: QualityReport, info: DeviceInfo) -> tuple[str, ...]:
+def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
     """Say what is not good enough.
 
     `report`: all but its verdict; `info`: of the device. Returns empty where all is well, or where there are too few
     samples to tell.
     """
-    lines = list(_stream(report, info))
+    found = [Reason(check=name, text=text) for name, text in _stream(report, info)]
     if report.samples >= _FEWEST:
         for column in report.columns:
             if not math.isfinite(column.rms):
-                lines.append(_absurd(column))
+                found.append(Reason(check="size", text=_absurd(column), grave=True))
                 continue
-            lines += _range(column) if column.role in MEASURED else _ordered(column, report.excited)
-            lines += _content(column, report) if column.role in MEASURED else []
-    return tuple(lines)
+            sensed = column.role in MEASURED
+            said = [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
+            found += [Reason(check=name, text=text, grave=name == _DEAD) for name, text in said]
+    return tuple(found)
 
 
 def _absurd(column: ColumnQuality) -> str:
@@ -359,74 +367,103 @@ def _absurd(column: ColumnQuality) -> str:
     )
 
 
-def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[str]:
+def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[tuple[str, str]]:
     replay = info.kind == "replay"  # what was is over: nothing of it is mended at a line or a device
     if report.lost:
         share = report.lost / (report.lost + report.samples)
-        yield f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): " + (
-            "they are missing in the replayed record. Read it with --gaps"
-            if replay
-            else "the line or the host is too slow. Lower daq.rate_hz, or free the machine"
+        yield (
+            "lost",
+            f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): "
+            + (
+                "they are missing in the replayed record. Read it with --gaps"
+                if replay
+                else "the line or the host is too slow. Lower daq.rate_hz, or free the machine"
+            ),
         )
     if report.repeated:
-        yield f"{counted(report.repeated, 'sample')} came twice and were omitted: " + (
-            "the time of the replayed record runs backwards. Check its time column"
-            if replay
-            else "the device counts wrongly. Restart it"
+        yield (
+            "repeated",
+            f"{counted(report.repeated, 'sample')} came twice and were omitted: "
+            + (
+                "the time of the replayed record runs backwards. Check its time column"
+                if replay
+                else "the device counts wrongly. Restart it"
+            ),
         )
     if report.damaged:
         where = "replayed record" if replay else "device"
-        yield f"{counted(report.damaged, 'sample')} with a value that is not a number omitted. Check the {where}"
+        yield (
+            "damaged",
+            f"{counted(report.damaged, 'sample')} with a value that is not a number omitted. Check the {where}",
+        )
     off = abs(report.measured_hz - report.rate_hz)
     # only hardware keeps the time of this world; NaN compares false
     if info.kind == "serial" and off > _RATE * report.rate_hz and off > _SURE * report.measured_sd:
         yield (
-            f"{report.measured_hz:.6g} samples arrive per second instead of {report.rate_hz:g}: the controller "
-            "clock is wrong. Check its crystal, or the firmware build"
+            "rate",
+            (
+                f"{report.measured_hz:.6g} samples arrive per second instead of {report.rate_hz:g}: the controller "
+                "clock is wrong. Check its crystal, or the firmware build"
+            ),
         )
 
 
-def _range(column: ColumnQuality) -> Iterator[str]:
+def _range(column: ColumnQuality) -> Iterator[tuple[str, str]]:
     """Judge how a sensor fills its converter."""
     if column.saturated > _SATURATED:
         yield (
-            f"{column.name} is at an end of the converter range in {column.saturated:.2%} of the samples, where it "
-            "is not measured. Reduce the sensor gain, shift its offset, or excite less"
+            "saturation",
+            (
+                f"{column.name} is at an end of the converter range in {column.saturated:.2%} of the samples, where it "
+                "is not measured. Reduce the sensor gain, shift its offset, or excite less"
+            ),
         )
     elif column.used is not None and 0.0 < column.used < _USED:
         yield (
-            f"{column.name} uses {column.used:.1%} of the converter range, so its resolution is coarse. Raise the "
-            "sensor gain, or excite more"
+            "range",
+            (
+                f"{column.name} uses {column.used:.1%} of the converter range, so its resolution is coarse. Raise the "
+                "sensor gain, or excite more"
+            ),
         )
 
 
-def _ordered(column: ColumnQuality, excited: bool) -> Iterator[str]:
+def _ordered(column: ColumnQuality, excited: bool) -> Iterator[tuple[str, str]]:
     """Judge what the controller orders."""
     if column.role != "voltage":
         return
     if column.saturated > _LIMITED:
         yield (
-            f"{column.name} is saturated in {column.saturated:.1%} of the samples: the loop is not linear there. "
-            "Excite less, or widen daq.duty"
+            "limit",
+            (
+                f"{column.name} is saturated in {column.saturated:.1%} of the samples: the loop is not linear there. "
+                "Excite less, or widen daq.duty"
+            ),
         )
     if excited and column.sd == 0.0:
-        yield f"{column.name} is constant although an excitation was requested. Drive or levitate to play it"
+        yield "still", f"{column.name} is constant although an excitation was requested. Drive or levitate to play it"
 
 
-def _content(column: ColumnQuality, report: QualityReport) -> Iterator[str]:
+def _content(column: ColumnQuality, report: QualityReport) -> Iterator[tuple[str, str]]:
     """Judge what is in a sensor's signal."""
     if column.sd == 0.0:
-        yield f"{column.name} is constant at {column.mean:.6g}: no sensor there? Check its cable and supply"
+        yield _DEAD, f"{column.name} is constant at {column.mean:.6g}: no sensor there? Check its cable and supply"
         return
     if report.excited and column.still_s > _STILL_S:
         yield (
-            f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
-            "stop, or a cable is loose. Check both"
+            "still",
+            (
+                f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
+                "stop, or a cable is loose. Check both"
+            ),
         )
     told = report.excited and column.noise_by == "periods" and column.role != "extra"
     if told and column.snr_db is not None and column.snr_db < _SNR_DB:
         rest = 1.0 / (1.0 + 10.0 ** (column.snr_db / 10.0))
         yield (
-            f"{column.name}: the signal-to-noise ratio is {column.snr_db:.0f} dB (limit {_SNR_DB:.0f}): {rest:.0%} "
-            "of its power does not come from the excitation. Excite more, or in a band that the plant follows"
+            "snr",
+            (
+                f"{column.name}: the signal-to-noise ratio is {column.snr_db:.0f} dB (limit {_SNR_DB:.0f}): {rest:.0%} "
+                "of its power does not come from the excitation. Excite more, or in a band that the plant follows"
+            ),
         )

@@ -13,6 +13,7 @@ from ambid.acquisition.quality import Quality, QualityReport
 from ambid.acquisition.recorder import JournalHeader, Recorded, Recorder
 from ambid.acquisition.session import Course, RunReport, Tap, run
 from ambid.errors import DeviceError
+from ambid.estimation.result import Reason, Result
 from ambid.record import Record, read_record
 from ambid.rig import Rig
 from ambid.tracking.blocks import Frame
@@ -28,9 +29,9 @@ class Progress:
     counters: Counters  # of the line
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Acquired:
-    """What an acquisition gave."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Acquired(Result):
+    """What an acquisition gave, file schema ``ambid.acquisition/1``."""
 
     info: DeviceInfo  # who gave it
     run: RunReport  # of the device
@@ -46,6 +47,29 @@ class Acquired:
         if self.recorded is None:
             raise DeviceError(f"{self.info.port}: nothing was recorded. Look at `run`, which says why")
         return read_record(self.recorded.path)
+
+    @property
+    def stored(self) -> int:
+        """Samples in the record."""
+        return self.run.samples - self.not_stored - self.quality.repeated
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """A run that ended early, samples that are not in the record, and what is not good enough of the others."""
+        found, run = list[Reason](), self.run
+        if self.recorded is None:
+            text = "nothing was recorded. Look at cable and supply, and record again"
+            found.append(Reason(check="samples", text=text, grave=True))
+        if run.fault is not None:
+            text = f"the controller went to its safe state: {run.fault.what}. Remove the cause, and record again"
+            found.append(Reason(check="fault", text=text))
+        elif not run.complete and not run.lost:
+            text = f"{run.samples} of {run.wanted} samples came before the end. Record again if they are too few"
+            found.append(Reason(check="complete", text=text))
+        if self.not_stored:
+            text = f"{self.not_stored} samples are not in the record: the disk was too slow or failed. Make room"
+            found.append(Reason(check="stored", text=text))
+        return (*found, *self.quality.faults)
 
 
 class Listeners(TypedDict, total=False):

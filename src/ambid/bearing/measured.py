@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.frequency import Channels, FrequencyEstimate, response
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.fit_file import fit_to_json
+from ambid.blackbox.fit_file import fit_from_json, fit_to_json
 from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import EstimatedParameter, covariance_together, fields_json, plain_json
+from ambid.estimation.estimate import (
+    EstimatedParameter,
+    covariance_apart,
+    covariance_together,
+    fields_json,
+    plain_json,
+    read_as,
+    read_whole,
+)
 from ambid.estimation.result import Reason, Result
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.linear_model import model as physical_model
@@ -76,6 +84,9 @@ class Measured(Result):
             pair = f"{frf.inputs[worst[1]]} → {frf.outputs[worst[0]]}"
             text = f"{least} of {lines} lines of {pair} stand out of the noise. Excite more, longer or in another band"
             found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
+        if not (self.references or self.open_loop):
+            text = "feedback, if there was any, biases it. Give the reference (--reference), or say --open-loop"
+            found.append(Reason(check="feedback", text=text))
         for name, model in (("fit", self.fit), ("physical", self.estimate)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
         return tuple(found)
@@ -233,6 +244,44 @@ def measured_to_json(measured: Measured) -> dict[str, Any]:
         **fields_json(frf, without=("G", "covariance", "noise_covariance", "coherence")),
         **plain_json(more),
     }
+
+
+def measured_from_json(document: Mapping[str, Any], where: str) -> Measured:
+    """Read a measured response back; `where` is the name of its file, for messages.
+
+    Of several inputs or outputs the noise comes back without correlations between the pairs.
+    """
+    return read_whole(lambda: _from_json(document, where), where, "frequency response", "frf")
+
+
+def _from_json(d: Mapping[str, Any], where: str) -> Measured:
+    inputs, outputs = d["inputs"], d["outputs"]
+
+    def whole(by_pair: Any, kind: Any) -> Any:
+        columns = [read_as(kind, by_pair[o][i], f"{o}.{i}") for o in outputs for i in inputs]
+        return None if by_pair is None else np.stack(columns, axis=1)
+
+    sd, noise = whole(d["sd"], Array), None if d["noise_sd"] is None else whole(d["noise_sd"], Array)
+    (n, pairs), coherence = sd.shape, d["coherence"]
+    matrix = None if d["covariance"] is None else read_as(Complex, d["covariance"]["matrix"]).reshape(n, pairs, pairs)
+    diagonal = np.eye(pairs)[None].astype(np.complex128)
+    response = {
+        **d,
+        "G": whole(d["G"], Complex).reshape(n, len(outputs), len(inputs)),
+        "covariance": diagonal * sd[:, None, :] ** 2 if matrix is None else matrix,
+        "noise_covariance": None if noise is None else diagonal * noise[:, None, :] ** 2,
+        "coherence": coherence and np.stack([read_as(Array, coherence[o]) for o in outputs], axis=1),
+    }
+    fit, estimate = d["fit"], d["estimate"]
+    return Measured(
+        response=read_as(FrequencyResponse, response),
+        references=tuple(d["references"]),
+        open_loop=d["open_loop"],
+        fit=None if fit is None else fit_from_json(fit, where),
+        estimate=None if estimate is None else read_as(FrequencyEstimate, covariance_apart(estimate)),
+        record=d["record"],
+        timing_s=d["timing_s"],
+    )
 
 
 def _by_pair(frf: FrequencyResponse, values: Any) -> dict[str, dict[str, Any]] | None:

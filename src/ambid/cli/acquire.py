@@ -18,7 +18,7 @@ from ambid.cli.devices import say_note
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
-from ambid.cli.terminal import painter, watching
+from ambid.cli.terminal import watching
 from ambid.errors import AmbidError, counted
 
 if TYPE_CHECKING:
@@ -71,13 +71,14 @@ def command(
         ),
     ] = None,
     json: Annotated[
-        str | None, option("--json FILE", "With --track: write the track as lines of JSON; - for standard output.")
+        str | None,
+        option("--json FILE", "Write the result, with --track the track as lines of JSON; - for standard output."),
     ] = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view of the track.")] = False,
     force: opt.ForceLoop = False,
-    strict: Annotated[
-        bool, switch("--strict", "End with exit code 3 if samples were lost or the quality is poor.")
-    ] = False,
+    strict: opt.Strict = False,
 ) -> None:
     """Record what a controller samples: it keeps the rotor levitated, plays the excitation and protects the bench.
 
@@ -88,13 +89,12 @@ def command(
     from ambid.report.device_text import progress_line
     from ambid.rig import load_rig
 
-    if json is not None and track is None:
-        raise AmbidError("--json writes a track, and none was requested. Give --track too, or omit it")
     between = opt.band_of(band)
     replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
-    with Outputs(rig, None if track in (None, "auto") else Path(str(track)), replayed) as outputs:
-        outputs.claim(record, "-o", _ENDINGS, force=force)
-        outputs.claim(json_path(json), "--json")
+    start_file = None if track in (None, "auto") else Path(str(track))
+    outputs = Outputs(rig, start_file, replayed, json=None if track else json, plot=plot, report=report)
+    outputs.claim(record, "-o", _ENDINGS, force=force)
+    outputs.claim(json_path(json) if track else None, "--json")
     known, stop, behind = load_rig(rig), Stop(), None if bench is None else opt.preset_of(bench) or bench
     words: dict[str, Any] = {
         "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
@@ -130,7 +130,7 @@ def command(
     except KeyboardInterrupt:
         typer.echo(f"ambid: interrupted{_left(record, _changed(record) != before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
-    job.tell(done, table=json != "-")
+    job.tell(done, outputs, table=track is None or json != "-")
     if track_end is not None:
         track_end()
     job.finish(done, strict=strict)
@@ -193,19 +193,15 @@ class Recording:
 
         return tap.acquired(runs[0]), ending
 
-    def tell(self, done: Acquired, *, table: bool) -> None:
+    def tell(self, done: Acquired, outputs: Outputs, *, table: bool) -> None:
         """Say what was recorded; where standard output is of the track, only what is not good of it."""
-        from ambid.report.device_text import acquired_text
-
         if done.recorded is None:
             return
+        with outputs:
+            outputs.give(done)
         if table:
-            said = acquired_text(
-                self.path, done.info, done.run, done.quality, done.counters, not_stored=done.not_stored,
-                paint=painter(),
-            )  # fmt: skip
             try:
-                typer.echo(said)
+                outputs.show(done)
             except OSError:
                 if self.stop.number is None:
                     raise
@@ -224,8 +220,7 @@ class Recording:
 
     def finish(self, done: Acquired, *, strict: bool) -> None:
         """Tell what ended the run early, and end with the exit code."""
-        stored = done.run.samples - done.not_stored - done.quality.repeated
-        kept = f"{self.path} holds the {stored} samples before it" if done.recorded else "nothing was recorded"
+        kept = f"{self.path} holds the {done.stored} samples before it" if done.recorded else "nothing was recorded"
         if done.run.fault is not None:
             from ambid.acquisition.default_daq import fault_words
             from ambid.rig.rig import Daq
@@ -249,7 +244,7 @@ class Recording:
         if not done.run.complete and not done.run.lost:
             ended = f"{self.port} ended after {done.run.samples} of {done.run.wanted} samples"
             typer.echo(f"ambid: note: {ended}", err=True)
-        end(failed=strict and (not done.run.complete or bool(done.quality.verdict)))
+        end(failed=strict and not done.passed)
 
     def _not_stored(self, done: Acquired) -> str:
         """Say what is not in the record, and where the rest is; why was told when it happened."""

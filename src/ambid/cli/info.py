@@ -8,27 +8,38 @@ from collections.abc import Iterable
 import typer
 
 from ambid.cli import options as opt
+from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import painter, progress
 
 
-def info(record: opt.RecordFile, rig: opt.RigFile = None, rate: opt.Rate = None, gaps: opt.Gaps = None) -> None:
+def info(
+    record: opt.RecordFile,
+    rig: opt.RigFile = None,
+    rate: opt.Rate = None,
+    gaps: opt.Gaps = None,
+    json: opt.JsonFile = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
+    strict: opt.Strict = False,
+) -> None:
     """Show what a record holds: channels, rate, levels, resolution, noise, saturation, drop-outs, outliers, excitation.
 
     With --rig: the channels by role, calibrated; the noise of the outputs is then told from what the input explains.
     """
     from ambid.physics.linear_model import model
     from ambid.record import read_record
-    from ambid.report.tables import record_text
     from ambid.rig import load_rig, read_bench
+    from ambid.validation.inspection import inspect
 
-    with progress("look"):
+    with Outputs(record, rig, json=json, plot=plot, report=report) as outputs, progress("look") as show:
         if rig is None:
-            text = record_text(read_record(record, rate_hz=rate, gaps=gaps or "error"), paint=painter())
+            found = inspect(read_record(record, rate_hz=rate, gaps=gaps or "error"))
         else:
             bench = load_rig(rig)
-            inputs = model(bench.model).inputs
-            text = record_text(read_bench(record, bench, rate_hz=rate, gaps=gaps), inputs=inputs, paint=painter())
-    typer.echo(text)
+            found = inspect(read_bench(record, bench, rate_hz=rate, gaps=gaps), inputs=model(bench.model).inputs)
+        outputs.give(found, show)
+    outputs.show(found)
+    end(failed=strict and not found.passed)
 
 
 def models() -> None:

@@ -15,6 +15,7 @@ import types
 from collections.abc import Callable, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import lru_cache
+from pathlib import PurePath
 from types import MappingProxyType
 from typing import Any, Literal, TypeVar, Union, cast, get_args, get_origin, get_type_hints
 
@@ -214,6 +215,8 @@ def plain_json(value: Any) -> Any:
         return value
     if isinstance(value, float):
         return value if math.isfinite(value) else None
+    if isinstance(value, (PurePath, AmbidError)):
+        return str(value)
     if isinstance(value, Mapping):
         return {str(k): plain_json(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
@@ -334,6 +337,8 @@ def read_as(kind: type[T], value: Any, at: str = "") -> T:
 
 def _read(kind: Any, value: Any, at: str) -> Any:
     origin, inner = get_origin(kind), get_args(kind)
+    if isinstance(kind, type) and issubclass(kind, (PurePath, AmbidError)):
+        return kind(_READERS[str](value, at))
     if kind in _READERS:
         return _READERS[kind](value, at)
     if is_dataclass(kind):
@@ -396,7 +401,9 @@ def _tuple(kinds: tuple[Any, ...], value: Any, at: str) -> tuple[Any, ...]:
 
 
 def _array(dtype: Any, value: Any, at: str) -> Any:
-    """Read numbers, null as NaN; text and truth values are no numbers."""
+    """Read numbers, null as NaN; text and truth values are no numbers. An array is taken as it is."""
+    if isinstance(value, np.ndarray):
+        return value
     found = np.array(value)
     if found.size and found.dtype.kind == "O":
         found = np.array(value, dtype=np.float64)  # null becomes NaN; anything else raises

@@ -289,7 +289,7 @@ class _Guide:
         )  # fmt: skip
         caption = f"The first {min(seconds, _SHOWN / info.rate_hz):.3g} s; dashed: the controller's trips."
         picture = trace_picture(f"The {name}", caption, kept.roles(), info.rate_hz, self._room.trips)
-        return judge.record(name, done, path, (picture,) if kept.values else ())
+        return judge.record(name, done, (picture,) if kept.values else ())
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
         wishes, rate_hz = self.wishes, self._device.info.rate_hz

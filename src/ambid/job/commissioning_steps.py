@@ -8,7 +8,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
@@ -302,10 +301,10 @@ def _numbers(shown: Mapping[str, tuple[float, float]]) -> dict[str, float]:
     return {f"{role}_{what}": x for role, pair in shown.items() for what, x in zip(("mean", "sd"), pair, strict=True)}
 
 
-def record(name: str, done: Acquired, path: Path, pictures: tuple[Picture, ...] = ()) -> Step:
+def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Step:
     """Judge a record as it was taken.
 
-    `name`: what it is for; `done`: from `acquire`; `path`: of its file; `pictures`: of it.
+    `name`: what it is for; `done`: from `acquire`; `pictures`: of it.
     Returns not passed where samples were lost or not stored, or a sensor saturates or stands still. Little signal over
     noise is a caution: whether it is enough is decided by the intervals of what is identified.
     """
@@ -327,7 +326,7 @@ def record(name: str, done: Acquired, path: Path, pictures: tuple[Picture, ...] 
         if column.role in ("position", "current") and column.sd == 0.0
     ]
     cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
-    text = acquired_text(path, done.info, done.run, done.quality, done.counters, not_stored=done.not_stored)
+    text = acquired_text(done)
     return Step(
         name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), text=text,
         pictures=pictures,

@@ -16,6 +16,7 @@ from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import EstimatedParameter, fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
+from ambid.record import Record, read_record
 from ambid.recursive.lines import Track
 from ambid.report.text import WIDTH, WORDS, Paint, joined, plain, verdict_lines
 
@@ -261,6 +262,40 @@ def _validation() -> View:
     )
 
 
+def _acquired() -> View:
+    from ambid.report.device_text import acquired_text
+    from ambid.report.record_figures import record_figure
+
+    def where(a: Any) -> str:
+        return "no record" if a.recorded is None else str(a.recorded.path)
+
+    def drawn(a: Any, used: Any, width: float) -> Figure:
+        at = used or (a.recorded is not None and a.recorded.path)
+        record = read_record(at, gaps="interpolate") if at and Path(at).exists() else None
+        return record_figure(record, f"{where(a)}, from {a.info.kind} {a.info.port}", a.quality.columns, width)
+
+    return View(
+        text=acquired_text, figure=drawn, document=_fields_of("ambid.acquisition/1"),
+        table=lambda a: ("name", _numbers_of([fields_json(c) for c in a.quality.columns])),
+        title=lambda a: f"{where(a)}, {a.stored} samples from {a.info.kind} {a.info.port}", beside=lambda _, at: at,
+    )  # fmt: skip
+
+
+def _inspection() -> View:
+    from ambid.report.record_figures import record_figure
+    from ambid.report.tables import inspection_text
+    from ambid.validation.inspection import SCHEMA
+
+    return View(
+        text=inspection_text,
+        figure=lambda i, used, w: record_figure(used, f"{i.record['file'] or 'record'}: channels", i.channels, w),
+        document=_fields_of(SCHEMA),
+        table=lambda i: ("name", _numbers_of([fields_json(c) for c in i.channels])),
+        title=lambda i: f"{i.record['file'] or 'record'}, {i.record['samples']} samples at {i.record['rate_hz']:g} Hz",
+        beside=lambda _, record: record if isinstance(record, Record) else read_record(record),
+    )
+
+
 def _track() -> View:
     from ambid.job.following import Followed
     from ambid.job.track_truth import truth_beside
@@ -400,6 +435,8 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Validation": _validation,
     "Measured": _measured,
     "Track": _track,
+    "Inspection": _inspection,
+    "Acquired": _acquired,
     "Comparison": _comparison,
     "Commissioned": _commissioned,
 }

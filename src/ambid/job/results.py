@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Unpack
 
@@ -11,7 +12,7 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_j
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as
+from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
 from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
 from ambid.nonlinear.fit import NonlinearFit
@@ -21,6 +22,8 @@ from ambid.physics.linear_model import model
 from ambid.record import GapPolicy
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, rig_from_text
+from ambid.tracking.lines_file import SCHEMA as TRACK
+from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
 from ambid.validation.fits import validation as fit_validation
 from ambid.validation.second_record import validation
@@ -28,19 +31,22 @@ from ambid.validation.second_result import Validation
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate
+_BEGIN = 200  # letters in which a track says that it is one
 
 
-def load(path: str | Path) -> AnyEstimate | AnyFit:
-    """Read an estimate, linear or nonlinear, or a black-box or nonlinear fit from its file.
+def load(path: str | Path) -> Any:
+    """Read a result of any verb from its file.
 
     Parameters
     ----------
     path : str or Path
-        JSON, schema ``ambid.estimate/1`` or ``ambid.fit/1``.
+        What ``--json`` or `Result.save` wrote: an estimate, fit, track, frequency response, comparison, validation,
+        inspection or acquisition.
 
     Returns
     -------
-    Estimate, NonlinearBearingEstimate, BlackBoxFit or NonlinearFit
+    Result
+        Without what it was made from: its figures then show what needs no record, or take ``record=``.
 
     Raises
     ------
@@ -49,6 +55,8 @@ def load(path: str | Path) -> AnyEstimate | AnyFit:
     """
     path = Path(path)
     text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
+    if f'"{TRACK}"' in text[:_BEGIN]:
+        return read_track(path)
     try:
         document = json.loads(text)
     except json.JSONDecodeError as failure:
@@ -61,13 +69,53 @@ def load(path: str | Path) -> AnyEstimate | AnyFit:
             "--json' wrote"
         ) from None
     schema = document.get("schema") if isinstance(document, dict) else None
-    if schema == FIT_SCHEMA:
-        if str(document.get("structure")) in NONLINEAR_STRUCTURES:
-            return nonlinear_fit_from_json(document, f"fit {path}")
-        return fit_from_json(document, f"fit {path}")
-    if schema == ESTIMATE and "law" in document:
-        return bearing_from_json(document, f"estimate {path}")
-    return estimate_from_json(document, f"estimate {path}")
+    read: Callable[[Mapping[str, Any], str], Any] = _READERS[str(schema)] if schema in _READERS else _estimate
+    return read(document, str(path))
+
+
+def _estimate(document: Mapping[str, Any], path: str) -> AnyEstimate:
+    nonlinear = isinstance(document, dict) and "law" in document
+    where = f"estimate {path}"
+    return bearing_from_json(document, where) if nonlinear else estimate_from_json(document, where)
+
+
+def _fit(document: Mapping[str, Any], path: str) -> AnyFit:
+    nonlinear = str(document.get("structure")) in NONLINEAR_STRUCTURES
+    where = f"fit {path}"
+    return nonlinear_fit_from_json(document, where) if nonlinear else fit_from_json(document, where)
+
+
+def _whole(module: str, name: str, verb: str) -> Callable[[Mapping[str, Any], str], Any]:
+    """Return a reader of a result whose file has all its fields by name."""
+
+    def read(document: Mapping[str, Any], path: str) -> Any:
+        kind = getattr(import_module(f"ambid.{module}"), name)
+        return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), verb)
+
+    return read
+
+
+def _measured(document: Mapping[str, Any], path: str) -> Any:
+    from ambid.bearing.measured import measured_from_json
+
+    return measured_from_json(document, f"frequency response {path}")
+
+
+def _comparison(document: Mapping[str, Any], path: str) -> Any:
+    from ambid.validation.comparison import comparison_from_json
+
+    return comparison_from_json(document, f"comparison {path}")
+
+
+_READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
+    ESTIMATE: _estimate,
+    FIT_SCHEMA: _fit,
+    "ambid.frf/1": _measured,
+    "ambid.comparison/1": _comparison,
+    "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
+    "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
+    "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),
+}
 
 
 def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:

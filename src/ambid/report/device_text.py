@@ -7,13 +7,12 @@ import textwrap
 from typing import TYPE_CHECKING
 
 from ambid.errors import counted
-from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain, wrapped
+from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain
 
 if TYPE_CHECKING:
-    from pathlib import Path
-
-    from ambid.acquisition.device import Counters, DeviceInfo
+    from ambid.acquisition.device import Counters
     from ambid.acquisition.quality import ColumnQuality, QualityReport
+    from ambid.acquisition.recording import Acquired
     from ambid.acquisition.session import RunReport
     from ambid.report.commission_page import Step
 
@@ -61,28 +60,18 @@ def _rate(q: QualityReport) -> str:
     return f"{q.measured_hz:.0f} Hz" if 0.5 < pace < 2.0 else f"{q.rate_hz:g} Hz at {pace:.2g} times real time"
 
 
-def acquired_text(
-    path: Path,
-    info: DeviceInfo,
-    run: RunReport,
-    q: QualityReport,
-    counters: Counters,
-    *,
-    not_stored: int = 0,
-    width: int = WIDTH,
-    paint: Paint = plain,
-) -> str:
-    """Write what an acquisition gave; colour does not change the layout."""
-    stored = run.samples - not_stored - q.repeated
+def acquired_text(done: Acquired, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what an acquisition gave, below its verdict; colour does not change the layout."""
+    info, run, q, stored = done.info, done.run, done.quality, done.stored
+    path = "no record" if done.recorded is None else done.recorded.path
     whole = "" if stored == run.wanted else f" of {run.wanted} wanted"
     head = (
         f"{path}: {counted(stored, 'sample')}{whole} at {q.rate_hz:g} Hz ({stored / q.rate_hz:.4g} s) from "
         f"{info.kind} {info.port}"
     )
     words = [paint(line, "dim") for line in textwrap.wrap(_noise_words(q), width)]
-    words += textwrap.wrap(_line_words(run, counters), width)
-    verdict = [paint(line, "bad") for line in wrapped(q.verdict, width, "  ")]
-    return joined([textwrap.wrap(head, width), _table(q, paint), words, verdict])
+    words += textwrap.wrap(_line_words(run, done.counters), width)
+    return joined([textwrap.wrap(head, width), _table(q, paint), words])
 
 
 def _line_words(run: RunReport, counters: Counters) -> str:

@@ -3,112 +3,51 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambid.errors import AmbidError, counted
-from ambid.record import Channel, Record
-from ambid.report.numbers import prefixed, sized
+from ambid.errors import counted
+from ambid.report.numbers import prefixed
 from ambid.report.text import WIDTH, Paint, columns, fraction, joined, plain, pure, wrapped
-from ambid.rig.roles import rank_roles
-from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from ambid.validation.comparison import Comparison, Entry
+    from ambid.validation.inspection import ChannelLook, Inspection
     from ambid.validation.sensitivity import SensitivityAnalysis
 
-_ORDER = 20  # of persistent excitation: far above what a plant of three states needs
-_LONGEST = 100_000  # samples from which the order of excitation is told
 _SHOWN = 24  # coefficients of a sensitivity analysis
 
 
-def record_text(record: Record, *, inputs: Sequence[str] = (), paint: Paint = plain) -> str:
-    """Describe a record: its channels, a sentence for each thing found, and its history."""
-    name = record.provenance.get("file", "record")
+def inspection_text(found: Inspection, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what a record holds, below its verdict: its channels, the columns for each role, its history."""
+    about = found.record
+    samples, rate_hz = int(str(about["samples"])), float(str(about["rate_hz"]))
     head = (
-        f"{paint(name, 'strong')}: {counted(record.n_samples, 'sample')} at {record.rate_hz:.6g} Hz, "
-        f"{record.duration_s:.6g} s from {record.start_s:g} s"
+        f"{paint(str(about['file'] or 'record'), 'strong')}: {counted(samples, 'sample')} at {rate_hz:.6g} Hz, "
+        f"{samples / rate_hz:.6g} s from {float(str(about['start_s'])):g} s"
     )
     rows: list[tuple[str, ...]] = [("channel", "unit", "min", "max", "mean", "sd", "step", "SNR")]
-    rows += [_row(record, c, inputs) for c in record.channels]
-    blocks = [[head], columns(rows, right=(2, 3, 4, 5, 6, 7)), _findings(record, inputs, paint)]
-    blocks += [] if inputs else [_roles(record, paint)]
-    blocks.append(["history: " + "; ".join(str(step) for step in record.history)] if record.history else [])
+    rows += [_row(c) for c in found.channels]
+    mark = [] if found.faults else [f"{paint('✓', 'good')} no saturation, drop-outs or outliers"]
+    likely: list[str] = []
+    for role, names in found.roles.items():
+        likely += names and [f"{paint(f'{role}: likely', 'strong')} {names[0]}", *(f"  or {x}" for x in names[1:])]
+    steps = about["history"]
+    history = "; ".join(map(str, steps)) if isinstance(steps, (list, tuple)) else ""
+    blocks = [[head], columns(rows, right=(2, 3, 4, 5, 6, 7)), [*mark, *found.notes], likely]
+    blocks.append([f"history: {history}"] if history else [])
     return joined(
-        [[x for line in b for x in (wrapped([line], WIDTH, "  ") if len(line) > WIDTH else [line])] for b in blocks]
+        [[x for line in b for x in (wrapped([line], width, "  ") if len(line) > width else [line])] for b in blocks]
     )
 
 
-def _roles(record: Record, paint: Paint) -> list[str]:
-    """For each role the column that is likely it, with its score and the reason, and the others."""
-    lines = []
-    for role, found in rank_roles(record).items():
-        for x in found:
-            head = f"{role}: likely {x.channel.name}" if x is found[0] else f"  or {x.channel.name}"
-            lines.append(f"{paint(head, 'strong' if x is found[0] else 'dim')} (score {x.score:.2f}), because {x.why}")
-    return lines
-
-
-def _row(record: Record, c: Channel, inputs: Sequence[str]) -> tuple[str, ...]:
-    x = c.values
-    size = float(np.max(np.abs(x)))
+def _row(c: ChannelLook) -> tuple[str, ...]:
+    size = max(abs(c.least), abs(c.most))
     scale, unit = (1.0, c.source_unit) if c.unit in (UNKNOWN, "1") else prefixed(size, c.unit)
-    numbers = [f"{float(v) / scale:.5g}" for v in (x.min(), x.max(), x.mean(), x.std())]
-    steps = resolution(record, c.name)
-    step = f"{steps.step / scale:.3g}" if steps.quantised and steps.step > 0 else "–"
-    return c.name, f"[{unit}]", *numbers, step, _ratio(record, c, inputs)
-
-
-def _ratio(record: Record, c: Channel, inputs: Sequence[str]) -> str:
-    if not np.ptp(c.values) > 0:
-        return "–"
-    driving = [] if c.name in inputs else [name for name in inputs if np.ptp(record[name].values) > 0]
-    try:
-        found = snr(record, c.name, inputs=driving)
-    except AmbidError:
-        return "too short"
-    return f"{found.db:.1f} dB" if np.isfinite(found.db) else "no signal" if found.db < 0 else "no noise"
-
-
-def _findings(record: Record, inputs: Sequence[str], paint: Paint) -> list[str]:
-    """A line for each fault of a channel, how the noise was told, and how rich the input is."""
-    lines: list[str] = []
-    for c in record.channels:
-        if c.unit == UNKNOWN:
-            lines.append(f"{paint('✗', 'bad')} {c.name}: unknown unit [{c.source_unit}]; a rig can declare it")
-        looks: tuple[Callable[[Record, str], object], ...] = (find_saturation, find_dropouts, find_outliers)
-        for look in looks:
-            try:
-                found = look(record, c.name)
-            except AmbidError:
-                continue
-            if found.count:  # type: ignore[attr-defined]
-                lines.append(f"{paint('✗', 'bad')} {found}")
-    if not lines:
-        lines.append(f"{paint('✓', 'good')} no saturation, drop-outs or outliers")
-    method = f"the part that 20 lags of the channel{' and of ' + ', '.join(inputs) if inputs else ''} do not predict"
-    lines.append(f"SNR: noise is {method}{'' if inputs else '; without a rig a lower bound'}")
-    lines += [_excitation(record, name) for name in inputs or record.names]
-    return lines
-
-
-def _excitation(record: Record, name: str) -> str:
-    """Order of persistent excitation above the channel's own noise, and the band that holds its power."""
-    u = record[name].values[:_LONGEST]
-    centred = u - u.mean()
-    power = np.cumsum(np.abs(np.fft.rfft(centred)) ** 2)
-    if not power[-1] > 0:
-        return f"{name}: constant, no excitation"
-    low, high = (np.searchsorted(power, part * power[-1]) * record.rate_hz / u.size for part in (0.005, 0.995))
-    band = f"99 % of its power between {sized(float(low), 'Hz')} and {sized(float(high), 'Hz')}"
-    try:
-        order = persistent_excitation(u, _ORDER, tolerance=1e-6)
-    except AmbidError:
-        return f"{name}: {band}"
-    return f"{name}: {order}; {band}"
+    numbers = [f"{v / scale:.5g}" for v in (c.least, c.most, c.mean, c.sd)]
+    return c.name, f"[{unit}]", *numbers, "–" if c.step is None else f"{c.step / scale:.3g}", c.snr
 
 
 def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint = plain) -> str:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit, structure
+from ambid.blackbox.fit_file import fit_from_json, fit_to_json
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import fields_json
+from ambid.estimation.estimate import fields_json, read_as, read_whole
 from ambid.estimation.result import Reason, Result
 from ambid.validation.fits import judge
 from ambid.validation.orders import HELD_OUT, hold_out, select
@@ -68,8 +70,8 @@ class Comparison(Result):
     def as_dict(self) -> dict[str, object]:
         """Return the table, ready for JSON.
 
-        Returns ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds
-        and refusal; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
+        Returns ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds,
+        refusal and the fit; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
         """
         entries = [
             {
@@ -78,11 +80,27 @@ class Comparison(Result):
                 "criteria": {} if x.fit is None else dict(x.fit.criteria),
                 "failed_checks": list(x.failed),
                 "refusal": x.refusal or None,
+                "fit": None if x.fit is None else fit_to_json(x.fit),
             }
             for x in self.entries
         ]
         fields = fields_json(self, without=("entries", "record", "meaning"))
         return {**fields, "summary": self.meaning, "entries": entries}
+
+
+def comparison_from_json(document: Mapping[str, Any], where: str) -> Comparison:
+    """Read a comparison back; `where` is the name of its file, for messages."""
+
+    def entry(d: Mapping[str, Any], at: str) -> Entry:
+        fit = None if d["fit"] is None else fit_from_json(d["fit"], at)
+        return read_as(Entry, {**d, "fit": fit, "refusal": d["refusal"] or ""}, at)
+
+    def read() -> Comparison:
+        entries = tuple(entry(d, f"entries[{k}]") for k, d in enumerate(document["entries"]))
+        whole = {**document, "entries": (), "meaning": document["summary"], "record": {"file": document["record"]}}
+        return replace(read_as(Comparison, whole), entries=entries)
+
+    return read_whole(read, where, "comparison", "compare")
 
 
 def compare(

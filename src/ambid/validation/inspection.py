@@ -1,0 +1,136 @@
+"""What a record holds, and what stands against using it, file schema ``ambid.inspection/1``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ambid.errors import AmbidError
+from ambid.estimation.result import Reason, Result
+from ambid.record import Channel, Record
+from ambid.rig.roles import rank_roles
+from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
+from ambid.units import UNKNOWN
+
+SCHEMA = "ambid.inspection/1"
+_ORDER = 20  # of persistent excitation: far above what a plant of three states needs
+_LONGEST = 100_000  # samples from which the order of excitation is told
+_REMEDIES: tuple[tuple[str, Callable[[Record, str], Any], str], ...] = (
+    ("saturation", find_saturation, "Excite less, or widen the range"),
+    ("drop-outs", find_dropouts, "Look at cable and sensor, or leave these samples out"),
+    ("outliers", find_outliers, "Look at the line; --gaps and --from leave samples out"),
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelLook:
+    """One channel of a record, in its unit."""
+
+    name: str
+    unit: str
+    source_unit: str  # as the file names it
+    least: float
+    most: float
+    mean: float
+    sd: float
+    step: float | None  # of the converter; None where none is seen
+    snr: str  # signal over noise in words
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Inspection(Result):
+    """What a record holds."""
+
+    record: Mapping[str, object]  # ``file``, ``samples``, ``rate_hz``, ``start_s``, ``history``
+    channels: tuple[ChannelLook, ...]
+    faults: tuple[Reason, ...]
+    roles: Mapping[str, tuple[str, ...]]  # role -> columns that are likely it, best first, each with the reason
+    notes: tuple[str, ...]  # how the noise was told, and how rich the inputs are
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """The faults of the channels."""
+        return self.faults
+
+    def __getitem__(self, name: str) -> ChannelLook:
+        return next(c for c in self.channels if c.name == name)
+
+
+def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
+    """Look through a record; `inputs`: those of a rig, through which it was read."""
+    method = f"the part that 20 lags of the channel{' and of ' + ', '.join(inputs) if inputs else ''} do not predict"
+    notes = [f"SNR: noise is {method}{'' if inputs else '; without a rig a lower bound'}"]
+    notes += [_excitation(record, name) for name in inputs or record.names]
+    ranked = {} if inputs else rank_roles(record)
+    about = {
+        "file": record.provenance.get("file"), "samples": record.n_samples, "rate_hz": record.rate_hz,
+        "start_s": record.start_s, "history": [str(step) for step in record.history],
+    }  # fmt: skip
+    return Inspection(
+        used=record,
+        record=about,
+        channels=tuple(_look(record, c, inputs) for c in record.channels),
+        faults=tuple(fault for c in record.channels for fault in _faults(record, c, grave=bool(inputs))),
+        roles={
+            role: tuple(f"{x.channel.name} (score {x.score:.2f}), because {x.why}" for x in found)
+            for role, found in ranked.items()
+        },
+        notes=tuple(notes),
+    )
+
+
+def _look(record: Record, c: Channel, inputs: Sequence[str]) -> ChannelLook:
+    x, steps = c.values, resolution(record, c.name)
+    return ChannelLook(
+        name=c.name, unit=c.unit, source_unit=c.source_unit, least=float(x.min()), most=float(x.max()),
+        mean=float(x.mean()), sd=float(x.std()), step=steps.step if steps.quantised and steps.step > 0 else None,
+        snr=_ratio(record, c, inputs),
+    )  # fmt: skip
+
+
+def _ratio(record: Record, c: Channel, inputs: Sequence[str]) -> str:
+    if not np.ptp(c.values) > 0:
+        return "–"
+    driving = [] if c.name in inputs else [name for name in inputs if np.ptp(record[name].values) > 0]
+    try:
+        found = snr(record, c.name, inputs=driving)
+    except AmbidError:
+        return "too short"
+    return f"{found.db:.1f} dB" if np.isfinite(found.db) else "no signal" if found.db < 0 else "no noise"
+
+
+def _faults(record: Record, c: Channel, *, grave: bool) -> list[Reason]:
+    """What is wrong with a channel; one that stands still is `grave` where the rig names it."""
+    found = []
+    if c.unit == UNKNOWN:
+        text = f"{c.name}: unknown unit [{c.source_unit}]; a rig can declare it"
+        found.append(Reason(check="unit", text=text))
+    for check, look, remedy in _REMEDIES:
+        try:
+            seen = look(record, c.name)
+        except AmbidError:
+            continue
+        if seen.count:
+            still = not np.ptp(c.values) > 0
+            found.append(Reason(check=check, text=f"{seen}. {remedy}", grave=still and grave))
+    return found
+
+
+def _excitation(record: Record, name: str) -> str:
+    """Order of persistent excitation above the channel's own noise, and the band that holds its power."""
+    u = record[name].values[:_LONGEST]
+    centred = u - u.mean()
+    power = np.cumsum(np.abs(np.fft.rfft(centred)) ** 2)
+    if not power[-1] > 0:
+        return f"{name}: constant, no excitation"
+    edges = (np.searchsorted(power, part * power[-1]) * record.rate_hz / u.size for part in (0.005, 0.995))
+    low, high = (f"{float(f'{edge:.3g}'):g} Hz" for edge in edges)
+    band = f"99 % of its power between {low} and {high}"
+    try:
+        order = persistent_excitation(u, _ORDER, tolerance=1e-6)
+    except AmbidError:
+        return f"{name}: {band}"
+    return f"{name}: {order}; {band}"
