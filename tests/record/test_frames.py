@@ -125,6 +125,8 @@ REFUSED = {
     "categories": (pd.DataFrame({"u": pd.Categorical(["on", "off"] * 25)}), {"rate_hz": RATE}, "no numbers.*'on'"),
     "complex": ({"voltage [V]": U + 1j * I}, {"rate_hz": RATE}, "complex"),
     "whole numbers too large": ({"stamp [1]": 10**18 + np.arange(N)}, {"rate_hz": RATE}, "2\\^53"),
+    "nullable ones": (pd.DataFrame({"stamp [1]": pd.array(10**18 + np.arange(N), dtype="Int64")}), {"rate_hz": RATE},
+                      "2\\^53"),
     "a matrix": ({"voltage [V]": np.c_[U, I]}, {"rate_hz": RATE}, "shape \\(50, 2\\)"),
     "a number": ({"voltage [V]": 1.0}, {"rate_hz": RATE}, "shape \\(\\)"),
     "lengths": ({"u [V]": U, "i [A]": I[:-1]}, {"rate_hz": RATE}, "differ in length \\(u 50, i 49\\)"),
@@ -170,6 +172,13 @@ def test_a_record_handed_in_stays_as_it_is_and_keeps_its_rate():
     assert read_record(record, rate_hz=RATE) is record
     with pytest.raises(RecordError, match="1000 Hz but rate_hz"):
         read_record(record, rate_hz=10.0)
+
+
+@pytest.mark.parametrize(("name", "method"), [("pandas", "to_dataframe"), ("xarray", "to_xarray")])
+def test_a_package_that_is_missing_is_named(name, method, monkeypatch):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(RecordError, match=f"{name} is not installed"):
+        getattr(Record.from_dataframe(PLAIN, rate_hz=RATE), method)()
 
 
 def test_reading_a_file_or_a_dict_imports_none_of_the_packages():

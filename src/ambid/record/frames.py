@@ -10,6 +10,7 @@ import hashlib
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from importlib import import_module
 from typing import Any
 
 import numpy as np
@@ -50,11 +51,6 @@ class _Parts:
     index: _Column | None = None
 
 
-def is_table(source: object) -> bool:
-    """Return whether something is a table in memory: a DataFrame, a Dataset or a mapping."""
-    return isinstance(source, Mapping) or _class_of(source) in _TABLES
-
-
 def read_table(
     table: object,
     *,
@@ -80,16 +76,14 @@ def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mappi
 
 def to_dataframe(record: Record) -> Any:
     """Return a record as a pandas DataFrame."""
-    import pandas
-
+    pandas = _imported("pandas", "a DataFrame")
     columns = {_label(c): c.values for c in record.channels}
     return pandas.DataFrame(columns, index=pandas.Index(record.time_s, name="time [s]"))
 
 
 def to_xarray(record: Record) -> Any:
     """Return a record as an xarray Dataset."""
-    import xarray
-
+    xarray = _imported("xarray", "a Dataset")
     return xarray.Dataset(
         {c.name: ("time", c.values, {} if c.unit == UNKNOWN else {"units": c.unit}) for c in record.channels},
         coords={"time": ("time", record.time_s, {"units": "s"})},
@@ -99,6 +93,14 @@ def to_xarray(record: Record) -> Any:
             **{f"source_{key}": text for key, text in record.provenance.items()},
         },
     )
+
+
+def _imported(name: str, what: str) -> Any:
+    """Import a package that is asked for."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise RecordError(f"{name} is not installed, and {what} needs it. Install {name}, or ambid[frames]") from None
 
 
 def _label(channel: Channel) -> str:
@@ -161,7 +163,9 @@ def _plain(values: Any) -> np.ndarray:
     if np.ma.isMaskedArray(values):
         values = np.ma.filled(values.astype(np.float64), np.nan)
     elif hasattr(values, "to_numpy") and not isinstance(dtype, np.dtype) and hasattr(dtype, "kind"):
-        if dtype.kind in "iufb":
+        if dtype.kind in "iu" and not values.isna().any():
+            values = values.to_numpy(dtype=f"{dtype.kind}8")
+        elif dtype.kind in "iufb":
             values = values.to_numpy(dtype=np.float64, na_value=np.nan)
         elif dtype.kind == "M":
             values = values.to_numpy(dtype="datetime64[ns]")
