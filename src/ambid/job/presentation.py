@@ -258,7 +258,7 @@ def _validation() -> View:
         figure=drawn,
         document=_fields_of("ambid.validation/1"),
         table=lambda v: ("output", {"output": list(v.fit), **_numbers_of(list(v.fit.values()))}),
-        title=lambda v: f"{v.record or 'record'} judged with {v.estimate or 'an estimate'}, {v.model}",
+        title=lambda v: f"{v.record or 'record'} tested with {v.estimate or 'an estimate'}, {v.model}",
     )
 
 

@@ -195,7 +195,7 @@ def validation_text(found: Validation, *, width: int = WIDTH, paint: Paint = pla
     first = next(iter(found.fit.values()))
     of_fit = isinstance(first["one_step"], Mapping)
     lines = second_lines(found.fit) if of_fit else columns(validation_rows({"fit": found.fit}))
-    head = f"{paint(found.record or 'record', 'strong')} judged with {found.estimate or 'a result'}, {found.model}"
+    head = f"{paint(found.record or 'record', 'strong')} tested with {found.estimate or 'a result'}, {found.model}"
     checks = check_lines(found.checks, width=width, paint=paint, above=True)
     return joined([[f"{head}; {found.samples} samples"], lines, checks])
 

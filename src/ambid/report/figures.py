@@ -190,7 +190,7 @@ def validation_figure(found: Validation, beside: Sequence[Traces] = (), width: f
     elif beside:
         (traces,) = beside
         blocks += [signals_panel(traces), residuals_panel(traces), whiteness_panel(traces, failed)]
-    return stacked(f"{found.record or 'record'} judged with {found.estimate or 'a result'}", blocks, width)
+    return stacked(f"{found.record or 'record'} tested with {found.estimate or 'a result'}", blocks, width)
 
 
 def _sizes_ahead(found: Validation) -> Block:
