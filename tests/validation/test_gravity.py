@@ -1,13 +1,15 @@
 """The balance of gravity: exact for a force that grows as the square of the current, off where current or sign are."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
-from ambid.rig import RigMagnet
-from ambid.validation.gravity import carries_weight, gravity_balance
+from ambid.rig import RigMagnet, rig_of_preset
+from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
 
 BALL = preset("levitated-ball")
 THETA = dict(BALL.parameters)
@@ -69,3 +71,21 @@ def test_only_one_magnet_against_gravity_is_asked():
                             (RigMagnet(kind="single", saturation=True), one),
                             (RigMagnet(kind="single", parameters=(level,)), one)):  # fmt: skip
         assert not carries_weight(magnet, current)
+
+
+@pytest.mark.parametrize("name", ["unstable-bearing", "rmit", "levitated-ball", "prototype"])
+def test_the_rigs_controller_tells_a_reversed_position(name):
+    bench = preset(name)
+    rig, theta = rig_of_preset(bench), dict(bench.parameters)
+    assert loop_agrees(rig, theta, bench.rate_hz).passed
+    check = loop_agrees(rig, {**theta, "k_i": -theta["k_i"]}, bench.rate_hz)
+    assert not check.passed
+    assert "position is reversed, or voltage and current both are" in check.detail
+    assert check.values["mirrored"] < 1.0 < check.values["largest_pole"]
+    assert "neither" in loop_agrees(rig, {**theta, "k_x": 1e6 * theta["k_x"]}, bench.rate_hz).detail
+
+
+def test_where_no_loop_is_known_or_none_acted_nothing_is_asked():
+    rig = rig_of_preset(BALL)
+    assert loop_agrees(replace(rig, open_loop=True), THETA, 2000.0) is None
+    assert loop_agrees(replace(rig, loop=None), THETA, 2000.0) is None

@@ -126,7 +126,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validation import physical
-    from ambid.validation.gravity import carries_weight, gravity_balance
+    from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
     from ambid.validation.residuals import fit_of
 
     problem = fit.problem
@@ -146,6 +146,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
         checks["in_time"] = check_lag(signals)
+        loop = loop_agrees(rig, problem.parameters(fit.vector), bench.rate_hz)
+        checks |= {} if loop is None else {"loop_agrees": loop}
         if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)

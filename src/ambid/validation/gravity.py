@@ -1,7 +1,10 @@
-"""The balance of gravity: a fact on force per current and mass that no fit has a part in.
+"""Facts that no fit has a part in: the balance of gravity, and the loop that held the rotor.
 
 The force of one magnet grows with the square of its current, f = i^2 h(x), and at rest it carries the weight, f = -m g
 (x grows away from the magnet). So k_i = df/di = 2 f/i0, and k_i/m = -2 g/i0 (theory.md sec. 1; thesis eq. 1.9).
+
+With a position that is reversed k_i has the other sign and every other parameter its own: a convention, until gravity
+or a controller says which it is.
 """
 
 from __future__ import annotations
@@ -13,8 +16,9 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.estimation.estimate import Check
 from ambid.record import Record
-from ambid.rig.rig import RigMagnet
+from ambid.rig.rig import Rig, RigMagnet
 from ambid.signals.faults import resolution
+from ambid.simulation.plant import closed_loop_poles
 
 GRAVITY = 9.81
 _FAR = 3.3  # standard deviations, as for other facts
@@ -78,3 +82,33 @@ def _value(p: object, value: float, sd: float) -> tuple[float, float]:
     """A number of the rig and its standard deviation, or what stands where it says nothing."""
     given = getattr(p, "value", None)
     return (value, sd) if given is None else (float(given), float(getattr(p, "sd", None) or 0.0))
+
+
+def loop_agrees(rig: Rig, theta: Mapping[str, float], rate_hz: float) -> Check | None:
+    """Check that the rig's controller holds what was identified, and not its mirror image.
+
+    `theta`: parameters of model one-axis, SI. Returns None where the rig tells of no loop, or the record was taken
+    without it.
+    """
+    if rig.loop is None or not rig.loop.closed or rig.open_loop:
+        return None
+    found, mirrored = (
+        float(np.abs(closed_loop_poles({**theta, "k_i": sign * theta["k_i"]}, rig.loop, rate_hz)).max())
+        for sign in (1.0, -1.0)
+    )
+    values = {"largest_pole": found, "mirrored": mirrored}
+    if found < 1.0 <= mirrored:
+        return Check(passed=True, values=values, detail="the controller of the rig holds the identified plant")
+    if mirrored < 1.0 <= found:
+        detail = (
+            f"the controller of the rig would not hold the identified plant (largest pole {found:.4g}), but its mirror "
+            f"image (k_i = {-theta['k_i']:.4g} N/A): position is reversed, or voltage and current both are. Give "
+            "channels.position.gain the other sign (k_i changes its sign with it, no other parameter does), or correct "
+            "the signs of [loop]"
+        )
+        return Check(passed=False, values=values, detail=detail)
+    detail = "the controller of the rig does not tell the sign of the position: "
+    detail += (
+        "it holds both" if found < 1.0 else f"it holds neither this plant (largest pole {found:.4g}) nor its mirror"
+    )
+    return Check(passed=True, values=values, detail=detail)
