@@ -31,6 +31,7 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE, NARROW = 11.0, 4.6  # inches: a page, and the screen of a telephone
 PIXELS = 800  # stretches of which a long curve shows the extremes, about one for each column of pixels
+_LETTERS = 13.7  # of a legend on an inch
 _LOGARITHMIC = 5.0  # ratio of limits from which an axis is
 _STYLE: dict[Any, Any] = {
     "font.size": 9,
@@ -72,6 +73,7 @@ class Block:
     widths: tuple[float, ...] = ()  # of the columns, beside each other
     title: str = ""
     shared: bool = True  # whether the panels of a column have one horizontal axis
+    by_row: bool = False  # whether a narrow page goes through the panels row by row
     legend: Sequence[Any] = ()  # entries beside those that the panels' artists make
 
     def height(self, width: float) -> float:
@@ -81,7 +83,8 @@ class Block:
 
     def draw(self, place: Figure | SubFigure, width: float) -> None:
         """Draw the block, with one legend below it, where it covers nothing."""
-        columns = self.columns if width > NARROW else [[p for column in self.columns for p in column]]
+        order = zip(*self.columns, strict=True) if self.by_row else self.columns
+        columns = self.columns if width > NARROW else [[p for part in order for p in part]]
         rows = max(len(column) for column in columns)
         tallest = [max((c[k].height for c in columns if k < len(c)), default=1.0) for k in range(rows)]
         axes = place.subplots(
@@ -100,9 +103,9 @@ class Block:
         named = {label: h for a in place.axes for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
         named |= {h.get_label(): h for h in self.legend}
         if named:
-            place.legend(
-                list(named.values()), list(named), loc="outside lower center", ncols=5 if width > NARROW else 2
-            )
+            fitting = int(_LETTERS * width / (6 + max(map(len, named))))
+            ncols = min(max(1, fitting), 5)
+            place.legend(list(named.values()), list(named), loc="outside lower center", ncols=ncols)
         if self.title:
             place.suptitle(textwrap.fill(self.title, int(11 * width)), fontsize=10)
 
@@ -153,7 +156,9 @@ def single(block: Block, width: float = WIDE) -> Figure:
 
 def head(axes: Axes, text: str, *, good: bool = True) -> None:
     """Write what a panel shows above it: in the colour of a warning where it speaks against the result."""
-    axes.set_title(text if good else f"✗ {text}", color="#1a1a1a" if good else BOUND)
+    width: float = axes.figure.figure.get_figwidth()
+    said = text if good else f"✗ {text}"
+    axes.set_title(said if width > NARROW else textwrap.fill(said, 48), color="#1a1a1a" if good else BOUND)
 
 
 def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = None) -> None:

@@ -9,8 +9,10 @@ import numpy as np
 
 from ambid.record import Record
 from ambid.report.drawing import BOUND, GREEN, MEASURED, PREDICTED, WIDE, Block, curve, head, panel, stacked
+from ambid.report.numbers import prefixed
 from ambid.rig.roles import Candidate
 from ambid.signals.spectra import cross_spectra
+from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,8 +32,10 @@ def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], widt
     t = record.start_s + np.arange(record.n_samples) / record.rate_hz
 
     def signal(axes: Axes, x: Candidate, first: bool) -> None:
-        curve(axes, t, x.channel.values, PREDICTED if first else MEASURED, "chosen" if first else "other candidates")
-        axes.set_ylabel(f"[{x.channel.unit}]")
+        values, unit = x.channel.values, x.channel.unit
+        scale, unit = (1.0, unit) if unit in (UNKNOWN, "1") else prefixed(float(np.max(np.abs(values))), unit)
+        curve(axes, t, values / scale, PREDICTED if first else MEASURED, "chosen" if first else "other candidates")
+        axes.set_ylabel(f"[{unit}]")
         axes.set_xlabel("time [s]")
         head(axes, f"{x.role}: {x.channel.name}, score {x.score:.2f}{' (chosen)' if first else ''}")
 
@@ -51,4 +55,4 @@ def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], widt
         [panel(coherence, x, height=1.6) for x, _ in rows],
     ]
     title = f"{record.provenance.get('file', 'record')}: which column is which"
-    return stacked(title, [Block(columns=columns, widths=(3, 2))] if rows else [], width)
+    return stacked(title, [Block(columns=columns, widths=(3, 2), by_row=True)] if rows else [], width)

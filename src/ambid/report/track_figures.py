@@ -19,6 +19,7 @@ from ambid.report.drawing import (
     BOUND,
     GREEN,
     MEASURED,
+    NARROW,
     NORMAL_95,
     PIXELS,
     PREDICTED,
@@ -141,6 +142,7 @@ def track_figure(
 
     def parameter(axes: Axes, name: str) -> None:
         _parameter_panel(axes, history, name, truth.get(name))
+        _stack_titles(axes, width)
         _event_marks(axes, marks, name, history, width)
         bottom(axes)
 
@@ -219,6 +221,14 @@ def _say_change(axes: Axes, history: TrackHistory, name: str, last: float) -> No
     begin = history.header.start.get(name)
     if begin is not None and begin.value and np.isfinite(last / begin.value):
         _say(axes, f"{100 * (last / begin.value - 1):+.3g} % from start", "left")
+
+
+def _stack_titles(axes: Axes, width: float) -> None:
+    """Put what stands at the left and at the right above a panel below each other where there is no room."""
+    left, right = axes.get_title(loc="left"), axes.get_title(loc="right")
+    if width <= NARROW and left and right:
+        _say(axes, "", "right")
+        _say(axes, f"{left}\n{right}", "left")
 
 
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
