@@ -149,6 +149,8 @@ TRIES: dict[str, Callable[[Session], Any]] = {
     "a table with the current in mA": lambda s: ambid.read_record(
         s.frame.rename(columns={"current [A]": "current [mA]"})
     )["current"].values == pytest.approx(1e-3 * s.arrays["current"]),
+    "what a record holds": lambda s: len(ambid.info(s.frame).channels) == 3,
+    "what a file holds": lambda s: "current" in ambid.info(s.csv, s.rig).summary(),
     # results
     "a parameter": lambda s: s.estimate["k_i"].ci95[0] < -310.08 < s.estimate["k_i"].ci95[1],
     "its standard deviation": lambda s: s.estimate["k_i"].sd > 0,
@@ -234,6 +236,7 @@ FUNCTIONS = (
     "validate",
     "load",
     "acquire",
+    "info",
 )
 
 

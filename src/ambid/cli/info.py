@@ -26,17 +26,10 @@ def info(
 
     With --rig: the channels by role, calibrated; the noise of the outputs is then told from what the input explains.
     """
-    from ambid.physics.linear_model import model
-    from ambid.record import read_record
-    from ambid.rig import load_rig, read_bench
-    from ambid.validation.inspection import inspect
+    from ambid.job import info
 
     with Outputs(record, rig, json=json, plot=plot, report=report) as outputs, progress("look") as show:
-        if rig is None:
-            found = inspect(read_record(record, rate_hz=rate, gaps=gaps or "error"))
-        else:
-            bench = load_rig(rig)
-            found = inspect(read_bench(record, bench, rate_hz=rate, gaps=gaps), inputs=model(bench.model).inputs)
+        found = info(record, rig, rate_hz=rate, gaps=gaps)
         outputs.give(found, show)
     outputs.show(found)
     end(failed=strict and not found.passed)

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from ambid.job.identification import identify as identify
     from ambid.job.identification import identify_nonlinear as identify_nonlinear
     from ambid.job.response import frf as frf
+    from ambid.job.results import info as info
     from ambid.job.results import load as load
     from ambid.job.results import validate as validate
     from ambid.job.simulation import simulate as simulate

@@ -19,13 +19,14 @@ from ambid.nonlinear.fit import NonlinearFit
 from ambid.nonlinear.fit_file import nonlinear_fit_from_json
 from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 from ambid.physics.linear_model import model
-from ambid.record import GapPolicy
+from ambid.record import GapPolicy, read_record
 from ambid.record.record import file_bytes, utf8_text
-from ambid.rig import Rig, rig_from_text
+from ambid.rig import Rig, read_bench, rig_from_text
 from ambid.tracking.lines_file import SCHEMA as TRACK
 from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
 from ambid.validation.fits import validation as fit_validation
+from ambid.validation.inspection import Inspection, inspect
 from ambid.validation.second_record import validation
 from ambid.validation.second_result import Validation
 
@@ -209,6 +210,47 @@ def validate(
         used=(known, data), estimate=name, record=str(source.get("file") or ""), model=model_name,
         samples=found["samples"], fit=found["fit"], checks=checks,
     )  # fmt: skip
+
+
+def info(
+    record: Source,
+    rig: Rig | str | Path | None = None,
+    *,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
+) -> Inspection:
+    """Look through a record: levels, resolution, noise, saturation, drop-outs, outliers, excitation, likely roles.
+
+    Parameters
+    ----------
+    record : file, Record, DataFrame, Dataset or dict of arrays
+    rig : Rig, str or Path, optional
+        Names and calibrates the channels; the noise of the outputs is then told from what the input explains.
+    rate_hz, gaps, units : optional
+        As `ambid.identify`.
+
+    Returns
+    -------
+    Inspection
+
+    Raises
+    ------
+    AmbidError
+        If record or rig break a rule.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> found = ambid.info(ambid.simulate("thesis", duration=0.1, seed=1))
+    >>> [c.name for c in found.channels]
+    ['voltage', 'current', 'position']
+    """
+    if rig is None:
+        return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units))
+    bench = known_rig(rig)
+    found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units)
+    return inspect(found, inputs=model(bench.model).inputs)
 
 
 def rig_of(estimate: AnyEstimate, where: str) -> Rig:
