@@ -23,8 +23,9 @@ from ambid.acquisition.settings import controller_settings
 from ambid.arrays import Array
 from ambid.rig import Rig
 
-_SETTLE_S, _HOLD_S, _LONGEST_S = 0.1, 0.015, 0.06  # before a pulse, its shortest and longest time
-_LIFT_SHARE = 0.8  # of the time to lift: a run is over by then, as the rotor may lie outside its trips
+_SETTLE_S, _HOLD_S, _LONGEST_S = 0.3, 0.015, 0.06  # before a pulse, its shortest and longest time
+# of the time to lift, in which the rotor may lie outside its trips: what settles, and what a pulse takes
+_SETTLE_SHARE, _HOLD_SHARE = 0.35, 0.2
 _FEWEST_TICKS = 8  # of a pulse
 _LENGTHS = 3.0  # of its time are looked at from its begin on
 _TRIES = 3  # of a pulse that a busy line made late
@@ -32,6 +33,7 @@ _FIRST, _GROWTH, _BLIND = 0.02, 2.0, 0.2  # of the voltage: the first pulse, its
 _STEPS = (0.1, 0.16, 0.25, 0.4, 0.6)  # parts of the way to the trip of the current that pulses use in turn
 _MOST = 0.95  # of the voltage
 _SIGMAS, _COUNTS, _MOTION = 6.0, 4.0, 0.01  # what shows: over noise, in counts, in parts of the way between the trips
+_COMMON = 0.5  # of what both pulses of a pair did to the current alike: what they did differently is more
 _TOGETHER = 3  # samples beyond it: one alone may be a disturbance
 
 
@@ -45,7 +47,8 @@ class Pulse:
     voltage: Array  # (n_samples,)
     current: Array
     position: Array
-    current_change: float  # at the end of the pulse, over before; 0 where it is within the noise
+    current_change: float  # at the end of the pulse, over before
+    current_noise: float  # standard deviation of that
     motion: float  # the farthest that the position went; 0 where it is within the noise
 
 
@@ -92,8 +95,9 @@ class _Pulses:
         away = min(settings.duty_bias - settings.duty_low, settings.duty_high - settings.duty_bias)
         self._voltage = away * self._step
         lift_s = full.daq.lift_ms / 1e3
-        self._settle_s = min(_SETTLE_S, _LIFT_SHARE * lift_s / 2.0)
-        self._longest_s = min(_LONGEST_S, _LIFT_SHARE * lift_s / 4.0)
+        self._settle_s = min(_SETTLE_S, _SETTLE_SHARE * lift_s)
+        self._longest_s = min(_LONGEST_S, _HOLD_SHARE * lift_s)
+        self._per_volt, self._hold_s = 0.0, 0.0  # what a pair of pulses did to the current, and how long they were
         self._pulses: list[Pulse] = []
 
     def found(self) -> Polarity:
@@ -105,67 +109,65 @@ class _Pulses:
             motion = self._sign_of_motion() if current else 0
         except _End as end:
             troubles = (str(end),)
-            current = current or _sign(self._pulses[-1].current_change * self._pulses[-1].volts)
+            current = _sign(self._per_volt)
         return Polarity(pulses=tuple(self._pulses), current=current, motion=motion, troubles=troubles)
 
     def _sign_of_current(self) -> int:
-        """Raise pulses, longer first, until the current shows; a second one has to agree."""
+        """Raise pairs of pulses, longer first, until the current shows."""
         volts, hold_s = max(_FIRST * self._voltage, 2.0 * self._step), min(_HOLD_S, self._longest_s)
-        while True:
-            seen = self._play(volts, hold_s)
-            if seen.current_change:
-                break
+        while not self._weigh(up := self._play(volts, hold_s), down := self._play(-volts, hold_s)):
             if hold_s < self._longest_s:
                 hold_s = min(2.0 * hold_s, self._longest_s)
             elif volts < _BLIND * self._voltage:
                 volts = min(_GROWTH * volts, _BLIND * self._voltage)
+            elif abs(up.current_change + down.current_change) > _SIGMAS * (up.current_noise + down.current_noise):
+                raise _End("the current goes the same way whichever way the voltage is pulsed: look at its sensor")
             else:
                 return 0
-        again = self._play(-volts, hold_s)
-        if again.current_change * seen.current_change > 0.0:
-            raise _End("the current goes the same way whichever way the voltage is pulsed: check its sensor")
-        return _sign(seen.current_change)
+        return _sign(self._per_volt)
+
+    def _weigh(self, up: Pulse, down: Pulse) -> bool:
+        """Tell the current of a pair of pulses from what goes on without them; whether it is more than noise."""
+        change, common = (
+            (up.current_change - down.current_change) / 2.0,
+            (up.current_change + down.current_change) / 2.0,
+        )
+        noise = _SIGMAS * math.hypot(up.current_noise, down.current_noise) / 2.0
+        if abs(change) <= max(noise, self._counts["current"], _COMMON * abs(common)):
+            return False
+        farthest = max(abs(up.current_change), abs(down.current_change))
+        self._per_volt, self._hold_s = math.copysign(farthest, change) / up.volts, up.hold_s
+        return True
 
     def _sign_of_motion(self) -> int:
         """Raise pulses of both signs until the position moves; a second one like it has to agree."""
         for share in _STEPS:
             for side in (1.0, -1.0):
-                seen = self._play(side * self._volts_for(share), self._hold_for(share))
+                volts, hold_s = self._size_for(share, side)
+                seen = self._play(volts, hold_s)
                 if not seen.motion:
                     continue
-                again = self._play(seen.volts, seen.hold_s)
-                if again.motion * seen.motion < 0.0:
+                if self._play(volts, hold_s).motion * seen.motion < 0.0:
                     raise _End("equal pulses moved the rotor once up and once down: something else moves it. Hold it")
-                return _sign(seen.motion * seen.volts) * self._towards()
+                return _sign(seen.motion * volts * self._per_volt)
         return 0
 
-    def _towards(self) -> int:
-        """Sign of the current for a positive voltage, by all pulses that showed it."""
-        return _sign(sum(p.current_change * p.volts for p in self._pulses))
+    def _size_for(self, share: float, side: float) -> tuple[float, float]:
+        """Return voltage and time of a pulse to one side that uses a part of the way to the current's trip.
 
-    def _per_volt(self) -> tuple[float, float]:
-        """Return the most that the current changed per volt, and the time that pulse took."""
-        largest = max(self._pulses, key=lambda p: abs(p.current_change))
-        return abs(largest.current_change / largest.volts), largest.hold_s
+        By the pair that showed the current: it grows with the voltage, and at most with the time.
+        """
+        most, wanted = _MOST * self._voltage, share * self._current_room(side) / abs(self._per_volt)
+        longer = min(max(1.0, wanted / most), self._longest_s / self._hold_s)  # where the voltage does not reach it
+        return math.copysign(max(2.0 * self._step, min(wanted / longer, most)), side), self._hold_s * longer
 
-    def _volts_for(self, share: float) -> float:
-        """Return the voltage of a pulse that uses a part of the way to the current's trip, by what was seen so far."""
-        per_volt, hold_s = self._per_volt()
-        longer = max(1.0, self._hold_for(share) / hold_s)
-        return max(2.0 * self._step, min(share * self._current_room() / (per_volt * longer), _MOST * self._voltage))
-
-    def _hold_for(self, share: float) -> float:
-        """Return the time of that pulse: longer where the voltage does not reach it."""
-        per_volt, hold_s = self._per_volt()
-        wanted = share * self._current_room() / (per_volt * _MOST * self._voltage)
-        return max(hold_s, min(hold_s * wanted, self._longest_s))
-
-    def _current_room(self) -> float:
+    def _current_room(self, side: float) -> float:
+        """Return the way to the trip that a pulse to this side goes towards."""
         low, high = self._room.trips["current"]
         if not math.isfinite(high - low):  # nothing is known but the voltage
-            return _BLIND * self._voltage * self._per_volt()[0]
+            return _BLIND * self._voltage * abs(self._per_volt)
         rest = float(np.median(self._pulses[-1].current[self._pulses[-1].time_s < 0.0]))
-        return min(side for side in (high - rest, rest - low) if side > 0.05 * (high - low))
+        return max(high - rest if side * self._per_volt > 0.0 else rest - low, 0.05 * (high - low))
 
     def _play(self, volts: float, hold_s: float) -> Pulse:
         """Play one pulse and look at it."""
@@ -198,23 +200,17 @@ class _Pulses:
         rest = voltage[-1] if voltage.size else 0.0
         ordered = np.flatnonzero((voltage - rest) * math.copysign(1.0, volts) > abs(volts) / 2.0)
         first = int(ordered[0]) if ordered.size else max(0, voltage.size - 1)
-        before = slice(max(0, first // 2), first + 1)  # the sample at which it is ordered is the last one without it
-        change, motion = 0.0, 0.0
+        before = slice(max(0, first - ticks), first + 1)  # the sample at which it is ordered is the last one without it
+        change, noise, motion = 0.0, math.inf, 0.0
         if ordered.size > ticks // 2:
             end = slice(first + 1 + 3 * ticks // 4, first + 1 + ticks)
-            change = self._shown("current", seen["current"], before, end)
+            change, noise = _change(seen["current"], before, end)
             motion = self._moved(seen["position"], before, first)
         time_s = (np.arange(voltage.size) - first) / self._rate_hz
         return Pulse(
             volts=volts, hold_s=ticks / self._rate_hz, time_s=time_s, voltage=voltage, current=seen["current"],
-            position=seen["position"], current_change=change, motion=motion,
+            position=seen["position"], current_change=change, current_noise=noise, motion=motion,
         )  # fmt: skip
-
-    def _shown(self, role: str, values: Array, before: slice, end: slice) -> float:
-        """Return a change of the mean that is more than noise and rounding, else 0."""
-        change = float(values[end].mean() - values[before].mean())
-        noise = float(values[before].std()) / math.sqrt(max(1, end.stop - end.start))
-        return change if abs(change) > max(_SIGMAS * noise, self._counts[role]) else 0.0
 
     def _moved(self, position: Array, before: slice, first: int) -> float:
         """Return how far the position went from where it lay, 0 where it did not."""
@@ -230,6 +226,14 @@ class _Pulses:
         same = away * away[begun] > 0.0  # a rotor that comes back and swings through is not looked at further
         stop = begun + int(np.argmin(same[begun:])) if not same[begun:].all() else away.size
         return float(away[begun:stop][np.argmax(np.abs(away[begun:stop]))])
+
+
+def _change(values: Array, before: slice, end: slice) -> tuple[float, float]:
+    """Return by how much the mean is another one at the end, and the standard deviation of that."""
+    steps = np.diff(values[before])  # a slow drift is no noise
+    sd = float(np.sqrt(np.mean(steps**2) / 2.0)) if steps.size else math.inf
+    n = max(1, end.stop - end.start)
+    return float(values[end].mean() - values[before].mean()), sd * math.sqrt(1.0 / n + 1.0 / max(1, steps.size))
 
 
 def _sign(value: float) -> int:
