@@ -17,6 +17,7 @@ from ambid.simulation import simulate_scenario
 
 bench = ambid.preset("unstable-bearing")
 record = simulate_scenario("change", bench, duration_s=3.0, at_s=2.0, seed=1).record
+record[1.9:2.1].plot()
 
 # %%
 # Followed as beside the machine

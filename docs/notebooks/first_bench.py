@@ -25,6 +25,7 @@ table.head()
 
 record = ambid.Record.from_dataframe(table)
 print(record.n_samples, "samples at", record.rate_hz, "Hz")
+record[2.0:2.5].plot()
 
 # %%
 # What is known of the bench

@@ -151,6 +151,24 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
     assert without_numbers(page) <= without_numbers(commissioned)
 
 
+def test_the_quickstart_has_commands_of_the_readme_and_its_python_runs(tmp_path, monkeypatch, capsys):
+    import ambid
+
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "quickstart.md"
+    quick, tested = (
+        {line for piece in blocks(p, "sh") for line in piece.splitlines()} for p in (page, ROOT / "README.md")
+    )
+    assert quick <= tested
+    for name, duration, seed in (("mine", 10.0, 1), ("second", 5.0, 2)):
+        record = ambid.simulate("levitated-ball", duration=duration, band=(0.2, 200.0), seed=seed)
+        ambid.write_record(record, f"{name}.csv")
+    (tmp_path / "bench.toml").write_text(blocks(page, "toml")[0], encoding="utf-8")
+    exec(compile(blocks(page, "python")[0], "quickstart.md", "exec"), {})
+    assert capsys.readouterr().out.startswith("usable\n-1.24")
+    assert ambid.load("mine.json").verdict.word == "usable"
+
+
 def test_the_page_on_nonlinear_models_names_every_structure():
     from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
 
@@ -183,7 +201,8 @@ def test_the_page_on_nonlinear_models_runs_and_shows_what_comes_out(tmp_path, mo
     for number, piece in enumerate(blocks(page, "python"), start=1):
         exec(compile(piece, f"nonlinear.md, piece {number}", "exec"), names)
     printed = capsys.readouterr().out
-    assert "status converged, checks passed: True" in printed
+    assert "status converged, verdict caution" in printed
+    assert [reason.check for reason in names["found"].verdict.reasons] == ["second_record"]
     assert re.search(r"^b3 = 8\.5\d* ± ", printed, re.MULTILINE)
     shares = [x for x in names["shares"] if x is not None]
     assert shares == sorted(shares)
