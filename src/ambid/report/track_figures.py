@@ -5,6 +5,7 @@ Below them the model error against its limit, and the supervisor's state. Long t
 
 from __future__ import annotations
 
+import textwrap
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -228,7 +229,7 @@ def _stack_titles(axes: Axes, width: float) -> None:
     left, right = axes.get_title(loc="left"), axes.get_title(loc="right")
     if width <= NARROW and left and right:
         _say(axes, "", "right")
-        _say(axes, f"{left}\n{right}", "left")
+        _say(axes, f"{left}\n{textwrap.fill(right, 50)}", "left")
 
 
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
