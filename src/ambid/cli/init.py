@@ -77,7 +77,7 @@ def _of_record(record: Path | None, rate: Rate, gaps: Gaps, outputs: Outputs, pl
     assert record is not None
     read = read_record(record, rate_hz=rate, gaps=gaps or "error")
     ranked = rank_roles(read)
-    if ask and sys.stdin.isatty() and sys.stderr.isatty():
+    if ask and _on_terminal():
         ranked = {role: _chosen(role, found) for role, found in ranked.items()}
     for role, found in ranked.items():
         typer.echo(f"{role}: {f'{found[0].channel.name}, because {found[0].why}' if found else 'none found'}", err=True)
@@ -86,6 +86,10 @@ def _of_record(record: Path | None, rate: Rate, gaps: Gaps, outputs: Outputs, pl
 
         outputs.draw(plot, lambda: roles_figure(read, ranked), lambda _: None)
     return draft_rig(read, ranked)
+
+
+def _on_terminal() -> bool:
+    return sys.stdin.isatty() and sys.stderr.isatty()
 
 
 def _chosen(role: str, found: Sequence[Candidate]) -> Sequence[Candidate]:

@@ -294,8 +294,14 @@ def _point(
     """The point at a vector, None without a predictor or its slope; `value`, `covariance`: where they are known."""
     if covariance is None:
         value, covariance = evaluate(problem, vector, work)
-    at = None if covariance is None else linearise(problem, vector, weight_of(covariance), work)
-    if at is None or covariance is None:
+    if covariance is None:
+        return None
+    try:
+        weight = weight_of(covariance)
+    except np.linalg.LinAlgError:  # a record without noise: what is left is rounding
+        return None
+    at = linearise(problem, vector, weight, work)
+    if at is None:
         return None
     r, J = prior_rows(problem, vector)
     return _Point(
