@@ -191,7 +191,9 @@ RIGS = {
     "unknown word for a role": (M, 'm = { value = 4.0, unit = "kg", role = "known" }', r"role is 'known'.*'fixed'"),
     "negative delay": ('delay  = "auto"', "delay = -1", r"channels\.voltage\.delay is -1"),
     "fractional delay": ('delay  = "auto"', "delay = 1.5", r"channels\.voltage\.delay is 1\.5"),
-    "delay of an output": ('column = "current"', 'column = "current"\ndelay = 3', r"channels\.current\.delay is 3"),
+    "delay of an output to be found": (
+        'column = "current"', 'column = "current"\ndelay = "auto"', r"channels\.current\.delay is 'auto'"
+    ),
     "gain of zero": ('column = "current"', 'column = "current"\ngain = 0.0', r"channels\.current\.gain is 0"),
     "missing table": ('column = "current"', 'column = "current"\ntable = "no.csv"', r"current\.table.*no\.csv"),
     "table and gain": (
