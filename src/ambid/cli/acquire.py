@@ -35,7 +35,7 @@ _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
 def command(
     port: opt.Port,
     rig: opt.RigOfDevice,
-    record: Annotated[Path, option("--output -o FILE", "Record to write: .h5, .csv or .csv.gz.")],
+    record: Annotated[Path, option("--out -o FILE", "Record to write: .h5, .csv or .csv.gz.")],
     seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 10.0,
     excitation: Annotated[
         str | None,

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 def command(
     port: opt.Port,
     rig: opt.RigOfDevice,
-    folder: Annotated[Path, option("--output -o FOLDER", "Folder for records, estimate and report.")],
+    folder: Annotated[Path, option("--out -o FOLDER", "Folder for records, estimate and report.")],
     seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 20.0,
     track_seconds: Annotated[
         float, option("--track-seconds S", "Length of live tracking at the end, in s.", True)

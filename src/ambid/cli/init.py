@@ -21,7 +21,7 @@ _WIRED = ("prototype",)  # presets with a controller, whose rig is among the pac
 
 def command(
     record: Annotated[Path | None, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")] = None,
-    rig: Annotated[Path | None, option("--output -o RIG", "Rig file to write.", "standard output")] = None,
+    rig: Annotated[Path | None, option("--out -o RIG", "Rig file to write.", "standard output")] = None,
     preset: Annotated[
         str | None,
         option(

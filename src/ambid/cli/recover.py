@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 def command(
     journals: Annotated[list[Path], argument("JOURNAL", "Journal of a recording that was cut off: NAME.journal.")],
     output: Annotated[
-        Path | None, option("--output -o FILE", "Record to write: .h5, .hdf5, .csv or .csv.gz.", "NAME")
+        Path | None, option("--out -o FILE", "Record to write: .h5, .hdf5, .csv or .csv.gz.", "NAME")
     ] = None,
     delete: Annotated[
         bool, switch("--delete", "Remove the journal once its record is written and nothing was damaged.")

@@ -22,7 +22,7 @@ _ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
 
 def command(
     rig: Annotated[str, argument("RIG|PRESET", "Rig file, or a bench that 'ambid models' lists.")],
-    record: Annotated[Path, option("--output -o FILE", "Record to write: .csv, .csv.gz or .h5.")],
+    record: Annotated[Path, option("--out -o FILE", "Record to write: .csv, .csv.gz or .h5.")],
     duration: Annotated[float | None, option("--duration S", "Length in s.", "1, or the scenario's")] = None,
     rate: Annotated[float | None, option("--rate HZ", "Sampling rate in Hz.", "the preset's, or the rig's")] = None,
     scenario: Annotated[

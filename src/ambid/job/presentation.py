@@ -18,7 +18,7 @@ from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
 from ambid.record import Record, read_record
 from ambid.recursive.lines import Track
-from ambid.report.text import WIDTH, WORDS, Paint, joined, plain, verdict_lines
+from ambid.report.text import SPREAD, WIDTH, WORDS, Paint, joined, plain, verdict_lines
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,7 +50,8 @@ class View:
 def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Return a result for people, the verdict first."""
     lines = verdict_lines(result.verdict, width=width, paint=paint)
-    return joined([lines, [view(result).text(result, width=width, paint=paint)]])
+    body = view(result).text(result, width=width, paint=paint)
+    return joined([lines, [body], [paint(SPREAD, "dim")] if "±" in body else []])
 
 
 def figure(result: Result, record: Any = None) -> Figure:

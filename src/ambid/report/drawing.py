@@ -16,7 +16,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.result import Verdict
-from ambid.report.text import WORDS
+from ambid.report.text import SPREAD, WORDS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -30,6 +30,7 @@ NORMAL_95 = 1.959963984540054
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE, NARROW = 11.0, 4.6  # inches: a page, and the screen of a telephone
+_WHOLE = 9.0  # inches from which verdict and convention stand on one line
 PIXELS = 800  # stretches of which a long curve shows the extremes, about one for each column of pixels
 _LETTERS = 13.7  # of a legend on an inch
 _LOGARITHMIC = 5.0  # ratio of limits from which an axis is
@@ -131,9 +132,9 @@ def judged(figure: Figure, found: Verdict) -> Figure:
     from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
     words, style = WORDS[found.word]
-    names = textwrap.shorten(
-        ", ".join(r.check for r in found.reasons), int(11 * figure.get_figwidth()) - 28, placeholder=" …"
-    )
+    wide = figure.get_figwidth() > _WHOLE
+    letters = int(11 * figure.get_figwidth()) - (75 if wide else 28)  # what there is room for
+    names = textwrap.shorten(", ".join(r.check for r in found.reasons), max(letters, 12), placeholder=" …")
     parts = [
         ("verdict: ", {}),
         (words, {"color": STYLES[style], "weight": "bold"}),
@@ -145,7 +146,11 @@ def judged(figure: Figure, found: Verdict) -> Figure:
     )
     box.set_in_layout(False)
     figure.add_artist(box)
-    figure.suptitle(f"\n{figure.get_suptitle()}", fontsize=12)  # the empty line is its place
+    figure.suptitle(f"{'' if wide else chr(10)}\n{figure.get_suptitle()}", fontsize=12)  # empty lines are their place
+    down = 0.05 if wide else 0.3  # inches from the top
+    at = (0.995, 1.0 - down / figure.get_figheight()) if wide else (0.01, 1.0 - down / figure.get_figheight())
+    said = figure.text(*at, SPREAD, ha="right" if wide else "left", va="top", size=8, color="#555555")
+    said.set_in_layout(False)
     return figure
 
 

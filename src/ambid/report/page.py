@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 from ambid.estimation.estimate import Check
 from ambid.estimation.result import Verdict
 from ambid.report.drawing import NARROW, WIDE, save
-from ambid.report.text import WORDS
+from ambid.report.text import SPREAD, WORDS
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,6 +80,7 @@ def page_html(page: Page, verdict: Verdict, *, made: str = "") -> str:
     return template.render(
         page=page,
         words=words,
+        spread=SPREAD,
         style=style,
         reasons=verdict.reasons,
         provenance=[*page.provenance, *last],

@@ -57,6 +57,9 @@ def title_line(name: object, what: str, samples: int, rate_hz: float, status: st
     )
 
 
+SPREAD = "± is one standard deviation; intervals and bands are 95 %"
+"""The one convention, which every result states once where it has a ±, and every figure and page."""
+
 WORDS: dict[str, tuple[str, Style]] = {
     "usable": ("usable", "good"),
     "caution": ("use with caution", "doubt"),
