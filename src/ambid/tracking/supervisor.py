@@ -248,15 +248,19 @@ class Supervisor:
 
 
 _BLOCKS = 240  # after as many the walks of the numbers have been adapted once
+_QUIET = 0.01  # of the innovations' standard deviation
 
 
 def warm_up(numbers: TrackedNumbers, memory: Memory = "auto") -> None:
-    """Track noise at the operating point, and search a change in it."""
+    """Track a rotor at rest, and search a change in it: what is compiled or loaded late is there when samples come.
+
+    The noise is far below that of the bench: as large as that, without the motion of the bench, it is a change.
+    """
     supervisor = Supervisor(PhysicalRpem(numbers, memory=memory))
     rpem, before = supervisor.rpem, supervisor.rpem.filter.copy()
     n, n_u = _BLOCKS * rpem.block_samples, len(numbers.problem.model.inputs)
     sizes = np.concatenate(
-        [np.zeros(n_u), np.sqrt(np.diag(numbers.innovation_covariance)) * numbers.problem.scales.output]
+        [np.zeros(n_u), _QUIET * np.sqrt(np.diag(numbers.innovation_covariance)) * numbers.problem.scales.output]
     )
     values = numbers.point + sizes * np.random.default_rng(0).standard_normal((n, sizes.size))
     samples = Samples(
