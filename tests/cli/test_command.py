@@ -21,7 +21,7 @@ USAGE = {
     "missing argument": (["identify"], "Missing argument 'RECORD...'. See 'ambid identify --help'"),
     "too many arguments": (["models", "x"], "(x)"),
     "no number": (["identify", "record.csv", "--from", "soon"], "Invalid value for '--from'"),
-    "missing output": (["simulate", "thesis"], "Missing option '--output'"),
+    "missing output": (["simulate", "thesis"], "Missing option '--out'"),
     "unknown preset": (["simulate", "thesos", "-o", "x.csv"], "Did you mean 'thesis'?"),
     "unknown excitation": (
         ["simulate", "thesis", "-o", "x.csv", "--excitation", "sinus"],
