@@ -12,7 +12,7 @@ class AmbidError(Exception):
     """Input refused.
 
     The message names what, where, the rule and the remedy, on one line:
-    ``column 'current' is in [V]; the rig wants a current unit. Fix the header, or give channels.current.gain``.
+    ``column 'current' is in [V]; the rig needs a current unit. Fix the header, or give channels.current.gain``.
     """
 
     def __init__(self, message: str) -> None:

@@ -135,7 +135,7 @@ def test_a_run_that_is_too_short_is_refused_before_anything_moves(start):
     with Spoiled(RIG) as device:
         with pytest.raises(DeviceError, match=r"needs 5 s for its start, and the run lasts 3 s.*give a start"):
             track_live(device, RIG, course(3.0))
-        with pytest.raises(DeviceError, match=r"wants 0\.5 s to begin with"):
+        with pytest.raises(DeviceError, match=r"needs 0\.5 s for its start"):
             track_live(device, RIG, course(0.4), start=start)
         assert device.starts == 0
 

@@ -54,7 +54,7 @@ def test_lost_blocks_are_told(track):
 def test_many_events_are_not_all_listed(track):
     events = [Event(kind="accepted", t=0.1 * k, why=f"number {k}", parameter="R") for k in range(50)]
     text = track_text(track, events=events)
-    assert "30 earlier events are not shown" in text
+    assert "30 earlier events are omitted" in text
     assert "number 29" not in text
     assert "number 30" in text
     assert "number 49" in text

@@ -169,7 +169,7 @@ def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float
 
 
 def band_for(trial: Trial, rate_hz: float) -> tuple[float, float] | None:
-    """Return the band as wished; without one, of a multisine that is to levitate, that in which the rotor moves."""
+    """Return the band as requested; without one, of a multisine that is to levitate, that in which the rotor moves."""
     if trial.band is not None or trial.mode != "levitate" or trial.name not in ("multisine", "schroeder"):
         return trial.band
     low, high = moving_band(rate_hz, trial.seconds)

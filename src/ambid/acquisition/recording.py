@@ -210,7 +210,7 @@ class Recording:
             self._on_event(event)
 
     def acquired(self, report: RunReport) -> Acquired:
-        """Return what came of a run, once the recording is closed."""
+        """Return the result of a run, once the recording is closed."""
         return Acquired(
             info=self._device.info,
             run=report,

@@ -52,7 +52,7 @@ class Course:
 
 @dataclass(slots=True, kw_only=True)
 class RunReport:
-    """What came of a run; counted while it goes on."""
+    """The result of a run; counted while it goes on."""
 
     wanted: int  # samples that the course asks for
     samples: int = 0  # passed on

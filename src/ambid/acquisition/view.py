@@ -1,4 +1,4 @@
-"""What a device samples, seen through a rig: blocks in the units and the order that a model wants."""
+"""What a device samples, seen through a rig: blocks in the units and the order that a model needs."""
 
 from __future__ import annotations
 

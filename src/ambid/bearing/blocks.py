@@ -155,7 +155,7 @@ def three_blocks(
     reference : ndarray, shape (n_samples,) or (n_samples, n_references), optional
         Outer excitation of the loop, independent of the noise. Without it the voltage itself is the instrument.
     open_loop : bool, optional
-        Say that no feedback was at work.
+        Declare the record open loop.
     delay : int, optional
         Whole samples by which the voltage reaches the coil late.
 

@@ -110,7 +110,7 @@ def coil_instrumental(voltage: Array, current: Array, rate_hz: float, *, open_lo
 def _regression(voltage: Array, current: Array) -> tuple[Array, Array]:
     if voltage.shape != current.shape or voltage.ndim != 1 or voltage.size < 10:
         raise EstimationError(
-            f"voltage has shape {voltage.shape} and current {current.shape}; the coil wants two columns of one length, "
+            f"voltage has shape {voltage.shape} and current {current.shape}; the coil needs two columns of one length, "
             "at least 10 samples. Check the record"
         )
     if np.ptp(voltage) == 0 or np.ptp(current) == 0:

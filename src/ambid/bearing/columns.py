@@ -2,7 +2,7 @@
 
 No bearing explains such a record, and the search for one is long: it is refused, with the column's name. A column
 without a signal is one of which the others explain nothing. A sign or an order is wrong where the start values fit
-badly, and those of the record with that sign or order changed lead to a fit that leaves nothing unexplained.
+badly, and those of the record with that sign or order changed lead to a fit that fits fully.
 """
 
 from __future__ import annotations

@@ -63,8 +63,8 @@ def greybox(
     seed : int, optional
         Of the global search: equal seeds give equal results.
     workers : int, optional
-        Threads of the global search; the result does not hang on them, and the time hardly (most of an evaluation is a
-        small Riccati equation, which does not leave Python's lock).
+        Threads of the global search; the result does not depend on them, and the time hardly (most of an evaluation is
+        a small Riccati equation, which does not leave Python's lock).
 
     Returns
     -------
@@ -154,7 +154,7 @@ def _search(candidate: Candidate, tick: Callable[[], None] | None, *, with_distu
 def _quiet(
     problem: PredictorProblem, vector: Array, tick: Callable[[], None] | None, work: Workspace | None
 ) -> Fit | None:
-    """Search with sensor noise alone; None for an unstable plant, which wants its states corrected."""
+    """Search with sensor noise alone; None for an unstable plant, which needs its states corrected."""
     at = assemble(problem, vector, with_derivatives=False)
     if at is None or not stable(at.A):
         return None
@@ -188,7 +188,7 @@ def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]
     least = 10 * (n_estimated + 3 * len(model.states)) + MAX_DELAY
     if signals.y.shape[0] < least:
         raise EstimationError(
-            f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters wants at least "
+            f"the record has {signals.y.shape[0]} samples; identifying {n_estimated} parameters needs at least "
             f"{least}. Record longer, or cut less"
         )
     if delay != "auto" and not 0 <= delay <= signals.y.shape[0] - least:

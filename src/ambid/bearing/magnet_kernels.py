@@ -451,7 +451,7 @@ def predict(
     """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite.
 
     `states`: as many as there are; `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what
-    is not known of the force, and of the motional voltage; `y` (n, 2) position and current, `valid` (n, 2): which of
+    is not known of the force, and of the back-EMF; `y` (n, 2) position and current, `valid` (n, 2): which of
     them are measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or twice the
     square of a level; without lanes the criterion alone. `noise2` holds the squares of the levels of position, current,
     force, voltage and drift (of one sample). `z`, `P` and `X` (`ROOM`,), which is zero at first, hold state, covariance

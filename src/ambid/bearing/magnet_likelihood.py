@@ -144,7 +144,7 @@ def sweep(
 
 
 def _knocks(problem: BearingProblem, r: int) -> Array:
-    """Variances (n, 2) of force and motional voltage while the rotor is knocked; they do not hang on the vector."""
+    """Variances (n, 2) of force and back-EMF while the rotor is knocked; they do not depend on the vector."""
     record = problem.records[r]
     if record.knock is None or not record.knock.any():
         return np.zeros((record.u.size, 2))
@@ -164,7 +164,7 @@ def _steps(problem: BearingProblem, r: int) -> int:
 
 
 def _through(problem: BearingProblem, record: BearingRecord) -> float:
-    """Steps in a sample that a stage's drop wants, two while the current runs through its width, and at most eight."""
+    """Steps in a sample that a stage's drop needs, two while the current runs through its width, and at most eight."""
     drop, width = (next(n for n in problem.numbers if n.name == name) for name in ("v_drop", "i_drop"))
     if not (drop.estimated or drop.value) or not record.kept[:, 1].min() < width.value > -record.kept[:, 1].max():
         return 1.0
@@ -172,7 +172,7 @@ def _through(problem: BearingProblem, record: BearingRecord) -> float:
 
 
 def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]:
-    """State before sample `begin`, and its covariance, which is generous and does not hang on the vector."""
+    """State before sample `begin`, and its covariance, which is generous and does not depend on the vector."""
     record, flags = problem.records[r], problem.flags(r)
     rate, n = record.rate_hz, 3 + int(flags[2]) + int(flags[3])
     noise, begun = np.exp(problem.noise_center[r]), {n.name: n.value for n in problem.numbers}

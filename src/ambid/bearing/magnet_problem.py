@@ -1,15 +1,15 @@
 """What is estimated from what: records, magnet law, numbers, and the layout of the vector that the search moves.
 
-The vector holds, in this order: the free and prior numbers (the logarithm of those that physics wants positive, the
+The vector holds, in this order: the free and prior numbers (the logarithm of those that physics needs positive, the
 others over their magnitudes), one delay for each sampling rate where delays are free, and the log noise levels of each
 record (position, current, force, voltage, drift; of a held rotor current and voltage alone).
 
 Samples in which the rotor touches a stop: a force acts there that the model does not have.
 
 A few touches in thousands of samples are enough to move every number by deviations, as each hits the predictor with a
-force hundreds of times the noise. They are not thrown away: position and current are measured on; force and motional
-voltage are what is unknown, as the speed ends somewhere within the sample. A rotor that lies on a stop is carried by a
-force that does not average out: those stretches are cut, and the predictor begins anew where the rotor is free again.
+force hundreds of times the noise. They are not thrown away: position and current are measured on; force and
+back-EMF are what is unknown, as the speed ends somewhere within the sample. A rotor that lies on a stop is carried by a
+force that does not average out: those stretches are cut, and the predictor begins again where the rotor is free again.
 
 Whether the force of one magnet carries the weight shows over any stretch without touches: the impulse of the force is
 that of the weight and the momentum gained, so that the mean of f/(m g) is (v_end - v_begin)/(g T) - 1. Neither coil nor

@@ -362,7 +362,7 @@ def _check_consistent(e: NonlinearBearingEstimate) -> None:
     acting = {*e.law.names, *BODY}
     for p in e.parameters:
         if p.name not in acting or p.unit != UNITS[p.name] or not math.isfinite(p.value):
-            raise ValueError(f"{p.name} = {p.value:g} {p.unit} is no number of this law")
+            raise ValueError(f"{p.name} = {p.value:g} {p.unit} is not a parameter of this law")
     missing = {*e.law.names[:2], "L_leak", "m", "R", "c", "g"} - set(e.values)
     if missing:
         raise ValueError(f"{sorted(missing)[0]} is missing")

@@ -53,7 +53,7 @@ class Measured(Result):
     references : tuple of str
         Channels of the loop's outer excitation that were used.
     open_loop : bool
-        Whether the user says that no feedback was at work.
+        Whether the user declares the record open loop.
     fit : BlackBoxFit or None
         Structure ``frf-ml`` or ``frf-subspace``.
     estimate : FrequencyEstimate or None
@@ -85,7 +85,7 @@ class Measured(Result):
             text = f"{least} of {lines} lines of {pair} stand out of the noise. Excite more, longer or in another band"
             found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
         if not (self.references or self.open_loop):
-            text = "feedback, if there was any, biases it. Give the reference (--reference), or say --open-loop"
+            text = "feedback, if there was any, biases it. Give the reference (--reference), or give --open-loop"
             found.append(Reason(check="feedback", text=text))
         for name, model in (("fit", self.fit), ("physical", self.estimate)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]

@@ -28,7 +28,7 @@ _P_LEAST = 0.05
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cancellation:
-    """A pole and a zero that cannot be told apart."""
+    """A pole and a zero that cannot be distinguished."""
 
     pole: complex  # in z, or rad/s for a continuous model
     zero: complex

@@ -31,7 +31,7 @@ class IOData:
     units : Mapping[str, str]
         SI unit by name.
     open_loop : bool
-        Whether the user says that no feedback was at work. False means "not told so".
+        Whether the user declares the record open loop. False means "not told so".
     reference : ndarray, shape (n_samples, n_references), SI
         Outer excitation of the loop, independent of the noise; no columns where there is none.
     references : tuple of str
@@ -126,7 +126,7 @@ def io_data(
     """Take inputs and outputs out of a record.
 
     `inputs`, `outputs`: channel names; no inputs for a time series; `references`: channels of the loop's outer
-    excitation; `open_loop`: say that no feedback was at work.
+    excitation; `open_loop`: whether the record is open loop.
     """
     if not outputs:
         raise EstimationError("no output was named; a model needs at least one. Give --output COLUMN")

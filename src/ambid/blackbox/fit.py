@@ -233,7 +233,7 @@ def build_fit(
 
     `name`: structure, as in the register; `data`: what it was estimated from; `orders`: as used, delays included;
     `noise_covariance`: (n_outputs, n_outputs), SI. Returns with a warning where the structure is biased under feedback
-    and the data are not said to be open loop.
+    and the data are not declared open loop.
     """
     if not np.all(np.isfinite(model.theta)) or not np.all(np.isfinite(noise_covariance)):
         raise EstimationError(f"{name}: no finite coefficients fit this record. Lower the orders, or check the columns")

@@ -315,7 +315,7 @@ class _Form:
 
     @property
     def n_estimated(self) -> int:
-        """The common factor is no number of the model."""
+        """The common factor is not a parameter of the model."""
         return self.n_vector - 1
 
 

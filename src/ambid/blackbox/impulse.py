@@ -339,7 +339,7 @@ def impulse_response(data: IOData, n_taps: int) -> ImpulseResponse:
 
     In open loop (``data.open_loop``) the taps are estimated directly, ``rfir``. Where feedback may act they follow from
     a long autoregression, ``rarx``, and the first tap is zero: without a delay in the loop input and output cannot be
-    told apart.
+    separated.
 
     Parameters
     ----------

@@ -430,7 +430,7 @@ def subspace_models(
     *,
     tick: Tick = None,
 ) -> tuple[OrderModel, ...]:
-    """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram wants them.
+    """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram needs them.
 
     Parameters
     ----------

@@ -330,7 +330,7 @@ def supports(n_samples: int, half_width_s: float | None, dt: float) -> list[int]
 
 
 def best_support(equation: Equation, halves: Sequence[int]) -> tuple[Solution, list[dict[str, float]]]:
-    """Solve from long supports to short, from the one before or anew; keep the one that predicts least variance.
+    """Solve from long supports to short, from the one before or again; keep the one that predicts least variance.
 
     Long supports average most but see low frequencies alone, where a wrong plant may fit as well; short ones see all.
     So every solution is also held against the shortest support, and those that it contradicts do not count. Returns

@@ -103,7 +103,7 @@ def command(
     wish, start, before = Wish(**words), start_of_track(track), _changed(record)
     job = Recording(known, port, record, wish.trial(port, known).settle_s, stop, force=force)
     if (record.exists() or record.is_symlink()) and not force:
-        raise AmbidError(f"-o {record} exists already. Choose another name, or give --force")
+        raise AmbidError(f"-o {record} already exists. Choose another name, or give --force")
     try:
         with watching() as watch, signals(stop.take):
 

@@ -58,7 +58,7 @@ class Stop:
     """
 
     def __init__(self) -> None:
-        """Nothing has been wished."""
+        """Nothing has been requested."""
         self.number: int | None = None
         self._torn = False
 
@@ -91,7 +91,7 @@ class Stop:
 
 
 def interruptible(show: Tick, stop: Stop) -> Tick:
-    """Return a tick that interrupts a search once where that is wished; what judges its result afterwards goes on.
+    """Return a tick that interrupts a search once where that is requested; what judges its result afterwards goes on.
 
     `show`: shows the progress; `stop`: whether the user wishes to end. Returns raises KeyboardInterrupt at the first
     call after the wish, but not in the stage ``"check"``; after a second signal, at every call.

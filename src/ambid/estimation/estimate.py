@@ -33,7 +33,7 @@ _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatedParameter:
-    """One parameter as it came out."""
+    """One parameter as estimated."""
 
     name: str  # name and SI unit
     unit: str
@@ -54,7 +54,7 @@ class EstimatedParameter:
         seen: Mapping[str, bool],
         alone: Mapping[str, float] | None = None,
     ) -> EstimatedParameter:
-        """Return a parameter as it came out.
+        """Return a parameter as estimated.
 
         `theta`, `sd`, `seen`: by name, value, standard deviation and whether the data show it; `alone`: standard
         deviations that the data alone would give, for the share of a prior.
@@ -630,7 +630,7 @@ def _check_consistent(estimate: Estimate) -> None:
         if p.unit != specs[p.name].unit:
             raise ValueError(f"{p.name} is in {p.unit!r} instead of {specs[p.name].unit!r}")
         if not 1e-15 < abs(p.value) < 1e15 and (p.name in ("m", "L") or p.value != 0):
-            raise ValueError(f"{p.name} = {p.value:g} is no number that a plant can have")
+            raise ValueError(f"{p.name} = {p.value:g} is not a number that a plant can have")
     if estimate.noise.gain.shape != (n, n_y) or estimate.noise.innovation_covariance.shape != (n_y, n_y):
         raise ValueError("the noise model is not of the model's size")
     size = len(estimate.covariance_names)

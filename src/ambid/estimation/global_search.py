@@ -2,7 +2,7 @@
 
 Numbers are searched for between bounds, scaled to 0 .. 1; SciPy's `differential_evolution` does it, strategy best1bin
 with dithered mutation, from a Sobol sequence. A generation is drawn as a whole before it is evaluated, so that the
-result hangs on the seed alone and not on the number of workers. Local refinement is the caller's.
+result depends on the seed alone and not on the number of workers. Local refinement is the caller's.
 """
 
 from __future__ import annotations

@@ -72,7 +72,7 @@ class PredictorProblem:
         if self.skip < self.delay + 2 or self.y.shape[0] <= self.skip:
             raise ValueError(f"skip {self.skip} must exceed the delay {self.delay} by two and leave samples")
         if self.stride > 1 and self.noise == "levels":
-            raise ValueError("a stride above 1 wants the noise as a gain")
+            raise ValueError("a stride above 1 needs the noise as a gain")
         n, n_y, n_d = len(self.model.states), len(self.model.outputs), len(self.model.disturbances)
         sizes = {
             "physical": self.n_physical,

@@ -4,7 +4,7 @@ Covariances come from the scores of a fit (slope of each sample's error times th
 taken as white: the sandwich in closed form, and a bootstrap in blocks of time.
 
 Both keep the correlation of the scores over about n^0.6 samples (Kuensch 1989; Newey and West 1987). The inputs are
-what was measured and are never made anew, so that a controller's reaction to the noise stays in: no residual bootstrap
+what was measured and are never made again, so that a controller's reaction to the noise stays in: no residual bootstrap
 that holds the inputs fixed would be right under feedback.
 
 Information criteria, so defined that all structures on the same data compare.
@@ -116,7 +116,7 @@ def penalty(criterion: str, k: int, n: int, m: int) -> float:
 
 def chi_squared_tail(degrees: int, x: float) -> float:
     """Return the probability that chi-squared with that many degrees of freedom exceeds `x`: a finite sum, all of one
-    sign (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5). A statistic that is no number has no probability: NaN.
+    sign (Abramowitz and Stegun 1964, 26.4.4 and 26.4.5). A statistic that is not a number has no probability: NaN.
     """
     half, shift = 0.5 * x, 0.5 * (degrees % 2)
     if half != half:  # 1 would pass every test

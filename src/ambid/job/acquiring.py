@@ -177,7 +177,7 @@ def acquire(
     )  # fmt: skip
     wish.trial(port, known)
     if (path.exists() or path.is_symlink()) and not force:
-        raise AmbidError(f"-o {path} exists already. Choose another name, or give --force")
+        raise AmbidError(f"-o {path} already exists. Choose another name, or give --force")
     with ready(port, known, wish, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
         return record_course(
             device, known, path, course, force=force, on_progress=on_progress, on_trouble=on_trouble, stopped=stopped

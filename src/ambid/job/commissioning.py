@@ -46,7 +46,7 @@ _SHOWN = 4000  # samples of a record that its picture shows
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Commissioned(Result):
-    """What came of a commissioning."""
+    """The result of a commissioning."""
 
     steps: tuple[Step, ...]  # those that were done, the last one perhaps not passed
     estimate: Estimate | None  # where it came as far
@@ -300,7 +300,7 @@ class _Guide:
         return judge.validation(self.estimate)
 
     def _tick(self, stage: str, done: float | None = None, /) -> None:
-        """Take a sign of life from what is worked out, and end it if that is wished."""
+        """Take a sign of life from what is worked out, and end it if that is requested."""
         if self._stopped():
             raise _Interrupted(f"interrupted while working it out ({stage})")
         self._told(stage, done)

@@ -1,4 +1,4 @@
-"""The steps of a guided commissioning: looks at the bench itself, and judgements of what came of it.
+"""The steps of a guided commissioning: looks at the bench itself, and judgements of the outcome of it.
 
 Each has findings and, where it is not good enough, the reasons.
 """
@@ -50,7 +50,7 @@ _NEAR = 0.85  # of the voltage: no room left
 _UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
 _SATURATED = 1e-3  # of the samples at the end of a converter's range
 _RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree")
-"""Checks that a model which explains the record only in part fails: the standard deviations then allow for it."""
+"""Checks that a model which does not fully fit the record fails: the standard deviations then allow for it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,12 +76,12 @@ class Wishes:
     def band(self, rate_hz: float) -> tuple[float, float]:
         """Return the band of the excitation in Hz.
 
-        `rate_hz`: of the device, Hz. Returns as wished, or from the rate.
+        `rate_hz`: of the device, Hz. Returns as requested, or from the rate.
         """
         return self.band_hz or moving_band(rate_hz)
 
     def longest_trial_s(self, rate_hz: float) -> float:
-        """Return the length of a trial in s: as wished, or longer where the band is slow.
+        """Return the length of a trial in s: as requested, or longer where the band is slow.
 
         `rate_hz`: of the device, Hz. Returns four periods of the lowest line at least.
         """

@@ -85,7 +85,7 @@ def fit(
     rig : Rig, str or Path, optional
         Names and calibrates the channels.
     open_loop : bool, optional
-        Say that no feedback was at work.
+        Declare the record open loop.
     at_rest : bool, optional
         Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
         are estimated. For polynomial structures; a record that contradicts it is warned of.

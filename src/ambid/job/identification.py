@@ -164,7 +164,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
     """Check the sizes of an estimate; where the rig's values are in doubt, of one that does without them.
 
-    `doubt`: whether the record speaks against a fixed value.
+    `doubt`: whether the data contradict a fixed value.
     """
     from ambid.bearing.linear import greybox
     from ambid.bearing.sizes import check_units

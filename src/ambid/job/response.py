@@ -65,7 +65,7 @@ def frf(
     rig : Rig, str or Path, optional
         Names and calibrates the channels; physical parameters of its model are estimated.
     open_loop : bool, optional
-        Say that no feedback was at work.
+        Declare the record open loop.
     method : {"auto", "periodic", "random", "local"}, optional
         As in `ambid.signals.frequency_response`. Periodic: leading periods with a transient are left out, and said so.
     hold : {"zoh", "band-limited"}, optional
@@ -107,7 +107,7 @@ def frf(
     )  # fmt: skip
     bench, wanted = channels.rig, orders_of(orders)
     if orders is not None and wanted is None:
-        raise EstimationError("--orders auto: a transfer function wants its degree. Give nf=2, or --state-space auto")
+        raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)
     if bench is None and not channels.inputs:
         raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")

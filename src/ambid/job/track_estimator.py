@@ -197,7 +197,7 @@ def _arx(
 
 
 def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
-    """Return what is to be mistrusted before the first sample: bias under feedback, above all."""
+    """Return what is doubtful before the first sample: bias under feedback, above all."""
     if method in ("rls", "lms", "nlms") and not data.open_loop:
         return (
             f"{method} is biased by feedback and by coloured noise. Use armax, or iv with --reference, or give "

@@ -49,7 +49,7 @@ LOOK_S = 0.1
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LiveTrack:
-    """What came of live tracking."""
+    """The result of live tracking."""
 
     track: Track  # header, lines where they were kept, summary
     run: RunReport  # of the device
@@ -204,7 +204,7 @@ class LiveRun:
     """The run of the device, in a thread of its own; leaving the context ends it.
 
     `job`: the run, but for what stops it; `ring`: ended with the run; `recorded`: others listen: where tracking fails,
-    the run goes on for them; `on_run`: given what came of the run.
+    the run goes on for them; `on_run`: given the result of the run.
     """
 
     def __init__(
@@ -245,7 +245,7 @@ class LiveRun:
                 self._on_run = None
 
     def report(self) -> RunReport:
-        """Return what came of the run; raise what ended it."""
+        """Return the result of the run; raise what ended it."""
         if self._failure is not None:
             raise self._failure
         assert self._report is not None

@@ -87,7 +87,7 @@ def track(
     orders : str or Mapping[str, int], optional
         Of those coefficients, as `ambid.fit`.
     open_loop : bool, optional
-        Say to such a method that no feedback was at work.
+        Declare the record open loop.
     step : float, optional
         Of ``lms`` and ``nlms``, for signals of size one.
     start : Estimate, str or Path, optional

@@ -455,7 +455,7 @@ def _choose_neurons(
 
 
 def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick | None) -> tuple[HybridFunction, Array]:
-    """Choose the order of C by an information criterion of the one-step errors, all numbers searched anew for each.
+    """Choose the order of C by an information criterion of the one-step errors, all numbers searched again for each.
 
     `theta` is the optimum for the order there is. Orders are nested, not chosen out of many; all outputs' errors count,
     as all their numbers do.
@@ -476,7 +476,7 @@ def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick 
 
 
 def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tick | None) -> None:
-    """Leave out terms of the polynomial, one at a time, as long as the criterion gains; all numbers are searched anew.
+    """Leave out terms of the polynomial, one at a time, as long as the criterion gains; all numbers are searched again.
 
     Terms were chosen before there was a network, so that some only imitate it. One that the network could take over
     stays: otherwise units that are to spare would swallow it, and what can be read would become what cannot.

@@ -607,7 +607,7 @@ def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[st
     """Return poles and gains over the range of the scheduling signal, by value of p.
 
     ``poles_rad_s`` has real and imaginary part and their standard deviations, ``dc_gain`` value and standard deviation
-    by input; None where there is no number.
+    by input; None where there is none.
     """
     out = list[dict[str, object]]()
     for p in np.linspace(model.schedule.low, model.schedule.high, _POINTS):

@@ -8,7 +8,7 @@ unknown ones, process terms stay as they are (Billings 2013, sec. 3.5).
 
 By simulation, from a linear model on, each candidate not in the model is looked at as a coefficient that is still zero:
 the slope of the free run by it, an exact sensitivity, is its column, and the simulation error what the columns have to
-explain. The one with the largest error reduction ratio enters, all coefficients are searched anew, terms that have
+explain. The one with the largest error reduction ratio enters, all coefficients are searched again, terms that have
 become useless go. The aim is that of Piroddi and Spinelli (2003), who try every candidate in a run of its own. Where
 only the magnitude of the output is measured, such as the speed of a pulse counter, the sign is not in the data, and a
 search from a wrong one ends in a wrong minimum. So linear models of order three (a real pole, a pair, a delay) are laid
@@ -378,7 +378,7 @@ def prune_by_simulation(
 ) -> Choice:
     """Leave out process terms as long as `value` falls, an information criterion of the simulation errors.
 
-    With `anew` only the least significant term is tried at a time, and coefficients are searched anew without it.
+    With `again` only the least significant term is tried at a time, and coefficients are searched again without it.
     """
     now, before = value(found), found.theta.size
     while found.theta.size > max(found.function.n_outputs, 2 * anew) and np.isfinite(now):

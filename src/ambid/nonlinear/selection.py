@@ -3,7 +3,7 @@
 Step by step that candidate is taken which, orthogonalised against those chosen before, has the largest error reduction
 ratio (Chen, Billings, Luo 1989; Billings 2013, sec. 3.2). One pass over the data makes the Gram matrix of candidates of
 unit length; steps then cost nothing beside. Where digits run short the candidates are made orthogonal to the chosen
-ones explicitly, by QR, and the Gram matrix anew. Candidates are made block by block from lagged signals: a long record
+ones explicitly, by QR, and the Gram matrix again. Candidates are made block by block from lagged signals: a long record
 needs no matrix of all of them.
 """
 

@@ -1,4 +1,4 @@
-"""First weights of a state-space network: delay, subspace model, the thesis's own training, and global search.
+"""First weights of a state-space network: delay, subspace model, the thesis's training, and global search.
 
 A predictor-based subspace estimate (PBSID-opt) stands for any stability and under feedback. Its states are turned into
 those of the network: measured outputs, and rates (``one-axis``; after the matrix logarithm) or differences (``free``).

@@ -2,7 +2,7 @@
 
 W'(x, i) = sum over magnets of g(gap) h(current) + S(i): force dW'/dx, flux linkage dW'/di, k_i = d2W'/dx di,
 k_x = -d2W'/dx2, L = d2W'/di2 (thesis eq. 1.9, 2.7, 4.4 and 4.8 are the case g = k/gap, h = i^2/2, S = 0). So force and
-motional voltage cannot disagree, whatever the numbers.
+back-EMF cannot disagree, whatever the numbers.
 
 - gap law g(d): hyperbolic k/(s + d), an ideal gap of reluctance proportional to s + d; or exponential L_g exp(-d/zeta),
   a small armature before a pole, whose flux spreads sideways.

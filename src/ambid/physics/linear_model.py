@@ -275,7 +275,7 @@ class Rotor:
     """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f.
 
     The current is the input, as with a transconductance amplifier; the data show only ratios to m (theory.md sec. 1),
-    so m wants a fixed value or a prior.
+    so m needs a fixed value or a prior.
     """
 
     name: str = "rotor"  # as in `LinearModel`

@@ -1,7 +1,7 @@
 """Magnets on one axis: co-energy, and from it force, flux linkage and inductance that agree with each other.
 
 Everything follows from one co-energy W'(x, i): force f = dW'/dx along +x, flux linkage lambda = dW'/di, so that the
-force per current df/di and the motional voltage per velocity dlambda/dx are the same number k_i (as in thesis eq. 4.4
+force–current factor df/di and the back-EMF per velocity dlambda/dx are the same number k_i (as in thesis eq. 4.4
 and 4.8).
 
 Geometry. One attracting magnet with gap d has W' = k i^2 / (2 d): it pulls with k (i/d)^2 / 2 (thesis eq. 1.9, 2.7).

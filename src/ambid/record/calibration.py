@@ -1,4 +1,4 @@
-"""Calibration: from what a column holds (duty, sensor volts, counts) to what the rig wants of it.
+"""Calibration: from what a column holds (duty, sensor volts, counts) to what the rig needs of it.
 
 Either a straight line, out = gain · raw + offset, or a two-column table with linear interpolation between its points.
 """

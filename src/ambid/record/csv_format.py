@@ -181,7 +181,7 @@ def _delimiter(line: str, row: int, path: Path) -> str:
 
 
 def read_plain(data: bytes, path: Path) -> tuple[Header, Array] | None:
-    """Read a long file without any fault; None for a short one, and for one that wants a closer look."""
+    """Read a long file without any fault; None for a short one, and for one that needs a closer look."""
     head = data[:_HEAD] if len(data) >= _LONG else b""
     if not head.isascii() or b"\r" in head or b"\0" in head:
         return None

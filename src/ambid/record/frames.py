@@ -244,7 +244,7 @@ def _named(what: str, column: _Column, units: dict[str, str]) -> tuple[str, str 
     said |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
     if len(said) > 1:
         one, other = sorted(said)[:2]
-        raise RecordError(f"column {name!r} of {what} is said to be in [{one}] and in [{other}]. Omit one of them")
+        raise RecordError(f"column {name!r} of {what} is declared in [{one}] and in [{other}]. Omit one of them")
     return name, next(iter(said), None)
 
 

@@ -1,6 +1,6 @@
 """Rows of a damaged record as they stand in the file: missing values, gaps and jumps of time are kept, not refused.
 
-For whoever meets damage itself, such as a stream that is replayed; everything else wants `read_record`.
+For whoever meets damage itself, such as a stream that is replayed; everything else needs `read_record`.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """ARX models estimated as their signals come: by any recursion on regressors, or by instrumental variables.
 
 A(q) y = B(q) u + constant + v, φ(t) = [-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7). Least
-squares wants white v; instruments leave v free.
+squares needs white v; instruments leave v free.
 """
 
 from __future__ import annotations
@@ -147,7 +147,7 @@ class RecursiveIvArx(_OnSignals):
     offset : bool
         Whether a constant is estimated; it is its own instrument.
     open_loop : bool
-        Say that no feedback is at work: the auxiliary model wants that, and `warnings` tells it.
+        Declare the loop open: the auxiliary model needs that, and `warnings` tells it.
     n_instruments : int, optional
         Past values of the reference, na + nb or more; na + nb + 2 if not given.
     **settings : object

@@ -88,7 +88,7 @@ class OnlineThreeBlocks:
     Attributes
     ----------
     n_used, n_rejected : int
-        Samples that were taken in, and those that held a value that is not finite: after one, filters begin anew.
+        Samples that were taken in, and those that held a value that is not finite: after one, filters begin again.
 
     Raises
     ------
@@ -283,7 +283,7 @@ class OnlineThreeBlocks:
         self._run(block, errors)
 
     def _forget(self) -> None:
-        """Begin the filters anew after a gap; while warming up, the warm-up."""
+        """Begin the filters again after a gap; while warming up, the warm-up."""
         self._n_waiting = 0
         if self._at is not None:
             self._filter = self._filter.anew(4)

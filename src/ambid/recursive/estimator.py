@@ -23,7 +23,7 @@ class RecursiveEstimator(Protocol):
     Splitting a stream into calls of `update` differently does not change any number: work that is done once for
     several samples is done at fixed counts of samples, not at the ends of blocks. A sample that holds a number that is
     not finite is rejected: it changes no estimate, is counted, and an estimator with a memory of past signals starts
-    that memory anew. Memory does not grow with the number of samples.
+    that memory again. Memory does not grow with the number of samples.
 
     Attributes
     ----------
@@ -121,7 +121,7 @@ def _fits(values: Array, n: int, width: int) -> bool:
 
 
 def _rows(values: Array, n: int, width: int) -> Array:
-    """Return values as (n, width): for arrays of another kind the recursions would be compiled anew."""
+    """Return values as (n, width): for arrays of another kind the recursions would be compiled again."""
     return np.require(values.reshape(n, width), np.float64, ["C", "W"])
 
 

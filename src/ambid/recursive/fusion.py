@@ -379,7 +379,7 @@ class SensorFusion:
         clock[at.FRESH] = 1.0
 
     def _begin_tests(self, now: int) -> None:
-        """Begin the tests of all sensors anew."""
+        """Begin the tests of all sensors again."""
         at = self._at
         self._watch[:, at.UP : at.EVIDENCE + 1] = 0.0
         self._watch[:, at.UP_0 : at.LOSS_0 + 1] = now

@@ -181,7 +181,7 @@ class JointFilter:
     covariance does not wind up where nothing excites.
 
     A sample of which one output is missing is used with the other. One without any output moves only the state. One
-    without input is rejected, and the state begins anew from the next outputs, as it does after 32 samples without
+    without input is rejected, and the state begins again from the next outputs, as it does after 32 samples without
     outputs and after an innovation of both outputs that no noise makes (a thousand standard deviations). Smaller
     errors of sensors are taken for noise: screen the samples before.
 

@@ -221,7 +221,7 @@ def ukf_block(
 ) -> None:  # fmt: skip
     """Run the unscented filter with points at √n standard deviations.
 
-    The central one has no weight in the mean, and 2 in the covariance, as a Gaussian wants.
+    The central one has no weight in the mean, and 2 in the covariance, as a Gaussian needs.
     """
     n, p, n_x, n_d, n_u, n_y = z.size, logs.size, C.shape[1], dist.size, u.shape[1], y.shape[1]
     s = n_x + n_d

@@ -47,7 +47,7 @@ class RecursivePolynomial:
     noise, whatever is forgotten; how far the estimate lags behind coefficients that move is not in it. `fir` and `oe`
     have no noise model: they are biased under feedback, and `warnings` says so unless `open_loop` is given. ARMAX, BJ
     and the others are consistent under feedback as long as their noise model holds the true one. An unstable plant
-    wants A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
+    needs A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
 
     A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
     learnt until the unknown states of the filters have died away (`counts`).
@@ -134,7 +134,7 @@ class RecursivePolynomial:
         forgetting : float, optional
         samples : int or None, optional
             How many samples `fit` saw, where those to come stand at the same operating point: its offsets and noise
-            then count so much. None: both are learnt anew.
+            then count so much. None: both are learnt again.
         open_loop : bool, optional
             Say that no feedback is at work.
 
@@ -384,7 +384,7 @@ class _Window:
         return n, gap
 
     def clear(self) -> int:
-        """Begin anew; return how many samples were stored."""
+        """Begin again; return how many samples were stored."""
         n, self.filled, self.target = self.filled, 0, self.first
         return n
 

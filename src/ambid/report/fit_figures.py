@@ -357,7 +357,7 @@ def _draw_bars(bars: Bars) -> Block:
     """Draw coefficients with their 95 % intervals, each on a scale of its own: they differ by orders of magnitude."""
     columns = -(-len(bars.names) // _ROWS)
     per = -(-len(bars.names) // columns)
-    more = f"; {bars.n_more} more, less significant, are not shown" if bars.n_more else ""
+    more = f"; {bars.n_more} more, less significant, are omitted" if bars.n_more else ""
     panels = [panel(_bars, bars, slice(c * per, (c + 1) * per), per, height=0.6 + 0.21 * per) for c in range(columns)]
     title = "coefficients with 95 % intervals, each on its own scale; orange: zero lies inside"
     return Block(columns=[[p] for p in panels], title=f"{title}{more}")

@@ -237,7 +237,7 @@ def poles_panel(
 ) -> Block:
     """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a text of numbers.
 
-    Poles that lie too close to be told apart on the scale of all of them are drawn again, larger.
+    Poles that lie too close to be separated on the scale of all of them are drawn again, larger.
     """
 
     def every(axes: Axes) -> None:

@@ -50,7 +50,7 @@ def columns(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list
 
 
 def title_line(name: object, what: str, samples: int, rate_hz: float, status: str, paint: Paint = plain) -> str:
-    """Say what came of how long a record, and whether the search converged."""
+    """State what was made of how long a record, and whether the search converged."""
     return (
         f"{paint(str(name or 'record'), 'strong')}: {what}, {counted(samples, 'sample')} at {rate_hz:g} Hz "
         f"({samples / rate_hz:.4g} s){status_words(status, paint)}"
@@ -77,7 +77,7 @@ def verdict_lines(found: Verdict, *, width: int = WIDTH, paint: Paint = plain) -
 
 
 def status_words(status: str, paint: Paint = plain) -> str:
-    """Name a status that is not the wished one."""
+    """Name a status other than converged."""
     return "" if status == "converged" else paint(f" – {status}", "bad")
 
 

@@ -101,7 +101,7 @@ def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
     where there is none.
     """
     if not math.isfinite(v.value):
-        return "not known", ""
+        return "unknown", ""
     if not math.isfinite(v.sd):
         return f"{sized(v.value, unit, 5)} ± ?", ""
     ci95 = (v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd)
@@ -134,7 +134,7 @@ def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = p
     last twenty, and how many came before.
     """
     shown = events[-_MOST:]
-    lines = [f"{len(events) - len(shown)} earlier events are not shown"] if len(shown) < len(events) else []
+    lines = [f"{len(events) - len(shown)} earlier events are omitted"] if len(shown) < len(events) else []
     for e in shown:
         who = f" {e.parameter}" if e.parameter else ""
         head = f"{e.t:10.3f} s  "

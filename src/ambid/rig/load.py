@@ -1,7 +1,7 @@
 """From a rig file to a rig, and a record through its eyes.
 
 Units become SI, the entries are checked against the model and each other. Columns of a record become roles, calibrated,
-in the units that the model wants.
+in the units that the model needs.
 """
 
 from __future__ import annotations

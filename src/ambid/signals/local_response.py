@@ -67,7 +67,7 @@ def frf_local(
     Parameters
     ----------
     u : ndarray, shape (n_samples, n_u), any units
-        Inputs, with a rough spectrum (noise, PRBS, multisine): a smooth one is not told apart from leakage.
+        Inputs, with a rough spectrum (noise, PRBS, multisine): a smooth one is not separated from leakage.
     y : ndarray, shape (n_samples, n_y), any units
         Outputs.
     rate_hz : float
@@ -80,7 +80,7 @@ def frf_local(
     band : (float, float), optional
         Band in Hz in which the estimate is wanted.
     open_loop : bool
-        Whether it is known that no feedback was at work.
+        Whether the record is known to be open loop.
     hold : {"zoh", "band-limited"}
         What the input does between samples; kept with the result.
     inputs, outputs : sequence of str, optional

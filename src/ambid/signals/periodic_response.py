@@ -1,4 +1,4 @@
-"""Frequency response from periodic excitation, with the noise and the nonlinear distortion told apart.
+"""Frequency response from periodic excitation, with the noise and the nonlinear distortion separated.
 
 Noise differs between periods; stochastic nonlinear distortion is the same in every period and differs between
 realisations of the random phases (Pintelon and Schoukens 2012, ch. 2 to 4). With one realisation, lines that the
@@ -367,7 +367,7 @@ def frf_periodic(
     drop_periods : int or "auto"
         Leading periods not used, for the transient; "auto" drops those that differ significantly, and says so.
     open_loop : bool
-        Whether it is known that no feedback was at work; otherwise single periods, which do not show the noise that
+        Whether the record is known to be open loop; otherwise single periods, which do not show the noise that
         feedback carries to the input, give a warning.
     hold : {"zoh", "band-limited"}
         What the input does between samples; kept with the result.

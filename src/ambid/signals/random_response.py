@@ -71,7 +71,7 @@ def frf_random(
         For "hv": variance of the input noise over that of the output noise. By default the noise is taken to be the
         same share of both signals at every line.
     open_loop : bool
-        Whether it is known that no feedback was at work.
+        Whether the record is known to be open loop.
     hold : {"zoh", "band-limited"}
         What the input does between samples; kept with the result.
     inputs, outputs : sequence of str, optional
@@ -87,7 +87,7 @@ def frf_random(
     Raises
     ------
     EstimationError
-        If there are too few segments, options contradict each other, or inputs cannot be told apart.
+        If there are too few segments, options contradict each other, or inputs cannot be distinguished.
     RecordError
         If the segment does not fit the record.
     """

@@ -106,7 +106,7 @@ class FrequencyResponse:
 
     @property
     def noise_sd(self) -> Array | None:
-        """Standard deviation due to noise alone, shape (n_f, n_y, n_u); None where it was not told apart."""
+        """Standard deviation due to noise alone, shape (n_f, n_y, n_u); None where it was not separated."""
         return None if self.noise_covariance is None else self._sd(self.noise_covariance)
 
     @property

@@ -153,7 +153,7 @@ def rest_of_rig(rig: Rig, plant: NonlinearPlant) -> OperatingPoint:
 
 
 def enough_steps(plant: NonlinearPlant, point: OperatingPoint, rate_hz: float) -> int:
-    """Return how many Runge-Kutta steps a sample wants, by the fastest rate of the plant at rest.
+    """Return how many Runge-Kutta steps a sample needs, by the fastest rate of the plant at rest.
 
     Returns at least 1.
     """

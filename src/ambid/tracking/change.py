@@ -98,7 +98,7 @@ class ChangeDetector:
 
     `threshold`: of T_j; `drift`: (p,); `windows`: lengths, blocks; `overdispersion`: (n_windows, n_hypotheses + 2),
     present factors; the last two columns are all numbers together and the unexplained part; `noise`: present usual
-    level of the unexplained part per degree of freedom. May be set anew at any time..
+    level of the unexplained part per degree of freedom. May be set again at any time..
     """
 
     def __init__(

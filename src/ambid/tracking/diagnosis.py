@@ -2,8 +2,8 @@
 
 A number of the bench that jumped is searched in the samples after the jump; a disturbance is given its freedom; and
 where nothing explains the data nothing is learned. A block with much larger innovations than usual is set aside and the
-predictor begins anew behind it: it may be a knock that passes. If that goes on, and no change of the bench explains it,
-it is taken as noise as long as it can be believed.
+predictor starts again after it: it may be a passing knock. If that goes on, and no change of the bench explains it, it
+is treated as noise as long as that is plausible.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class Unexplained:
         return self.deaf and t >= self._again
 
     def over(self) -> None:
-        """Begin anew: the model explains the data again."""
+        """Begin again: the model explains the data again."""
         self.blocks, self._sum, self.deaf, self._wait = 0, 0.0, False, _FIRST_WAIT_S
 
 
@@ -159,7 +159,7 @@ class Diagnosis:
         self._recent.add(samples, last)
 
     def restart(self, sample: int) -> None:
-        """Start the predictor anew, as after a gap; a search waits for samples from then on.
+        """Start the predictor again, as after a gap; a search waits for samples from then on.
 
         `sample`: number of the next sample.
         """
@@ -316,7 +316,7 @@ class Diagnosis:
             self._give_up(t)
 
     def _adopt(self, found: Recovered, t: float) -> None:
-        """Go on with numbers that were found anew, as a candidate for publication."""
+        """Go on with numbers that were found again, as a candidate for publication."""
         rpem, refined = self._rpem, found.refined
         self.update_s = max(self.update_s, found.computing_s)
         if refined is None or not found.moved:  # it was a knock: nothing has moved

@@ -179,7 +179,7 @@ class EvidenceSum:
         self.clear(np.zeros(p))
 
     def clear(self, at: Array) -> None:
-        """Begin anew at a point."""
+        """Begin again at a point."""
         self.T[:] = 0.0
         self.at, self.rest, self.freedom, self.blocks = at, 0.0, 0, 0
 
@@ -292,7 +292,7 @@ class EvidenceStream:
         self.at, self._M = at, self._stacked(at)
 
     def restart(self, sample: int) -> None:
-        """Begin anew after a gap: signals before it are forgotten, and a part of the block that was begun is
+        """Begin again after a gap: signals before it are forgotten, and a part of the block that was begun is
         dropped.
 
         `sample`: number of the next sample.

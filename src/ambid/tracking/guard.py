@@ -109,7 +109,7 @@ class RowCheck:
         return found
 
     def _filled(self, values: Array) -> Array:
-        """Return the values with each one that is no number replaced by the one before: no frozen run ends there."""
+        """Return the values with each one that is not a number replaced by the one before: no frozen run ends there."""
         known = np.isfinite(values)
         at = np.maximum.accumulate(np.where(known, np.arange(values.shape[0])[:, None], -1), axis=0)
         return np.where(at >= 0, np.take_along_axis(values, np.maximum(at, 0), axis=0), self._last)

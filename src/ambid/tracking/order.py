@@ -45,7 +45,7 @@ class SampleClock:
         self.start(0, 0.0)
 
     def start(self, number: int, time_s: float) -> None:
-        """Begin anew at one stamp, keeping what is known of the drift.
+        """Begin again at one stamp, keeping what is known of the drift.
 
         `number`: sample number; `time_s`: its stamp, s.
         """
@@ -224,7 +224,7 @@ class BlockOrder:
             self._clock.start(part.first, part.time_s)
 
     def _take_old(self, part: Part) -> None:
-        """Refuse numbers that have passed, unless they show that the acquisition counts anew."""
+        """Refuse numbers that have passed, unless they show that the acquisition counts again."""
         before = self._old
         follows = before is not None and part.first == before.end and self._confirms(before, part)
         self._old_samples = part.size + (self._old_samples if follows else 0)
@@ -243,7 +243,7 @@ class BlockOrder:
         raw = parts[0].first - self.offset
         self.offset += shift
         self._ledger.reject(
-            "number", 0, self.next, f"the acquisition counts anew from {raw}; its samples are numbered on"
+            "number", 0, self.next, f"the acquisition counts again from {raw}; its samples are numbered on"
         )
         self._broke()
         self._tail = None

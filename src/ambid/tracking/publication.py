@@ -171,7 +171,7 @@ class Publication:
 
     `rpem`: the working estimate; what it starts from is published first; `t0`: time of the start, s of record.
 
-    `unconfirmed`: numbers were found anew after a change, and no later data have confirmed them yet; `updates`: times
+    `unconfirmed`: numbers were found again after a change, and no later data have confirmed them yet; `updates`: times
     that published parameters or gains moved.
     """
 
@@ -211,7 +211,7 @@ class Publication:
         """Decide on the candidate with one more block; offer the next.
 
         `evidence`: already taken in by the working estimate; `t`: its end, s of record. Returns whether numbers that
-        were found anew have been confirmed.
+        were found again have been confirmed.
         """
         if self._operator.holding:
             self._held = True

@@ -1,4 +1,4 @@
-"""After a change: find the moved number anew from the raw samples since, beside what was known before.
+"""After a change: find the moved number again from the raw samples since, beside what was known before.
 
 Each suspect alone is given its freedom back; the one that explains the stretch best is the one that moved. Where none
 does, all physical parameters are freed. An explanation has to bring the innovations down to what they were. The search
@@ -72,7 +72,7 @@ def _first_shown(
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Recovered:
-    """Numbers found anew."""
+    """Numbers found again."""
 
     refined: Refined | None  # none where nothing has moved
     moved: tuple[str, ...]  # numbers that were freed

@@ -3,8 +3,8 @@
 The innovations-form predictor of the off-line estimator runs along the stream with exact sensitivities. Every block
 leaves its evidence, which a Kalman filter of the tracked numbers takes in: square-root covariance, Joseph's form
 (Bierman 1977, ch. 5); numbers that are held enter with their uncertainty but are not moved (Schmidt). The predictor is
-assembled anew where the estimate has moved so far that second-order terms matter. Under feedback it is as consistent as
-the off-line estimator, and with unlimited memory it ends where that does.
+assembled again where the estimate has moved so far that second-order terms matter. It is as consistent in closed loop
+as the off-line estimator, and with unlimited memory it ends where that does.
 
 How fast each number walks is found by maximum likelihood: over a window of merged evidence the score by each walk
 variance w_j is half the difference of sum(lambda_j^2) and sum(N_jj) of the disturbance smoother (Koopman and Shephard
@@ -170,7 +170,7 @@ class DriftRates:
         self._since += 1
 
     def adapt(self, known: ParameterFilter, noise: float) -> None:
-        """Look at the window where a look is due; where something walks faster than thought, filter its end anew.
+        """Look at the window where a look is due; where something walks faster than thought, filter its end again.
 
         `noise`: variance of the evidence's residual.
         """
@@ -207,7 +207,7 @@ class DriftRates:
         return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
 
     def _catch_up(self, known: ParameterFilter, noise: float) -> None:
-        """Filter the recent past anew: with the rates as they were, what moved was taken for chance."""
+        """Filter the recent past again: with the rates as they were, what moved was taken for chance."""
         _, _, q, P = self._run(min(max(_RECENT), self._count), known.active, noise)
         held = ~known.active
         if not (np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0)):
@@ -299,7 +299,7 @@ class PhysicalRpem(PhysicalEstimator):
         Variance of the innovations over that at identification, followed through what no number explains.
     n_used, n_rejected : int
     n_linearised : int
-        Times that the predictor was assembled anew.
+        Times that the predictor was assembled again.
     n_unreached : int
         Times that there was no predictor at the estimate: the one in use is the nearest that was found on the way.
 
@@ -404,7 +404,7 @@ class PhysicalRpem(PhysicalEstimator):
             self.filter.walk(self.drift.variance, self.block_s)
 
     def refresh(self) -> None:
-        """Assemble the predictor anew where the estimate has moved too far from it.
+        """Assemble the predictor again where the estimate has moved too far from it.
 
         Too far is where second-order terms matter, or where its innovations are noticeably larger than those at the
         estimate.
@@ -445,7 +445,7 @@ class PhysicalRpem(PhysicalEstimator):
 
     @property
     def noise(self) -> float:
-        """Variance of the evidence's residual: above 1 where the model explains the record only in part."""
+        """Variance of the evidence's residual: above 1 where the model does not fully fit the record."""
         return self.numbers.overdispersion * max(self.noise_level, _LOWEST_NOISE)
 
     def move_to(self, q: Array) -> bool:

@@ -195,7 +195,7 @@ class Supervisor:
         self.diagnosis.restart(first)
 
     def _take(self, evidence: Evidence) -> None:
-        """Judge a block, use it, and judge what came of it."""
+        """Judge a block, use it, and judge the outcome of it."""
         rpem, t = self.rpem, self._t0 + evidence.last / self._rate
         if self._silent:
             self._silent = False

@@ -2,7 +2,7 @@
 
 The tracked numbers that explain a stretch of raw samples best are found by iterating: linearise, run the predictor
 over the stretch, take its evidence in beside what is known from before. Used alone it forgets sharply; the supervisor
-uses it to find a parameter anew after a jump, where the recursion's first-order step would be too long.
+uses it to find a parameter again after a jump, where the recursion's first-order step would be too long.
 """
 
 from __future__ import annotations

@@ -278,7 +278,7 @@ def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
 def beyond(novelty: Array) -> NDArray[np.bool_]:
     """Return where a model extrapolates.
 
-    `novelty`: (n_samples,). Returns (n_samples,), true outside the training data, and where novelty is no number.
+    `novelty`: (n_samples,). Returns (n_samples,), true outside the training data, and where novelty is not a number.
     """
     out: NDArray[np.bool_] = ~(novelty <= 1.0 + _ROUNDING)
     return out

@@ -99,7 +99,7 @@ def select(
     if not ranked:
         raise EstimationError(
             f"{of.name}: no order could be fitted and judged by {by}: {trial.refusal or 'the models are unstable'}. "
-            "Give orders, or take another criterion"
+            "Give orders, or use another criterion"
         )
     return Selection(
         structure=of.name,

@@ -127,7 +127,7 @@ def innovation_checks(fit: Fit, found: Products, known: Uncertainty, moved: Agre
 
 
 def innovation_tests(fit: Fit, found: Products) -> tuple[ResidualTest, ResidualTest]:
-    """Test the innovations against their own past, and against past inputs, from `innovation_products`."""
+    """Test the innovations for whiteness, and against past inputs, from `innovation_products`."""
     own, inputs = _lags(fit.problem.n_used)
     first = len(own) * fit.problem.y.shape[1]
     return (

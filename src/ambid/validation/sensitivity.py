@@ -45,7 +45,7 @@ class Influence:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class SensitivityAnalysis:
-    """What matters, and what cannot be told apart."""
+    """What matters, and what cannot be distinguished."""
 
     influences: tuple[Influence, ...]  # largest effect on the fit first
     collinearity: float  # index of all numbers together; under 10 is good, infinite where they are not independent

@@ -341,7 +341,7 @@ class Controller:
                 str(failure)
                 if isinstance(failure, PortEnded)
                 else f"port {self._port.name} was lost ({failure}); {_LOST}. Plug the cable in again and open the port"
-                " anew"
+                " again"
             )
             self._news.notify_all()
         with self._due:
@@ -373,7 +373,7 @@ _REMEDY = {
     "length": "Put the firmware of this ambid on the board",
     "range": "Correct the rig",
     "state": "Stop it first, or clear its fault",
-    "unready": "Give the rig a loop with gains, and open the device anew",
+    "unready": "Give the rig a loop with gains, and open the device again",
     "interlock": "Close the interlock loop (emergency stop, cable), then try again",
 }
 

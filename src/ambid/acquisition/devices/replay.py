@@ -38,7 +38,7 @@ class ReplayDevice(PlayedDevice):
         if missing:
             raise DeviceError(
                 f"record {path} has no column {missing[0]!r}, which the rig needs; it has {', '.join(record.names)}."
-                " Correct the rig, or take another record"
+                " Correct the rig, or use another record"
             )
         _check_units(record, rig, f"record {path}")
         super().__init__(record.rate_hz, pace)
