@@ -102,7 +102,7 @@ def test_a_record_that_holds_the_journal_is_said_to_and_the_journal_goes(left, a
     before = (left / name).read_bytes()
     found = ambid("recover", "run.h5.journal", "-o", name)
     assert (found.code, found.err) == (0, "")
-    said = f"{name} holds that already: nothing is to be done. run.h5.journal"
+    said = f"{name} holds that already: nothing to do. run.h5.journal"
     assert found.out.splitlines()[1] == f"{said} is kept; --delete removes it"
     found = ambid("recover", "run.h5.journal", "-o", name, "--delete")
     assert (found.code, found.err) == (0, "")
