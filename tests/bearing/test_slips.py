@@ -11,7 +11,7 @@ from ambid.bearing.lag import check_lag, lag_of, without_lag
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
-from ambid.job import identify
+from ambid.job import identify, simulate
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
@@ -284,6 +284,31 @@ def test_the_lag_is_measured_to_a_fraction_of_a_sample():
             assert lag.shown == (n > 0)
         assert lag_of(late("current", 2)(signals)).samples == pytest.approx(-2, abs=0.2)
         assert lag_of(without_lag(late("position", 7)(signals), found[7])).samples == pytest.approx(0, abs=0.2)
+
+
+def test_the_lag_of_a_sound_record_is_within_what_is_said():
+    """Over 24 sound records of half a second its root mean square is that of its standard deviation; none is named."""
+    found = []
+    for seed in range(24):
+        record = simulate("unstable-bearing", duration=0.5, seed=seed)
+        v, x, i = (record[role].values for role in ("voltage", "position", "current"))
+        found.append(lag_of(Signals(u=v[:, None].copy(), y=np.column_stack([x, i]), rate_hz=record.rate_hz)))
+    off = [lag.samples / lag.sd for lag in found if lag.share > 0.7]
+    assert len(off) > 20
+    assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
+    assert not any(lag.shown for lag in found)
+
+
+def test_swapped_columns_are_not_taken_for_a_lag():
+    record, rig = simulate("levitated-ball", duration=0.6, seed=1), default_rig()
+    columns = {"voltage [V]": "current", "current [A]": "voltage", "position [m]": "position"}
+    weighed = tuple(replace(p, value=0.077, role="fixed") if p.name == "m" else p for p in rig.parameters)
+    with pytest.raises(EstimationError, match="'voltage' and 'current' are swapped"):
+        identify(
+            {name: record[role].values for name, role in columns.items()},
+            replace(rig, parameters=weighed),
+            rate_hz=record.rate_hz,
+        )
 
 
 def test_an_estimate_with_a_lag_of_one_sample_is_not_to_be_used():

@@ -141,12 +141,12 @@ def refuse_mistaken(
         return
     below = as_is - (0.0 if searched else _GAIN)
     _refuse_units(model, signals, parameters, delay, follow, np.inf if searched else below)
-    if model.name == "one-axis":
-        _refuse_late(model, signals, parameters, delay, follow)
     better: list[tuple[float, str, str, list[Candidate]]] = []
     likely, others = _likely(model, _changes(model, signals), 0.0 if coil is None or turned else coil.share)
     for text, remedy, changed in likely:  # one start and one search, where a coil shows what is wrong
         _refuse_explained(text, remedy, _starts(model, changed, parameters, delay), follow)
+    if model.name == "one-axis":  # after them: two columns that are swapped look like one that lags by a lot
+        _refuse_late(model, signals, parameters, delay, follow)
     for text, remedy, changed in others:
         found = _starts(model, changed, parameters, delay)
         per_sample = found[0].criterion / found[0].problem.n_used if found else np.inf
@@ -204,7 +204,7 @@ def _refuse_late(
     if lag is not None and lag.shown and round(lag.samples):
         found = _starts(model, without_lag(signals, lag), parameters, delay)
         fit = _try(follow, found) if found else None
-        if fit is not None:
+        if fit is not None and _can_be(fit):
             raise EstimationError(
                 f"{lag.describe(signals.rate_hz)}: no bearing explains the record as it is, but one does after that "
                 f"({_numbers(fit)})"

@@ -454,7 +454,7 @@ def _discrete(
     C = spaces[0].C * sc.state / sc.output[:, None]
     scaled = [StateSpace(A=a, B=b, E=e, C=C) for a, b, e in zip(A, B, E, strict=True)]
     fraction = lag - np.floor(lag) if len(problem.taps) > 1 else None
-    plant, slopes = discretise(scaled[0], 1.0 / problem.rate_hz, fraction=fraction, derivatives=scaled[1:])
+    plant, slopes = _sampled(scaled[0], problem, fraction, scaled[1:])
     return plant, slopes[: problem.slices["fraction"].stop] if with_derivatives else ()
 
 
@@ -470,7 +470,18 @@ def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fra
             ([s.E for s in spaces], push),
         )
     )
-    return discretise(StateSpace(A=A, B=B, E=E, C=C), 1.0 / pairs[0][0].rate_hz, fraction=fraction)[0]
+    return _sampled(StateSpace(A=A, B=B, E=E, C=C), pairs[0][0], fraction)[0]
+
+
+def _sampled(
+    space: StateSpace, problem: PredictorProblem, fraction: float | None, derivatives: Sequence[StateSpace] = ()
+) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
+    """Discretise a plant of a trial step, or raise LinAlgError where it passes all numbers within a sample."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        plant, slopes = discretise(space, 1.0 / problem.rate_hz, fraction=fraction, derivatives=derivatives)
+    if not all(np.isfinite(x).all() for of in (plant, *slopes) for x in (of.A, of.B, of.B_late, of.E)):
+        raise np.linalg.LinAlgError("the plant passes all numbers within a sample")
+    return plant, slopes
 
 
 def _gain(

@@ -53,7 +53,7 @@ def gravity_balance(
     found, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
     slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
     sd = abs(found) * float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
-    rise = theta["k_x"] / (theta["m"] * g)  # -f_x/f
+    rise = theta["k_x"] / (theta["m"] * g)  # f_x/f, as f = -m g
     ripple = float(along[1]) / i0**2
     bend = ripple + 2.0 * rise * float(along[0]) / i0 + 0.75 * rise**2 * float(spread[0])
     doubt = abs(expected) * float(np.sqrt((g_sd / g) ** 2 + (zero_sd / i0) ** 2 + bend**2 + ripple**2))
