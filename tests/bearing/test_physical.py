@@ -243,6 +243,7 @@ def test_another_plant_is_called_another_plant():
     assert any("only roughly" in w for w in rough.warnings)
     assert any("contradicts 'coil'" in w for w in sharp.warnings)
     assert not any(p.identifiable for p in sharp.parameters)
+    assert (rough.verdict.word, sharp.verdict.word) == ("caution", "unusable")
 
 
 def test_what_does_not_show_is_not_identifiable():

@@ -29,6 +29,7 @@ from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
 
+_WRONG = 0.05  # of the response's power that a model with too large a cost may leave unexplained
 _COPIES = 2000  # rows for the bands of the weak form, which count in parts of a long spectrum
 
 
@@ -192,7 +193,7 @@ class FrequencyEstimate(Parametric, Judged, Linear):
     covariance_method: Literal["information", "robust"]
     delay: Delay  # of the inputs, in samples
     continuous: Continuous
-    checks: Mapping[str, Check]  # ``cost`` and ``identifiable``
+    checks: Mapping[str, Check]  # ``cost``, ``response_fit`` and ``identifiable``
     warnings: tuple[str, ...] = ()
     # singular values of the scaled information matrix and the weakest direction
     information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
@@ -219,6 +220,9 @@ def frequency_estimate(
     data = J[: J.shape[0] - n_priors] / np.sqrt(ln.widening)
     whole = directions(np.vstack([data, J[J.shape[0] - n_priors :]])).inverse()
     check = ln.verdict(cost, v.size, n_priors)
+    # each line weighted by its variance
+    left = 2 * cost / max(float(np.sum(ln.whitened(ln.G) ** 2)), 1e-300)
+    fits = check.passed or left < _WRONG
     theta = problem.theta(v)
     covariance = whole[:n, :n]
     if not check.passed:
@@ -233,6 +237,11 @@ def frequency_estimate(
     unseen = [k for k in names if not seen[k]]
     checks = {
         "cost": check,
+        "response_fit": Check(
+            passed=fits,
+            detail=f"the model explains all but {100 * left:.2g} % of the response's power"
+            + ("" if fits else ". Check columns, hold and reference, or use 'ambid identify'"),
+        ),
         "identifiable": Check(
             passed=not unseen,
             detail=f"not identifiable from these lines: {', '.join(unseen)}. Excite another band, or give a prior"

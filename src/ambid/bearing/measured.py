@@ -85,7 +85,9 @@ class Measured(Result):
             text = f"{least} of {lines} lines of {pair} stand out of the noise. Excite more, longer or in another band"
             found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
         if not (self.references or self.open_loop):
-            text = "feedback, if there was any, biases it. Give the reference (--reference), or give --open-loop"
+            text = (
+                "without a reference, feedback biases the response. Give --reference, or --open-loop if there is none"
+            )
             found.append(Reason(check="feedback", text=text))
         for name, model in (("fit", self.fit), ("physical", self.estimate)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]

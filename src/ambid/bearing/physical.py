@@ -54,10 +54,12 @@ class PhysicalFit(Parametric, Result):
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """A black box that cannot be this physics, and parameters that it does not show."""
-        found = [] if self.misfit.passed else [Reason(check="misfit", text=self.misfit.detail)]
+        v = self.misfit.values
+        gross = bool(v) and v["statistic"] >= _GROSS * v["freedom"]
+        found = [] if self.misfit.passed else [Reason(check="misfit", text=self.misfit.detail, grave=gross)]
         unseen = ", ".join(p.name for p in self.parameters if not p.identifiable)
         if unseen:
-            text = f"the fit does not show {unseen}. Excite more, or give a prior"
+            text = f"not identifiable from the fit: {unseen}. Excite more, or give a prior"
             found.append(Reason(check="identifiable", text=text))
         return tuple(found)
 

@@ -103,7 +103,9 @@ class OutputFit:
     innovation_sd: float  # SI
 
 
-_GRAVE = frozenset({"units", "plausible", "delay_in_range", "in_time", "finite_prediction", "stable_predictor"})
+_GRAVE = frozenset(
+    {"units", "plausible", "delay_in_range", "in_time", "finite_prediction", "stable_predictor", "response_fit"}
+)
 """Checks after whose failure no number is to be used."""
 
 _UNFINISHED = {

@@ -200,7 +200,7 @@ class Track(Result):
             n for n, v in last.parameters.items() if self.header.model in model_names() and v.sd > _VAGUE * abs(v.value)
         ]
         if vague:
-            text = f"the record does not show {', '.join(vague)}: sd above {_VAGUE:.0%} of the value. Excite more"
+            text = f"not identifiable: {', '.join(vague)} (sd above {_VAGUE:.0%} of the value). Excite more"
             found.append(Reason(check="identifiable", text=text))
         return (*found, *(Reason(check="start", text=text) for text in header.warnings))
 

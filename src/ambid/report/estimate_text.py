@@ -228,7 +228,7 @@ def physics_text(found: PhysicalFit | FrequencyEstimate, *, width: int = WIDTH, 
         about, checks, warnings = status_words(found.status, paint), dict(found.checks), []
     lines = [
         paint(f"physical parameters of model {found.model}", "strong") + about,
-        *parameter_lines(found.parameters, width=width, paint=paint),
+        *parameter_lines(found.parameters, width=width, paint=paint, found=found.verdict),
         delay,
         *check_lines(checks, width=width, paint=paint),
         *warning_lines(warnings, width=width, paint=paint),

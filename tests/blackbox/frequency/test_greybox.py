@@ -116,14 +116,18 @@ def test_model_errors_widen_the_intervals():
     # 40 Hz of an unmodelled flexible mount: 5 % of stiffness
     G = plant("unstable-bearing", F)
     s = 2j * np.pi * F
-    wrong = G * (1 + 0.05 * (2 * np.pi * 400) ** 2 / (s**2 + 100 * s + (2 * np.pi * 400) ** 2))[:, None, None]
-    frf = noisy(F, wrong, 0.005, 1)
+    mount = ((2 * np.pi * 400) ** 2 / (s**2 + 100 * s + (2 * np.pi * 400) ** 2))[:, None, None]
+    frf = noisy(F, G * (1 + 0.05 * mount), 0.005, 1)
     estimate = greybox_frf(frf, model("one-axis"), free(**NO_DAMPING))
     right = greybox_frf(noisy(F, G, 0.005, 1), model("one-axis"), free(**NO_DAMPING))
     assert not estimate.checks["cost"].passed
     assert estimate.covariance_method == "robust"
     assert any("model errors" in w for w in estimate.warnings)
     assert all(estimate.parameter(k).sd > 1.5 * right.parameter(k).sd for k in FREE)
+    assert estimate.verdict.word == "caution"
+    far = greybox_frf(noisy(F, G * (1 + 5 * mount), 0.005, 1), model("one-axis"), free(**NO_DAMPING))
+    assert not far.checks["response_fit"].passed
+    assert far.verdict.word == "unusable"
 
 
 def test_position_alone_wants_start_values():
