@@ -21,7 +21,7 @@ SEEDS, BAR_SEEDS, DRIFTS = 100, 40, 20
 AT_S, LENGTH_S = 2.0, 4.0
 SOON_S = 0.3  # after a change: what is published comes from few samples
 DRIFT_S, SLOPE = 10.0, 0.2 / 60.0  # of R, per second: a fifth in a minute
-GROUP = "Tracking: coverage of the 95 % bands"
+GROUP = "Tracking: coverage of the bands"
 COLUMNS = ("scenario", "lines", *PHYSICAL)
 _Z = 1.959964
 

@@ -166,8 +166,8 @@ def test_ratios_to_the_mass_are_said_to_be_ratios():
     found = identify(Record(rate_hz=rec.rate_hz, channels=rec.channels[1:]), default_rig("rotor"))
     assert not found.passed
     assert not any(found.parameter(k).identifiable for k in ("m", "k_x", "k_i"))
-    assert "common factor" in found.checks["identifiable"].detail
-    assert any("common factor" in w for w in found.warnings)
+    assert "ratios of m, k_x and k_i" in found.checks["identifiable"].detail
+    assert any("ratios of m, k_x and k_i" in w for w in found.warnings)
 
 
 def test_equal_records_give_equal_estimates(estimate):

@@ -173,8 +173,8 @@ def test_a_replay_that_ends_early_says_so(acquire):
         (("--seconds", "nan"), "--seconds is nan"),
         (("--settle", "-1"), "--settle is -1"),
         (("--amplitude", "-2", "--excitation", "prbs"), "--amplitude is -2"),
-        (("--amplitude", "2"), "--amplitude is of an excitation, and none is named"),
-        (("--band", "1:20"), "--band is of an excitation, and none is named"),
+        (("--amplitude", "2"), "--amplitude is for an excitation, and none was named"),
+        (("--band", "1:20"), "--band is for an excitation, and none was named"),
         (("--band", "20:1", "--excitation", "prbs"), "--band is '20:1'"),
         (("--excitation", "multisin"), "'multisin'"),
         (("--excitation", "chirp"), "multisine"),
@@ -222,7 +222,7 @@ def test_a_record_that_exists_is_kept_unless_forced(acquire, place, monkeypatch)
     monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: opened.append(1))
     done = acquire("--seconds", "1")
     assert (done.code, opened) == (2, [])
-    assert "o.h5 already exists" in done.err
+    assert "o.h5 exists" in done.err
     assert "--force" in done.err
     assert (place / "o.h5").read_text() == "precious"
     monkeypatch.undo()
@@ -276,7 +276,7 @@ def test_a_poor_record_is_seen_without_strict_and_ends_with_3_with_it(acquire, m
         bench(monkeypatch, Spoiled(prototype(), spoil=dead))
         done = acquire("--seconds", "2", *words)
         assert done.code == code
-        assert "current stands still" in done.out
+        assert "current is constant" in done.out
 
 
 def test_a_lost_line_says_what_the_record_holds(acquire, monkeypatch):
@@ -393,7 +393,7 @@ def test_with_a_track_on_standard_output_nothing_else_is_there(acquire, place, e
     track = track_of(done.out)
     assert track[0]["schema"] == "ambid.track/1"
     assert "summary" in track[-1]
-    assert "of the converter's range" in done.err  # what is poor is still seen
+    assert "of the converter range" in done.err  # what is poor is still seen
 
 
 def test_a_fit_is_no_start(acquire, place, estimate, ambid):

@@ -345,6 +345,6 @@ def test_settings_that_make_no_sense_are_refused() -> None:
         hybrid([data.part(0, 12)], {})
     few = hybrid([data.part(0, 40)], {})
     assert few.settings["neurons"] == 0
-    assert not any("follows the noise" in w for w in few.warnings)
+    assert not any("overfits" in w for w in few.warnings)
     crowded = hybrid([data.part(0, 20)], {"neurons": 4})
-    assert any("follows the noise" in w for w in crowded.warnings)
+    assert any("overfits" in w for w in crowded.warnings)

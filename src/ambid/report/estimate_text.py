@@ -105,7 +105,7 @@ def curve_lines(estimate: NonlinearBearingEstimate, *, width: int = WIDTH) -> li
     for table in tables:
         lines += ["", *columns(table)] if lines else columns(table)
     if any("*" in cell for table in tables for row in table for cell in row):
-        lines += ["* outside the recorded range: the law extrapolates, and its sd does not cover that"]
+        lines += ["* outside the recorded range: the law extrapolates; its sd does not cover that"]
     return lines
 
 

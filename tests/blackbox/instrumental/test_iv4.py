@@ -105,7 +105,7 @@ def test_exact_data_give_exact_coefficients():
 def test_feedback_is_warned_of():
     d = _record(np.random.default_rng(1))
     closed = io_data(d.u, d.y)
-    assert any("controller" in w for w in iv4(closed, ORDERS).warnings)
+    assert any("feedback" in w for w in iv4(closed, ORDERS).warnings)
     assert not iv4(d, ORDERS).warnings
 
 

@@ -154,4 +154,4 @@ def test_refusals():
         srivc(d, {"nb": 4, "nf": 2, "nk": 0})
     with pytest.raises(EstimationError, match="no input"):
         srivc(io_data(np.empty((d.n_samples, 0)), d.y), {"nb": 1, "nf": 2})
-    assert any("controller" in w for w in srivc(io_data(d.u, d.y, dt=0.02), {"nb": 1, "nf": 2, "nk": 0}).warnings)
+    assert any("feedback" in w for w in srivc(io_data(d.u, d.y, dt=0.02), {"nb": 1, "nf": 2, "nk": 0}).warnings)

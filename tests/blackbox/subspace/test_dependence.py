@@ -83,7 +83,7 @@ def test_inputs_that_nearly_move_together_have_honest_spreads(method, digits):
 @pytest.mark.parametrize("name", ["cva", "pbsid", "sspem"])
 def test_more_states_than_a_record_without_noise_shows_are_refused(name):
     u, _, _ = signals(4)
-    with pytest.raises(EstimationError, match="shows 1 state, not 2"):
+    with pytest.raises(EstimationError, match="identifies 1 state, not 2"):
         METHODS[name](given(np.r_[0.0, u[:-1]], u=u), {"n": 2})
     assert len(subspace_models(given(np.r_[0.0, u[:-1]], u=u), "pbsid", 3)) == 1
 
