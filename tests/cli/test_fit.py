@@ -32,10 +32,10 @@ def test_a_step_from_rest(step, ambid):
     np.testing.assert_allclose(fit["polynomials"]["F"], [1.0, -1.5, 0.7], atol=0.05)
     assert not any("rest" in x for x in fit["warnings"])
     late = json.loads(ambid("fit", "late.csv", "--structure", "oe", *words, "--json", "-").out)
-    assert any("does not begin at rest" in x for x in late["warnings"])
+    assert any("does not start at rest" in x for x in late["warnings"])
     refused = ambid("fit", "step.csv", "--structure", "iv4", *words)
     assert refused.code != 0
-    assert "iv4 cannot be told that a record begins at rest; fir, arx, armax" in " ".join(refused.err.split())
+    assert "structure iv4 cannot start at rest; fir, arx, armax" in " ".join(refused.err.split())
 
 
 @pytest.fixture(scope="module")

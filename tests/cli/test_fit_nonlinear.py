@@ -164,8 +164,8 @@ def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     words = ("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0")
     for more, said in (
         (("./r0.csv",), "record r0.csv is given twice and would count twice. Omit one"),
-        (("--validate", "r0.csv"), "--validate r0.csv is fitted to as well"),
-        (("--validate", "r0.csv", "--to", "3", "--validate-from", "2"), "--validate r0.csv is fitted to as well"),
+        (("--validate", "r0.csv"), "--validate r0.csv is used for fitting too"),
+        (("--validate", "r0.csv", "--to", "3", "--validate-from", "2"), "--validate r0.csv is used for fitting too"),
     ):
         found = ambid(*words, *more)
         assert (found.code, said in found.err) == (2, True), found.err

@@ -132,7 +132,7 @@ def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, ri
     assert free.record.knock is None
     taken = take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(np.quantile(x, 0.5))))), Reading())
     assert "is treated as unknown" in taken.warnings[0]
-    assert "lies on a stop" in taken.warnings[1]
+    assert "rests on a stop" in taken.warnings[1]
     assert np.count_nonzero(taken.record.cut) == taken.record.u.size - taken.record.kept.shape[0] > 0
     with pytest.raises(EstimationError, match="nowhere free for 100 samples"):
         take_record(balls[0], replace(rig, limits=Limits(position=(0.0, float(x.min())))), Reading())

@@ -282,7 +282,7 @@ def test_an_unstable_plant_in_output_form_fails_with_the_reason():
 
 def test_feedback_without_an_error_model_is_warned_of():
     data = record(0, 600, gains=(0.3, 0.0))
-    assert any("biased under feedback" in w for w in lpv([data], {**KNOWN, "error_order": 0}).warnings)
+    assert any("biased by feedback" in w for w in lpv([data], {**KNOWN, "error_order": 0}).warnings)
     assert not any("biased" in w for w in lpv([data], KNOWN).warnings)
     told = replace(data, open_loop=True)
     assert not any("biased" in w for w in lpv([told], {**KNOWN, "error_order": 0}).warnings)

@@ -238,8 +238,8 @@ def test_settings_that_make_each_other_void_are_refused(told: dict[str, object],
 
 def test_a_model_that_follows_the_noise_says_so() -> None:
     record, _ = bumpy(62, 14, 0.1)
-    assert any("follows the noise" in w for w in rbf([record], {"ny": 20, "nu": 20, "neurons": 0}).warnings)
-    assert not any("follows the noise" in w for w in rbf([record], {"ny": 1, "nu": 1, "neurons": 0}).warnings)
+    assert any("overfits" in w for w in rbf([record], {"ny": 20, "nu": 20, "neurons": 0}).warnings)
+    assert not any("overfits" in w for w in rbf([record], {"ny": 1, "nu": 1, "neurons": 0}).warnings)
 
 
 def test_numbers_that_the_data_do_not_tell_apart_are_named() -> None:
@@ -248,9 +248,9 @@ def test_numbers_that_the_data_do_not_tell_apart_are_named() -> None:
     for t in range(1, 300):
         y[t] = 0.5 * y[t - 1] + u[t - 1] + 0.2 * rng.standard_normal()
     told = {"ny": 1, "neurons": 3, "width": 1.4, "trained": "all"}
-    (found,) = [w for w in rbf([data(u, y)], {**told, "nu": 2}).warnings if "apart" in w]
+    (found,) = [w for w in rbf([data(u, y)], {**told, "nu": 2}).warnings if "distinguish" in w]
     assert "y: u(t-1), y: u(t-2)." in found
-    assert not any("apart" in w for w in rbf([data(u, y)], {**told, "nu": 1}).warnings)
+    assert not any("distinguish" in w for w in rbf([data(u, y)], {**told, "nu": 1}).warnings)
 
 
 def test_units_that_have_no_place_are_left_out_and_told() -> None:
