@@ -223,7 +223,9 @@ def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
     assert truth_beside(bench / "record.csv", None, {"R": "ohm"}) == {}
     given = {}
     drawn = track_figures.track_figure
-    monkeypatch.setattr(track_figures, "track_figure", lambda h, truth, **form: given.update(truth) or drawn(h, truth=truth, **form))
+    monkeypatch.setattr(
+        track_figures, "track_figure", lambda h, truth, **form: given.update(truth) or drawn(h, truth=truth, **form)
+    )
     assert ambid("track", "true.csv", "--plot", "t.png").code == 0
     assert list(given) == ["R"]
 

@@ -55,7 +55,7 @@ def test_a_wrong_minimum_shows_in_its_errors_and_is_left() -> None:
     short = bearing(600, 1.0, 2, quiet=30.0)
     before = nn([short], {"delay": 1, "descent": 0, "evaluations": 0})
     assert before.status == "converged"  # so it says, with errors that are several times too large
-    assert any("wrong minimum" in w for w in before.warnings)
+    assert any("local minimum" in w for w in before.warnings)
     assert before.noise_covariance[1, 1] > 2.0 * 0.06**2
     fit = nn([short], {"delay": 1, "descent": 0, "evaluations": 500})
     np.testing.assert_allclose(np.sqrt(np.diag(fit.noise_covariance)), [3e-6, 6e-2], rtol=0.3)
@@ -69,17 +69,17 @@ def test_a_wrong_minimum_of_nearly_the_right_errors_is_noticed() -> None:
     record = bearing(4000, 1.0, 5, quiet=30.0)
     plain = nn([record], {"delay": 1, "descent": 0})
     assert max(errors(plain).values()) > 1.0  # with errors that are 7 % too large
-    assert any("wrong minimum" in w and "evaluations=2000" in w for w in plain.warnings)
+    assert any("local minimum" in w and "evaluations=2000" in w for w in plain.warnings)
     fit = nn([record], {"delay": 1, "descent": 0, "evaluations": 500})
     assert max(errors(fit).values()) < 0.1
-    assert not any("wrong minimum" in w for w in fit.warnings)
+    assert not any("local minimum" in w for w in fit.warnings)
 
 
 def test_a_wrong_minimum_is_noticed_in_a_short_record() -> None:
     """One state for a system of two: 70 samples are few for the regression, and enough to see it."""
     record, *_ = sampled(70, 3, noise=0.05)
     fit = nn([record], {"states": 1, "neurons": 0})
-    assert any("wrong minimum" in w for w in fit.warnings)
+    assert any("local minimum" in w for w in fit.warnings)
 
 
 def test_it_is_not_called_where_ordinary_starts_work(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -93,7 +93,7 @@ def test_it_is_not_called_where_ordinary_starts_work(monkeypatch: pytest.MonkeyP
     assert fit.status == "converged"
     assert max(errors(fit).values()) < 0.01
     assert "global_search" not in fit.details
-    assert not any("wrong minimum" in w for w in fit.warnings)
+    assert not any("local minimum" in w for w in fit.warnings)
     strong = nn([bearing(4000, 4.0, 1)], {"delay": 1, "descent": 0})  # nonlinear, but no linear model does better
     assert "global_search" not in strong.details
 

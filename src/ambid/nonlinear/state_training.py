@@ -420,7 +420,7 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
         reason = "the network does not stay finite on its training records: check the columns"
         return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
     if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
-        way_out = "say " if state.layout.sensor else "give noise = innovations, or "
+        way_out = "" if state.layout.sensor else "give noise = innovations, or "
         fitting.warnings.append(
             f"trained on simulation errors, nn is biased by feedback: {way_out}give --open-loop if the records are "
             "open loop"

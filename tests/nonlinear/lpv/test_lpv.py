@@ -218,7 +218,7 @@ def test_an_interrupted_fit_says_which_error_model_it_has():
 
 def test_too_short_for_the_numbers_asked_for():
     data = record(0, 60)
-    with pytest.raises(EstimationError, match="48 samples remain after lags for 50 numbers"):
+    with pytest.raises(EstimationError, match="48 samples remain after lags for 50 parameters"):
         lpv([data.part(0, 55)], {"schedule": "p", "degree": 8})
     few = lpv([data.part(0, 28)], {"schedule": "p"})  # a cubic would have more coefficients than there are samples
     assert few.settings["degree"] == 0
