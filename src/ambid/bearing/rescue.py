@@ -16,7 +16,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,6 +34,7 @@ from ambid.bearing.multistart import (
     fixed_values,
     race,
 )
+from ambid.estimation.estimate import Check
 from ambid.estimation.global_search import STAGE, global_search
 from ambid.estimation.likelihood import Fit, evaluate, search
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
@@ -188,6 +189,22 @@ def describe_search(report: Mapping[str, object]) -> str:
         return out + "found this fit"
     fall = float(str(before)) - float(str(after))
     return out + f"found this fit, whose likelihood criterion is {fall:.2g} per sample lower"
+
+
+def warnings_of(fit: Any, checks: Mapping[str, Check], inflated_by: str) -> tuple[str, ...]:
+    """Return what a reader has to know before using the values, most important first.
+
+    `fit`: of either estimator; `inflated_by`: where its robust standard deviations come from; empty if not used.
+    """
+    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
+    found += [] if fit.global_search is None else [describe_search(fit.global_search)]
+    found += [c.detail for c in checks.values() if not c.passed]
+    if inflated_by:
+        found.append(
+            f"the model does not fully fit; standard errors are inflated ({inflated_by}) but cannot cover a systematic "
+            "bias"
+        )
+    return tuple(found)
 
 
 def _better(after: Fit, before: Fit) -> bool:

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.devices import say_note
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end, json_path
-from ambid.cli.terminal import watching
+from ambid.cli.terminal import say_note, watching
 from ambid.errors import AmbidError, counted
 
 if TYPE_CHECKING:
@@ -85,7 +84,7 @@ def command(
     PORT is a serial port, 'emulated' (the firmware on an emulated controller before a simulated bench), 'simulated'
     (a simulated bench alone), or 'replay:FILE'. What is recorded is in a journal at once: see 'ambid recover'.
     """
-    from ambid.job.acquiring import Wish, acquire, ready
+    from ambid.job.acquiring import Request, acquire, ready
     from ambid.report.device_text import progress_line
     from ambid.rig import load_rig
 
@@ -96,12 +95,12 @@ def command(
     outputs.claim(record, "-o", _ENDINGS, force=force)
     outputs.claim(json_path(json) if track else None, "--json")
     known, stop, behind = load_rig(rig), Stop(), None if bench is None else opt.preset_of(bench) or bench
-    words: dict[str, Any] = {
+    settings: dict[str, Any] = {
         "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
         "settle": settle, "seed": seed, "stopped": stop.wished,
     }  # fmt: skip
-    wish, start, before = Wish(**words), start_of_track(track), _changed(record)
-    job = Recording(known, port, record, wish.trial(port, known).settle_s, stop, force=force)
+    wanted, start, before = Request(**settings), start_of_track(track), _changed(record)
+    job = Recording(known, port, record, wanted.trial(port, known).settle_s, stop, force=force)
     if (record.exists() or record.is_symlink()) and not force:
         raise AmbidError(f"-o {record} already exists. Choose another name, or give --force")
     try:
@@ -120,11 +119,11 @@ def command(
 
             if track is None:
                 done, track_end = acquire(
-                    port, known, record, **words, bench=behind, pace=pace, force=force, on_note=note, on_progress=show,
-                    on_trouble=_say_trouble, tick=stage,
+                    port, known, record, **settings, bench=behind, pace=pace, force=force, on_note=note,
+                    on_progress=show, on_trouble=_say_trouble, tick=stage,
                 ), None  # fmt: skip
             else:
-                opening = ready(port, known, wish, bench=behind, pace=pace, force=force, note=note, tick=stage)
+                opening = ready(port, known, wanted, bench=behind, pace=pace, force=force, note=note, tick=stage)
                 with opening as (device, course):
                     done, track_end = job.follow(device, course, start, json, quiet=quiet)
     except KeyboardInterrupt:

@@ -12,11 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.devices import open_bench
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import end
-from ambid.cli.terminal import painter, watching
+from ambid.cli.terminal import painter, say_note, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
@@ -52,6 +51,7 @@ def command(
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
     """
     from ambid.job import commission
+    from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
     from ambid.job.commissioning_steps import STEPS, Wishes
     from ambid.report.device_text import next_text, progress_line, step_text
@@ -75,7 +75,8 @@ def command(
     if folder.exists():
         check_folder(folder)
     last: list[Step] = []
-    opening = open_bench(port, known, bench=bench, pace=pace, seed=seed, closes=not force)
+    behind = None if bench is None else opt.preset_of(bench) or bench
+    opening = opened(port, known, bench=behind, pace=pace, seed=seed, closes=not force, note=say_note)
     with watching() as watch, signals(stop.take), opening as device:
         new = _make(folder)
 

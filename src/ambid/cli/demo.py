@@ -13,7 +13,7 @@ from ambid.cli.terminal import painter, progress
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from ambid.estimation.estimate import EstimatedParameter
+    from ambid.estimation.estimate import Estimate
     from ambid.report.text import Paint
 
 # Truth of the thesis's simulation rig (table 4.1, corrected) and what its own identification found there (eq. 4.11).
@@ -32,7 +32,7 @@ def command() -> None:
     from ambid.job import identify
     from ambid.physics.presets import preset
     from ambid.report.estimate_text import delay_lines, header_lines, output_rows
-    from ambid.report.text import check_lines, columns
+    from ambid.report.text import check_lines, columns, verdict_lines
 
     with (
         as_file(demo_file("demo.csv.gz")) as record,
@@ -42,26 +42,27 @@ def command() -> None:
         estimate = identify(record, rig, tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
+    typer.echo("\n".join([*verdict_lines(estimate.verdict, paint=paint), ""]))
     typer.echo(f"{header_lines(estimate, paint=paint)[0]}\nsimulated in closed loop; no parameter was given\n")
-    typer.echo("\n".join(truth_lines(estimate.parameters, truth, paint)))
+    typer.echo("\n".join(truth_lines(estimate, truth, paint)))
     typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(output_rows(estimate))]))
     typer.echo("\n" + "\n".join(check_lines(estimate.checks, paint=paint)))
     whole = sum(estimate.timing_s.values())
     typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate (the thesis* reports about 5 s)")
 
 
-def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float], paint: Paint) -> list[str]:
+def truth_lines(found: Estimate, truth: Mapping[str, float], paint: Paint) -> list[str]:
     """Write estimated parameters beside their truth.
 
-    `found`: fixed ones are left out; `truth`: SI; `paint`: adds colour. Returns a table, and a line on how many truths
-    lie inside their 99.9 % intervals.
+    `found`: its fixed parameters are left out; `truth`: SI; `paint`: adds colour. Returns a table, and a
+    line on how many truths lie inside their 99.9 % intervals.
     """
     from ambid.report.numbers import quantity
-    from ambid.report.text import columns
+    from ambid.report.text import columns, verdict
 
     rows = [("", "estimate ± sd", "truth", "error", "in sd", "thesis*", "verdict")]
     inside = []
-    for p in (p for p in found if p.role != "fixed"):
+    for p in (p for p in found.parameters if p.role != "fixed"):
         true, (was, got) = truth[p.name], _THESIS[p.name]
         z = (p.value - true) / p.sd
         inside.append(abs(z) < _INSIDE)
@@ -69,7 +70,7 @@ def truth_lines(found: tuple[EstimatedParameter, ...], truth: Mapping[str, float
         scale, decimals = p.value / float(q.value), len(q.value.partition(".")[2])
         shown = f"{true / scale:.{decimals}f} {q.unit}"
         errors = (_percent(p.value - true, true, 2), f"{z:+.1f}", _percent(got - was, was, 1))
-        rows.append((p.name, q.text, shown, *errors, "identified" if p.identifiable else "not identifiable"))
+        rows.append((p.name, q.text, shown, *errors, verdict(p, found.verdict)))
     mark = paint("✓", "good") if all(inside) else paint("✗", "bad")
     return [
         *columns(rows, right=(3, 4, 5)),

@@ -24,7 +24,7 @@ def info(
 ) -> None:
     """Show what a record holds: channels, rate, levels, resolution, noise, saturation, drop-outs, outliers, excitation.
 
-    With --rig: the channels by role, calibrated; the noise of the outputs is then told from what the input explains.
+    With --rig, channels are named by role and calibrated, and what the inputs explain does not count as noise.
     """
     from ambid.job import info
 

@@ -54,7 +54,7 @@ TrackFile = Annotated[
 ]
 Plot = Annotated[Path | None, option("--plot FILE.png", "Draw the result.")]
 Report = Annotated[Path | None, option("--report FILE.html", "Write a report in one self-contained file.")]
-Strict = Annotated[bool, switch("--strict", "End with exit code 3 if the search did not converge or a check failed.")]
+Strict = Annotated[bool, switch("--strict", "End with exit code 3 unless the verdict is usable.")]
 Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeatable.")]
 OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeatable.")]
 References = Annotated[
@@ -64,7 +64,7 @@ References = Annotated[
 OpenLoop = Annotated[bool, switch("--open-loop", "The record was taken without feedback.")]
 Force = Annotated[bool, switch("--force", "Overwrite an existing record.")]
 ForceLoop = Annotated[
-    bool, switch("--force", "Write over a record that exists; go on with a loop that is predicted unstable.")
+    bool, switch("--force", "Overwrite an existing record; go on with a loop that is predicted unstable.")
 ]
 SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Validate on this record too, on all of it.")]
 
@@ -89,7 +89,7 @@ BenchName = Annotated[
 ]
 Pace = Annotated[
     Literal["fastest", "real-time"],
-    switch("--pace", "Of an emulated, simulated or replayed device: as fast as possible, or in real time."),
+    switch("--pace", "Speed of an emulated, simulated or replayed device."),
 ]
 Seed = Annotated[int, option("--seed N", "Seed of excitation and simulated noise.", True, min=0)]
 

@@ -27,11 +27,10 @@ def command(
     force: Force = False,
     strict: Annotated[bool, switch("--strict", "End with exit code 3 if something was damaged.")] = False,
 ) -> None:
-    """Make the record of a recording that was killed or whose power was cut, from the journal that it left.
+    """Recover a recording that was killed, or lost its power, from the journal that it left.
 
-    Every block that the recorder had acknowledged comes back; what is damaged or missing is counted, and becomes rows
-    without values, which --gaps of the other verbs treats. A record that is there is left as it is: where it holds
-    just what the journal does, that is said, and --delete removes the journal.
+    Every block that the recorder had acknowledged comes back. Damaged or missing samples are counted and become empty
+    rows; the other verbs treat these by --gaps. An existing record is left as it is.
     """
     if output is not None and len(journals) > 1:
         raise AmbidError(

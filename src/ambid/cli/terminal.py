@@ -50,6 +50,11 @@ def _in_plain_letters(error: UnicodeError) -> tuple[str, int]:
     return "".join(_PLAIN.get(c, "?") for c in error.object[error.start : error.end]), error.end
 
 
+def say_note(line: str) -> None:
+    """Say something on standard error."""
+    typer.echo(f"ambid: note: {line}", err=True)
+
+
 def painter() -> Paint:
     """Return the way of painting that standard output can show: colour on a terminal, nothing elsewhere.
 

@@ -83,7 +83,7 @@ def command(
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view, even on a terminal.")] = False,
     strict: opt.Strict = False,
 ) -> None:
-    """Follow the physical parameters of a bench through a record, as the tracker does beside a running machine.
+    """Track the physical parameters of a bench through a record, as beside a running machine.
 
     On a terminal a live view shows parameters, error, state and decisions; h, t, a and r set flags, q ends.
     """

@@ -25,7 +25,7 @@ def command(
 ) -> None:
     """Judge an estimate on another record of the same bench: nothing is fitted but offsets and initial state.
 
-    Without --rig: the record is read as the one that the estimate came from.
+    Without --rig, the record is read through the rig that the estimate was made with.
     """
     from ambid.job.results import validate
 

@@ -1,4 +1,4 @@
-"""The job of recording: a port and a rig in, a record on the disk out; who is interested is told meanwhile."""
+"""The job of recording: a port and a rig in, a record on the disk out, with callbacks for progress."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from ambid.acquisition.settings import controller_settings
 from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, counted, refuse_given
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
-from ambid.job.simulation import bearer_of
+from ambid.job.simulation import bench_of_source
 from ambid.physics.presets import Preset
 from ambid.record.sampling import MIN_SAMPLES
 from ambid.rig import Rig
@@ -36,8 +36,8 @@ def _mute(_: object) -> None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wish:
-    """What is to be recorded."""
+class Request:
+    """Settings of a recording."""
 
     seconds: float = 10.0
     excitation: str | None = None  # None: nothing is played
@@ -131,11 +131,11 @@ def acquire(
     seconds : float, optional
         Length of the record in s.
     excitation : {"multisine", "schroeder", "prbs", "steps"}, optional
-        What the controller adds to its output; default nothing.
+        Signal that the controller adds to its output; default none.
     amplitude : float, optional
-        Its peak in V; default found by trials, small first.
+        Peak of the excitation in V; default: found by trials, smallest first.
     band : (float, float), optional
-        Its band in Hz; default that in which the rotor moves, or what the controller can play.
+        Band of the excitation in Hz; default: where the rotor moves, or what the controller can play.
     mode : {"sample", "drive", "levitate"}, optional
         Output off; excitation without feedback; position loop on the controller. Default levitate where the rig has a
         loop, sample a replay.
@@ -144,25 +144,25 @@ def acquire(
     bench : str, Path, Rig or Preset, optional
         Plant behind an emulated or simulated controller; default daq.bench of the rig, or its own values.
     pace : {"fastest", "real-time"}, optional
-        Of a device that is no hardware.
+        Speed of an emulated, simulated or replayed device.
     seed : int, optional
-        Of excitation and simulated noise.
+        Seed of excitation and simulated noise.
     force : bool, optional
-        Write over a record that exists, and close a loop that is predicted unstable.
+        Overwrite an existing record, and close a loop that is predicted unstable.
     stopped : callable, optional
-        Asked now and then; True ends the run.
+        Called now and then; the run ends when it returns True.
     on_note, on_progress, on_trouble, tick : callable, optional
-        Told what is made up or found, how far it is, of a disk that is slow or full, and of the present stage.
+        Called with a remark, with the progress, with trouble of the disk, and with the name of the present stage.
 
     Returns
     -------
     Acquired
-        Its `record` is what was written. Also where a fault ended the run early: see ``run.fault``.
+        Its `record` is what was written, also when a fault ended the run early (see ``run.fault``).
 
     Raises
     ------
     AmbidError
-        If port, rig or wishes break a rule, a loop is predicted unstable, or the device or the disk fails.
+        If port, rig or settings break a rule, a loop is predicted unstable, or the device or the disk fails.
 
     Examples
     --------
@@ -171,14 +171,14 @@ def acquire(
     >>> ambid.identify(done.record, "bench.toml")  # doctest: +SKIP
     """
     known, path = known_rig(rig), Path(out)
-    wish = Wish(
+    wanted = Request(
         seconds=seconds, excitation=excitation, amplitude=amplitude, band=band, mode=mode, settle=settle, seed=seed,
         stopped=stopped,
     )  # fmt: skip
-    wish.trial(port, known)
+    wanted.trial(port, known)
     if (path.exists() or path.is_symlink()) and not force:
         raise AmbidError(f"-o {path} already exists. Choose another name, or give --force")
-    with ready(port, known, wish, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
+    with ready(port, known, wanted, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
         return record_course(
             device, known, path, course, force=force, on_progress=on_progress, on_trouble=on_trouble, stopped=stopped
         )
@@ -188,7 +188,7 @@ def acquire(
 def ready(
     port: str,
     rig: Rig,
-    wish: Wish,
+    wanted: Request,
     *,
     bench: str | Path | Rig | Preset | None,
     pace: Literal["fastest", "real-time"],
@@ -197,10 +197,10 @@ def ready(
     tick: Tick | None,
 ) -> Iterator[tuple[Device, Course]]:
     """Open a device, say what it is to do, and close it; arguments as those of `acquire`."""
-    trial, say = wish.trial(port, rig), tick or silent
+    trial, say = wanted.trial(port, rig), tick or silent
     closes = trial.mode == "levitate" and not force
-    with opened(port, rig, bench=bench, pace=pace, seed=wish.seed, closes=closes, note=note) as device:
-        course = wish.course(device, rig, trial, note=note, tick=say)
+    with opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note) as device:
+        course = wanted.course(device, rig, trial, note=note, tick=say)
         say("record")
         yield device, course
 
@@ -223,7 +223,7 @@ def opened(
     """
     from ambid.acquisition.devices.choose import open_device
 
-    behind, invented = None if bench is None else bearer_of(bench), port in ("emulated", "simulated")
+    behind, invented = None if bench is None else bench_of_source(bench), port in ("emulated", "simulated")
     complete = with_default_daq(rig) if invented else rig
     for line in default_daq_notes(rig) if invented else ():
         note(line)

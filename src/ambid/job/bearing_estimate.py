@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
-from ambid.bearing.rescue import describe_search
+from ambid.bearing.rescue import warnings_of
 from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
@@ -173,17 +173,7 @@ def _unseen(fit: BearingFit) -> list[str]:
 
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
-
-    if fit.global_search is not None:
-        found.append(describe_search(fit.global_search))
-    found += [c.detail for c in checks.values() if not c.passed]
-    if robust:
-        found.append(
-            "the model does not fully fit; standard errors are inflated (scatter over the records) but cannot cover a "
-            "systematic bias"
-        )
-    found += _unseen(fit)
+    found = [*warnings_of(fit, checks, "scatter over the records" if robust else ""), *_unseen(fit)]
     if fit.problem.drift:
         found.append("a random-walk force absorbs what the force law does not explain; static forces count for less")
     return tuple(found)

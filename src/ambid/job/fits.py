@@ -72,23 +72,23 @@ def fit(
         Names of channels; no input for a time series. With a rig its roles or columns, by default all of its model.
         References are the loop's outer excitation, for methods that use it.
     orders : str or Mapping[str, int, "auto" or tuple of int], optional
-        Of a linear structure: ``"na=2,nb=2,nk=1"`` as the command takes them, or by name, a tuple with a number for
-        each input. "auto": all are chosen by `criterion`.
+        Orders of a linear structure: ``"na=2,nb=2,nk=1"`` as in the command, or by name, with a tuple where inputs
+        differ. "auto": all are chosen by `criterion`.
     settings : str or Mapping, optional
-        Of a nonlinear structure, as the register describes them; what is left out the method chooses.
+        Settings of a nonlinear structure, as ``ambid models`` lists them; the method chooses those left out.
     seed : int, optional
-        Of everything random in a nonlinear structure, 0 or more: equal seeds give equal results.
+        Seed of all randomness in a nonlinear structure, 0 or more; equal seeds give equal results.
     criterion : str, optional
-        For the choice of orders, see `ambid.validation.orders`.
+        Criterion that chooses orders, see `ambid.validation.orders`.
     fix : Mapping[str, float] or sequence of str, optional
-        Coefficients that are known, for polynomial structures, by name (``{"a1": -1.5}`` or ``["a1=-1.5"]``).
+        Known coefficients of polynomial structures, by name (``{"a1": -1.5}`` or ``["a1=-1.5"]``).
     rig : Rig, str or Path, optional
         Names and calibrates the channels.
     open_loop : bool, optional
         Declare the record open loop.
     at_rest : bool, optional
-        Say that everything was zero before the first sample of the part that is fitted: no offsets and initial states
-        are estimated. For polynomial structures; a record that contradicts it is warned of.
+        All signals are zero before the first sample: no offsets and initial states are estimated. For polynomial
+        structures; a warning tells if the record contradicts it.
     from_s, to_s : float, optional
         Part of every record to fit, in s.
     rate_hz : float, optional
@@ -262,7 +262,7 @@ def compare(
     validate : as `record`, optional
         A second record to validate on; without one the last part of the record is held out.
     holdout : float, optional
-        That part, 0 to 1.
+        Size of that part relative to the record, 0 to 1.
 
     Returns
     -------

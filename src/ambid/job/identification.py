@@ -122,6 +122,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     `bench`: the record it came from, channels named by role.
     """
     from ambid.bearing.lag import check_lag
+    from ambid.bearing.rescue import warnings_of
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
@@ -152,11 +153,12 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
     y, error = problem.y[problem.skip :], simulation_error(fit)
+    inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
         means={role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
         one_step=fit_of(e * problem.scales.output, y), simulation=None if error is None else fit_of(error, y),
-        checks=checks, warnings=_warnings(fit, checks, robust=robust), record=origin(bench), rig=rig_entry(rig),
+        checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     return replace(estimate, global_search=fit.global_search)
 
@@ -180,22 +182,6 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
         if alone.status == "converged" and not again.passed:
             return again
     return check
-
-
-def _warnings(fit: Fit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
-    """What a reader has to know before using the numbers, most important first."""
-    from ambid.bearing.rescue import describe_search
-
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
-    if fit.global_search is not None:
-        found.append(describe_search(fit.global_search))
-    found += [c.detail for c in checks.values() if not c.passed]
-    if robust:
-        found.append(
-            "the model does not fully fit; standard errors are inflated (scatter over the record, disagreement of "
-            "refits) but cannot cover a systematic bias"
-        )
-    return tuple(found)
 
 
 def identify_nonlinear(

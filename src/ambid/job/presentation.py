@@ -154,10 +154,6 @@ def _numbers(result: Any) -> list[tuple[str, str]]:
     return [(p.name, quantity(p.value, p.sd, p.unit).text.removesuffix(" 1")) for p in found if p.role != "fixed"]
 
 
-def _parameter_table(result: Any) -> Table:
-    return parameter_columns(result.parameters)
-
-
 def parameter_columns(parameters: Sequence[EstimatedParameter]) -> Table:
     """Return parameters as columns, one row each."""
     columns: dict[str, list[object]] = {
@@ -172,9 +168,7 @@ def parameter_columns(parameters: Sequence[EstimatedParameter]) -> Table:
 
 def _estimate() -> View:
     from ambid.physics.linear_model import model
-    from ambid.report.estimate_page import estimate_page
-    from ambid.report.estimate_text import estimate_text
-    from ambid.report.figures import Evidence, overview
+    from ambid.report.figures import Evidence
     from ambid.validation.second_record import replay
 
     def evidence(e: Any, used: Any) -> Evidence:
@@ -183,32 +177,33 @@ def _estimate() -> View:
         run = None if used is None else replay(e, signals_of(used, model(e.model)))
         return Evidence(estimate=e, run=run, start_s=0.0 if used is None else used.start_s)
 
-    return View(
-        text=estimate_text,
-        figure=lambda e, used, width: overview(evidence(e, used), width),
-        page=lambda e, used: estimate_page(evidence(e, used)),
-        document=lambda e: str(e.dumps()),
-        table=_parameter_table,
-        title=lambda e: f"{e.record.get('file') or 'record'}, model {e.model}",
-    )
+    return _of_evidence(evidence, lambda e: f"{e.record.get('file') or 'record'}, model {e.model}")
 
 
 def _bearing() -> View:
-    from ambid.report.estimate_page import estimate_page
-    from ambid.report.estimate_text import estimate_text, names_words
-    from ambid.report.figures import BearingEvidence, bearing_evidence, overview
+    from ambid.report.estimate_text import names_words
+    from ambid.report.figures import BearingEvidence, bearing_evidence
 
     def evidence(e: Any, used: Any) -> BearingEvidence:
         taken = () if used is None else used if isinstance(used, tuple) else (used,)
         return bearing_evidence(e, [(t.record, t.start_s) for t in taken])
 
+    return _of_evidence(evidence, lambda e: f"{names_words(list(e.noise))}, {e.law}")
+
+
+def _of_evidence(evidence: Callable[[Any, Any], Any], title: Callable[[Any], str]) -> View:
+    """Return how an estimate is shown beside `evidence` of it and what it was made from."""
+    from ambid.report.estimate_page import estimate_page
+    from ambid.report.estimate_text import estimate_text
+    from ambid.report.figures import overview
+
     return View(
         text=estimate_text,
         figure=lambda e, used, width: overview(evidence(e, used), width),
         page=lambda e, used: estimate_page(evidence(e, used)),
         document=lambda e: str(e.dumps()),
-        table=_parameter_table,
-        title=lambda e: f"{names_words(list(e.noise))}, {e.law}",
+        table=lambda e: parameter_columns(e.parameters),
+        title=title,
     )
 
 

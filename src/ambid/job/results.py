@@ -47,12 +47,12 @@ def load(path: str | Path) -> Any:
     Returns
     -------
     Result
-        Without what it was made from: its figures then show what needs no record, or take ``record=``.
+        Without the record it was made from: give that as ``record=`` to figures that show it.
 
     Raises
     ------
     EstimationError
-        If the file cannot be read, or is no whole result.
+        If the file cannot be read, or is not a complete result.
     """
     path = Path(path)
     text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
@@ -172,7 +172,7 @@ def validate(
     record : file, Record, DataFrame, Dataset or dict of arrays
         Of a rotor that moves.
     rig : Rig, str or Path, optional
-        Through which the record is read; default: as the estimate remembers it.
+        Through which the record is read; default: the rig that the estimate was made with.
     from_s, to_s, rate_hz, gaps, units : optional
         As `ambid.identify`.
 
@@ -226,7 +226,7 @@ def info(
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays
     rig : Rig, str or Path, optional
-        Names and calibrates the channels; the noise of the outputs is then told from what the input explains.
+        Names and calibrates the channels; what the inputs explain then does not count as noise.
     rate_hz, gaps, units : optional
         As `ambid.identify`.
 
@@ -261,4 +261,4 @@ def rig_of(estimate: AnyEstimate, where: str) -> Rig:
     try:
         return rig_from_text(text, Path(folder) / "rig.toml")
     except AmbidError as error:
-        raise EstimationError(f"{where}: the rig that it remembers cannot be used: {error}. Or give --rig") from None
+        raise EstimationError(f"{where}: its rig cannot be used: {error}. Give --rig") from None

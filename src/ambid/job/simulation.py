@@ -21,7 +21,7 @@ from ambid.signals import excitation as make_excitation
 from ambid.simulation.bench import Simulation
 from ambid.simulation.rig_bench import Bench
 
-Bearer = str | Path | Rig | Preset | Estimate
+BenchSource = str | Path | Rig | Preset | Estimate
 """Who has the numbers of a bench: a preset by name, a rig, a linear estimate, or a file of one of these."""
 
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
@@ -36,7 +36,7 @@ class Excited:
 
 
 def simulate(
-    source: Bearer,
+    source: BenchSource,
     *,
     duration: float = 1.0,
     rate_hz: float | None = None,
@@ -56,8 +56,7 @@ def simulate(
     Parameters
     ----------
     source : str, Path, Rig, Preset or Estimate
-        A preset by its name; a rig or its file; a linear estimate or its file: the rig that it remembers, with the
-        numbers that it found.
+        A preset by its name; a rig or its file; a linear estimate or its file: its rig, with the estimated values.
     duration : float, optional
         Length in s.
     rate_hz : float, optional
@@ -65,33 +64,33 @@ def simulate(
     excitation : str, optional
         One of `ambid.signals.EXCITATIONS`.
     amplitude : float, optional
-        Peak in V, rms of a gaussian; default what half of the limits allows.
+        Peak in V (rms for ``gaussian``); default: what half of the limits allows.
     band : (float, float), optional
-        Of the excitation, in Hz; default one period to a fifth of the rate.
+        Band of the excitation in Hz; default: one period over the record to a fifth of the rate.
     periods : int, optional
-        How often the excitation repeats.
+        Number of repetitions of the excitation.
     seed : int, optional
-        Of excitation and noise.
+        Seed of excitation and noise.
     closed : bool, optional
-        With or without the controller; default as the bench usually works.
+        With or without the controller; default: as the bench usually works.
     nonlinear : bool, optional
-        The nonlinear magnet instead of its linearisation.
+        Simulate the nonlinear magnet instead of its linearisation.
     position : float, optional
-        Nonlinear: where the loop holds the rotor, m.
+        With `nonlinear`: position at which the loop holds the rotor, m.
     log_excitation : bool, optional
-        A channel of it too.
+        Add a channel ``excitation``, the reference for `ambid.frf`.
     force : bool, optional
-        A loop that is predicted unstable too.
+        Simulate a loop that is predicted unstable too.
 
     Returns
     -------
     Record
-        Columns named as the rig names them, of a preset by role.
+        Columns are named as in the rig; those of a preset by role.
 
     Raises
     ------
     AmbidError
-        If a word breaks a rule, the rig lacks a value, or the loop is predicted unstable.
+        If a setting breaks a rule, the rig lacks a value, or the loop is predicted unstable.
 
     Examples
     --------
@@ -111,7 +110,7 @@ def simulate(
 
 
 def simulate_used(
-    source: Bearer,
+    source: BenchSource,
     *,
     duration: float = 1.0,
     rate_hz: float | None = None,
@@ -146,7 +145,7 @@ def simulate_used(
     return done, Excited(kind=excitation, peak=peak)
 
 
-def bearer_of(source: Bearer) -> Rig | Preset:
+def bench_of_source(source: BenchSource) -> Rig | Preset:
     """Return the preset or rig that a name, a file or an estimate stands for."""
     if isinstance(source, str) and source in preset_names():
         return preset(source)
@@ -157,9 +156,11 @@ def bearer_of(source: Bearer) -> Rig | Preset:
     return source if isinstance(source, (Rig, Preset)) else load_rig(Path(source))
 
 
-def _bench(given: Bearer, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None) -> Bench:
+def _bench(
+    given: BenchSource, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None
+) -> Bench:
     """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
-    source = bearer_of(given)
+    source = bench_of_source(given)
     if isinstance(source, Preset):
         if position is not None and source.plant is not None:
             source = replace(source, operating_point=source.plant.equilibrium(position))

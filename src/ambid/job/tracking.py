@@ -72,7 +72,7 @@ def track(
     keep: bool = True,
     tick: Tick | None = None,
 ) -> Track:
-    """Follow the physical parameters of a bench through a record, or with another `method` what that estimates.
+    """Track the physical parameters of a bench through a record, or the coefficients of another `method`.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def track(
     open_loop : bool, optional
         Declare the record open loop.
     step : float, optional
-        Of ``lms`` and ``nlms``, for signals of size one.
+        Step size of ``lms`` and ``nlms``, for signals of size one.
     start : Estimate, str or Path, optional
         Where tracking begins; default: an identification of the first part of the record.
     start_s : float, optional
@@ -99,11 +99,11 @@ def track(
     limit : float, optional
         Acceptable model error, in multiples of that at identification.
     memory : float, "auto" or "all", optional
-        How long data count: a time constant in s, found from the data, or for ever.
+        Memory of the estimator: a time constant in s, found from the data ("auto"), or infinite ("all").
     pace : {"fastest", "real-time"}, optional
         Replay as fast as possible, or as the record was taken.
     flags : sequence of (float, str), optional
-        What an operator sets and when, s of record: "track", "hold", "accept" or "revert".
+        Flags that an operator sets, with their times in s of record: "track", "hold", "accept" or "revert".
     from_s, to_s : float, optional
         Part of the record to use, s.
     rate_hz : float, optional

@@ -142,7 +142,7 @@ class TrackSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Course:
+class ParameterTrack:
     """One tracked number: its last value and interval, and how it came there."""
 
     name: str
@@ -204,7 +204,7 @@ class Track(Result):
             found.append(Reason(check="identifiable", text=text))
         return (*found, *(Reason(check="start", text=text) for text in header.warnings))
 
-    def __getitem__(self, name: str) -> Course:
+    def __getitem__(self, name: str) -> ParameterTrack:
         names = [] if not self.lines else [*self.lines[-1].parameters, *self.lines[-1].extra]
         if name not in names:
             raise EstimationError(
@@ -212,7 +212,7 @@ class Track(Result):
             )
         kept = [(x.t, {**x.parameters, **x.extra}.get(name, _UNKNOWN)) for x in self.lines]
         last = kept[-1][1]
-        return Course(
+        return ParameterTrack(
             name=name, unit=self.header.units.get(name, ""), value=last.value, sd=last.sd,
             ci95=(last.value - NORMAL_95 * last.sd, last.value + NORMAL_95 * last.sd), t=np.array([t for t, _ in kept]),
             values=np.array([v.value for _, v in kept]), sds=np.array([v.sd for _, v in kept]),

@@ -55,7 +55,7 @@ def comparison_text(comparison: Comparison, *, width: int = WIDTH, paint: Paint 
     name = comparison.record.get("file") or "record"
     signals = f"{', '.join(comparison.inputs)} → " if comparison.inputs else ""
     n, where = comparison.judged_samples, comparison.judged_on
-    on = f"the {n} of a second record" if where == "second record" else f"{n} of the {where}"
+    on = f"a second record ({n})" if where == "second record" else f"the {where} ({n})"
     header = (
         f"{paint(str(name), 'strong')}: {signals}{', '.join(comparison.outputs)}; "
         f"{counted(comparison.fitted_samples, 'sample')} fitted, validated on {on}"
