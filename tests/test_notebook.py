@@ -297,7 +297,7 @@ def test_a_record_is_acquired_and_never_written_over(tmp_path):
     assert done.record["excitation"].max() == pytest.approx(0.5, rel=0.05)
     assert done.record.n_samples == 2000
     assert any(line.startswith("voltage:") for line in told)  # what the rig does not say is assumed, and told
-    with pytest.raises(ambid.AmbidError, match="exists already"):
+    with pytest.raises(ambid.AmbidError, match="already exists"):
         ambid.acquire("simulated", rig, tmp_path / "run.h5", **played)
     with pytest.raises(ambid.AmbidError, match="nothing can be excited"):
         ambid.acquire("simulated", rig, tmp_path / "other.h5", **played, mode="sample")

@@ -25,7 +25,7 @@ def test_delay_in_open_loop(delay, pole):
     found = find_delay(u, coil(u, delay, 0.005 * rng.standard_normal(4000), pole))
     assert found.samples == delay
     assert found.confidence > 0.99
-    assert f"delay {delay} samples" in str(found)
+    assert f"delay {delay} sample" in str(found)
 
 
 @pytest.mark.parametrize("delay", [0, 3, 10])

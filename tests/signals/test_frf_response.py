@@ -61,7 +61,7 @@ def test_a_band_keeps_everything_at_its_lines():
 def test_wrong_shapes_are_refused_and_values_frozen():
     with pytest.raises(EstimationError, match="covariance has shape"):
         measured(covariance=np.zeros((3, 2, 2), dtype=complex))
-    with pytest.raises(EstimationError, match="rise"):
+    with pytest.raises(EstimationError, match="rising"):
         measured(frequency_hz=np.array([1.0, 1.0, 2.0]))
     with pytest.raises(FrozenInstanceError):
         measured().method = "another"

@@ -283,7 +283,7 @@ def test_a_predictor_that_runs_away_fails_its_check_and_breaks_nothing():
     data = record(n=3000)
     model = StateSpaceModel(A=[[1.6]], B=[[1.0]], C=[[1.0]], D=[[0.0]], K=[[0.1]], dt=DT)
     fit = judge(by_hand(model, data), data, second=data)
-    assert failed(fit) == {"stable_predictor"}
+    assert failed(fit) == {"stable_predictor", "second_record"}
     assert np.isnan(fit.fit["y0"].one_step)
     assert fit.fit["y0"].simulation is None
     assert not fit.criteria
