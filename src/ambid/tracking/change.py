@@ -67,12 +67,12 @@ class Alarm:
         if self.parameter is None:
             what = f"noise at {self.noise:.2f} of its usual level, all parameters together at {self.joint:.0f}"
             return (
-                f"no single parameter explains {seen}: {what} (statistic {self.statistic:.0f} above "
+                f"no single parameter explains {seen}: {what} (statistic {self.statistic:.0f}, limit "
                 f"{self.threshold:.0f})"
             )
         doubt = f"; {', '.join(n for n, _ in self.rivals)} would explain it nearly as well" if self.rivals else ""
-        move = f"{self.parameter} changed by {self.size:+.3g} (sd {self.sd:.2g})"
-        return f"{move} in {seen}: statistic {self.statistic:.0f} above {self.threshold:.0f}{doubt}"
+        move = f"{self.parameter} changed by {100 * self.size:+.3g} % (sd {100 * self.sd:.2g} %)"
+        return f"{move} in {seen} (statistic {self.statistic:.0f}, limit {self.threshold:.0f}){doubt}"
 
 
 class ChangeDetector:

@@ -331,7 +331,7 @@ class Diagnosis:
         if all(self._kind(name) in _DISTURBED for name in found.moved):
             self.settling = True
             return
-        why = f"{names} estimated again from the samples after the change"
+        why = f"{names} re-estimated from the samples after the change"
         self._publication.propose(t, why)
         self._publication.unconfirmed = self.renewed = True
 
@@ -346,12 +346,12 @@ class Diagnosis:
         if told.kind == "change" and told.parameter == name:
             return
         disturbed = self._kind(name) in _DISTURBED
-        what = f"a change of {', '.join(found.moved)} explains the data after it"
+        what = f"a change of {', '.join(found.moved)} explains the data that followed"
         event = Event(
             kind="disturbed" if disturbed else "change",
             t=told.t,
             parameter=name,
-            why=f"{what}; {told.why}",
+            why=f"{what}; at first: {told.why}",
             values={**told.values, "named": t},
         )
         if disturbed:
@@ -382,7 +382,7 @@ class Diagnosis:
         """Let the recursion find what no search has found: all parameters are unknown again."""
         for place in self._rpem.numbers.places("parameter"):
             self._rpem.filter.widen(int(place), _UNKNOWN)
-        why = "nothing explains the data after the change; all parameters are estimated again"
+        why = "nothing explains the data after the change; all parameters are re-estimated"
         self._log.add(Event(kind="disturbed", t=t, why=why))
         self._fresh_start()
         self._publication.unconfirmed = True

@@ -53,8 +53,8 @@ class Comparison:
     def text(self) -> str:
         """The reason in numbers, one line."""
         return (
-            f"over {counted(self.blocks, 'block')}: gain {self.gain:.3g}, expected {self.separation:.3g} with sd "
-            f"{self.sd:.2g}, lack of fit {self.misfit:.3g}"
+            f"over {counted(self.blocks, 'block')}: gain {self.gain:.3g} (expected {self.separation:.3g}, "
+            f"sd {self.sd:.3g}), lack of fit {self.misfit:.3g}"
         )
 
     @property
