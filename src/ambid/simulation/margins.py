@@ -73,9 +73,10 @@ class LoopMargins:
     @property
     def phase_deg(self) -> float | None:
         """Smallest phase margin in degrees; None where the modulus of L never passes 1."""
-        size, angle = np.abs(self.open_loop), np.angle(self.open_loop)
-        passes = np.flatnonzero(np.diff(np.sign(size - 1.0)))
-        return None if not passes.size else float(np.degrees(np.min(np.pi - np.abs(angle[passes]))))
+        size, angle = np.log(np.abs(self.open_loop)), np.unwrap(np.angle(self.open_loop))
+        k = np.flatnonzero(np.diff(np.sign(size)))
+        at = angle[k] + (angle[k + 1] - angle[k]) * size[k] / (size[k] - size[k + 1])  # where it is 1
+        return float(np.degrees(np.min(np.abs((at % (2.0 * np.pi)) - np.pi)))) if k.size else None
 
     def words(self) -> str:
         """Say how stable the loop is, on one line."""
@@ -128,7 +129,9 @@ def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *,
         "kp, ki and kd": replace(loop, kp=-loop.kp, ki=-loop.ki, kd=-loop.kd),
         "kc": replace(loop, kc=-loop.kc),
     }
-    frequency = np.geomspace(_SPAN * rate_hz, 0.5 * rate_hz, _FREQUENCIES)
+    own = np.abs(np.angle(poles)) * rate_hz / (2.0 * np.pi)  # a narrow peak of the sensitivity stands there
+    own = own[(own > _SPAN * rate_hz) & (own < 0.5 * rate_hz)]
+    frequency = np.union1d(np.geomspace(_SPAN * rate_hz, 0.5 * rate_hz, _FREQUENCIES), own)
     with np.errstate(all="ignore"):  # of a plant near the end of all numbers
         z, command, excited = excited_loop(parameters, loop, rate_hz, of=of)
         around = np.exp(2j * np.pi * frequency / rate_hz)[:, None, None] * np.eye(z.shape[0]) - z
