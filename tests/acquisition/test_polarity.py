@@ -102,6 +102,20 @@ def test_a_trip_of_the_current_ends_it_with_its_words():
     assert "safe state during a pulse of 0.228 V for 0.015 s: over_current" in found.reasons[0]
 
 
+@pytest.mark.parametrize("phase", [1.0, 4.0])
+def test_a_position_that_swings_by_itself_is_no_motion(phase):
+    """A rotor that cannot be lifted, and 5 Hz of 40 counts: half of such benches would be said to be reversed."""
+    seen = [0]
+
+    def swinging(values, device):
+        t = (seen[0] + np.arange(len(values))) / device.info.rate_hz
+        values[:, POSITION] += 40.0 * np.sin(2 * np.pi * 5.0 * t + phase)
+        seen[0] += len(values)
+
+    found = polarity(Spoiled(prototype(), spoil=swinging, bench=heavy(m=0.6)))
+    assert (found.current, found.motion) == (1, 0)
+
+
 def test_a_noisy_position_hides_nothing_and_invents_nothing():
     noise = np.random.default_rng(1)
 

@@ -217,7 +217,8 @@ class _Pulses:
         low, high = self._room.trips["position"]
         away = position[first:] - float(position[before].mean())
         width = high - low if math.isfinite(high - low) else 0.0
-        bound = max(_SIGMAS * float(position[before].std()), _COUNTS * self._counts["position"], _MOTION * width)
+        swing = float(np.ptp(position[: first + 1]))  # what it does without the pulse
+        bound = max(_SIGMAS * float(position[before].std()), swing, _COUNTS * self._counts["position"], _MOTION * width)
         beyond = np.abs(away) > bound
         held = np.convolve(beyond, np.ones(_TOGETHER), "valid") >= _TOGETHER
         if not held.any():
