@@ -2,14 +2,15 @@
 
 import io
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from matplotlib.transforms import Bbox
 
-from ambid.estimation.estimate import Check
+from ambid.estimation.estimate import Check, Delay
 from ambid.report.drawing import NARROW, WIDE, save, single
-from ambid.report.figures import figures, measured_beside, overview, responses, validation_figure
+from ambid.report.figures import figures, measured_beside, overview, responses, unsampled, validation_figure
 from ambid.report.response_panels import Pole, poles_panel
 from ambid.report.signal_panels import autocorrelation, whiteness_panel
 from ambid.validation.second_result import Validation
@@ -100,6 +101,23 @@ def test_the_measured_response_of_a_loop_agrees_with_the_plant(unstable):
         at = [np.interp(found.frequency_hz[known], plant.frequency_hz, f(plant.G[:, o, 0])) for f in (np.real, np.imag)]
         off = np.abs(found.G[known, o, 0] - (at[0] + 1j * at[1]))
         assert np.mean(off < radius[known, o, 0]) > 0.9
+
+
+def test_hold_delay_and_sampling_are_taken_out_of_what_is_measured(unstable):
+    """A sampled response is the sum of the held one's copies around all multiples of the rate (Poisson)."""
+    late = Delay(samples=2, fraction=0.3, sd=None, how="given")
+    estimate, c = replace(unstable.estimate, delay={"voltage": late}), unstable.estimate.continuous
+    frequency, rate_hz = np.array([100.0, 2000.0, 4000.0, 9000.0]), 20_000.0
+
+    def plant(f):
+        s = 2j * np.pi * f[:, None, None] * np.eye(3)
+        return c.C @ np.linalg.solve(s - c.A, np.broadcast_to(c.B, (f.size, 3, 1)))
+
+    def held(f):
+        return plant(f) * (np.sinc(f / rate_hz) * np.exp(-2j * np.pi * f / rate_hz * 2.8))[:, None, None]
+
+    copies = sum(held(frequency + k * rate_hz) for k in range(-300, 301))
+    np.testing.assert_allclose(unsampled(estimate, frequency, rate_hz) * copies, plant(frequency), rtol=2e-3)
 
 
 @pytest.mark.parametrize("width", [WIDE, NARROW])

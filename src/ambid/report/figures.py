@@ -20,7 +20,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.likelihood import prediction_error
 from ambid.estimation.linear import one_thread
-from ambid.physics.linear_model import model
+from ambid.physics.linear_model import discretise, model
 from ambid.report.drawing import (
     BOUND,
     CYCLE,
@@ -272,6 +272,9 @@ def poles(estimate: Estimate) -> list[Pole]:
 def measured_beside(evidence: Evidence) -> FrequencyResponse | None:
     """Measure the response of the record without a model, as the plant's own: without hold and delay of the input.
 
+    A held input's response repeats itself around the rate: sampling adds 13 % to a coil's at a fifth of the rate. So
+    what is measured is not divided by the hold, but by what the model says that hold, delay and sampling do to it.
+
     Feedback would bias a plain ratio of spectra. The reference is the part of the input that residuals, which a
     controller answers, do not explain (joint input-output method); where that is not nearly all of the input, the
     response is not known. None where the record shows none.
@@ -298,11 +301,20 @@ def measured_beside(evidence: Evidence) -> FrequencyResponse | None:
     share = (own / np.maximum(all_of, 1e-300))[_LOBE:]  # the first lines have lost the mean
     shares = sliding_window_view(np.pad(share, (2 * _LOBE, _LOBE), "edge"), 2 * _LOBE + 1)
     known = np.interp(found.frequency_hz, at, shares.min(axis=-1)) > _OWN
-    late = evidence.estimate.delay[plant.inputs[0]]
-    turns = found.frequency_hz / rate_hz
-    plain = np.exp(2j * np.pi * turns * (late.samples + late.fraction + 0.5)) / np.sinc(turns)
-    covariance = np.where(known[:, None, None], found.covariance * (np.abs(plain) ** 2)[:, None, None], np.inf)
-    return replace(found, G=found.G * plain[:, None, None], covariance=covariance, noise_covariance=None)
+    plain = unsampled(evidence.estimate, found.frequency_hz, rate_hz)
+    pairs = plain.reshape(plain.shape[0], -1)
+    covariance = found.covariance * pairs[:, :, None] * pairs[:, None, :].conj()
+    covariance = np.where(known[:, None, None], covariance, np.inf)
+    return replace(found, G=found.G * plain, covariance=covariance, noise_covariance=None)
+
+
+def unsampled(estimate: Estimate, frequency_hz: Array, rate_hz: float) -> NDArray[np.complex128]:
+    """Response of the plant itself over the one that a record shows, with hold, delay and sampling, (n, n_y, n_u)."""
+    space, late = model(estimate.model).matrices(estimate.values), estimate.delay[model(estimate.model).inputs[0]]
+    d = discretise(space, 1.0 / rate_hz, fraction=late.fraction)[0]
+    z = np.exp(2j * np.pi * frequency_hz / rate_hz)[:, None, None]
+    shown = d.C @ np.linalg.solve(z * np.eye(len(d.A)) - d.A, (d.B + d.B_late / z) / z**late.samples)
+    return np.asarray(_as_black_box(estimate)[0].frequency_response(2 * np.pi * frequency_hz) / shown)
 
 
 def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
