@@ -52,8 +52,10 @@ def words_of(text):
 
 
 def test_a_good_bench_ends_with_0_and_a_line_that_runs_next(commission, ambid):
-    done = commission(*QUICK)
+    done = commission(*QUICK, "--json", "told.json")
     assert done.code == 0
+    with open("told.json", encoding="utf-8") as file:
+        assert json.load(file) == told()
     for number, name in enumerate(
         ("self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "track"), 1
     ):

@@ -41,6 +41,7 @@ def test_the_rig_of_the_demo_knows_nothing(tmp_path):
 def test_the_demo_prints_estimate_and_truth(ambid):
     found = ambid("demo")
     assert (found.code, found.err) == (0, "")
+    assert found.out.startswith("verdict: usable\n\n")
     assert "✓ 5 of 5 true values lie in their 99.9 % intervals" in found.out
     assert "✗" not in found.out
     assert max(map(len, found.out.splitlines())) <= 80

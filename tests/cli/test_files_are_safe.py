@@ -49,6 +49,28 @@ def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
     assert target.read_text() == MEASURED
 
 
+@pytest.mark.parametrize("words", [("--plot", "a.png"), ("--report", "a.html")])
+def test_a_record_behind_a_link_or_under_another_name_is_not_drawn_over(made, ambid, monkeypatch, words):
+    monkeypatch.chdir(made)
+    target, name = made / "measured.csv", made / words[1]
+    target.write_text(MEASURED)
+    for place in (lambda: name.symlink_to(target), lambda: name.write_text(MEASURED)):
+        place()
+        done = ambid("info", "r.csv", *words)
+        assert (done.code, len(done.err.splitlines())) == (2, 1)
+        assert "exists, and is not a result of ambid" in done.err
+        assert target.read_text() == name.read_text() == MEASURED
+        name.unlink()
+
+
+def test_a_figure_behind_a_link_of_another_ending_is_drawn_again(made, ambid, monkeypatch):
+    monkeypatch.chdir(made)
+    (made / "old").write_bytes(b"\x89PNG of a moment ago")
+    (made / "new.png").symlink_to("old")
+    assert ambid("info", "r.csv", "--plot", "new.png").code == 0
+    assert (made / "old").stat().st_size > 10_000
+
+
 def test_commission_writes_into_no_folder_of_a_record(made, ambid, monkeypatch):
     monkeypatch.chdir(made)
     (made / "bench").mkdir()

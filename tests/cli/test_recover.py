@@ -9,7 +9,7 @@ import pytest
 
 from ambid.acquisition.recorder import Recorded, Recorder, journal_path
 from ambid.acquisition.recorder.reader import Damage, Survey
-from ambid.cli.recover import _lacks
+from ambid.job import load
 from ambid.record import read_record
 from tests.acquisition.recorder.signals import ROWS, block, header, same_bits, values_at
 
@@ -45,12 +45,24 @@ def test_what_was_acknowledged_comes_back(left, ambid):
     found = ambid("recover", "run.h5.journal", "--strict")
     assert (found.code, found.err) == (0, "")
     assert found.out.splitlines() == [
-        "run.h5.journal: 30 blocks, 600 samples, 0.3 s; cut off while recording",
+        "verdict: usable",
+        "",
+        "run.h5: 30 blocks, 600 samples, 0.3 s; cut off while recording",
         "run.h5 written. run.h5.journal is kept; --delete removes it",
     ]
     assert same_bits(values_of("run.h5"), values_at(0, BLOCKS * ROWS))
     assert (left / "run.h5.journal").exists()
     assert ambid("identify", "run.h5").code == 2  # a record like any other: its columns are no bearing
+
+
+def test_figure_page_and_json_are_of_the_record_and_the_json_reads_back(left, ambid):
+    damaged(left)
+    words = ("--plot", "run.png", "--report", "run.html", "--json", "run.json", "--strict")
+    assert ambid("recover", "run.h5.journal", *words).code == 3
+    assert (left / "run.png").stat().st_size > 10_000
+    assert "use with caution" in (left / "run.html").read_text()
+    again = load(left / "run.json")
+    assert (again.verdict.word, again.survey.gap_samples) == ("caution", 20)
 
 
 def test_delete_removes_the_journal(left, ambid):
@@ -65,10 +77,10 @@ def test_a_complete_journal_says_so_and_an_incomplete_end_too(left, ambid):
     (left / "cut.h5.journal").write_bytes(data[:-30] + bytes(100))
     found = ambid("recover", "run.h5.journal", "cut.h5.journal", "--strict")
     assert found.code == 0  # what was being written at the end was not acknowledged
-    lines = found.out.splitlines()
-    assert len(lines) == 4
-    assert "29 blocks" in lines[2]
-    assert "at its end are not a whole block" in lines[2]
+    assert found.out.count("verdict: usable\n\n") == 2
+    said = " ".join(found.out.partition("cut.h5: ")[2].split())
+    assert "29 blocks" in said
+    assert "at the end of the journal are not a whole block" in said
     assert same_bits(values_of("cut.h5"), values_at(0, 29 * ROWS))
 
 
@@ -76,7 +88,8 @@ def test_a_damaged_block_is_counted_and_becomes_rows_without_values(left, ambid)
     damaged(left)
     found = ambid("recover", "run.h5.journal", "--delete")
     assert found.code == 0
-    assert "1 block damaged, in 1 place; 20 samples missing in 1 place (read it with --gaps)" in found.out
+    assert found.out.startswith("verdict: use with caution\n  ✗ journal: 1 block damaged, in 1 place.")
+    assert "✗ samples: 20 samples missing in 1 place. Read the record with --gaps" in found.out
     assert "is kept: the record does not hold all of it" in found.out
     assert (left / "run.h5.journal").exists()
     refused = ambid("identify", "run.h5")
@@ -103,10 +116,10 @@ def test_a_record_that_holds_the_journal_is_said_to_and_the_journal_goes(left, a
     found = ambid("recover", "run.h5.journal", "-o", name)
     assert (found.code, found.err) == (0, "")
     said = f"{name} holds that already: nothing to do. run.h5.journal"
-    assert found.out.splitlines()[1] == f"{said} is kept; --delete removes it"
+    assert found.out.splitlines()[-1] == f"{said} is kept; --delete removes it"
     found = ambid("recover", "run.h5.journal", "-o", name, "--delete")
     assert (found.code, found.err) == (0, "")
-    assert found.out.splitlines()[1] == f"{said} removed"
+    assert found.out.splitlines()[-1] == f"{said} removed"
     assert [p.name for p in left.iterdir()] == [name]
     assert (left / name).read_bytes() == before
 
@@ -177,7 +190,8 @@ def test_a_damaged_journal_stays_although_the_record_holds_what_is_left_of_it(le
     ambid("recover", "run.h5.journal")
     found = ambid("recover", "run.h5.journal", "--delete")
     assert found.code == 0
-    assert "run.h5 holds that already with 1 block damaged" in found.out
+    assert "✗ journal: 1 block damaged" in found.out
+    assert "run.h5 holds that already" in found.out
     assert "is kept: the record does not hold all of it" in found.out
     assert (left / "run.h5.journal").exists()
 
@@ -198,6 +212,8 @@ def test_another_name_and_another_format(left, ambid):
         (["run.h5.journal", "-o", "none/run.h5"], "there is no folder"),
         (["run.h5.journal", "-o", "run.h5.journal"], "is also an input"),
         (["run.h5.journal", "run.h5.journal", "-o", "a.h5"], "one by one"),
+        (["run.h5.journal", "run.h5.journal", "--plot", "a.png"], "one by one"),
+        (["run.h5.journal", "--json", "text.csv"], "is not a result"),
         ([], "Missing argument"),
     ],
 )
@@ -247,4 +263,4 @@ def test_one_that_is_refused_does_not_keep_the_others_back(left, ambid):
 )
 def test_only_what_is_damaged_is_counted(damage, words):
     made = Recorded(path=Path("a.h5"), rate_hz=2000.0, survey=Survey(damage=damage))
-    assert _lacks(made) == f" with {words}"
+    assert [r.text for r in made.reasons] == [f"{words}. Keep it, and look at the disk"]

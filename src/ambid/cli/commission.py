@@ -14,7 +14,7 @@ import typer
 from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
 from ambid.cli.options import option, switch
-from ambid.cli.output import end
+from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import painter, say_note, watching
 from ambid.errors import AmbidError
 
@@ -42,6 +42,9 @@ def command(
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
     seed: opt.Seed = 0,
+    json: opt.JsonFile = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
     force: Annotated[bool, switch("--force", "Go on with a loop that is predicted unstable.")] = False,
     yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
@@ -60,6 +63,7 @@ def command(
     opt.check_positive(
         {"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest}
     )
+    outputs = Outputs(rig, json=json, plot=plot, report=report)
     wishes = Wishes(
         record_s=seconds,
         second_s=_second_s(seconds),
@@ -89,7 +93,7 @@ def command(
         def tell(step: Step) -> None:
             last.append(step)
             watch.clear()
-            typer.echo(step_text(step, f"{len(last)}/{len(STEPS)}", paint=paint))
+            typer.echo(step_text(step, f"{len(last)}/{len(STEPS)}", paint=paint), err=json == "-")
 
         def agreed(name: StepName) -> bool:
             del name
@@ -106,10 +110,10 @@ def command(
             watch.show("identify", STEPS.index("identify") / len(STEPS), stage)
 
         try:
-            passed = commission(
+            done = commission(
                 device, known, folder, wishes=wishes, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
                 stopped=stop.wished, tick=alive, force=force,
-            ).passed  # fmt: skip
+            )  # fmt: skip
         except AmbidError:
             with suppress(OSError):
                 if new:
@@ -120,7 +124,11 @@ def command(
     if stop.number is not None:
         typer.echo(f"ambid: interrupted; the output is off, and {folder} holds what was found before", err=True)
         raise typer.Exit(stop.code)
-    name, command = last[-1].name, ""
+    with outputs:
+        outputs.give(done)
+    if json == "-":
+        outputs.show(done)
+    name, command, passed = last[-1].name, "", done.passed
     if passed:
         volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")
         given = {"--port": port, "--rig": rig, "--bench": bench, "--excitation": "multisine", "--band": band,
@@ -129,7 +137,7 @@ def command(
         command = _line("acquire", given) + (" --force" if force else "")
     elif name == "identify":
         command = _line("identify", {"": folder / "record.h5", "--rig": rig})
-    typer.echo(next_text(passed, name, len(last), len(STEPS), str(folder), command=command))
+    typer.echo(next_text(passed, name, len(last), len(STEPS), str(folder), command=command), err=json == "-")
     end(failed=not passed)
 
 

@@ -13,8 +13,9 @@ from ambid.errors import AmbidError
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm")
-_DRAWN = (FIGURE_ENDINGS, PAGE_ENDINGS)  # what such an option names is replaced
 _LOOKED = 64  # bytes of a file that say what it is
+_MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
+_BEGINNINGS = {FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<",)}
 _STREAMED = ("--json",)  # options that take - for standard output
 
 
@@ -44,7 +45,7 @@ class Files:
             return
         try:
             self._check(path, option, suffixes)
-            if path.is_file() and not force and not (suffixes in _DRAWN or _made_here(path)):
+            if path.is_file() and not force and not _made_here(path, _BEGINNINGS.get(tuple(suffixes), ())):
                 remedy = "Choose another name" + ("" if force is None else ", or give --force")
                 raise AmbidError(f"{option} {path} exists, and is not a result of ambid. {remedy}")
         except (OSError, RuntimeError) as failure:  # a name that no file can have, a link to itself
@@ -77,8 +78,8 @@ class Files:
 
         `path`: where the file will be; `write`: takes the present name, which ends like `path`, and writes it.
         """
-        path = path.resolve()  # through a link, to the file that it stands for
-        beside = path.with_name(f".{os.getpid()}-{path.name}")
+        named, path = path.name, path.resolve()  # through a link, to the file that it stands for
+        beside = path.with_name(f".{os.getpid()}-{named}")
         self._staged[path] = beside
         try:
             write(beside)
@@ -112,8 +113,8 @@ class Files:
                 beside.unlink(missing_ok=True)
 
 
-def _made_here(path: Path) -> bool:
-    """Whether a file is empty, or says that it is a result or a simulated record."""
+def _made_here(path: Path, drawn: tuple[bytes, ...]) -> bool:
+    """Whether a file is empty, or begins as a result, a simulated record or, whatever its name, what is drawn."""
     with path.open("rb") as raw:
         begin = raw.read(_LOOKED)
     try:
@@ -127,7 +128,7 @@ def _made_here(path: Path) -> bool:
                 return b"simulat" in found["provenance"][()]
     except (OSError, EOFError, KeyError, TypeError, ValueError, zlib.error):  # damaged: nobody knows what it was
         return False
-    return not begin or begin.startswith((b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.'))
+    return not begin or begin.startswith((*_MADE, *drawn))
 
 
 def _same(a: Path, b: Path) -> bool:

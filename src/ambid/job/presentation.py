@@ -277,6 +277,23 @@ def _acquired() -> View:
     )  # fmt: skip
 
 
+def _recorded() -> View:
+    from ambid.report.device_text import recorded_text
+    from ambid.report.record_figures import record_figure
+
+    def drawn(r: Any, used: Any, width: float) -> Figure:
+        return record_figure(read_record(used or r.path, gaps="interpolate"), title(r), (), width)
+
+    def title(r: Any) -> str:
+        return f"{r.path}, {r.survey.samples} samples from a journal"
+
+    return View(
+        text=recorded_text, figure=drawn, document=_fields_of("ambid.recovery/1"), title=title,
+        table=lambda r: ("path", {"path": [str(r.path)], **_numbers_of([fields_json(r.survey)])}),
+        beside=lambda _, at: at,
+    )  # fmt: skip
+
+
 def _inspection() -> View:
     from ambid.report.record_figures import record_figure
     from ambid.report.tables import inspection_text
@@ -433,6 +450,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Track": _track,
     "Inspection": _inspection,
     "Acquired": _acquired,
+    "Recorded": _recorded,
     "Comparison": _comparison,
     "Commissioned": _commissioned,
 }

@@ -12,6 +12,7 @@ from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, pla
 if TYPE_CHECKING:
     from ambid.acquisition.device import Counters
     from ambid.acquisition.quality import ColumnQuality, QualityReport
+    from ambid.acquisition.recorder import Recorded
     from ambid.acquisition.recording import Acquired
     from ambid.acquisition.session import RunReport
     from ambid.report.commission_page import Step
@@ -72,6 +73,19 @@ def acquired_text(done: Acquired, *, width: int = WIDTH, paint: Paint = plain) -
     words = [paint(line, "dim") for line in textwrap.wrap(_noise_words(q), width)]
     words += textwrap.wrap(_line_words(run, done.counters), width)
     return joined([textwrap.wrap(head, width), _table(q, paint), words])
+
+
+def recorded_text(made: Recorded, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write what a journal held, below its verdict."""
+    del paint
+    found, damage = made.survey, made.survey.damage
+    text = (
+        f"{made.path}: {counted(found.blocks, 'block')}, {counted(found.samples, 'sample')}, "
+        f"{found.samples / made.rate_hz:.6g} s; {'complete' if damage.closed else 'cut off while recording'}"
+    )
+    if damage.tail_bytes and not damage.closed:
+        text += f"; {counted(damage.tail_bytes, 'byte')} at the end of the journal are not a whole block"
+    return textwrap.fill(text, width, break_on_hyphens=False)
 
 
 def _line_words(run: RunReport, counters: Counters) -> str:

@@ -21,7 +21,8 @@ from ambid.acquisition.recorder.disk import sync_folder
 from ambid.acquisition.recorder.layout import JournalHeader
 from ambid.acquisition.recorder.reader import JournalReader, Survey, survey
 from ambid.arrays import Array
-from ambid.errors import DeviceError, RecordError
+from ambid.errors import DeviceError, RecordError, counted
+from ambid.estimation.result import Reason, Result
 from ambid.record.chunks import check_chunks, write_chunks
 from ambid.record.csv_format import head_lines
 from ambid.record.record import Channel, Record, Step
@@ -34,9 +35,9 @@ _GAP_ROWS = 10_000_000  # of NaN, that are always allowed
 _GAP_SHARE = 10  # and so many times the samples
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Recorded:
-    """A record that was made from a journal."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Recorded(Result):
+    """A record that was made from a journal, file schema ``ambid.recovery/1``."""
 
     path: Path  # of the record
     rate_hz: float
@@ -46,6 +47,26 @@ class Recorded:
     def keep_journal(self) -> bool:
         """Whether the journal holds, or may hold, what is not in the record."""
         return bool(self.survey.misplaced or self.survey.damage.frames or self.survey.damage.places)
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What was damaged, and what is missing."""
+        found, damage, said = self.survey, self.survey.damage, list[Reason]()
+        if damage.frames or damage.places:
+            others = damage.frames - damage.blocks
+            what = [counted(damage.blocks, "block")] if damage.blocks else []
+            if others:
+                what.append(f"{others} {'other ' if what else ''}{'entry' if others == 1 else 'entries'}")
+            where = counted(max(damage.places, 1), "place")
+            text = f"{' and '.join(what)} damaged, in {where}" if what else f"bytes damaged in {where}"
+            said.append(Reason(check="journal", text=f"{text}. Keep it, and look at the disk"))
+        if found.gap_samples:
+            text = f"{counted(found.gap_samples, 'sample')} missing in {counted(found.gaps, 'place')}"
+            said.append(Reason(check="samples", text=f"{text}. Read the record with --gaps"))
+        if found.misplaced:
+            text = f"{counted(found.misplaced, 'sample')} left out whose number had occurred before. Keep the journal"
+            said.append(Reason(check="order", text=text))
+        return tuple(said)
 
 
 def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
