@@ -21,8 +21,8 @@ def doubled(bench, record_text):
 def test_it_says_why_and_draws(bench, ambid, doubled):
     made = ambid("init", "two.csv", "-o", "new.toml", "--plot", "new.png", "--yes")
     assert made.code == 0
-    assert "voltage: voltage, because unit [V] and name fit; with current a coil explains" in made.err
-    assert re.search("position: (position|gap), because unit", made.err)
+    assert "voltage: voltage, because its unit [V] and name fit; a coil model with current explains" in made.err
+    assert re.search("position: (position|gap), because its unit", made.err)
     assert re.search("CHECK; or (position|gap)", (bench / "new.toml").read_text(encoding="utf-8"))
     assert (bench / "new.png").stat().st_size > 10_000
     refused = ambid("init", "--preset", "prototype", "--plot", "new.png")

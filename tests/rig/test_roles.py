@@ -38,7 +38,7 @@ def test_of_two_currents_the_one_of_the_coil_is_taken(bench):
     assert names[0] == "current_c"
     assert not close(found["current"])
     why = {c.channel.name: c.why for c in found["current"]}
-    assert "with voltage a coil explains 100.0 % (R about 1.6 ohm, L about 0.026 H)" in why["current_c"]
+    assert "a coil model with voltage explains 100.0 % (R about 1.6 ohm, L about 0.026 H)" in why["current_c"]
     assert "no signal, noise alone" in why["current_a"] or "only" in why["current_a"]
     assert "never changes" in why["coil_d"]
 

@@ -185,6 +185,8 @@ class Recording:
                     self.stop.number = self.stop.number or (follower.code or INTERRUPTED) - 128
 
         def ending() -> None:
+            if json != "-":
+                typer.echo("")
             if failures:
                 raise AmbidError(f"{failures[0]}; {self.path} holds all {runs[0].samples} samples")
             if follower.track is not None or (runs[0].fault is None and not self.stop.wished()):

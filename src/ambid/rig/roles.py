@@ -216,7 +216,7 @@ def _judged(
         if best is not None and coils[best].share > 0:
             fits, other = coils[best].share, best[c.role != "current"]
             words.append(
-                f"with {other} a coil explains {100.0 * fits:.1f} % ({_coil_words(coils[best], best, record)})"
+                f"a coil model with {other} explains {100.0 * fits:.1f} % ({_coil_words(coils[best], best, record)})"
             )
         elif best is not None:
             words.append("no coil (R, L > 0) between it and any other column")
@@ -228,16 +228,16 @@ def _weak(c: Candidate) -> list[str]:
 
 
 def _unit_words(c: Candidate) -> str:
-    words = f"unit [{c.channel.source_unit}]"
+    words = f"its unit [{c.channel.source_unit}]"
     if c.channel.unit == ROLES[c.role]:
         return f"{words} and name fit" if c.named == 1.0 else f"{words} fits"
     return f"{words} instead of [{ROLES[c.role]}]" + ("" if c.named == _UNNAMED else ", but the name fits")
 
 
 def _coil_words(coil: Coil, pair: tuple[str, str], record: Record) -> str:
-    R, L = coil.R, coil.L
+    R, L = float(f"{coil.R:.2g}"), coil.L
     if [record.channel(name).unit for name in pair] == ["V", "A"]:
-        words = f"R about {R:.2g} ohm, L about {L:.2g} H" if R else f"L about {L:.2g} H"
+        words = f"R about {R:g} ohm, L about {L:.2g} H" if R else f"L about {L:.2g} H"
     else:
         words = f"L/R about {L / R:.2g} s" if R else "L > 0"
     return words + (", one of the two reversed" if coil.reversed else "")
