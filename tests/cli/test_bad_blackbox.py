@@ -118,7 +118,7 @@ def test_fit_files_that_were_edited(bench, ambid, structure, orders, edits):
     assert ambid("validate", "fit.json", "r.csv").code == 0
     for path, value in edits:
         (bench / "fit.json").write_text(json.dumps(edited(document, path, value)))
-        assert "is not a whole fit" in refused(ambid, bench, "validate", "fit.json", "r.csv"), (path, value)
+        assert "is not a complete fit" in refused(ambid, bench, "validate", "fit.json", "r.csv"), (path, value)
 
 
 def test_a_fit_is_judged_on_its_own_units_only(bench, ambid):

@@ -118,7 +118,7 @@ def test_the_folder_of_an_earlier_one_is_refused_before_the_bench_is_opened(comm
         (("--seconds", "0.5"), {}, "the record: a multisine from 2 Hz needs 2 s"),
         (("--band", "2:1200"), {}, "a trial of the amplitude: "),
         ((), {"port": "replay:o.h5"}, "nothing can be levitated"),
-        ((), {"port": "/dev/ttyNONE"}, "nobody can be asked"),
+        ((), {"port": "/dev/ttyNONE"}, "no terminal to ask"),
         (("--yes",), {"port": "/dev/ttyNONE"}, "does not exist"),
         ((), {"rig": "coil.toml"}, "no [loop] with a gain"),
         ((), {"rig": "none.toml"}, "none.toml"),

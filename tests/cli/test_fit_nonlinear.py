@@ -184,7 +184,7 @@ def test_a_damaged_fit_is_refused_in_one_line(at, ambid, place, value) -> None:
     out.write_text(json.dumps(document), encoding="utf-8")
     found = ambid("validate", out, "r1.csv")
     assert found.code == 2, found.err
-    assert "is not a whole fit" in found.err
+    assert "is not a complete fit" in found.err
 
 
 def test_strict_looks_at_the_second_record(at, ambid) -> None:

@@ -211,4 +211,4 @@ def test_a_damaged_estimate_is_refused_in_one_line(at, ambid, place, value) -> N
     (at / "damaged.json").write_text(json.dumps(document), encoding="utf-8")
     found = ambid("validate", at / "damaged.json", "r1.csv")
     assert found.code == 2, found.err
-    assert "is not a whole estimate" in found.err
+    assert "is not a complete estimate" in found.err

@@ -16,7 +16,7 @@ from ambid.errors import AmbidError, EstimationError, ModelError
 from ambid.job import commissioning as room
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning import FILES, Declined, check_folder, commission
-from ambid.job.commissioning_steps import STEPS, Wishes, tracking
+from ambid.job.commissioning_steps import STEPS, Plan, tracking
 from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
 from ambid.rig import load_rig
@@ -26,14 +26,14 @@ from tests.job.benches import COIL, CURRENT, DUTY, POSITION, Silent, Spoiled, pr
 
 __all__ = ["avr_gcc", "bench_program", "firmware_elf", "native_cc"]
 
-SHORT = Wishes(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
+SHORT = Plan(record_s=4.0, second_s=2.0, hover_s=0.5, rest_s=0.2, track_s=2.0, settle_s=0.5)
 TRUTH = {"m": 0.3, "k_x": -6702.0, "k_i": 20.1, "R": 6.0, "L": 0.0803}
 
 
-def ran(folder, device, *, rig=None, wishes=SHORT, **options):
+def ran(folder, device, *, rig=None, plan=SHORT, **options):
     """What came of it, and what is in the folder; the output is off, nothing is half-written."""
     with device:
-        done = commission(device, rig or prototype(), folder, wishes=wishes, **options)
+        done = commission(device, rig or prototype(), folder, plan=plan, **options)
         assert device.state in ("idle", "fault")
     told = json.loads((folder / "commission.json").read_text(), parse_constant=pytest.fail)
     assert [s["name"] for s in told["steps"]] == [s.name for s in done.steps] == list(STEPS[: len(done.steps)])
@@ -161,7 +161,7 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("wishes", "said"),
+    ("plan", "said"),
     [
         ({"record_s": 0.5}, "the record: a multisine from 2 Hz needs 2 s for 4 periods"),
         ({"second_s": 1.0}, "the second record: "),
@@ -169,10 +169,10 @@ def test_a_folder_that_is_not_there_is_refused(tmp_path):
         ({"band_hz": (2.0, 1500.0)}, "a trial of the amplitude: "),
     ],
 )
-def test_what_cannot_be_played_is_refused(tmp_path, wishes, said):
+def test_what_cannot_be_played_is_refused(tmp_path, plan, said):
     with Spoiled(prototype()) as device:
         with pytest.raises(AmbidError, match=said):
-            commission(device, prototype(), tmp_path, wishes=replace(SHORT, **wishes))
+            commission(device, prototype(), tmp_path, plan=replace(SHORT, **plan))
         assert device.starts == 0
     assert files(tmp_path) == set()
 
@@ -247,7 +247,7 @@ def test_a_loop_that_is_predicted_unstable_is_refused_with_its_pole_before_anyth
     rig = prototype(("kd = 92.57", "kd = 9.257"))
     with Spoiled(rig) as device:
         with pytest.raises(ModelError, match=r"largest pole 1\.00\d+; it is stable for [\d.]+ to \d+ times its gains"):
-            commission(device, rig, tmp_path, wishes=SHORT)
+            commission(device, rig, tmp_path, plan=SHORT)
         assert device.starts == 0
     assert files(tmp_path) == set()
 
@@ -296,7 +296,7 @@ def test_a_reversed_sign_is_named_and_never_levitated(tmp_path, of, what):
     device = of(rig)
     if what == "k_i":  # it is seen in the loop already
         with device, pytest.raises(ModelError, match="stable with the other sign of kp, ki and kd"):
-            commission(device, rig, tmp_path, wishes=SHORT)
+            commission(device, rig, tmp_path, plan=SHORT)
     modes, start = [], device.start
     device.start = lambda mode: (modes.append(mode), start(mode))
     stopped_at("polarity", ran(tmp_path, device, rig=rig, force=True), *words)
@@ -315,7 +315,7 @@ def test_a_rotor_that_strays_stops_it(tmp_path):
         if device.lifts == 1:
             values[:, POSITION] = 512 + 200 * np.sign(np.sin(device.blocks))
 
-    stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=stray)), "strays", "badly damped")
+    stopped_at("levitate", ran(tmp_path, Spoiled(prototype(), spoil=stray)), "drifts", "badly damped")
 
 
 def test_a_voltage_that_is_nearly_used_up_stops_it(tmp_path):
@@ -327,7 +327,7 @@ def test_a_voltage_that_is_nearly_used_up_stops_it(tmp_path):
 
 
 def test_an_amplitude_that_trips_stops_it(tmp_path):
-    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=11.0))
+    done = ran(tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=11.0))
     stopped_at("excite", done, "safe state during excitation of 11 V")
     assert json.loads((tmp_path / "commission.json").read_text())["steps"][-1]["numbers"]["used"] is None
 
@@ -337,14 +337,14 @@ def lost_in(lift):
 
 
 def test_lost_samples_stop_it_at_the_record(tmp_path):
-    wishes = replace(SHORT, amplitude_v=1.4)  # hover, one trial: the record is the third time that it levitates
-    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(3)), wishes=wishes)
+    plan = replace(SHORT, amplitude_v=1.4)  # hover, one trial: the record is the third time that it levitates
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(3)), plan=plan)
     stopped_at("record", done, "20 of 8000 samples were lost during the record")
     assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5"}
 
 
 def test_lost_samples_of_the_second_record_stop_it_too(tmp_path):
-    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, Spoiled(prototype(), lose=lost_in(4)), plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("record", done, "20 of 4000 samples were lost during the second record")
     assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
 
@@ -354,43 +354,43 @@ def test_a_sensor_at_its_end_stops_it_at_the_record(tmp_path):
         if device.lifts == 3:
             values[::50, POSITION] = 1023
 
-    done = ran(tmp_path, Spoiled(prototype(), spoil=clip), wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, Spoiled(prototype(), spoil=clip), plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("record", done, "position is at the end of its range")
 
 
 def test_a_line_that_is_lost_stops_it_with_that_reason_and_keeps_the_record(tmp_path):
     device = Silent(prototype(), after=400 + 250)
     with device:
-        done = commission(device, prototype(), tmp_path, wishes=replace(SHORT, amplitude_v=1.4))
+        done = commission(device, prototype(), tmp_path, plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("record", done, "the line is lost", "record.h5 holds the")
     assert len(read_record(tmp_path / "record.h5").channels[0].values) > 1000
 
 
 def test_a_fixed_value_that_is_wrong_stops_it(tmp_path):
     rig = prototype(('R   = { value = 6.0, unit = "ohm" }', 'R = { value = 9.0, unit = "ohm", role = "fixed" }'))
-    done = ran(tmp_path, SimulatedDevice(rig), rig=rig, wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, SimulatedDevice(rig), rig=rig, plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "contradict the fixed R = 9 ohm", "Check it, or free it")
     assert "estimate.json" in files(tmp_path)
 
 
 def test_too_little_excitation_stops_it_by_the_width_of_the_intervals(tmp_path):
-    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=0.05))
-    stopped_at("identify", done, "10 % is wanted", "record longer")
+    done = ran(tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=0.05))
+    stopped_at("identify", done, "limit 10 %", "record longer")
     # signal over noise alone is a caution of the record: the intervals decide
     assert any("signal-to-noise" in c for s in done.steps for c in s.cautions)
 
 
 def test_a_marginal_signal_is_a_caution_where_the_intervals_are_narrow(tmp_path):
     with SimulatedDevice(prototype()) as device:
-        done = commission(device, prototype(), tmp_path, wishes=replace(SHORT, amplitude_v=0.6))
+        done = commission(device, prototype(), tmp_path, plan=replace(SHORT, amplitude_v=0.6))
     snr = [c for s in done.steps if s.name == "record" for c in s.cautions if "signal-to-noise" in c]
     assert snr
     assert done.steps[-1].name == "track"
 
 
 def test_a_wish_that_is_narrower_than_the_record_allows_stops_it(tmp_path):
-    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4, widest=0.001))
-    stopped_at("identify", done, "m is known to", "0.1 % is wanted")
+    done = ran(tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=1.4, widest=0.001))
+    stopped_at("identify", done, "m is known to", "limit 0.1 %")
 
 
 def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
@@ -398,7 +398,7 @@ def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
         raise EstimationError("the record says nothing. Take another")
 
     monkeypatch.setattr("ambid.job.commissioning.identify", refuse)
-    done = ran(tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "the record says nothing. Take another")
     assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
 
@@ -409,13 +409,13 @@ def change_before(lift, *changes):
 
 def test_another_bench_in_the_second_record_stops_it_at_validation(tmp_path):
     device = Spoiled(prototype(), before=change_before(4, ("R", 2.0), ("m", 1.3)))
-    done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, device, plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("validate", done, "innovations")
 
 
 def test_another_bench_when_it_tracks_stops_it_there(tmp_path):
     device = Spoiled(prototype(), before=change_before(5, ("R", 1.4), ("m", 1.2)))
-    done = ran(tmp_path, device, wishes=replace(SHORT, amplitude_v=1.4))
+    done = ran(tmp_path, device, plan=replace(SHORT, amplitude_v=1.4))
     assert done.steps[-1].name == "track"
     assert done.steps[-1].reasons
     assert files(tmp_path) == set(FILES)
@@ -453,7 +453,7 @@ def test_an_operator_who_declines_leaves_the_output_off(tmp_path):
     asked = []
     with Spoiled(prototype()) as device:
         with pytest.raises(Declined, match="output stayed off"):
-            commission(device, prototype(), tmp_path, wishes=SHORT, confirm=lambda name: asked.append(name))
+            commission(device, prototype(), tmp_path, plan=SHORT, confirm=lambda name: asked.append(name))
         assert device.starts == 1  # the look at rest, with the output off
         assert device.state == "idle"
     assert asked == ["polarity"]
@@ -465,7 +465,7 @@ def test_an_operator_who_declines_leaves_the_output_off(tmp_path):
 def test_an_interruption_is_the_reason_of_the_step_under_way(tmp_path, name, plain_report):
     begun = []
     done = ran(
-        tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
+        tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
         stopped=lambda: begun[-1:] == [name],
     )  # fmt: skip
     stopped_at(name, done, "interrupted")
@@ -474,7 +474,7 @@ def test_an_interruption_is_the_reason_of_the_step_under_way(tmp_path, name, pla
 def test_an_interruption_while_numbers_are_worked_out(tmp_path):
     begun = []
     done = ran(
-        tmp_path, SimulatedDevice(prototype()), wishes=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
+        tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=1.4), on_begin=begun.append,
         stopped=lambda: begun[-1:] == ["identify"],
     )  # fmt: skip
     stopped_at("identify", done, "interrupted while working it out")

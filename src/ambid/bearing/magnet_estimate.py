@@ -69,7 +69,7 @@ def estimate_bearing(
     """
     free = [r for r in records if not r.held]
     if not free:
-        raise EstimationError("every record holds the rotor; masses and forces want one in which it moves")
+        raise EstimationError("the rotor is held in every record; mass and force need one in which it moves")
     laws = [_widened(law, known) for law in laws]
     short = [_short(r) for r in records]
     few, many = (float(sum(r.u.size for r in x)) for x in (short, records))

@@ -507,7 +507,7 @@ def _first_stage(who: str, data: IOData) -> tuple[Array, int, tuple[str, ...]]:
         ()
         if lags >= memory
         else (
-            f"the loop remembers its reference for {memory} samples, and the record allows a first stage of "
+            f"the response of the loop to its reference lasts {memory} samples, and the record allows a first stage of "
             f"{lags}: the rest counts as noise. Use a longer record, or cliv",
         )
     )

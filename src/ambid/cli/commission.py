@@ -56,7 +56,7 @@ def command(
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
-    from ambid.job.commissioning_steps import STEPS, Wishes
+    from ambid.job.commissioning_steps import STEPS, Plan
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
@@ -64,7 +64,7 @@ def command(
         {"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest}
     )
     outputs = Outputs(rig, json=json, plot=plot, report=report)
-    wishes = Wishes(
+    plan = Plan(
         record_s=seconds,
         second_s=_second_s(seconds),
         track_s=track_seconds,
@@ -111,7 +111,7 @@ def command(
 
         try:
             done = commission(
-                device, known, folder, wishes=wishes, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
+                device, known, folder, plan=plan, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
                 stopped=stop.wished, tick=alive, force=force,
             )  # fmt: skip
         except AmbidError:
@@ -158,8 +158,8 @@ def _check_port(port: str, *, yes: bool) -> None:
         raise AmbidError(f"{port} is a replayed record: nothing can be levitated. Give a bench")
     if port not in ("emulated", "simulated") and not yes and not sys.stdin.isatty():
         raise AmbidError(
-            f"{port}: the controller would switch its output on, and nobody can be asked. Clear the bench, and "
-            "give --yes"
+            f"{port}: the controller would switch its output on, and there is no terminal to ask. Clear the "
+            "bench, and give --yes"
         )
 
 

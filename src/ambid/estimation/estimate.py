@@ -323,7 +323,7 @@ def read_whole(read: Callable[[], T], where: str, what: str, verb: str) -> T:
         return read()
     except (AmbidError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
         raise EstimationError(
-            f"{where} is not a whole {what} ({type(error).__name__}: {error}). "
+            f"{where} is not a complete {what} ({type(error).__name__}: {error}). "
             f"Write it again with 'ambid {verb} --json'"
         ) from error
 

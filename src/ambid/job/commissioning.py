@@ -24,7 +24,7 @@ from ambid.estimation.estimate import Estimate, json_text, plain_json
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
-from ambid.job.commissioning_steps import STEPS, StepName, Wishes
+from ambid.job.commissioning_steps import STEPS, Plan, StepName
 from ambid.job.identification import identify
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
@@ -54,7 +54,7 @@ class Commissioned(Result):
     folder: Path  # where the files are
     rig: Rig
     device: DeviceInfo
-    wishes: Wishes
+    plan: Plan
     names: tuple[StepName, ...] = STEPS  # of all steps, those that were not reached too
 
     @property
@@ -83,7 +83,7 @@ class Commissioned(Result):
                     "identity": dict(info.identity),
                     "rate_hz": info.rate_hz,
                 },
-                "wishes": plain_json(self.wishes),
+                "wishes": plain_json(self.plan),
                 "steps": [s.as_json() for s in self.steps],
                 "passed": self.passed,
             }
@@ -103,7 +103,7 @@ def commission(
     rig: Rig,
     folder: str | Path,
     *,
-    wishes: Wishes | None = None,
+    plan: Plan | None = None,
     on_begin: Callable[[StepName], object] | None = None,
     on_step: Callable[[Step], object] | None = None,
     confirm: Callable[[StepName], bool] | None = None,
@@ -122,7 +122,7 @@ def commission(
         The bench, with ``[loop]`` and ``[daq]``.
     folder : str or Path
         Where everything is left; see `FILES`.
-    wishes : Wishes, optional
+    plan : Plan, optional
         What is to be reached.
     on_begin, on_step : callable, optional
         Called with the name of a step before it begins, and with what it found.
@@ -149,7 +149,7 @@ def commission(
     """
     place = Path(folder)
     check_folder(place)
-    guide = _Guide(device, rig, place, wishes or Wishes(), listeners, stopped, tick or silent)
+    guide = _Guide(device, rig, place, plan or Plan(), listeners, stopped, tick or silent)
     guide.check()
     guide.predict(force=force)
     write_text(place / "rig.toml", rig_text(rig, place))
@@ -193,7 +193,7 @@ class _Guide:
         device: Device,
         rig: Rig,
         place: Path,
-        wishes: Wishes,
+        plan: Plan,
         listeners: Listeners,
         stopped: Callable[[], bool],
         tick: Tick,
@@ -201,7 +201,7 @@ class _Guide:
         self._device, self._rig, self._place = device, rig, place
         self._listeners, self._stopped, self._told = listeners, stopped, tick
         self._room = Room.of(rig)
-        self.wishes = wishes
+        self.plan = plan
         self.estimate: Estimate | None = None
         self.track: Track | None = None
         self.done: list[Step] = []
@@ -211,7 +211,7 @@ class _Guide:
         """Return what came of it so far."""
         return Commissioned(
             steps=tuple(self.done), estimate=self.estimate, track=self.track, folder=self._place, rig=self._rig,
-            device=self._device.info, wishes=self.wishes,
+            device=self._device.info, plan=self.plan,
         )  # fmt: skip
 
     def predict(self, *, force: bool) -> None:
@@ -224,16 +224,16 @@ class _Guide:
 
     def check(self) -> None:
         """Refuse what cannot be done, before anything moves."""
-        wishes, rate_hz = self.wishes, self._device.info.rate_hz
+        plan, rate_hz = self.plan, self._device.info.rate_hz
         if self._device.info.kind == "replay":
             raise AmbidError(f"{self._device.info.port} is a record that is replayed: it cannot be commissioned")
         if self._rig.loop is None or not self._rig.loop.closed or self._rig.open_loop:
             raise AmbidError("the rig has no [loop] with a gain: there is nothing to levitate with. Give [loop]")
         for what, seconds in (
-            ("a trial of the amplitude", wishes.longest_trial_s(rate_hz)),
-            ("the record", wishes.record_s),
-            ("the second record", wishes.second_s),
-            ("tracking", wishes.track_s),
+            ("a trial of the amplitude", plan.longest_trial_s(rate_hz)),
+            ("the record", plan.record_s),
+            ("the second record", plan.second_s),
+            ("tracking", plan.track_s),
         ):
             try:
                 self._course(1.0, seconds, 0)
@@ -242,7 +242,7 @@ class _Guide:
 
     def steps(self, confirm: Callable[[StepName], bool]) -> Iterator[tuple[StepName, Callable[[], Step]]]:
         """Yield one step after the other; whoever iterates does it, and stops at one that is not passed."""
-        device, room, wishes = self._device, self._room, self.wishes
+        device, room, plan = self._device, self._room, self.plan
         look, rate_hz = make_look(device, self._rig, self._stopped), device.info.rate_hz
         found: dict[str, Step] = {}
 
@@ -254,12 +254,12 @@ class _Guide:
             return found["excite"].numbers["amplitude_v"]
 
         yield "self-test", lambda: judge.self_test(device)
-        yield "rest", lambda: judge.rest(look, room, wishes, device.info.rate_hz)
+        yield "rest", lambda: judge.rest(look, room, plan, device.info.rate_hz)
         if not confirm("polarity"):
             raise Declined("pulses and levitation were not agreed to; the output stayed off. Clear the bench first")
         yield "polarity", lambda: judge.polarity(look, room, self._rig, device)
-        yield "levitate", lambda: keep(judge.levitate(look, room, wishes, rate_hz))
-        yield "excite", lambda: keep(judge.excite(look, room, wishes, rate_hz, found["levitate"]))
+        yield "levitate", lambda: keep(judge.levitate(look, room, plan, rate_hz))
+        yield "excite", lambda: keep(judge.excite(look, room, plan, rate_hz, found["levitate"]))
         yield "record", lambda: self._record(amplitude())
         yield "identify", self._identify
         yield "validate", self._validate
@@ -267,11 +267,11 @@ class _Guide:
 
     def _record(self, amplitude_v: float) -> Step:
         """Take the record, and a second one with another excitation."""
-        wishes = self.wishes
-        first = self._acquire("record", "record.h5", amplitude_v, wishes.record_s, 0)
+        plan = self.plan
+        first = self._acquire("record", "record.h5", amplitude_v, plan.record_s, 0)
         if not first.passed:
             return first
-        second = self._acquire("second record", "second.h5", 0.8 * amplitude_v, wishes.second_s, 1)
+        second = self._acquire("second record", "second.h5", 0.8 * amplitude_v, plan.second_s, 1)
         return replace(
             second,
             findings=(*first.findings, *second.findings),
@@ -292,8 +292,8 @@ class _Guide:
         return judge.record(name, done, (picture,) if kept.values else ())
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
-        wishes, rate_hz = self.wishes, self._device.info.rate_hz
-        return wishes.trial(rate_hz, seconds, seed).course(amplitude_v, rate_hz)
+        plan, rate_hz = self.plan, self._device.info.rate_hz
+        return plan.trial(rate_hz, seconds, seed).course(amplitude_v, rate_hz)
 
     def _validate(self) -> Step:
         assert self.estimate is not None
@@ -312,11 +312,11 @@ class _Guide:
         write_text(self._place / "estimate.json", self.estimate.dumps())
         found = loop_on(self._rig, self._device.info, self.estimate.values)[0]
         loops = {"identified": found} if found is not None else {}
-        return judge.identification(self.estimate, self.wishes, {**loops, **self._loops})
+        return judge.identification(self.estimate, self.plan, {**loops, **self._loops})
 
     def _track(self, amplitude_v: float) -> Step:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""
-        course = self._course(amplitude_v, self.wishes.track_s, 2)
+        course = self._course(amplitude_v, self.plan.track_s, 2)
         done = track_live(
             self._device, self._rig, course, start=self.estimate, limit=_LIMIT,
             on_event=self._listeners.get("on_event"), stopped=self._stopped,

@@ -54,7 +54,7 @@ _RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consisten
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Wishes:
+class Plan:
     """What a commissioning is to reach, and how long it may take for it."""
 
     # length of the record, of the one for validation, of levitation without excitation, of the look at rest, of each
@@ -108,13 +108,13 @@ def self_test(device: Device) -> Step:
     return Step(name="self-test", findings=findings, reasons=found.failed, numbers=found.numbers)
 
 
-def rest(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
+def rest(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
     """Look at the sensors with the output off.
 
-    `look`: see `make_look`; `room`: limits; `wishes`: lengths; `rate_hz`: of the device, Hz. Returns not
+    `look`: see `make_look`; `room`: limits; `plan`: lengths; `rate_hz`: of the device, Hz. Returns not
     passed where a sensor is noisy, or a current is shown that cannot be.
     """
-    report, seen = look(Course(mode="sample", seconds=wishes.rest_s))
+    report, seen = look(Course(mode="sample", seconds=plan.rest_s))
     reasons = list(why_incomplete(report, "the look at rest"))
     cautions: list[str] = []
     shown = {role: _mean_sd(x) for role, x in seen.items() if role in ("position", "current") and x.size}
@@ -223,15 +223,15 @@ def _reversed(found: Polarity, rig: Rig) -> list[str]:
     return []
 
 
-def levitate(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
+def levitate(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
     """Lift the rotor and let it hover without excitation.
 
-    `look`: see `make_look`; `room`: limits; `wishes`: lengths; `rate_hz`: of the device, Hz. Returns not
+    `look`: see `make_look`; `room`: limits; `plan`: lengths; `rate_hz`: of the device, Hz. Returns not
     passed where the controller tripped, the rotor strays, or no room is left.
     """
-    course = Course(mode="levitate", seconds=wishes.hover_s, settle_s=wishes.settle_s, transient=True)
+    course = Course(mode="levitate", seconds=plan.hover_s, settle_s=plan.settle_s, transient=True)
     report, whole = look(course)
-    settled = max(round(wishes.settle_s * rate_hz), whole["position"].size - round(wishes.hover_s * rate_hz))
+    settled = max(round(plan.settle_s * rate_hz), whole["position"].size - round(plan.hover_s * rate_hz))
     seen = {role: values[settled:] for role, values in whole.items()}
     caption = "From the start on; dashed: the controller's trips. Shaded: lift-off, which is given time to settle."
     pictures = (trace_picture("Lift-off", caption, whole, rate_hz, room.trips, from_s=settled / rate_hz),)
@@ -249,7 +249,7 @@ def levitate(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
     stray = float(np.ptp(seen["position"]))
     if math.isfinite(high - low) and stray > _WANDER * (high - low):
         reasons.append(
-            f"the rotor strays by {sized(stray, 'm')} without excitation, {100 * stray / (high - low):.0f} % of the way"
+            f"the rotor drifts by {sized(stray, 'm')} without excitation, {100 * stray / (high - low):.0f} % of the way"
             " between the trips: the loop is badly damped or the sensor disturbed; change the gains of [loop]"
         )
     v_low, v_high = room.voltage
@@ -265,18 +265,18 @@ def levitate(look: Look, room: Room, wishes: Wishes, rate_hz: float) -> Step:
     return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown), pictures=pictures)
 
 
-def excite(look: Look, room: Room, wishes: Wishes, rate_hz: float, hover: Step) -> Step:
+def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> Step:
     """Find the largest excitation that keeps to its part of the room.
 
-    `look`: see `make_look`; `room`: limits; `wishes`: band, part of the room, perhaps the amplitude
+    `look`: see `make_look`; `room`: limits; `plan`: band, part of the room, perhaps the amplitude
     itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
     `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """
     resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
-    trial = wishes.trial(rate_hz, wishes.longest_trial_s(rate_hz))
-    found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=wishes.use, given=wishes.amplitude_v)
+    trial = plan.trial(rate_hz, plan.longest_trial_s(rate_hz))
+    found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=plan.use, given=plan.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
-    picture = trials_picture(found.trials, wishes.use, found.last, rate_hz, room.trips)
+    picture = trials_picture(found.trials, plan.use, found.last, rate_hz, room.trips)
     return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=(picture,))
 
 
@@ -333,10 +333,10 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
     )  # fmt: skip
 
 
-def identification(estimate: Estimate, wishes: Wishes, loops: Mapping[str, LoopMargins]) -> Step:
+def identification(estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargins]) -> Step:
     """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
 
-    `estimate`: of the record; `wishes`: how wide an interval may be; `loops`: margins of the controller on the plant
+    `estimate`: of the record; `plan`: how wide an interval may be; `loops`: margins of the controller on the plant
     that was identified, and that was expected, by name, the first one first. Returns tests of residuals that
     fail are cautions, because the standard deviations allow for them; all else stops.
     """
@@ -355,10 +355,10 @@ def identification(estimate: Estimate, wishes: Wishes, loops: Mapping[str, LoopM
         numbers |= {p.name: p.value, f"{p.name}_sd": p.sd}
         if not p.identifiable:
             reasons.append(f"{p.name} is not identifiable from this record: excite more, or fix what is known")
-        elif wide > wishes.widest:
+        elif wide > plan.widest:
             reasons.append(
-                f"{p.name} is known to ± {100 * wide:.2g} % only, {100 * wishes.widest:g} % is wanted: record longer,"
-                " or excite more"
+                f"{p.name} is known to ± {100 * wide:.2g} % only (limit {100 * plan.widest:g} %, --widest): record"
+                " longer, or excite more"
             )
     for name, check in estimate.checks.items():
         if not check.passed:

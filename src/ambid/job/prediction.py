@@ -69,7 +69,7 @@ def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, 
     wanted = len(model(result.model).inputs if isinstance(result, Estimate) else result.inputs)
     if inputs.ndim != 2 or inputs.shape[1] != wanted or not np.all(np.isfinite(inputs)):
         raise EstimationError(
-            f"the inputs have shape {np.shape(u)}; finite numbers of shape (n_samples, {wanted}) are wanted. Correct u"
+            f"the inputs have shape {np.shape(u)}; finite numbers of shape (n_samples, {wanted}) are needed. Correct u"
         )
     if isinstance(result, Estimate):
         plant, at = model(result.model), result.operating_point

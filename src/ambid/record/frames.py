@@ -147,7 +147,7 @@ def _of_pandas(table: Any) -> _Parts:
     for what, labels in (("column", table.columns), ("row", table.index)):
         if labels.nlevels > 1:
             raise RecordError(
-                f"the DataFrame has a MultiIndex with {labels.nlevels} labels for each {what}; one is wanted. Select a"
+                f"the DataFrame has a MultiIndex with {labels.nlevels} labels for each {what}; one is needed. Select a"
                 " level first, or reset_index"
             )
     columns = tuple(_Column(label=x, values=table.iloc[:, j]) for j, x in enumerate(table.columns))

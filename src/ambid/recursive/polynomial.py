@@ -467,7 +467,7 @@ def _warnings_of(
         found.append(
             f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
             "estimate may stick at the stability limit after a standstill, and standard deviations are too small. "
-            f"Remember {least} samples or more, or use arx"
+            f"Use a memory of {least} samples or more, or arx"
         )
     if structure_named(name).feedback == "biased" and not open_loop:
         found.append(f"{name} is biased by feedback: use bj or armax, or give open_loop if there is no feedback")

@@ -180,7 +180,7 @@ def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path
     place = f"rig {path}: channels.{role}"
     if entry.delay == "auto" and role not in plant.inputs:
         raise RigError(
-            f"{place}.delay is 'auto'; only of inputs ({', '.join(plant.inputs)}) it is found. Give whole samples"
+            f"{place}.delay is 'auto'; it can be found for inputs only ({', '.join(plant.inputs)}). Give whole samples"
         )
     delay = entry.delay if entry.delay is not None else "auto" if role in plant.inputs else 0
     return RigChannel(
@@ -622,7 +622,7 @@ def _through_a_rig(record: Record, rig: Rig, wanted: Mapping[str, str]) -> Recor
             has = "is not there" if unit is None else f"is in [{unit}]"
             raise RecordError(
                 f"the record went through a rig already (columns became {', '.join(record)}); its channel {c.role!r} "
-                f"{has}, this rig wants it in [{wanted[c.role]}]. Read the record again, through this rig"
+                f"{has}, this rig needs it in [{wanted[c.role]}]. Read the record again, through this rig"
             )
     return record
 

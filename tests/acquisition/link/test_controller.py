@@ -109,7 +109,7 @@ def test_another_version_is_refused_at_once():
 @pytest.mark.parametrize(
     ("before", "words"),
     [
-        (b"", ("nobody answers", "reset the board")),
+        (b"", ("no answer to 'identify'", "reset the board")),
         (bytes(range(1, 200)) * 4 + b"\0", ("no sound frame", "daq.baud")),
         (encode(message("ack", id=3, code=0, detail=0)), ("does not hear the host",)),
     ],

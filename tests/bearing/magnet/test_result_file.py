@@ -125,6 +125,6 @@ def put(value, *keys):
 def test_a_damaged_file_is_refused_on_one_line(estimate, damage):
     document = json.loads(estimate.dumps())
     damage(document)
-    with pytest.raises(EstimationError, match=r"estimate nonlinear\.json is not a whole estimate") as refused:
+    with pytest.raises(EstimationError, match=r"estimate nonlinear\.json is not a complete estimate") as refused:
         back(document)
     assert "\n" not in str(refused.value)

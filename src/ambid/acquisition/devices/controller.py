@@ -363,8 +363,8 @@ class Controller:
                 " program. Give the firmware's baud (daq.baud), or put the firmware amb_daq on the board"
             )
         return (
-            f"port {name}: nobody answers; a controller with the firmware amb_daq answers 'identify' at once. Look at"
-            " the cable and the supply, reset the board, or put the firmware on it"
+            f"port {name}: no answer to 'identify'. Check cable and supply, reset the board, or load the firmware"
+            " amb_daq"
         )
 
 
