@@ -37,10 +37,14 @@ def test_the_presets_own_parameters_balance_its_weight():
     assert check.values["sd"] == pytest.approx(np.hypot(0.005, 0.005) * abs(THETA["k_i"] / THETA["m"]))
 
 
-def test_a_current_that_reads_too_large_does_not():
+def test_a_current_with_an_offset_does_not_and_the_offset_is_told():
+    """Were it a factor, k_i would be smaller by it, and the balance would hold."""
     check = balance(found=record(0.01, current=1.1))
     assert not check.passed
     assert "10 % more" in check.detail
+    assert "A position that reads as much too large, or a current that reads 0.095 A at zero" in check.detail
+    scaled = {**THETA, "k_i": THETA["k_i"] / 1.1}
+    assert balance(theta=scaled, found=record(0.01, current=1.1)).passed
     assert "asks for -2 g/i0 = -18.78" in check.detail
 
 

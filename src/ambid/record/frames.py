@@ -275,8 +275,9 @@ def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
             f"{place} holds complex numbers; a measured channel is real. Pass real and imaginary part as two columns"
         )
     if kind not in "iufb":
-        example = next((x for x in values.ravel() if not isinstance(x, (int, float))), "")
-        raise RecordError(f"{place} holds no numbers (such as {str(example)[:20]!r}). Convert it, or omit it")
+        others = [x for x in values.ravel() if not isinstance(x, (int, float))]
+        what = f"no numbers (such as {str(others[0])[:20]!r})" if others else f"numbers as {values.dtype}s"
+        raise RecordError(f"{place} holds {what}. Convert it with astype(float), or omit it")
     found = np.asarray(values, dtype=np.float64)
     if kind in "iu" and found.size and np.abs(found).max() > _EXACT:
         raise RecordError(

@@ -1,7 +1,9 @@
 """Facts that no fit has a part in: the balance of gravity, and the loop that held the rotor.
 
 The force of one magnet grows with the square of its current, f = i^2 h(x), and at rest it carries the weight, f = -m g
-(x grows away from the magnet). So k_i = df/di = 2 f/i0, and k_i/m = -2 g/i0 (theory.md sec. 1; thesis eq. 1.9).
+(x grows away from the magnet). So k_i = df/di = 2 f/i0, and k_i/m = -2 g/i0 (theory.md sec. 1; thesis eq. 1.9). A
+current read too large by a factor makes both sides smaller by it, and the motion alone gives k_i/m, whatever mass and
+voltage are: the balance tests position, rate and the current's zero.
 
 With a position that is reversed k_i has the other sign and every other parameter its own: a convention, until gravity
 or a controller says which it is.
@@ -71,8 +73,10 @@ def gravity_balance(
         detail += f": {100.0 * abs(off):.3g} % {'more' if off > 0 else 'less'}"
     if not passed and abs(off) < 1.0:
         detail += (
-            ". Force, mass or current are off by as much: check calibration and mass, and that one magnet alone "
-            "carries the rotor; else record away from limits, with more excitation"
+            f". A position that reads as much too {'large' if off > 0 else 'small'}, or a current that reads "
+            f"{zero + i0 * off / (1.0 + off):.3g} A at zero would explain it (a factor on current, voltage or mass "
+            "would not). Check these two, and that one magnet alone carries the rotor; else record away from limits, "
+            "with more excitation"
         )
     values = {"k_i_over_m": found, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
     return Check(passed=passed, values=values, detail=detail)
