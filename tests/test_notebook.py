@@ -164,6 +164,7 @@ TRIES: dict[str, Callable[[Session], Any]] = {
     "simulate with inputs": lambda s: s.estimate.simulate(s.arrays["voltage"])["current"].shape == (4000,),
     "judge on another record": lambda s: s.estimate.validate(s.second).passed,
     "python-control": lambda s: s.estimate.to_control().nstates == 3,
+    "parameter on one line": lambda s: repr(s.estimate["k_i"]).startswith("<k_i = "),
     "a fit on one line": lambda s: "arx" in repr(s.fit),
     "a fit's table": lambda s: len(s.fit.to_dataframe()) >= 4,
     "a fit's summary": lambda s: "arx" in s.fit.summary(),

@@ -175,7 +175,10 @@ def test_linear_plants_go_to_python_control(results):
     plant = results["estimate"].to_control()
     assert isinstance(plant, control.StateSpace)
     assert plant.poles() == pytest.approx(results["estimate"].continuous.poles)
+    assert plant.input_labels == ["voltage"]
+    assert plant.state_labels == ["position", "velocity", "current"]
     assert results["fit"].to_control().dt == results["fit"].dt
+    assert results["fit"].to_control().output_labels == list(results["fit"].outputs)
     assert results["bearing"].to_control().nstates == 3
     assert not hasattr(results["nonlinear fit"], "to_control")
 

@@ -31,7 +31,7 @@ _NORMAL_95 = 1.959963984540054
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, repr=False)
 class EstimatedParameter:
     """One parameter as estimated."""
 
@@ -44,6 +44,11 @@ class EstimatedParameter:
     # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
     identifiable: bool
     data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
+
+    def __repr__(self) -> str:
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        spread = f" ± {self.sd:.2g}{unit}, 95 % interval {self.ci95[0]:.4g} … {self.ci95[1]:.4g}" if self.sd else unit
+        return f"<{self.name} = {self.value:.5g}{spread}, {self.role}>"
 
     @classmethod
     def of(

@@ -103,8 +103,13 @@ def _delayed(estimate: Estimate, u: Array) -> Array:
 
 
 def to_control(result: Any) -> Any:
-    """Return a linear plant as an object of python-control."""
+    """Return a linear plant as an object of python-control, its signals named."""
     if isinstance(result, BlackBoxFit):
-        return black_box_to_control(result.model)
+        found = black_box_to_control(result.model)
+        found.update_names(inputs=list(result.inputs), outputs=list(result.outputs))
+        return found
     at = linearised(result) if isinstance(result, NonlinearBearingEstimate) else result.continuous
-    return state_space_to_control(at.A, at.B, at.C)
+    found = state_space_to_control(at.A, at.B, at.C)
+    plant = model(result.model)
+    found.update_names(inputs=list(plant.inputs), outputs=list(plant.outputs), states=list(at.states))
+    return found
