@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Annotated
 
 from ambid.cli import options as opt
-from ambid.cli.output import Outputs, end
+from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 
 
@@ -48,5 +48,4 @@ def command(
             holdout=holdout, tick=tick,
         )  # fmt: skip
         outputs.give(found, tick)
-    outputs.show(found)
-    end(failed=strict and not found.passed)
+    outputs.show(found, strict=strict)

@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 from ambid.cli import options as opt
 from ambid.cli.options import option, switch
-from ambid.cli.output import Outputs, end
+from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
@@ -80,8 +80,7 @@ def command(
                 domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
             )  # fmt: skip
             outputs.give(found, tick)
-    outputs.show(found)
-    end(failed=strict and not found.passed)
+    outputs.show(found, strict=strict)
 
 
 def _order(text: str | None) -> int | Literal["auto"] | None:

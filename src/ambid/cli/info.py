@@ -8,7 +8,7 @@ from collections.abc import Iterable
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.output import Outputs, end
+from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
 
@@ -31,8 +31,7 @@ def info(
     with Outputs(record, rig, json=json, plot=plot, report=report) as outputs, progress("look") as show:
         found = info(record, rig, rate_hz=rate, gaps=gaps)
         outputs.give(found, show)
-    outputs.show(found)
-    end(failed=strict and not found.passed)
+    outputs.show(found, strict=strict)
 
 
 def models() -> None:

@@ -71,11 +71,15 @@ class Outputs(Files):
             pages = figure()
             self.stage(path, lambda beside: save(pages, beside))
 
-    def show(self, result: Result) -> None:
-        """Print a result, once the files are in place: its JSON after ``--json -``, else its text."""
+    def show(self, result: Result, *, strict: bool = False) -> None:
+        """Print a result, once the files are in place: its JSON after ``--json -``, else its text.
+
+        `strict`: end the verb with exit code 3 unless it is usable.
+        """
         from ambid.job import presentation
 
         if self._json == "-":
             typer.echo(self._document, nl=False)
         else:
             typer.echo(presentation.text(result, paint=painter()))
+        end(failed=strict and not result.passed)

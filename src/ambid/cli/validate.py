@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated
 
 from ambid.cli import options as opt
-from ambid.cli.output import Outputs, end
+from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 
 
@@ -32,5 +32,4 @@ def command(
     with Outputs(estimate, record, rig, json=json, plot=plot, report=report) as outputs, progress("validate") as show:
         found = validate(estimate, record, rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
         outputs.give(found, show)
-    outputs.show(found)
-    end(failed=strict and not found.passed)
+    outputs.show(found, strict=strict)
