@@ -56,12 +56,6 @@ def test_the_result_hangs_on_the_seed_and_not_on_the_workers() -> None:
     assert np.any(other.vector != one.vector)
 
 
-def test_a_start_that_is_given_is_never_lost() -> None:
-    good = np.full(5, 1e-4)
-    found = global_search(rastrigin, LOW, HIGH, seed=0, evaluations=100, starts=[good, 100.0 * HIGH])
-    assert found.cost <= rastrigin(good)
-
-
 def test_where_half_of_the_space_has_no_model_and_where_none_has() -> None:
     found = global_search(lambda x: rastrigin(x) if x[0] > 0.5 else np.nan, LOW, HIGH, seed=1, evaluations=8000)
     assert found.cost == pytest.approx(0.995, abs=1e-3)

@@ -29,6 +29,7 @@ _FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
 _TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
 _ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
 _AIM = 0.9  # of that part
+USE = 0.3  # of the way to the trips that an excitation may use
 _VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
 _NEAR = 0.85  # of the way to a trip: no room left
 
@@ -220,12 +221,10 @@ def find_amplitude(
     )  # fmt: skip
 
 
-def fitting_amplitude(
-    device: Device, rig: Rig, trial: Trial, *, use: float = 0.3, stopped: Callable[[], bool] = lambda: False
-) -> float:
+def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callable[[], bool] = lambda: False) -> float:
     """Find an amplitude for a device that has not run yet.
 
-    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `use`: part of the room; `stopped`: as
+    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `stopped`: as
     `session.run`. Returns peak in V.
     """
     look, room = make_look(device, rig, stopped), Room.of(rig)
@@ -233,7 +232,7 @@ def fitting_amplitude(
     reasons = why_incomplete(report, "the look before the excitation")
     if not reasons:
         resting = {role: float(seen[role].mean()) for role in room.trips}
-        found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=use)
+        found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=USE)
         if not found.reasons:
             return found.amplitude_v
         reasons = found.reasons

@@ -22,6 +22,7 @@ STAGE = "global search"
 _MUTATION = (0.5, 1.0)  # factor of the difference vectors, drawn anew for each generation
 _RECOMBINATION = 0.9  # numbers of a physical model hang together: most of them change at once
 _MEMBERS = 8  # of the population, for each number
+_TOLERANCE = 1e-3  # spread of the costs, relative to their mean, at which a search has ended
 _FEWEST = 16
 
 
@@ -45,9 +46,7 @@ def global_search(
     *,
     seed: int | Sequence[int],
     evaluations: int,
-    starts: Sequence[Array] = (),
     workers: int = 1,
-    tolerance: float = 1e-3,
     tick: Tick = silent,
     stage: str = STAGE,
     keep: Callable[[Array, float], None] | None = None,
@@ -55,21 +54,20 @@ def global_search(
     """Search for the least cost between bounds.
 
     `low`, `high`: (n,), finite, low below high. Scale what spans decades before (logarithm, inverse hyperbolic sine);
-    `seed`: equal seeds give equal results, with any number of workers; `evaluations`: of `cost`, at most; `starts`:
-    (n,), vectors of the first generation; moved to the bounds where they lie outside; `workers`: threads: they help
-    where `cost` leaves Python's lock (compiled loops, linear algebra).
+    `seed`: equal seeds give equal results, with any number of workers; `evaluations`: of `cost`, at most; `workers`:
+    threads: they help where `cost` leaves Python's lock (compiled loops, linear algebra).
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if low.shape != high.shape or not np.all(np.isfinite(low) & np.isfinite(high)) or not np.all(low < high):
         raise ValueError("bounds of a global search must be finite, and each lower one below its upper one")
     began = perf_counter()
     run = _Run(cost=cost, low=low, span=high - low, budget=evaluations, tick=tick, stage=stage, keep=keep)
-    first = _first_generation(low.size, evaluations, seed, [(np.asarray(s) - low) / (high - low) for s in starts])
+    first = _first_generation(low.size, evaluations, seed)
     if workers > 1:
         with ThreadPoolExecutor(workers) as pool:
-            last = _evolved(run, first, seed, tolerance, pool.map)
+            last = _evolved(run, first, seed, pool.map)
     else:
-        last = _evolved(run, first, seed, tolerance, map)
+        last = _evolved(run, first, seed, map)
     return GlobalFound(
         vector=run.vector,
         cost=run.least,
@@ -105,21 +103,16 @@ class _Run:
             yield value
 
 
-def _first_generation(n: int, budget: int, seed: int | Sequence[int], starts: Sequence[Array]) -> Array:
-    """A Sobol sequence, some of it replaced by the starts given."""
+def _first_generation(n: int, budget: int, seed: int | Sequence[int]) -> Array:
+    """A Sobol sequence."""
     from scipy.stats import qmc
 
     size = max(_FEWEST, min(_MEMBERS * n, budget // 10))
     power = int(np.ceil(np.log2(size)))
-    out = np.asarray(qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(power), dtype=np.float64)[:size]
-    for k, z in enumerate(starts[: size // 2]):
-        out[k] = np.clip(z, 0.0, 1.0)
-    return out
+    return np.asarray(qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(power), dtype=np.float64)[:size]
 
 
-def _evolved(
-    run: _Run, first: Array, seed: int | Sequence[int], tolerance: float, share: Callable[..., Iterable[Any]]
-) -> Array:
+def _evolved(run: _Run, first: Array, seed: int | Sequence[int], share: Callable[..., Iterable[Any]]) -> Array:
     """Members of the last generation, best first."""
     from scipy.optimize import differential_evolution
 
@@ -130,7 +123,7 @@ def _evolved(
 
     found = differential_evolution(
         run.value, [(0.0, 1.0)] * first.shape[1], strategy="best1bin", init=first, mutation=_MUTATION,
-        recombination=_RECOMBINATION, maxiter=max(run.budget // first.shape[0] - 1, 1), tol=tolerance, polish=False,
+        recombination=_RECOMBINATION, maxiter=max(run.budget // first.shape[0] - 1, 1), tol=_TOLERANCE, polish=False,
         updating="deferred", workers=evaluated, seed=np.random.default_rng(seed),
     )  # fmt: skip
     order = np.argsort(found.population_energies, kind="stable")

@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ambid.acquisition.amplitude import Look, Room, Trial, find_amplitude, moving_band, why_incomplete
+from ambid.acquisition.amplitude import USE, Look, Room, Trial, find_amplitude, moving_band, why_incomplete
 from ambid.acquisition.device import Device
 from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
 from ambid.acquisition.recording import Acquired
@@ -68,7 +68,7 @@ class Plan:
     settle_s: float = 1.0  # time that lift-off is given, s
     amplitude_v: float | None = None  # peak of the excitation, V; None: found by trials
     band_hz: tuple[float, float] | None = None  # of the excitation; None: a thousandth to a thirtieth of the rate
-    use: float = 0.3  # part of the way to the trips that the excitation may use
+    use: float = USE  # part of the way to the trips that the excitation may use
     # largest half width of a 95 % interval, relative to the value, of a parameter that counts as found
     widest: float = 0.10
     seed: int = 0  # of the excitation
