@@ -43,12 +43,12 @@ class DeviceError(AmbidError):
     """A controller, its port or its line: not there, not understood, refusing, or in its safe state."""
 
 
-def nearest(word: str, known: Sequence[str]) -> str:
+def nearest(word: object, known: Sequence[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known word closest to `word`, or an empty string.
 
     `word`: what was written; `known`: what may be written. Returns a sentence that begins with a space, or ``""``.
     """
-    close = difflib.get_close_matches(word, known, n=1, cutoff=0.4)
+    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
     return f" Did you mean {close[0]!r}?" if close else ""
 
 

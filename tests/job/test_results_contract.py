@@ -170,6 +170,52 @@ def test_models_predict_simulate_and_are_validated(results, record):
         results["estimate"].simulate(np.zeros((5, 2)))
 
 
+@pytest.mark.parametrize("ahead", [0, -1, 1.5, True, None, "3", 10**9])
+def test_what_is_no_number_of_samples_ahead_is_refused(results, record, ahead):
+    with pytest.raises(AmbidError, match="ahead is"):
+        results["estimate"].predict(record, ahead=ahead)
+
+
+@pytest.mark.parametrize("u", [[], "voltage", 1j * np.ones(9), [np.nan], np.ones((9, 2)), [[1], [1, 2]], {"u": [1.0]}])
+def test_what_are_no_inputs_is_refused(results, u):
+    with pytest.raises(AmbidError, match="voltage in SI units, are needed"):
+        results["estimate"].simulate(u)
+
+
+def test_a_table_without_time_is_predicted_and_judged_at_the_rate_that_is_said(results, record):
+    table, words = {name: record[name].values for name in record}, {"units": {"voltage": "V", "current": "A"}}
+    words["units"]["position"] = "m"
+    wanted = results["estimate"].predict(record)["current"]
+    found = results["estimate"].predict(table, rate_hz=record.rate_hz, **words)["current"]
+    np.testing.assert_array_equal(found, wanted)
+    with pytest.raises(AmbidError, match="rates must agree"):
+        results["estimate"].validate(table, rate_hz=2 * record.rate_hz, **words)
+
+
+def test_what_it_does_not_have_is_refused_under_any_key(results):
+    for key in ("nope", 0, None):
+        for kind in ("estimate", "fit", "track", "inspection"):
+            with pytest.raises(AmbidError, match="has no"):
+                results[kind][key]
+    assert "R" in results["estimate"]
+    assert list(results["estimate"]) == [p.name for p in results["estimate"].parameters]
+
+
+@pytest.mark.parametrize(
+    ("at", "value"),
+    [(("schema",), []), (("record", "samples"), None), (("continuous", "A"), []), (("parameters", "R", "sd"), -1.0)],
+)
+def test_a_file_that_was_edited_is_refused_on_reading(results, tmp_path, at, value):
+    document = json.loads(presentation.document(results["estimate"]))
+    part = document
+    for key in at[:-1]:
+        part = part[key]
+    part[at[-1]] = value
+    (tmp_path / "e.json").write_text(json.dumps(document))
+    with pytest.raises(AmbidError, match=r"has schema|is not a complete estimate"):
+        ambid.load(tmp_path / "e.json")
+
+
 def test_linear_plants_go_to_python_control(results):
     control = pytest.importorskip("control")
     plant = results["estimate"].to_control()

@@ -103,6 +103,12 @@ def test_missing_values_are_refused_or_treated_as_in_files():
 
 JITTERED = T + 0.4e-3 * (np.arange(N) == 20)
 REFUSED = {
+    "a rate in words": (PLAIN, {"rate_hz": "1000"}, "rate given is '1000'"),
+    "a truth as a rate": (PLAIN, {"rate_hz": True}, "rate given is True"),
+    "an absurd rate": (PLAIN, {"rate_hz": 1e300}, "up to 1e"),
+    "several rates": (PLAIN, {"rate_hz": [1.0]}, "positive number of Hz"),
+    "units without names": (PLAIN, {"rate_hz": RATE, "units": ["V", "mA"]}, "a unit by column"),
+    "numbers as objects": ({"u [V]": U.astype(object)}, {"rate_hz": RATE}, "numbers as objects"),
     "neither time nor rate": (PLAIN, {}, "no column 'time \\[s\\]'"),
     "rate against time": ({"time [s]": T} | PLAIN, {"rate_hz": 500.0}, "1000 Hz.*500 Hz"),
     "jitter": ({"time [s]": JITTERED} | PLAIN, {}, "row 20.*1 %"),
@@ -143,7 +149,7 @@ REFUSED = {
     "a LazyFrame": (pl.DataFrame(PLAIN).lazy(), {"rate_hz": RATE}, "collect"),
     "a DataArray": (dataset()["voltage"], {}, "to_dataset"),
     "an array": (np.c_[U, I], {"rate_hz": RATE}, "ndarray.*dict of arrays"),
-    "a list of tables": ([PLAIN], {"rate_hz": RATE}, "from a list"),
+    "a list of tables": ([PLAIN], {"rate_hz": RATE}, "of type list"),
     "nothing at all": (None, {}, "NoneType"),
 }  # fmt: skip
 

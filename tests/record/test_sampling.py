@@ -128,7 +128,7 @@ def test_cut_leaves_a_sound_record_alone():
 def test_cut_refuses_when_too_little_is_left():
     ramp = RAMP.copy()
     ramp[::5] = np.nan
-    with pytest.raises(RecordError, match="4 rows in its longest stretch"):
+    with pytest.raises(RecordError, match="4 rows of data in its longest stretch"):
         sample_uniformly(table(GRID, ramp), None, "cut")
     with pytest.raises(RecordError, match="no row without"):
         sample_uniformly(table(GRID, np.full(N, np.nan)), None, "cut")

@@ -12,7 +12,7 @@ from __future__ import annotations
 import json
 import math
 import types
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass
 from functools import lru_cache
 from pathlib import PurePath
@@ -146,6 +146,9 @@ class Parametric:
 
     def __getitem__(self, name: str) -> EstimatedParameter:
         return self.parameter(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.values)
 
     @property
     def values(self) -> dict[str, float]:
@@ -634,6 +637,8 @@ def _check_consistent(estimate: Estimate) -> None:
     if [p.name for p in estimate.parameters] != list(specs):
         raise ValueError(f"the parameters are not those of model {estimate.model!r}")
     for p in estimate.parameters:
+        if p.sd < 0:
+            raise ValueError(f"{p.name} has the standard deviation {p.sd:g}")
         if p.unit != specs[p.name].unit:
             raise ValueError(f"{p.name} is in {p.unit!r} instead of {specs[p.name].unit!r}")
         if not 1e-15 < abs(p.value) < 1e15 and (p.name in ("m", "L") or p.value != 0):
@@ -643,6 +648,10 @@ def _check_consistent(estimate: Estimate) -> None:
     size = len(estimate.covariance_names)
     if set(estimate.covariance_names) - set(specs) or estimate.covariance.shape != (size, size):
         raise ValueError("the covariance is not of the parameters")
+    if estimate.continuous.A.shape != (n, n) or estimate.continuous.C.shape != (n_y, n):
+        raise ValueError("the continuous plant is not of the model's size")
+    if estimate.continuous.B.shape != (n, len(plant.inputs)) or int(str(estimate.record["samples"])) < 1:
+        raise ValueError("the continuous plant or the record is not of the model's size")
     if not float(str(estimate.record["rate_hz"])) > 0 or estimate.status not in ("converged", "stalled"):
         raise ValueError("the record's rate or the status is not that of a finished estimate")
     for delay in (estimate.delay[role] for role in plant.inputs):

@@ -6,6 +6,7 @@ Results stand low, texts and figures high. A method of a result asks for what sh
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -155,7 +156,9 @@ class Predicting:
 
     __slots__ = ()
 
-    def predict(self, record: Any, *, ahead: int = 1) -> dict[str, Array]:
+    def predict(
+        self, record: Any, *, ahead: int = 1, rate_hz: float | None = None, units: Mapping[str, str] | None = None
+    ) -> dict[str, Array]:
         """Predict the outputs of a record some samples ahead; nothing but offsets and initial state is fitted.
 
         Parameters
@@ -164,28 +167,32 @@ class Predicting:
             Of the same bench and rate, as the verb's function takes it.
         ahead : int, optional
             Samples; 1: each sample from all before it.
+        rate_hz, units : optional
+            As the verb's function.
 
         Returns
         -------
         dict of str to ndarray, shape (n_samples,), SI
             By output; NaN where nothing precedes.
         """
-        found: dict[str, Array] = _predicted("predict")(self, record, ahead)
+        found: dict[str, Array] = _predicted("predict")(self, record, ahead, rate_hz=rate_hz, units=units)
         return found
 
-    def validate(self, record: Any) -> Any:
+    def validate(self, record: Any, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Any:
         """Judge the model on a further record, as ``ambid validate`` does.
 
         Parameters
         ----------
         record : Record, file or table
             Of the same bench and rate.
+        rate_hz, units : optional
+            As the verb's function.
 
         Returns
         -------
         Validation
         """
-        return _predicted("validated")(self, record)
+        return _predicted("validated")(self, record, rate_hz=rate_hz, units=units)
 
 
 class Simulating:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from numbers import Integral
+from typing import Any, Unpack
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form, run_states
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import signals_of
+from ambid.job.data import Reading, signals_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.linear_model import StateSpace, discretise, model
@@ -22,11 +23,14 @@ from ambid.physics.linear_model import StateSpace, discretise, model
 validated = validate
 
 
-def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int) -> dict[str, Array]:
+def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int, **reading: Unpack[Reading]) -> dict[str, Array]:
     """Predict the outputs of a record some samples ahead, (n_samples,) by output in SI; NaN where nothing precedes."""
-    if ahead < 1:
-        raise EstimationError(f"ahead is {ahead}; it is a number of samples, 1 or more. Correct it")
-    data = data_of(result, record, where="the result")
+    if isinstance(ahead, bool) or not isinstance(ahead, Integral) or ahead < 1:
+        raise EstimationError(f"ahead is {ahead!r}; it is a whole number of samples, 1 or more. Correct it")
+    ahead, data = int(ahead), data_of(result, record, where="the result", **reading)
+    n = int((data.record.y.shape if isinstance(result, NonlinearBearingEstimate) else (data.n_samples,))[0])
+    if ahead >= n:
+        raise EstimationError(f"ahead is {ahead}, and the record has {n} samples. Give a smaller number")
     if isinstance(result, Estimate):
         from ambid.estimation.likelihood import prediction_error
         from ambid.validation.second_record import replay
@@ -64,13 +68,19 @@ def _nonlinear(fit: NonlinearFit, data: Any, ahead: int) -> Array:
 
 def simulate(result: Estimate | AnyFit, u: Any, start: Any = None) -> dict[str, Array]:
     """Run a model on inputs alone, from rest at its operating point, (n_samples,) by output in SI."""
-    inputs = np.asarray(u, dtype=np.float64)
-    inputs = inputs[:, None] if inputs.ndim == 1 else inputs
-    wanted = len(model(result.model).inputs if isinstance(result, Estimate) else result.inputs)
-    if inputs.ndim != 2 or inputs.shape[1] != wanted or not np.all(np.isfinite(inputs)):
+    names = model(result.model).inputs if isinstance(result, Estimate) else result.inputs
+    try:
+        given = np.asarray(u)
+    except ValueError:  # rows of several lengths
+        given = np.empty(0, dtype=object)
+    inputs = given[:, None] if given.ndim == 1 else given
+    real = given.dtype.kind in "iuf" and inputs.size and np.all(np.isfinite(inputs))
+    if not real or inputs.ndim != 2 or inputs.shape[1] != len(names):
         raise EstimationError(
-            f"the inputs have shape {np.shape(u)}; finite numbers of shape (n_samples, {wanted}) are needed. Correct u"
+            f"the inputs have shape {given.shape} and type {given.dtype}; finite real numbers of shape (n_samples, "
+            f"{len(names)}), {', '.join(names)} in SI units, are needed. Correct u"
         )
+    inputs = inputs.astype(np.float64)
     if isinstance(result, Estimate):
         plant, at = model(result.model), result.operating_point
         y = _delayed(result, inputs - [at[role] for role in plant.inputs]) + [at[role] for role in plant.outputs]

@@ -69,8 +69,8 @@ def load(path: str | Path) -> Any:
             f"estimate {path} is nested too deeply, or holds a number that is too long. Give what 'ambid identify "
             "--json' wrote"
         ) from None
-    schema = document.get("schema") if isinstance(document, dict) else None
-    read: Callable[[Mapping[str, Any], str], Any] = _READERS[str(schema)] if schema in _READERS else _estimate
+    schema = str(document.get("schema")) if isinstance(document, dict) else ""
+    read: Callable[[Mapping[str, Any], str], Any] = _READERS.get(schema, _estimate)
     return read(document, str(path))
 
 

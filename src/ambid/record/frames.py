@@ -63,7 +63,7 @@ def read_table(
     `table`: a DataFrame of pandas or polars, a Dataset of xarray or a mapping; `rate_hz`: sampling rate in Hz, where it
     holds no time; `units`: by column, beside or instead of ``name [unit]``. Returns SI units.
     """
-    found = _table(_parts(table), units or {})
+    found = _table(_parts(table), units)
     if gaps == "error":
         refuse_gaps(found)
     return uniform_record(found, rate_hz, gaps)
@@ -71,7 +71,7 @@ def read_table(
 
 def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
     """Take the rows of a table as they stand, whatever is missing and however time runs (`ambid.record.rows`)."""
-    return record_of_rows(_table(_parts(table), units or {}), rate_hz)
+    return record_of_rows(_table(_parts(table), units), rate_hz)
 
 
 def to_dataframe(record: Record) -> Any:
@@ -129,8 +129,8 @@ def _parts(table: Any) -> _Parts:
         return _Parts(what="the dict of arrays", columns=columns)
     remedy = _REMEDIES.get(kind, 'Pass a file, or a dict of arrays such as {"voltage [V]": u} with rate_hz=')
     raise RecordError(
-        f"a record cannot be taken from a {type(table).__name__}; a file, a Record, a DataFrame, a Dataset or a dict of"
-        f" arrays can. {remedy}"
+        f"a record cannot be taken from what is of type {type(table).__name__}; a file, a Record, a DataFrame, a "
+        f"Dataset or a dict of arrays can. {remedy}"
     )
 
 
@@ -189,10 +189,12 @@ def _of_xarray(table: Any) -> _Parts:
     return _Parts(what="the Dataset", columns=columns, index=index)
 
 
-def _table(parts: _Parts, units: Mapping[str, str]) -> Table:
+def _table(parts: _Parts, units: Mapping[str, str] | None) -> Table:
     """Check names, units and numbers, and find time."""
+    if units is not None and not isinstance(units, Mapping):
+        raise RecordError(f"units is {units!r}; it holds a unit by column. Write units={{'voltage': 'V'}}")
     names, texts, arrays = list[str](), list[str | None](), list[Array]()
-    left, time = dict(units), None
+    left, time = dict(units or {}), None
     for column in parts.columns:
         name, text = _named(parts.what, column, left)
         if name in names:

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, RecordError, nearest
+from ambid.errors import LARGEST, AmbidError, RecordError, nearest
 
 if TYPE_CHECKING:
     import pandas
@@ -145,10 +145,7 @@ class Record:
     provenance: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.rate_hz) and self.rate_hz > 0):
-            raise RecordError(
-                f"the sampling rate is {self.rate_hz}; it must be a positive number of Hz. Correct --rate"
-            )
+        check_rate(self.rate_hz)
         if not self.channels:
             raise RecordError("the record has no channels; it needs at least one. Check the file's columns")
         names = [c.name for c in self.channels]
@@ -347,6 +344,9 @@ def cut(record: Record, from_s: float | None = None, to_s: float | None = None) 
         If an end lies outside the record, or nothing would be left.
     """
     begin, end = record.start_s, record.start_s + record.duration_s
+    for label, given in (("from", from_s), ("to", to_s)):
+        if not (given is None or isinstance(given, Real)):
+            raise RecordError(f"cut {label} {given!r}: it must be a time in s. Give a number")
     first_s = begin if from_s is None else float(from_s)
     last_s = end if to_s is None else float(to_s)
     slack = _GRID_TOLERANCE / record.rate_hz
@@ -363,6 +363,16 @@ def cut(record: Record, from_s: float | None = None, to_s: float | None = None) 
     channels = tuple(replace(c, values=c.values[first:last].copy()) for c in record.channels)
     step = Step(name="cut", settings={"from_s": first_s, "to_s": last_s, "samples": last - first})
     return record.with_step(step, channels=channels, start_s=begin + first / record.rate_hz)
+
+
+def check_rate(rate_hz: object) -> float:
+    """Return a sampling rate in Hz; refuse what is none, and what is absurd."""
+    if isinstance(rate_hz, Real) and not isinstance(rate_hz, bool) and 1.0 / LARGEST <= float(rate_hz) <= LARGEST:
+        return float(rate_hz)
+    raise RecordError(
+        f"the sampling rate given is {rate_hz!r}; it must be a positive number of Hz, up to {LARGEST:g}. Correct "
+        "rate_hz (--rate)"
+    )
 
 
 def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> bytes:

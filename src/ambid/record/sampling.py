@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import RecordError, UnitError
-from ambid.record.record import Channel, Record, Step
+from ambid.errors import RecordError, UnitError, counted
+from ambid.record.record import Channel, Record, Step, check_rate
 from ambid.record.rows import Rows
 from ambid.units import UNKNOWN, nearest_unit, parse_unit
 
@@ -63,7 +63,7 @@ def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) 
     `rate_hz`: has to agree with the record's, in Hz.
     """
     check_gap_policy(gaps)
-    if rate_hz is not None and not abs(rate_hz / record.rate_hz - 1) <= JITTER:
+    if rate_hz is not None and not abs(check_rate(rate_hz) / record.rate_hz - 1) <= JITTER:
         raise RecordError(
             f"{where} was sampled at {record.rate_hz:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz. Omit it"
         )
@@ -154,7 +154,7 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
     """
     check_gap_policy(gaps)
     _check_rate(table, rate_hz)
-    _enough(table.values.shape[0], table.where, "rows")
+    _enough(table.values.shape[0], table.where, "row")
     steps: list[Step] = []
     values, first = table.values, 0
     if gaps == "interpolate":
@@ -187,12 +187,12 @@ def usual_rate(table: Table, rate_hz: float | None) -> tuple[float, float]:
 
 
 def _check_rate(table: Table, rate_hz: float | None) -> None:
-    if rate_hz is not None and not (np.isfinite(rate_hz) and rate_hz > 0):
-        raise RecordError(f"the sampling rate given is {rate_hz}; it must be a positive number of Hz. Correct --rate")
+    if rate_hz is not None:
+        check_rate(rate_hz)
     if table.time is None and rate_hz is None:
         raise RecordError(
             f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
-            " Add the column, or give --rate HZ"
+            " Add the column, or give rate_hz (--rate)"
         )
 
 
@@ -201,8 +201,8 @@ def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
     found = float(f"{found_hz:.10g}")  # stamps carry no more than 10 digits of a rate
     if rate_hz is not None and abs(rate_hz / found - 1) > JITTER:
         raise RecordError(
-            f"{table.where}: its time column says {found:g} Hz but --rate says {rate_hz:g} Hz; they must agree."
-            " Give one of them only"
+            f"{table.where}: its time column says {found:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz; they must "
+            "agree. Give one of them only"
         )
     return found
 
@@ -216,9 +216,11 @@ def check_gap_policy(gaps: str) -> None:
         raise RecordError(f"gaps = {gaps!r} is not known. Choose one of {', '.join(GAP_POLICIES)}")
 
 
-def _enough(n: int, where: str, what: str) -> None:
+def _enough(n: int, where: str, what: str, more: str = "") -> None:
     if n < MIN_SAMPLES:
-        raise RecordError(f"{where} has {n} {what} of data; a record needs at least {MIN_SAMPLES}. Record for longer")
+        raise RecordError(
+            f"{where} has {counted(n, what)} of data{more}; a record needs at least {MIN_SAMPLES}. Record for longer"
+        )
 
 
 def _check_uniform(time: Array, where: str, name: str, first_row: int | None) -> None:
@@ -241,7 +243,7 @@ def _check_uniform(time: Array, where: str, name: str, first_row: int | None) ->
             k,
             f"advances by {steps[k - 1] / period:.4g} samples instead of 1 within 1 %",
             "Uniform sampling is required: print time with more digits, resample before, treat drop-outs with"
-            " --gaps interpolate or --gaps cut, or remove the time column and give --rate HZ",
+            " --gaps interpolate or --gaps cut, or remove the time column and give rate_hz (--rate)",
         )
 
 
@@ -267,7 +269,7 @@ def _irregular(time: Array, period: float) -> NDArray[np.bool_]:
 def _period_of(time: Array, where: str) -> float:
     """Return the usual interval of a time column that has gaps (NaN)."""
     known = time[np.isfinite(time)]
-    _enough(known.size, where, "usable rows")
+    _enough(known.size, where, "usable row")
     period = _usual_interval(np.diff(known))
     if not period > 0:
         raise RecordError(f"{where}: time does not increase from row to row; sort the rows, or remove the time column")
@@ -349,7 +351,7 @@ def _longest_stretch(table: Table, steps: list[Step]) -> tuple[int, Array]:
         raise RecordError(f"{table.where} has no row without a missing value. Check what was recorded")
     best = int(np.argmax(stops - starts))
     start, stop = int(starts[best]), int(stops[best])
-    _enough(stop - start, table.where, "rows in its longest stretch without a gap")
+    _enough(stop - start, table.where, "row", " in its longest stretch without a gap")
     if stop - start < values.shape[0]:
         settings = {"first": start, "kept": stop - start, "dropped": values.shape[0] - (stop - start)}
         steps.append(Step(name="gaps_cut", settings=settings))

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, RecordError, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.record import Channel, Record
 from ambid.rig.roles import rank_roles
@@ -56,7 +56,13 @@ class Inspection(Result):
         return self.faults
 
     def __getitem__(self, name: str) -> ChannelLook:
-        return next(c for c in self.channels if c.name == name)
+        found = next((c for c in self.channels if c.name == name), None)
+        if found is None:
+            names = [c.name for c in self.channels]
+            raise RecordError(
+                f"the record has no channel {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
+            )
+        return found
 
 
 def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
