@@ -216,6 +216,16 @@ def test_a_file_that_was_edited_is_refused_on_reading(results, tmp_path, at, val
         ambid.load(tmp_path / "e.json")
 
 
+@pytest.mark.parametrize("factor", [1e160, 1e-310])
+def test_values_whose_squares_overflow_or_vanish_are_refused_without_a_warning(record, factor):
+    table = {f"{c.name} [{c.unit}]": c.values for c in record.channels}
+    table["voltage [V]"] = factor * table["voltage [V]"]
+    with pytest.raises(AmbidError, match="no sensor shows"):
+        ambid.identify(table, rate_hz=record.rate_hz)
+    if factor < 1:
+        assert ambid.info(table, rate_hz=record.rate_hz)["voltage"].unit == "V"
+
+
 def test_linear_plants_go_to_python_control(results):
     control = pytest.importorskip("control")
     plant = results["estimate"].to_control()

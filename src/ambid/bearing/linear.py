@@ -203,6 +203,12 @@ def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]
                     f"channel {role!r} is constant at {column[0]:g} over the whole record; nothing can be identified "
                     "from it. Check the sensor and its wiring, or the column the rig names"
                 )
+            largest = float(np.max(np.abs(column)))
+            if not 1e-100 < largest < 1e100:  # squares overflow or vanish
+                raise EstimationError(
+                    f"channel {role!r} reaches {largest:.3g} in SI units, which no sensor shows. Correct the export, "
+                    "or the gain in the rig"
+                )
 
 
 def carry(fit: Fit, problem: PredictorProblem) -> Array:

@@ -8,6 +8,7 @@ a second-order response to the force: coherent with current and voltage where it
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -116,7 +117,8 @@ def _named(c: Channel, role: str, record: Record) -> Candidate:
     if np.ptp(c.values) > 0:
         try:
             ratio = snr(record, c.name)
-            part = ratio.signal_sd**2 / (ratio.signal_sd**2 + ratio.noise_sd**2)
+            whole = math.hypot(ratio.signal_sd, ratio.noise_sd)
+            part = (ratio.signal_sd / whole) ** 2 if whole else 0.0  # 0: the squares of its values vanish
         except AmbidError:
             part = 0.5  # too short to tell
     return Candidate(role=role, channel=c, named=_name(c, role), signal=part, fits=0.0, why="")
