@@ -50,7 +50,7 @@ CASES = {
     "broken delay": ("delay = 2", "delay = 1.5", ["channels.voltage.delay", "1.5", "whole number", "auto"]),
     "delay in words": ("delay = 2", 'delay = "one"', ["channels.voltage.delay", "'one'", "auto"]),
     "bool delay": ("delay = 2", "delay = true", ["channels.voltage.delay", "whole number"]),
-    "delay of an output": ("gain = 0.5", 'delay = "auto"\ngain = 0.5', ["channels.current.delay", "inputs (voltage)"]),
+    "delay of an output": ("gain = 0.5", 'delay = "auto"\ngain = 0.5', ["channels.current.delay", "inputs only"]),
     "table and gain": ("delay = 2", "gain = 2.0", ["channels.voltage", "both a table and a gain"]),
     "table missing": ("table.csv", "tabel.csv", ["channels.voltage.table", "does not exist", "table.csv"]),
     "gain of zero": ("gain = 0.5", "gain = 0", ["channels.current.gain", "0"]),

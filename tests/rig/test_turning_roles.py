@@ -56,7 +56,7 @@ def test_turns_per_second_are_not_taken_for_an_angular_speed(rig_file):
 
 
 def test_a_delay_or_a_misspelt_role_is_refused(rig_file):
-    with pytest.raises(RigError, match=r"channels\.speed\.delay.*of inputs"):
+    with pytest.raises(RigError, match=r"channels\.speed\.delay.*inputs only"):
         load_rig(rig_file(PLAIN + TURNING + 'delay = "auto"\n'))
     with pytest.raises(RigError, match=r"unknown role \[channels\.sped\].*'speed'"):
         load_rig(rig_file(PLAIN + '[channels.sped]\ncolumn = "tacho"\n'))
