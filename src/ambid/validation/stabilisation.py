@@ -19,6 +19,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.subspace import subspace_models
 from ambid.errors import EstimationError, nearest
+from ambid.estimation.modes import assurance
 
 Complex = NDArray[np.complex128]
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
@@ -130,16 +131,6 @@ def _mark(p: ModePole, before: Sequence[ModePole]) -> ModePole:
     same_damping = abs(c - d) <= _DAMPING * max(abs(c), abs(d), 0.1)
     stable = same_frequency and same_damping and assurance(p.shape, near.shape) >= _SHAPE
     return replace(p, stable_frequency=same_frequency, stable=stable)
-
-
-def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
-    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
-
-    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
-    """
-    a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
-    size = float(np.vdot(a, a).real * np.vdot(b, b).real)
-    return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
 
 
 def _modes(poles: Sequence[ModePole], largest: int) -> tuple[Mode, ...]:

@@ -1,0 +1,99 @@
+"""A mode of vibration with its uncertainty, and how much two modes are alike.
+
+The value that every estimator of modes gives: from a frequency response, from outputs alone, or from a rotor's physical
+parameters. Likeness of shapes is the modal assurance criterion (Allemang and Brown 1982).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+
+NORMAL_95 = 1.959963984540054
+_SEEN = 0.25  # relative standard deviation up to which data show a number, as for parameters
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EstimatedNumber:
+    """A number as estimated."""
+
+    value: float
+    sd: float
+    ci95: tuple[float, float]
+    identifiable: bool  # whether the data show it
+
+    @classmethod
+    def of(
+        cls, value: float, sd: float, *, quantile: float = NORMAL_95, size: float | None = None, shown: bool = True
+    ) -> EstimatedNumber:
+        """Return a number with its interval, value -+ quantile sd.
+
+        `size`: what the standard deviation is judged against where that is not the value itself; `shown`: False where
+        something else says that the data do not show it.
+        """
+        judged = abs(value) if size is None else size
+        sound = bool(np.isfinite(sd) and np.isfinite(value))
+        return cls(
+            value=float(value),
+            sd=float(sd),
+            ci95=(float(value - quantile * sd), float(value + quantile * sd)),
+            identifiable=shown and sound and sd <= _SEEN * judged,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Mode:
+    """A mode: natural frequency |pole|/(2 pi), damping -Re(pole)/|pole|, and its shape over outputs or planes."""
+
+    frequency_hz: EstimatedNumber
+    damping: EstimatedNumber  # ratio
+    shape: Mapping[str, EstimatedNumber]  # by name; as the estimator scales it: largest 1, or modal mass 1 kg
+    # part of the shape a quarter of a period later, where outputs do not move in step; none of a real shape
+    shape_quadrature: Mapping[str, EstimatedNumber] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def complex_shape(self) -> dict[str, complex]:
+        """The shape as complex numbers, by name."""
+        late = self.shape_quadrature
+        return {k: complex(x.value, late[k].value if k in late else 0.0) for k, x in self.shape.items()}
+
+    @property
+    def identifiable(self) -> bool:
+        """Whether the data show both frequency and damping."""
+        return self.frequency_hz.identifiable and self.damping.identifiable
+
+
+def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
+    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
+
+    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
+    """
+    a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
+    size = float(np.vdot(a, a).real * np.vdot(b, b).real)
+    return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
+
+
+def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
+    """Return the modal assurance criterion of each mode with each of others, on the outputs that both have.
+
+    Returns (n_ones, n_others), 0 to 1. EstimationError where fewer than two outputs have the same name: with one, all
+    shapes are alike.
+    """
+    found = np.zeros((len(ones), len(others)))
+    for i, a in enumerate(ones):
+        for j, b in enumerate(others):
+            own, other = a.complex_shape, b.complex_shape
+            both = [name for name in own if name in other]
+            if len(both) < 2:
+                raise EstimationError(
+                    f"two lists of modes share {len(both)} outputs ({', '.join(own)}; {', '.join(other)}); a "
+                    "comparison of shapes needs two of the same name. Name the outputs alike"
+                )
+            found[i, j] = assurance([own[k] for k in both], [other[k] for k in both])
+    return found
