@@ -17,9 +17,20 @@ from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitErro
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
+from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
-from ambid.rig.rig import DAQ_RATE_HZ, OPTIONAL_ROLES, Daq, RecordSettings, Rig, RigChannel, RigMagnet, role_units
+from ambid.rig.rig import (
+    DAQ_RATE_HZ,
+    Daq,
+    RecordSettings,
+    Rig,
+    RigChannel,
+    RigMagnet,
+    optional_roles,
+    role_units,
+)
+from ambid.rig.rotor import modes_of, planes_of, rotor_of
 from ambid.units import UNKNOWN, Unit, parse_unit
 
 if TYPE_CHECKING:
@@ -110,9 +121,14 @@ def default_rig(model_name: str = "one-axis") -> Rig:
 def _build(file: RigFile, path: Path) -> Rig:
     where = f"rig {path}"
     try:
-        plant = model(file.model)
+        plant = rotor_of(file, where) if file.bearings else model(file.model)
     except ModelError as error:
         raise RigError(f"{where}: {error}") from None
+    if not file.bearings and (file.modes or file.speed):
+        key = "modes" if file.modes else "speed"
+        raise RigError(
+            f"{where}: {key} is given, but no [bearings.X]; only a rotor on many axes has it. Add its bearings"
+        )
     record = file.record
     if record.from_ is not None and record.to is not None and record.to <= record.from_:
         raise RigError(f"{where}: record.to is {record.to} s, not after record.from = {record.from_} s. Correct one")
@@ -122,7 +138,9 @@ def _build(file: RigFile, path: Path) -> Rig:
         name=file.name,
         model=file.model,
         channels=channels,
-        parameters=_parameters(file.parameters, plant, where),
+        parameters=_parameters({**file.parameters, **planes_of(file)}, plant, where),
+        rotor=plant if isinstance(plant, RotorModel) else None,
+        modes=modes_of(file),
         magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop) if file.loop else None,
@@ -161,7 +179,7 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
     for role in units:
         if role in entries:
             channels.append(_channel(role, entries[role], units[role], plant, path))
-        elif role not in OPTIONAL_ROLES:
+        elif role not in optional_roles(plant):
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
             )
@@ -574,7 +592,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
     UnitError
         If a column's unit is missing or unknown, or is not the role's and no gain or table turns it into that.
     """
-    wanted = role_units(model(rig.model))
+    wanted = role_units(rig.plant)
     if any(step.name == SELECTED.name for step in record.history):
         return _through_a_rig(record, rig, wanted)
     for c in rig.channels:
@@ -599,7 +617,7 @@ def bench_record(record: Record, rig: Rig, *, beside: Sequence[str] = ()) -> Rec
 
 def _taken_back(record: Record, rig: Rig) -> Record:
     """Take channels that are logged late earlier by their delays, at the cost of the record's end."""
-    inputs = model(rig.model).inputs
+    inputs = rig.plant.inputs
     late = {c.role: int(c.delay) for c in rig.channels if c.role not in inputs and c.delay not in ("auto", 0)}
     if not late:
         return record
@@ -618,7 +636,7 @@ def _through_a_rig(record: Record, rig: Rig, wanted: Mapping[str, str]) -> Recor
     """Check a record whose channels are named by role already."""
     for c in rig.channels:
         unit = record.channel(c.role).unit if c.role in record else None
-        if unit != wanted[c.role] and not (unit is None and c.role in OPTIONAL_ROLES):
+        if unit != wanted[c.role] != UNKNOWN and not (unit is None and c.role in optional_roles(rig.plant)):
             has = "is not there" if unit is None else f"is in [{unit}]"
             raise RecordError(
                 f"the record went through a rig already (columns became {', '.join(record)}); its channel {c.role!r} "
@@ -647,7 +665,7 @@ def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
 
 def _refuse_swapped(found: dict[str, Channel], wanted: dict[str, str], rig: Rig) -> None:
     """Refuse two columns each of which has exactly the unit of the other's role."""
-    plain = [c.role for c in rig.channels if c.calibration is None and found[c.role].unit != wanted[c.role]]
+    plain = [c.role for c in rig.channels if c.calibration is None and found[c.role].unit != wanted[c.role] != UNKNOWN]
     for a in plain:
         for b in plain:
             if a != b and found[a].unit == wanted[b] and found[b].unit == wanted[a]:
@@ -660,7 +678,7 @@ def _refuse_swapped(found: dict[str, Channel], wanted: dict[str, str], rig: Rig)
 def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, Step | None]:
     """Return the channel in the role's unit, and the line for the history if it was calibrated."""
     if c.calibration is None:
-        if channel.unit != unit:
+        if channel.unit != unit != UNKNOWN:
             raise UnitError(
                 f"column {channel.name!r} is in [{channel.source_unit}]; the rig needs a {c.role} in [{unit}]."
                 f" Fix the header, or give channels.{c.role}.gain or table"

@@ -6,7 +6,7 @@ import json
 import math
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 from typing import Literal
@@ -14,6 +14,7 @@ from typing import Literal
 from ambid.errors import RigError, nearest
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
+from ambid.physics.rotor_model import RotorModel
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
 
@@ -25,6 +26,7 @@ DAQ_RATE_HZ = 2000.0
 
 OPTIONAL_ROLES: Mapping[str, str] = MappingProxyType({"reference": "m", "speed": "rad/s", "angle": "rad"})
 """Roles that every model may have beside its own, with their units: set point, speed and angle of a turning rotor."""
+_TURNING_ROLES = {role: OPTIONAL_ROLES[role] for role in ("speed", "angle")}
 _EMPTY: Mapping[str, float] = MappingProxyType({})
 
 
@@ -193,6 +195,14 @@ class RigMagnet:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RigModes:
+    """What is known of the bending modes of a rotor."""
+
+    count: int | None = None  # how many are in the excited band; None: the record decides
+    frequency_hz: tuple[float, ...] = ()  # where they may be found; searched everywhere without
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rig:
     """A bench: model, channels and their calibration, parameters, loop, noise. All numbers SI.
 
@@ -209,6 +219,10 @@ class Rig:
         model's default where it has one.
     magnet : RigMagnet or None
         What is known of the nonlinear law of its magnet.
+    rotor : RotorModel or None
+        Bearings, axes, planes and speed of a rotor on many axes (``[bearings.X]``).
+    modes : RigModes
+        What is known of its bending modes.
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
@@ -232,6 +246,8 @@ class Rig:
     channels: tuple[RigChannel, ...]
     parameters: tuple[Parameter, ...]
     magnet: RigMagnet | None = None
+    rotor: RotorModel | None = None
+    modes: RigModes = field(default_factory=RigModes)
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
     limits: Limits | None = None
@@ -240,6 +256,11 @@ class Rig:
     daq: Daq | None = None
     open_loop: bool = False
     source: Path | None = None
+
+    @property
+    def plant(self) -> LinearModel:
+        """The linear model of the rig: the rotor of its bearings, or the one-axis model that it names."""
+        return model(self.model) if self.rotor is None else self.rotor
 
     def channel(self, role: str) -> RigChannel:
         """Return the channel of a role.
@@ -318,9 +339,14 @@ class Rig:
 def role_units(plant: LinearModel) -> dict[str, str]:
     """Return the roles that a rig of this model may name, with their SI units.
 
-    `plant`: a model. Returns its inputs, its outputs, and `OPTIONAL_ROLES`.
+    `plant`: a model. Returns its inputs, its outputs, and the roles that are `optional_roles`.
     """
-    return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **OPTIONAL_ROLES}
+    return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **optional_roles(plant)}
+
+
+def optional_roles(plant: LinearModel) -> Mapping[str, str]:
+    """Return the roles that a rig of this model may leave out, with their SI units; ``"?"``: any unit."""
+    return OPTIONAL_ROLES if not isinstance(plant, RotorModel) else {**_TURNING_ROLES, **plant.optional_roles}
 
 
 def write_rig(rig: Rig, path: str | Path) -> None:
@@ -368,13 +394,16 @@ def rig_text(rig: Rig, folder: Path) -> str:
     """
     lines = ['schema = "ambid.rig/1"', f"name = {toml_text(rig.name)}", f"model = {toml_text(rig.model)}"]
     lines += ["open_loop = true"] if rig.open_loop else []
-    inputs = model(rig.model).inputs
+    lines += [f'speed = {{ value = {rig.rotor.speed!r}, unit = "rad/s" }}'] if rig.rotor and rig.rotor.speed else []
+    lines += _rotor_lines(rig) if rig.rotor else []
+    inputs = rig.plant.inputs
     for c in rig.channels:
         lines += ["", *_channel_lines(c, folder, is_input=c.role in inputs)]
-    lines += ["", "[parameters]", *(_parameter_line(p) for p in rig.parameters)]
+    planes = () if rig.rotor is None else rig.rotor.places
+    lines += ["", "[parameters]", *(_parameter_line(p) for p in rig.parameters if p.name not in planes)]
     if rig.magnet is not None:
         lines += ["", *_magnet_lines(rig.magnet)]
-    units = role_units(model(rig.model))
+    units = role_units(rig.plant)
     if rig.operating_point:
         lines += ["", "[operating_point]"]
         lines += [f'{role} = {{ value = {x!r}, unit = "{units[role]}" }}' for role, x in rig.operating_point.items()]
@@ -424,7 +453,29 @@ def _parameter_line(p: Parameter) -> str:
     entries = [f"value = {p.value!r}"] if p.value is not None else []
     entries += [f'unit = "{p.unit}"', f'role = "{p.role}"']
     entries += [f"sd = {p.sd!r}"] if p.sd is not None else []
-    return f"{p.name} = {{ {', '.join(entries)} }}"
+    return f"{toml_text(p.name) if '.' in p.name else p.name} = {{ {', '.join(entries)} }}"
+
+
+def _rotor_lines(rig: Rig) -> list[str]:
+    assert rig.rotor is not None
+    lines: list[str] = []
+
+    def plane(name: str) -> str:
+        return _parameter_line(replace(rig.parameter(name), name="x")).removeprefix("x = ")
+
+    for b in rig.rotor.bearings:
+        lines += ["", f"[bearings.{b.name}]", f"axes = {json.dumps(list(b.axes))}"]
+        if b.axial:
+            lines.append("axial = true")
+            continue
+        lines.append(f"z = {plane(f'{b.name}.z')}")
+        read = [plane(b.sensor_parameter(k)) for k in range(len(b.z_sensors))]
+        lines.append(f"z_sensor = {read[0]}" if len(read) == 1 else f"z_sensors = [{', '.join(read)}]")
+    if rig.modes != RigModes():
+        count = '"auto"' if rig.modes.count is None else rig.modes.count
+        lines += ["", "[modes]", f"count = {count}"]
+        lines += [f"frequency_hz = {list(rig.modes.frequency_hz)}"] if rig.modes.frequency_hz else []
+    return lines
 
 
 def _magnet_lines(magnet: RigMagnet) -> list[str]:

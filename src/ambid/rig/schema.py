@@ -29,6 +29,9 @@ Name = Annotated[
 ]
 
 
+AxisName = Annotated[str, Field(strict=True, max_length=40, pattern=r"^[A-Za-z][A-Za-z0-9]*$")]
+
+
 class _Entry(BaseModel):
     """Unknown keys are refused everywhere."""
 
@@ -158,6 +161,32 @@ class MagnetEntry(_Entry):
     parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
 
 
+class PlaneEntry(_Entry):
+    """Where something stands along the shaft: fixed where a value is given, unless told otherwise."""
+
+    value: Number | None = None
+    unit: Text
+    role: Literal["free", "fixed", "prior"] | None = None
+    sd: Number | None = None
+
+
+class BearingEntry(_Entry):
+    """``[bearings.<name>]``: a radial bearing with its planes and axes, or an axial one."""
+
+    z: PlaneEntry | None = None
+    z_sensor: PlaneEntry | None = None
+    z_sensors: list[PlaneEntry] | None = None
+    axes: Annotated[list[AxisName], Field(min_length=1, max_length=2)]
+    axial: Annotated[bool, Field(strict=True)] = False
+
+
+class ModesEntry(_Entry):
+    """``[modes]``: how many bending modes a rotor has, and where they may be."""
+
+    count: Literal["auto"] | Whole = "auto"
+    frequency_hz: list[Positive] = Field(default_factory=list)
+
+
 class RigFile(_Entry):
     """The whole file."""
 
@@ -167,6 +196,9 @@ class RigFile(_Entry):
     channels: dict[str, ChannelEntry] = Field(default_factory=dict)
     parameters: dict[str, ParameterEntry] = Field(default_factory=dict)
     magnet: MagnetEntry | None = None
+    bearings: dict[AxisName, BearingEntry] = Field(default_factory=dict)
+    modes: ModesEntry | None = None
+    speed: QuantityEntry | None = None
     operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
     loop: LoopEntry | None = None
     noise: NoiseEntry | None = None
@@ -181,6 +213,11 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("parameters", "*"): ParameterEntry,
     ("magnet",): MagnetEntry,
     ("magnet", "parameters", "*"): ParameterEntry,
+    ("bearings", "*"): BearingEntry,
+    ("bearings", "*", "z"): PlaneEntry,
+    ("bearings", "*", "z_sensor"): PlaneEntry,
+    ("modes",): ModesEntry,
+    ("speed",): QuantityEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,
     ("loop", "limits"): LimitsEntry,
@@ -294,7 +331,10 @@ def _unknown_key(keys: list[str]) -> str:
     """Name an unknown key, the table it stands in, and the nearest known key."""
     *table, key = keys
     pattern = tuple(table)
-    entry = _ENTRIES.get(pattern) or _ENTRIES.get((*pattern[:-1], "*"), RigFile)
+    near = (
+        p for p in _ENTRIES if len(p) == len(pattern) and all(a in ("*", b) for a, b in zip(p, pattern, strict=True))
+    )
+    entry = _ENTRIES[next(near, ())]
     known = [field.alias or name for name, field in entry.model_fields.items()]
     inside = f"in [{'.'.join(table)}]" if table else "at the top"
     return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"

@@ -1,0 +1,129 @@
+"""From the tables of a rig file to a rotor on many axes: its bearings, planes and speed, and what drives it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+from ambid.errors import RigError, UnitError
+from ambid.physics.rotor_model import Bearing, Drive, RotorModel
+from ambid.rig.rig import RigModes
+from ambid.units import parse_unit
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, RigFile
+
+_SPEEDS = {"rad/s": 1.0, "Hz": 6.283185307179586}
+"""SI units in which a speed may be given, and what makes rad/s of them."""
+
+
+def rotor_of(file: RigFile, where: str) -> RotorModel:
+    """Return the rotor that a rig file describes by ``[bearings.X]``.
+
+    `where`: the file, for messages. An axis with a voltage channel, or of a rig without channels, is driven by that
+    voltage; one with a current alone by its current.
+    """
+    if file.model != "rotor":
+        raise RigError(f'{where}: [bearings] are given, but the model is {file.model!r}. Set model = "rotor"')
+    bearings = tuple(_bearing(name, entry, f"{where}: bearings.{name}") for name, entry in file.bearings.items())
+    speed = _speed(file, where)
+    axes = [axis for b in bearings for axis in b.axes]
+    drives: list[Drive] = []
+    for axis in axes:
+        driven = not file.channels or f"{axis}_voltage" in file.channels
+        if not driven and f"{axis}_current" not in file.channels:
+            raise RigError(
+                f"{where}: axis {axis!r} has neither [channels.{axis}_voltage] nor [channels.{axis}_current]; one of "
+                "them drives it. Add it with its column"
+            )
+        drives.append("voltage" if driven else "current")
+    known = {f"{axis}.{what}" for axis in axes for what in ("gain", "sensor_pole")} | {"a"}
+    return RotorModel(
+        bearings=bearings, speed=speed, drives=tuple(drives),
+        polar=bool(speed) or "angle" in file.channels or "speed" in file.channels or "Ip" in file.parameters,
+        extras=tuple(sorted(name for name in file.parameters if name in known)),
+    )  # fmt: skip
+
+
+def planes_of(file: RigFile) -> Mapping[str, ParameterEntry]:
+    """Return the planes of all bearings and sensors as parameters, under the names of the model."""
+    from ambid.rig.schema import ParameterEntry
+
+    def entry(plane: PlaneEntry) -> ParameterEntry:
+        role = plane.role or ("free" if plane.value is None else "fixed")
+        return ParameterEntry(value=plane.value, unit=plane.unit, role=role, sd=plane.sd)
+
+    found: dict[str, ParameterEntry] = {}
+    for name, given in file.bearings.items():
+        if not given.axial:
+            bearing = Bearing(name=name, axes=tuple(given.axes))
+            planes = [
+                (f"{name}.z", given.z),
+                *((bearing.sensor_parameter(k), z) for k, z in enumerate(_read_at(given))),
+            ]
+            found |= {place: entry(plane) for place, plane in planes if plane is not None}
+    return found
+
+
+def modes_of(file: RigFile) -> RigModes:
+    """Return what a rig file says of bending modes."""
+    if file.modes is None:
+        return RigModes()
+    count = None if file.modes.count == "auto" else int(file.modes.count)
+    return RigModes(count=count, frequency_hz=tuple(file.modes.frequency_hz))
+
+
+def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
+    if given.axial:
+        if len(given.axes) != 1:
+            raise RigError(f"{place} is axial with {len(given.axes)} axes; it has one. Name one, or remove axial")
+        return Bearing(name=name, axes=tuple(given.axes), axial=True)
+    if given.z is None:
+        raise RigError(
+            f'{place}.z is missing; the magnet stands there along the shaft. Give z = {{ value = …, unit = "mm" }}'
+        )
+    if given.z_sensor is not None and given.z_sensors is not None:
+        raise RigError(f"{place} has both z_sensor and z_sensors; it has one of them. Remove one")
+    sensors = _read_at(given)
+    if not sensors:
+        raise RigError(
+            f"{place}.z_sensor is missing; it is the plane of the sensor. Give it, equal to z if they are one"
+        )
+    values = [None if plane.value is None else _metres(plane, place) for plane in sensors]
+    return Bearing(
+        name=name,
+        axes=tuple(given.axes),
+        z=None if given.z.value is None else _metres(given.z, place),
+        z_sensors=tuple(values),
+    )
+
+
+def _read_at(given: BearingEntry) -> list[PlaneEntry]:
+    """Return the planes of the sensors of a bearing."""
+    return given.z_sensors or ([] if given.z_sensor is None else [given.z_sensor])
+
+
+def _metres(plane: PlaneEntry, place: str) -> float:
+    try:
+        unit = parse_unit(plane.unit)
+    except UnitError as error:
+        raise RigError(f"{place}: {error}") from None
+    if unit.si != "m":
+        raise RigError(f"{place} has a plane in [{plane.unit}]; it is measured in [m]. Correct unit")
+    assert plane.value is not None
+    return unit.to_si(plane.value)
+
+
+def _speed(file: RigFile, where: str) -> float:
+    """Return the speed of a rig in rad/s, 0 where it gives none."""
+    if file.speed is None:
+        return 0.0
+    try:
+        unit = parse_unit(file.speed.unit)
+    except UnitError as error:
+        raise RigError(f"{where}: speed.unit: {error}") from None
+    if unit.si not in _SPEEDS:
+        raise RigError(
+            f"{where}: speed is in [{file.speed.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit"
+        )
+    return unit.to_si(file.speed.value) * _SPEEDS[unit.si]
