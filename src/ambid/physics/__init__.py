@@ -1,4 +1,4 @@
-"""Parameters, magnets, models and their exact discretisation, control loop, presets."""
+"""Parameters, magnets, models and their exact discretisation, control loop, presets, shafts and their whirl."""
 
 from __future__ import annotations
 
@@ -17,5 +17,15 @@ if TYPE_CHECKING:
     from ambid.physics.magnet import DifferentialPair as DifferentialPair
     from ambid.physics.nonlinear import NonlinearPlant as NonlinearPlant
     from ambid.physics.presets import preset as preset
+    from ambid.physics.shaft import Disc as Disc
+    from ambid.physics.shaft import FreeRotor as FreeRotor
+    from ambid.physics.shaft import Material as Material
+    from ambid.physics.shaft import Shaft as Shaft
+    from ambid.physics.shaft import Step as Step
+    from ambid.physics.whirl import Campbell as Campbell
+    from ambid.physics.whirl import CriticalSpeed as CriticalSpeed
+    from ambid.physics.whirl import Support as Support
+    from ambid.physics.whirl import campbell as campbell
+    from ambid.physics.whirl import critical_speeds as critical_speeds
 
 __getattr__, __dir__, __all__ = exports(__name__)
