@@ -30,6 +30,7 @@ from ambid.estimation.estimate import (
     read_as,
     read_whole,
 )
+from ambid.estimation.modes import Modal, Mode
 from ambid.estimation.result import Reason, Result
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.linear_model import model as physical_model
@@ -58,6 +59,8 @@ class Measured(Result):
         Structure ``frf-ml`` or ``frf-subspace``.
     estimate : FrequencyEstimate or None
         Physical parameters.
+    modal : Modal or None
+        Modes, with their checks; None where none were asked for.
     record : Mapping[str, object]
         ``samples``, ``rate_hz``, ``sha256``, ``file``, ``history``.
     timing_s : Mapping[str, float]
@@ -69,6 +72,7 @@ class Measured(Result):
     open_loop: bool = False
     fit: BlackBoxFit | None = None
     estimate: FrequencyEstimate | None = None
+    modal: Modal | None = None
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
@@ -89,9 +93,14 @@ class Measured(Result):
                 "without a reference, feedback biases the response. Give --reference, or --open-loop if there is none"
             )
             found.append(Reason(check="feedback", text=text))
-        for name, model in (("fit", self.fit), ("physical", self.estimate)):
+        for name, model in (("fit", self.fit), ("physical", self.estimate), ("modes", self.modal)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
         return tuple(found)
+
+    @property
+    def modes(self) -> tuple[Mode, ...]:
+        """Modes in order of frequency; none where none were asked for."""
+        return () if self.modal is None else self.modal.modes
 
     def __getitem__(self, name: str) -> EstimatedParameter:
         model = self.estimate or self.fit
@@ -239,10 +248,12 @@ def measured_to_json(measured: Measured) -> dict[str, Any]:
         "covariance": _covariance_json(frf),
         "fit": None if measured.fit is None else fit_to_json(measured.fit),
         "estimate": None if estimate is None else covariance_together(fields_json(estimate, without=("record",))),
+        "modes": measured.modes,
+        "modal": None if measured.modal is None else fields_json(measured.modal, without=("modes", "record")),
     }
     return {
         "schema": SCHEMA,
-        **fields_json(measured, without=("response", "fit", "estimate")),
+        **fields_json(measured, without=("response", "fit", "estimate", "modal")),
         **fields_json(frf, without=("G", "covariance", "noise_covariance", "coherence")),
         **plain_json(more),
     }
@@ -274,13 +285,14 @@ def _from_json(d: Mapping[str, Any], where: str) -> Measured:
         "noise_covariance": None if noise is None else diagonal * noise[:, None, :] ** 2,
         "coherence": coherence and np.stack([read_as(Array, coherence[o]) for o in outputs], axis=1),
     }
-    fit, estimate = d["fit"], d["estimate"]
+    fit, estimate, modal = d["fit"], d["estimate"], d.get("modal")
     return Measured(
         response=read_as(FrequencyResponse, response),
         references=tuple(d["references"]),
         open_loop=d["open_loop"],
         fit=None if fit is None else fit_from_json(fit, where),
         estimate=None if estimate is None else read_as(FrequencyEstimate, covariance_apart(estimate)),
+        modal=None if modal is None else read_as(Modal, {**modal, "modes": d["modes"], "record": d["record"]}),
         record=d["record"],
         timing_s=d["timing_s"],
     )

@@ -44,6 +44,13 @@ def command(
     feedthrough: Annotated[
         bool, switch("--feedthrough", "With --state-space: include a direct path from input to output (D).")
     ] = False,
+    modes: Annotated[
+        str | None,
+        option(
+            "--modes auto|N",
+            "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so many.",
+        ),
+    ] = None,
     domain: Annotated[
         Literal["s", "z"] | None,
         option(
@@ -72,12 +79,13 @@ def command(
     from ambid.job import frf
 
     with Outputs(record, rig, json=json, plot=plot, report=report) as outputs:
-        between, n, late = opt.band_of(band), _order(state_space), _delay(delay)
+        between, n, late, count = opt.band_of(band), _order(state_space), _delay(delay), _modes(modes)
         with progress("measure") as tick:
             found = frf(
                 record, input=inputs, output=output, reference=reference, open_loop=open_loop,
                 method=method, hold=hold, band=between, orders=orders, state_space=n, feedthrough=feedthrough,
-                domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
+                modes=count, domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps,
+                tick=tick,
             )  # fmt: skip
             outputs.give(found, tick)
     outputs.show(found, strict=strict)
@@ -90,6 +98,14 @@ def _order(text: str | None) -> int | Literal["auto"] | None:
     if not number.isdecimal() or len(number) > 3:
         raise AmbidError(f"--state-space is {text!r}; it must be an order, or auto. Give n=3, for example")
     return int(number)
+
+
+def _modes(text: str | None) -> int | Literal["auto"] | None:
+    if text is None or text.strip() == "auto":
+        return None if text is None else "auto"
+    if not text.strip().isdecimal() or not 1 <= int(text) <= 999:
+        raise AmbidError(f"--modes is {text!r}; it must be a number of modes, or auto. Give --modes auto, for example")
+    return int(text)
 
 
 def _delay(text: str | None) -> float | Literal["auto"] | None:

@@ -9,11 +9,14 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check, Judged
+from ambid.estimation.stable_poles import TrialPole, assurance
 
 NORMAL_95 = 1.959963984540054
 _SEEN = 0.25  # relative standard deviation up to which data show a number, as for parameters
@@ -69,16 +72,6 @@ class Mode:
         return self.frequency_hz.identifiable and self.damping.identifiable
 
 
-def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
-    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
-
-    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
-    """
-    a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
-    size = float(np.vdot(a, a).real * np.vdot(b, b).real)
-    return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
-
-
 def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
     """Return the modal assurance criterion of each mode with each of others, on the outputs that both have.
 
@@ -97,3 +90,46 @@ def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
                 )
             found[i, j] = assurance([own[k] for k in both], [other[k] for k in both])
     return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Modal(Judged):
+    """Modes of a record, file schema ``ambid.modes/1``; as ``modal`` beside ``modes`` in a frequency response's file.
+
+    Attributes
+    ----------
+    status : {"converged", "failed"}
+        "failed" where no mode was found.
+    method : str
+        How they were estimated.
+    modes : tuple of Mode
+        In order of frequency.
+    checks : Mapping[str, Check]
+    inputs, outputs : tuple of str
+        No inputs: operational modes.
+    units : Mapping[str, str]
+        SI unit by name.
+    band_hz : (float, float), Hz
+        Band that was searched.
+    poles : tuple of TrialPole
+        Poles of all models that the search began from: the stabilisation diagram.
+    record : Mapping[str, object]
+    warnings : tuple of str
+    timing_s : Mapping[str, float]
+    details : Mapping[str, object]
+        By mode (same order): ``energy_share``, ``misfit``, ``residual_correlation``; ``rejected`` poles with reasons.
+    """
+
+    status: Literal["converged", "failed"]
+    method: str
+    modes: tuple[Mode, ...]
+    checks: Mapping[str, Check]
+    inputs: tuple[str, ...]
+    outputs: tuple[str, ...]
+    units: Mapping[str, str]
+    band_hz: tuple[float, float]
+    poles: tuple[TrialPole, ...] = ()
+    record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))

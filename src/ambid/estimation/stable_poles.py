@@ -14,7 +14,16 @@ from itertools import pairwise
 import numpy as np
 
 from ambid.arrays import Complex
-from ambid.estimation.modes import assurance
+
+
+def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
+    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
+
+    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
+    """
+    a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
+    size = float(np.vdot(a, a).real * np.vdot(b, b).real)
+    return float(abs(np.vdot(a, b)) ** 2 / size) if size > 0 else 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

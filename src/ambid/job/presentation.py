@@ -440,6 +440,17 @@ def _flat(row: Mapping[str, Any], before: str = "") -> dict[str, Any]:
     return found
 
 
+def _modal() -> View:
+    from ambid.report.modes_text import modal_text, mode_table
+    from ambid.report.response_figures import modal_figure
+
+    return View(
+        text=modal_text, figure=lambda m, _, width: modal_figure(m, width), document=_fields_of("ambid.modes/1"),
+        table=lambda m: ("mode", mode_table(m.modes)),
+        title=lambda m: f"{m.record.get('file') or 'record'}, {len(m.modes)} modes",
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
     "Estimate": _estimate,
     "NonlinearBearingEstimate": _bearing,
@@ -447,6 +458,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "NonlinearFit": _fit,
     "Validation": _validation,
     "Measured": _measured,
+    "Modal": _modal,
     "Track": _track,
     "Inspection": _inspection,
     "Acquired": _acquired,

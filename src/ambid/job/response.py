@@ -17,9 +17,11 @@ from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets
+from ambid.blackbox.modes import find_modes
 from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
+from ambid.estimation.modes import Modal
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Channels, Clock, Names, Source
 from ambid.physics.linear_model import model
@@ -45,6 +47,7 @@ def frf(
     orders: Orders | str | None = None,
     state_space: int | Literal["auto"] | None = None,
     feedthrough: bool = False,
+    modes: int | Literal["auto"] | None = None,
     domain: Literal["s", "z"] | None = None,
     delay: Delay | None = None,
     from_s: float | None = None,
@@ -54,7 +57,7 @@ def frf(
     units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
 ) -> Measured:
-    """Measure a frequency response from one record, and fit models to it.
+    """Measure a frequency response from one record, and fit models to it; find the modes of vibration.
 
     Parameters
     ----------
@@ -78,6 +81,9 @@ def frf(
         Order of a state space, fitted by subspace with the Laguerre operator. Not together with `orders`.
     feedthrough : bool, optional
         Whether that state space has a direct path D; in z, one within a sample.
+    modes : int or "auto", optional
+        Find so many modes, or all that the record shows: poles common to all outputs, by maximum likelihood on the
+        record's own spectrum. Without `band`, those where the input has power.
     domain : {"s", "z"}, optional
         Of that model; default z for transfer functions of a held input, else s.
     delay : float or "auto", s, optional
@@ -109,10 +115,16 @@ def frf(
     if orders is not None and wanted is None:
         raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)
+    _check_modes(modes)
     if bench is None and not channels.inputs:
         raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
+    modal: Modal | None = None
+    if modes is not None:
+        modal = find_modes(data, modes, band=band, tick=say)
+        clock.lap("modes")
+        band = modal.band_hz
     say("measure")
     response = _measure(data, method, hold, band)
     clock.lap("measure")
@@ -128,7 +140,7 @@ def frf(
         clock.lap("identify")
     return Measured(
         response=response, references=data.references, open_loop=data.open_loop, fit=found, estimate=estimate,
-        record=data.record, timing_s=clock.laps,
+        modal=modal, record=data.record, timing_s=clock.laps,
     )  # fmt: skip
 
 
@@ -154,6 +166,11 @@ def _check(
         raise EstimationError("--delay is for a model; none was requested. Give --orders, --state-space or --rig too")
     if isinstance(delay, float | int) and not (np.isfinite(delay) and delay >= 0):
         raise EstimationError(f"the delay is {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
+
+
+def _check_modes(modes: object) -> None:
+    if modes is not None and modes != "auto" and (isinstance(modes, bool) or not isinstance(modes, int) or modes < 1):
+        raise EstimationError(f"{modes!r} modes were requested; it must be at least 1, or 'auto'. Correct --modes")
 
 
 def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:

@@ -113,6 +113,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     FIT_SCHEMA: _fit,
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
+    "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
     "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),

@@ -16,6 +16,7 @@ from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel, pole_covariance
 from ambid.nonlinear.structures import nonlinear_structure
 from ambid.report.estimate_text import names_words, physics_text, second_lines
+from ambid.report.modes_text import modal_body
 from ambid.report.numbers import prefixed, quantity, response_unit, sized
 from ambid.report.tables import sensitivity_text
 from ambid.report.text import (
@@ -319,6 +320,7 @@ def frf_text(measured: Measured, *, width: int = WIDTH, paint: Paint = plain) ->
             _distortion_lines(measured, width),
             [] if fit is None else _response_fit_lines(fit, width, paint),
             [] if estimate is None else [physics_text(estimate, width=width, paint=paint)],
+            [] if measured.modal is None else [modal_body(measured.modal, width=width, paint=paint)],
             warning_lines(warnings_of(measured), width=width, paint=paint),
             timing_lines(measured.timing_s, paint=paint),
         ]

@@ -10,7 +10,22 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import Measured, ModelResponse, model_responses
-from ambid.report.drawing import BAND, BOUND, GREEN, MEASURED, ORANGE, PREDICTED, WIDE, Block, Panel, head, stacked
+from ambid.estimation.modes import NORMAL_95, Modal, Mode
+from ambid.estimation.stable_poles import PoleCluster, TrialPole
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    GREEN,
+    MEASURED,
+    ORANGE,
+    PREDICTED,
+    WIDE,
+    Block,
+    Panel,
+    head,
+    panel,
+    stacked,
+)
 from ambid.report.numbers import sized
 from ambid.report.response_panels import Complex, Pair, angle_ticks, magnitude_axis, pairs_panel, phase_axis, unwrapped
 from ambid.validation.stabilisation import Stabilisation
@@ -49,7 +64,8 @@ def frf_figure(measured: Measured, width: float = WIDE) -> Figure:
         frf.inputs, frf.outputs, frf.units,
     )  # fmt: skip
     name = measured.record.get("file") or "record"
-    return stacked(f"{name}: frequency response, {frf.method}", [block], width)
+    modal = [] if measured.modal is None else [modal_panel(measured.modal)]
+    return stacked(f"{name}: frequency response, {frf.method}", [block, *modal], width)
 
 
 def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
@@ -77,6 +93,14 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], 
     if f.size > 1:
         axes.set_xlim(f[0], f[-1])
     axes.set_ylim(bottom, 2.0 * float(np.max(size)))
+    _mark_modes(axes, measured.modes)
+
+
+def _mark_modes(axes: Axes, modes: Sequence[Mode]) -> None:
+    """Lines at the frequencies of modes; dashed where the data do not show one."""
+    for m in modes:
+        style, label = ("-", "mode") if m.identifiable else (":", "mode, not identifiable")
+        axes.axvline(m.frequency_hz.value, color=_MODE, linewidth=0.9, alpha=0.6, linestyle=style, label=label)
 
 
 def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair: Pair) -> None:
@@ -116,33 +140,7 @@ def stabilisation_figure(found: Stabilisation, width: float = WIDE) -> Figure:
     seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
     logarithmic = bool(seen.size and seen.max() > _WIDE * seen.min())
 
-    def over_frequency(axes: Axes) -> None:
-        for mode in found.modes:
-            axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6, label="mode")
-        axes.set_xlabel("frequency of the pole [Hz]")
-        if logarithmic:
-            axes.set_xscale("log")
-
-    def damping(axes: Axes) -> None:
-        over_frequency(axes)
-        axes.set_ymargin(0.25)
-        stable = [p for p in found.poles if p.stable]
-        axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
-        for mode in found.modes:
-            at, words = (mode.frequency_hz, mode.damping), sized(mode.frequency_hz, "Hz")
-            axes.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
-        axes.axhline(0, color=_NEW, linewidth=0.8)
-        axes.set_ylabel("damping")
-        head(axes, "damping (under 0: unstable)")
-
-    def diagram(axes: Axes) -> None:
-        over_frequency(axes)
-        for k, (label, marker, color) in enumerate(_KINDS):
-            chosen = [p for p in found.poles if (2 if p.stable else int(p.stable_frequency)) == k]
-            frequency, orders = [p.frequency_hz for p in chosen], [p.order for p in chosen]
-            axes.plot(frequency, orders, marker, color=color, markersize=5, label=label, linestyle="none")
-        _orders(axes)
-        head(axes, "poles by order")
+    damping, diagram = pole_panels(found.poles, found.modes, logarithmic=logarithmic)
 
     def values(axes: Axes) -> None:
         size = np.asarray(found.singular_values)
@@ -154,10 +152,46 @@ def stabilisation_figure(found: Stabilisation, width: float = WIDE) -> Figure:
 
     empty = Panel(draw=lambda axes: axes.axis("off"), height=0.2)
     block = Block(
-        columns=[[Panel(draw=damping, height=2.0), Panel(draw=diagram, height=3.6)], [empty, Panel(draw=values)]],
+        columns=[[damping, diagram], [empty, Panel(draw=values)]],
         widths=(4, 1),
     )
     return stacked(f"stabilisation diagram, {found.method}", [block], width)
+
+
+def pole_panels(
+    poles: Sequence[TrialPole], modes: Sequence[PoleCluster], *, logarithmic: bool = False
+) -> tuple[Panel, Panel]:
+    """Return damping over frequency of stable poles, with the modes' names, and below it all poles by order."""
+
+    def over_frequency(axes: Axes) -> None:
+        for mode in modes:
+            axes.axvline(mode.frequency_hz, color=_MODE, linewidth=0.9, alpha=0.6, label="mode")
+        axes.set_xlabel("frequency of the pole [Hz]")
+        if logarithmic:
+            axes.set_xscale("log")
+
+    def damping(axes: Axes) -> None:
+        over_frequency(axes)
+        axes.set_ymargin(0.25)
+        stable = [p for p in poles if p.stable]
+        axes.plot([p.frequency_hz for p in stable], [p.damping for p in stable], "o", color=_STABLE, markersize=4)
+        for mode in modes:
+            at, words = (mode.frequency_hz, mode.damping), sized(mode.frequency_hz, "Hz")
+            axes.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
+        axes.axhline(0, color=_NEW, linewidth=0.8)
+        axes.set_ylabel("damping")
+        head(axes, "damping (under 0: unstable)")
+
+    def diagram(axes: Axes) -> None:
+        over_frequency(axes)
+        for k, (label, marker, color) in enumerate(_KINDS):
+            chosen = [p for p in poles if (2 if p.stable else int(p.stable_frequency)) == k]
+            frequency, orders = [p.frequency_hz for p in chosen], [p.order for p in chosen]
+            axes.plot(frequency, orders, marker, color=color, markersize=5, label=label, linestyle="none")
+        _orders(axes)
+        head(axes, "poles by order")
+
+    return Panel(draw=damping, height=2.0), Panel(draw=diagram, height=3.6)
 
 
 def _orders(axes: Axes) -> None:
@@ -165,3 +199,39 @@ def _orders(axes: Axes) -> None:
 
     axes.set_ylabel("order")
     axes.yaxis.set_major_locator(MaxNLocator(integer=True))
+
+
+# --- modes ----------------------------------------------------------------------------------------------------------
+
+
+def modal_panel(modal: Modal) -> Block:
+    """Return the poles that the search for modes began from, with the modes it ended in, and the modes' shapes."""
+    found = [
+        PoleCluster(pole=2 * np.pi * m.frequency_hz.value * complex(-m.damping.value, 1.0), orders=())
+        for m in modal.modes
+    ]
+    damping, diagram = pole_panels(modal.poles, found)
+    columns = [[damping, diagram]]
+    if modal.modes and len(modal.outputs) > 1:
+        empty = Panel(draw=lambda axes: axes.axis("off"), height=2.0)
+        columns.append([empty, panel(_shapes, modal, height=3.6)])
+    return Block(columns=columns, widths=(3, 2)[: len(columns)] if len(columns) > 1 else (), title="modes")
+
+
+def _shapes(axes: Axes, modal: Modal) -> None:
+    """Shapes over outputs, one row of bars for each mode, with 95 % intervals."""
+    at = np.arange(len(modal.outputs))
+    for k, m in enumerate(modal.modes):
+        numbers = [m.shape[o] for o in modal.outputs]
+        size, error = np.array([x.value for x in numbers]), np.array([NORMAL_95 * x.sd for x in numbers])
+        axes.bar(at, 0.4 * size, 0.7, bottom=k, color=BAND, edgecolor=PREDICTED, linewidth=0.6)
+        axes.errorbar(at, k + 0.4 * size, 0.4 * error, fmt="none", color=MEASURED, elinewidth=0.8)
+        axes.axhline(k, color=_NEW, linewidth=0.6)
+    axes.set_xticks(at, modal.outputs, rotation=45)
+    axes.set_yticks(range(len(modal.modes)), [sized(m.frequency_hz.value, "Hz") for m in modal.modes])
+    head(axes, "shapes")
+
+
+def modal_figure(modal: Modal, width: float = WIDE) -> Figure:
+    """Draw modes that were found without a response."""
+    return stacked(f"{modal.record.get('file') or 'record'}: operational modes", [modal_panel(modal)], width)

@@ -1,0 +1,602 @@
+"""Modes from a record: common poles of all outputs by maximum likelihood on its discrete Fourier transform, leakage
+included.
+
+About a mode each output's spectrum is Y = (sum_r a_r/(jw - p_r) + P(w)) U + sum_r b_r/(jw - p_r) + Q(w) + V: poles p
+are common, the residues a, the transients b (first and last state of the record) and the polynomials P, Q, which stand
+for everything farther away, are linear (Pintelon and Schoukens 2012, sec. 6.3.2; McKelvey and Guerin 2012). A hold, a
+delay or a sensor multiply this by what is smooth about the mode: they change a, P and Q, not p. So each mode is fitted
+in a window of its own, with its neighbours, by variable projection (Golub and Pereyra 1973); no smoothed response is
+formed. The noise V is what the fit leaves about each line, model errors included.
+
+Starts: a common denominator in a basis of z^k on bands of the record (Guillaume et al. 2003, least-squares complex
+frequency, with leakage), of all orders up to 32, of which the stable poles are followed (Cauberghe 2004: with the
+lowest coefficient 1, poles of noise come out unstable).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array, Complex
+from ambid.blackbox.data import IOData
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
+from ambid.estimation.linear import one_thread
+from ambid.estimation.modes import EstimatedNumber, Modal, Mode
+from ambid.estimation.search import Rows, search
+from ambid.estimation.stable_poles import Tolerance, TrialPole, assurance, clusters, followed, trial_poles
+
+_DEGREE = 2  # of the polynomials P and Q
+_REACH = 10.0  # of a window to either side, in half bandwidths of its mode
+_FEWEST = 24  # lines of a window to either side, at least
+_MOST_DAMPED = 0.15  # above, a resonance is no line: rigid and control modes go into P
+_BAND_LINES, _BAND_SHARE = 600, 0.15  # lines, and part of its frequency, that a band of the start has at least
+_ORDERS = (2, 32)
+_NEAR = Tolerance(frequency=0.001, damping=0.25, least=0.002, shape=0.9)
+_SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
+_LEVERAGE = 0.9  # most that a line's own share in its fit counts
+_PASSES = 2
+_SHARE = 0.01  # least part of an output's energy at a mode's frequency that must be the mode's
+_MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
+_LOST = 0.5  # energy left from which a mode's numbers are not shown
+_DROP_DB = 15.0  # between the excitation's band and the floor beside it
+_LEAST_LINES = 60
+
+
+# --- lines ----------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Lines:
+    """Spectra of a record in a band, and the variance of the noise of each output."""
+
+    omega: Array  # (n_lines,), rad/s
+    U: Complex  # (n_lines, 1 + n_inputs), a column of ones for the leakage, then the inputs
+    Y: Complex  # (n_lines, n_outputs)
+    variance: Array  # (n_lines, n_outputs)
+    step: float  # rad/s from line to line
+
+    def part(self, first: int, last: int) -> _Lines:
+        s = slice(first, last)
+        return replace(self, omega=self.omega[s], U=self.U[s], Y=self.Y[s], variance=self.variance[s])
+
+    def between(self, low_hz: float, high_hz: float) -> _Lines:
+        first, last = np.searchsorted(self.omega, [2 * np.pi * low_hz, 2 * np.pi * high_hz])
+        return self.part(int(first), int(last))
+
+
+def _lines(data: IOData, band: tuple[float, float] | None) -> _Lines:
+    n, rate = data.y.shape[0], 1.0 / data.dt
+    U, Y = (np.fft.rfft(x - x.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for x in (data.u, data.y))
+    f = np.arange(1, U.shape[0] + 1) * (rate / n)
+    low, high = excited_band(U, f) if band is None else band
+    keep = (f >= low) & (f <= high)
+    if np.count_nonzero(keep) < _LEAST_LINES:
+        raise EstimationError(
+            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; modes want {_LEAST_LINES}. "
+            "Use a longer record or a wider --band"
+        )
+    U, Y, f = U[keep], Y[keep], f[keep]
+    silent = [name for name, x in zip(data.inputs, U.T, strict=True) if not np.any(x)]
+    if silent:
+        raise EstimationError(f"input {silent[0]!r} does not move between {low:g} and {high:g} Hz. Omit it")
+    size = np.sqrt(np.mean(np.abs(U) ** 2, axis=0))
+    ones = np.full((f.size, 1), 1.0 + 0j)
+    columns = np.hstack([ones, U / size])
+    return _Lines(omega=2 * np.pi * f, U=columns, Y=Y, variance=_local_noise(columns, Y), step=2 * np.pi * rate / n)
+
+
+def excited_band(U: Complex, frequency_hz: Array) -> tuple[float, float]:
+    """Return the band in which inputs have power: the upper of two classes of their level over the logarithm of the
+    frequency (Otsu 1979); all lines where there is no floor beside it.
+
+    `U`: (n_lines, n_inputs), spectra. Returns lowest and highest frequency, Hz.
+    """
+    width = max(frequency_hz.size // 2000, 16)
+    n = frequency_hz.size // width
+    if n < 8:
+        return float(frequency_hz[0]), float(frequency_hz[-1])
+    power = np.abs(U[: n * width]) ** 2
+    level = np.median(power.reshape(n, width, -1), axis=1)  # a line of the mains does not move a median
+    level = 10 * np.log10(np.sum(level / np.maximum(level.max(axis=0), 1e-300), axis=1) + 1e-30)
+    centre = frequency_hz[: n * width].reshape(n, width).mean(axis=1)
+    weight = np.diff(np.log(np.r_[centre[0] / 2, centre]))
+    order = np.argsort(level)
+    x, w = level[order], weight[order]
+    below, total = np.cumsum(w), np.sum(w)
+    mean_below = np.cumsum(w * x) / below
+    mean_above = (np.sum(w * x) - np.cumsum(w * x))[:-1] / (total - below)[:-1]
+    between = (below * (total - below))[:-1] * (mean_above - mean_below[:-1]) ** 2
+    k = int(np.argmax(between))
+    if mean_above[k] - mean_below[k] < _DROP_DB:
+        return float(frequency_hz[0]), float(frequency_hz[-1])
+    inside = np.flatnonzero(level > 0.5 * (x[k] + x[k + 1]))
+    edges = inside[0] * width, min((inside[-1] + 1) * width, frequency_hz.size) - 1
+    return float(frequency_hz[edges[0]]), float(frequency_hz[edges[1]])
+
+
+def _local_noise(U: Complex, Y: Complex) -> Array:
+    """Variance that polynomials of response and leakage leave in short stretches; medians pass over resonances."""
+    n_unknown = (_DEGREE + 1) * U.shape[1]
+    width = n_unknown + 12
+    n = max(Y.shape[0] // width, 1)
+    x = np.linspace(-1, 1, width)[:, None] ** np.arange(_DEGREE + 1)
+    u, y = (a[: n * width].reshape(n, width, -1) for a in (U, Y))
+    columns = (u[:, :, :, None] * x[:, None, :]).reshape(n, width, -1)
+    Q = np.linalg.qr(columns)[0]
+    left = y - Q @ (_h(Q) @ y)
+    level = np.log(np.sum(np.abs(left) ** 2, axis=1) / 12 + 1e-300)
+    half = min(7, n - 1)
+    wide = np.pad(level, ((half, half), (0, 0)), mode="reflect")
+    smooth = np.median(np.lib.stride_tricks.sliding_window_view(wide, 2 * half + 1, axis=0), axis=-1)
+    at = (np.arange(n) + 0.5) * width
+    lines = np.arange(Y.shape[0])
+    return np.asarray(np.exp(np.column_stack([np.interp(lines, at, column) for column in smooth.T])))
+
+
+def _h(x: Complex) -> Complex:
+    return np.asarray(np.conj(np.swapaxes(x, -1, -2)))
+
+
+# --- starts ---------------------------------------------------------------------------------------------------------
+
+
+def _starts(lines: _Lines, say: Callable[[float], None]) -> tuple[list[complex], list[TrialPole]]:
+    """Poles that stay as the order grows, band by band, and all that were tried."""
+    found, tried = list[complex](), list[TrialPole]()
+    first, n = 0, lines.omega.size
+    while True:
+        size = max(_BAND_LINES, int(_BAND_SHARE * lines.omega[first] / lines.step))
+        last = min(first + size, n)
+        if n - last < size // 4:
+            last = n
+        begin, end = first if first == 0 else first + (last - first) // 4, last if last == n else last - size // 4
+        low, high = lines.omega[begin], lines.omega[end - 1]
+        poles = _followed_poles(lines.part(first, last))
+        tried += [p for p in poles[0] if low <= p.pole.imag < high]
+        found += [c for c in poles[1] if low <= c.imag < high]
+        say(last / n)
+        if last == n:
+            return found, tried
+        first += size // 2
+
+
+def _followed_poles(lines: _Lines) -> tuple[list[TrialPole], list[complex]]:
+    """Poles of all orders in one band, and the centres of stable clusters."""
+    n_lines, columns = lines.U.shape
+    most = min(_ORDERS[1], int(0.5 * n_lines / columns) - 1)
+    models = list(range(_ORDERS[0], most + 1, 2))
+    rows = []
+    for order, p, shapes in _common_denominators(lines, models):
+        lightly = (p.real < 0) & (-p.real < 2 * _MOST_DAMPED * np.abs(p))
+        inside = lightly & (p.imag > lines.omega[0]) & (p.imag < lines.omega[-1])
+        rows.append(trial_poles(order, p[inside], shapes[inside]))
+    poles = followed(rows, _NEAR)
+    return poles, [c.pole for c in clusters(poles, models, _NEAR)]
+
+
+def _common_denominators(lines: _Lines, models: Sequence[int]) -> list[tuple[int, Complex, Complex]]:
+    """Order, poles (n,) and shapes (n, n_outputs) of common denominators by linear least squares.
+
+    All products of powers of x = exp(s T) depend on their difference alone: the normal equations of all orders are
+    parts of a few sums over the lines.
+    """
+    n, (n_lines, m), n_y = max(models), lines.U.shape, lines.Y.shape[1]
+    angle = 0.9 * 2 * np.pi / n_lines
+    period, centre = angle / lines.step, lines.omega[n_lines // 2]
+    x = np.exp(1j * angle * (np.arange(n_lines) - n_lines // 2))
+    powers = x[None, :] ** np.arange(-n, n + 1)[:, None]
+    weight = 1.0 / lines.variance
+    both = lines.U.conj()[:, :, None, None] * lines.U[:, None, :, None] * weight[:, None, None, :]
+    R, S, T = (
+        (powers @ g.reshape(n_lines, -1)).reshape(2 * n + 1, *g.shape[1:])
+        for g in (
+            both,
+            lines.U.conj()[:, :, None] * (lines.Y * weight)[:, None, :],
+            np.abs(lines.Y) ** 2 * weight,
+        )
+    )
+    at = np.arange(n + 1)
+    lag = at[None, :] - at[:, None] + n
+    out = []
+    for order in models:
+        k, size = lag[: order + 1, : order + 1], m * (order + 1)
+        own = R[k].transpose(4, 2, 0, 3, 1).reshape(n_y, size, size)
+        cross = S[k].transpose(3, 2, 0, 1).reshape(n_y, size, order + 1)
+        scale = np.einsum("jaa->j", own).real / size
+        solved = np.linalg.solve(own + 1e-12 * scale[:, None, None] * np.eye(size), cross)
+        M = np.sum(T[k].transpose(2, 0, 1) - _h(cross) @ solved, axis=0)
+        a = np.r_[1.0, np.linalg.lstsq(M[1:, 1:], -M[1:, 0], rcond=1e-14)[0]]
+        roots = np.roots(a[::-1])
+        roots = roots[np.abs(roots) > 1e-3]
+        numerator = (solved @ a).reshape(n_y, m, order + 1)[:, 1:]
+        residues = np.einsum("jum,pm->pju", numerator, roots[:, None] ** at[: order + 1])
+        out.append((order, 1j * centre + np.log(roots) / period, _principal(residues)))
+    return out
+
+
+def _principal(residues: Complex) -> Complex:
+    """Shape (n, n_outputs) that residues (n, n_outputs, n_inputs) of all inputs share most."""
+    if residues.shape[2] == 1:
+        return np.asarray(residues[:, :, 0])
+    u, s, _ = np.linalg.svd(residues, full_matrices=False)
+    return np.asarray(u[:, :, 0] * s[:, :1])
+
+
+# --- the likelihood about one mode ----------------------------------------------------------------------------------
+
+
+@dataclass(slots=True, eq=False)
+class _Projected:
+    """What variable projection leaves at some poles."""
+
+    inverse: Complex  # (n_lines, n_poles + n_fixed), step/(jw - p)
+    Q: Complex  # (n_outputs, n_lines, n_columns), of the weighted columns
+    root: Complex  # (n_outputs, n_columns, n_columns), from the coefficients' own unit covariance
+    c: Complex  # (n_outputs, n_columns)
+    e: Complex  # (n_outputs, n_lines), weighted
+
+    @property
+    def leverage(self) -> Array:
+        """Share of each line in its own fit, (n_outputs, n_lines)."""
+        return np.asarray(np.minimum(np.sum(np.abs(self.Q) ** 2, axis=2), _LEVERAGE))
+
+    @property
+    def cost(self) -> float:
+        """Sum of squares: minus the logarithm of the likelihood."""
+        return float(np.sum(np.abs(self.e) ** 2))
+
+
+class _Window:
+    """Lines about a mode: poles that are searched, poles beside them that are known, polynomials."""
+
+    def __init__(self, lines: _Lines, fixed: Complex) -> None:
+        self.lines, self.fixed = lines, fixed
+        self.variance = lines.variance
+        omega = lines.omega
+        x = (omega - omega.mean()) / max(np.ptp(omega) / 2, 1e-300)
+        powers = x[:, None] ** np.arange(_DEGREE + 1)
+        self.smooth = (lines.U[:, :, None] * powers[:, None, :]).reshape(omega.size, -1)
+        self._at: tuple[bytes, _Projected] | None = None
+
+    def project(self, poles: Complex, *, without_input: int | None = None) -> _Projected:
+        """Fit what is linear; `without_input`: a pole that the inputs do not excite."""
+        key = poles.tobytes()
+        if without_input is None and self._at is not None and self._at[0] == key:
+            return self._at[1]
+        lines = self.lines
+        inverse = lines.step / (1j * lines.omega[:, None] - np.r_[poles, self.fixed])
+        of_poles = (inverse[:, :, None] * lines.U[:, None, :]).reshape(lines.omega.size, -1)
+        if without_input is not None:
+            m = lines.U.shape[1]
+            of_poles = np.delete(of_poles, np.arange(without_input * m + 1, (without_input + 1) * m), axis=1)
+        columns = np.concatenate([of_poles, self.smooth], axis=1)
+        weight = 1.0 / np.sqrt(self.variance.T)
+        weighted = weight[:, :, None] * columns
+        size = np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
+        Q, R = np.linalg.qr(weighted / size)
+        diagonal = np.abs(np.einsum("jaa->ja", R))
+        R[np.any(diagonal < 1e-13, axis=1)] += 1e-13 * np.eye(R.shape[1])  # two poles in one place
+        root = np.linalg.inv(R) / np.swapaxes(size, 1, 2)
+        y = (weight * lines.Y.T)[:, :, None]
+        along = _h(Q) @ y
+        found = _Projected(inverse=inverse, Q=Q, root=root, c=(root @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
+        if without_input is None:
+            self._at = key, found
+        return found
+
+    def slopes(self, poles: Complex) -> Complex:
+        """Derivatives of the residuals by the real and the imaginary part of each pole, in steps: (2n, n_outputs,
+        n_lines); the change of the projection itself has no part in the gradient (Kaufman 1975).
+        """
+        at, m = self.project(poles), self.lines.U.shape[1]
+        weight, out = 1.0 / np.sqrt(self.variance.T), []
+        for r in range(poles.size):
+            d = weight * (at.c[:, r * m : (r + 1) * m] @ self.lines.U.T) * at.inverse[:, r] ** 2
+            d = d - (at.Q @ (_h(at.Q) @ d[:, :, None]))[:, :, 0]
+            out += [-d, -1j * d]
+        return np.array(out)
+
+    def _rows(self) -> Rows:
+        def residual(v: Array) -> Array:
+            e = self.project(v.view(np.complex128) * self.lines.step).e.ravel()
+            return np.concatenate([e.real, e.imag])
+
+        def slope(v: Array) -> Array:
+            J = self.slopes(v.view(np.complex128) * self.lines.step).reshape(v.size, -1)
+            return np.concatenate([J.real, J.imag], axis=1).T
+
+        return Rows(residual, slope)
+
+    def search(self, poles: Complex) -> Complex:
+        """Most likely poles from these on, the noise as it is."""
+        start = np.ascontiguousarray(poles / self.lines.step).view(np.float64).copy()
+        found = search(self._rows(), start, most=25, tolerance=1e-7)
+        return np.asarray(found.theta.view(np.complex128) * self.lines.step)
+
+    def fit(self, poles: Complex, rounds: int = 2) -> Complex:
+        """Most likely poles, the noise from what the fit leaves."""
+        for _ in range(rounds):
+            poles = self.search(poles)
+            self._weigh(poles)
+        return self.search(poles)
+
+    def _weigh(self, poles: Complex) -> None:
+        """Take the noise about each line from what is left there, model errors included."""
+        at = self.project(poles)
+        power = np.abs(at.e) ** 2 * self.variance.T / (1 - at.leverage)
+        self.variance = np.maximum(_averaged(power.T), 1e-14 * np.mean(np.abs(self.lines.Y) ** 2, axis=0))
+        self._at = None
+
+    def covariance(self, poles: Complex) -> tuple[Array, Array]:
+        """Covariance of real and imaginary parts from the likelihood, outputs whose errors go together counted so
+        (sandwich), and by the jackknife over outputs (of one step), both (2n, 2n) in (rad/s)²; the second is zero
+        with one output.
+        """
+        at, J = self.project(poles), self.slopes(poles)
+        apart = np.real(np.einsum("ajk,bjk->jab", J.conj(), J))
+        H = np.sum(apart, axis=0)
+        inverse = np.linalg.pinv(H, hermitian=True)
+        e = at.e / np.sqrt(1 - at.leverage)
+        together = _averaged(np.einsum("jk,ik->kji", e, e.conj()))
+        middle = np.real(np.einsum("ajk,kji,bik->ab", J.conj(), together, J, optimize=True)) / 2
+        n_y, square = e.shape[0], self.lines.step**2
+        if n_y == 1:
+            return inverse @ middle @ inverse * square, np.zeros_like(H)
+        score = np.real(np.einsum("ajk,jk->ja", J.conj(), at.e))
+        moved = np.array([np.linalg.pinv(H - h, hermitian=True) @ g for h, g in zip(apart, score, strict=True)])
+        moved -= moved.mean(axis=0)
+        return inverse @ middle @ inverse * square, moved.T @ moved * ((n_y - 1) / n_y) * square
+
+
+def _averaged(values: NDArray[np.inexact]) -> NDArray[np.inexact]:
+    """Averages over neighbouring lines (axis 0), fewer at the ends."""
+    n = values.shape[0]
+    total = np.concatenate([np.zeros((1, *values.shape[1:]), dtype=values.dtype), np.cumsum(values, axis=0)])
+    low, high = np.maximum(np.arange(n) - _SMOOTH, 0), np.minimum(np.arange(n) + _SMOOTH + 1, n)
+    width = (high - low).reshape(-1, *(1,) * (values.ndim - 1))
+    return np.asarray((total[high] - total[low]) / width)
+
+
+# --- which modes there are ------------------------------------------------------------------------------------------
+
+
+@dataclass(slots=True, eq=False)
+class _Candidate:
+    """A pole in its window, with what speaks for it."""
+
+    pole: complex
+    gain: float = 0.0  # of -2 log likelihood over what its numbers cost (BIC), the lesser of pole and input
+    share: float = 0.0  # most of an output's energy at its frequency
+    misfit: float = 0.0  # energy left there
+    correlation: float = 0.0  # of what is left, from line to line
+    shape: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
+    shape_variance: Array = field(default_factory=lambda: np.zeros(0))
+    likelihood: Array = field(default_factory=lambda: np.zeros((2, 2)))
+    jackknife: Array = field(default_factory=lambda: np.zeros((2, 2)))
+
+    @property
+    def frequency_hz(self) -> float:
+        return abs(self.pole) / (2 * np.pi)
+
+    @property
+    def damping(self) -> float:
+        return -self.pole.real / abs(self.pole)
+
+
+def _half_width(pole: complex, step: float) -> float:
+    """Of a mode's window, rad/s: enough half bandwidths and lines, no more than a quarter of its frequency."""
+    return max(min(_REACH * abs(pole.real), 0.25 * pole.imag), _FEWEST * step)
+
+
+def _window(lines: _Lines, k: int, poles: Complex) -> tuple[_Window, Complex, int]:
+    """Window of pole k: lines, the poles that are searched (pole k and those inside), and where pole k stands."""
+    own, width = poles[k], _half_width(complex(poles[k]), lines.step)
+    distance = np.abs(poles.imag - own.imag)
+    part = lines.between((own.imag - width) / (2 * np.pi), (own.imag + width) / (2 * np.pi))
+    most = max(int(part.omega.size / (2.5 * lines.U.shape[1])) - _DEGREE - 1, 1)  # columns that its lines tell apart
+    near = [j for j in np.argsort(distance) if distance[j] < 3 * width][:most]
+    inside = [j for j in near if distance[j] < width][:5]
+    beside = [j for j in near if j not in inside]
+    return _Window(part, poles[beside]), poles[inside], inside.index(k)
+
+
+def _refine(lines: _Lines, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
+    """Fit each candidate in its window, drop what is no mode, and again with those that are left."""
+    for turn in range(_PASSES + 2):
+        poles = np.array([c.pole for c in candidates])
+        for k, c in enumerate(candidates):
+            _fit(lines, k, poles, c, judge=turn > 0)
+            say((turn + (k + 1) / len(candidates)) / (_PASSES + 2))
+        kept = _kept(candidates, lines, judged=turn > 0)
+        if turn >= _PASSES - 1 and len(kept) == len(candidates):
+            return kept
+        candidates = kept
+        if not candidates:
+            return []
+    return candidates
+
+
+def _fit(lines: _Lines, k: int, poles: Complex, c: _Candidate, *, judge: bool) -> None:
+    """Fit pole k in its window and, where asked, see what speaks for it; `poles` is brought up to date."""
+    window, inside, at = _window(lines, k, poles)
+    if window.lines.omega.size < 2 * window.smooth.shape[1]:
+        c.pole = complex(abs(c.pole))  # at the border of the band, too few lines: dropped as undamped
+        return
+    found = window.fit(inside)
+    moved = abs(found[at].imag - c.pole.imag)
+    c.pole = complex(found[at]) if moved < _half_width(c.pole, lines.step) / 2 else complex(abs(c.pole))
+    poles[k] = c.pole
+    if not judge or c.pole.real >= 0:
+        return
+    own, m = window.project(found), lines.U.shape[1]
+    rest = np.delete(found, at)
+    without = window.project(window.search(rest)) if rest.size else window.project(rest)
+    deaf = window.project(found, without_input=at)
+    numbers, n = own.e.size * 2, lines.Y.shape[1]
+    price = np.log(numbers)
+    c.gain = min(
+        2 * (without.cost - own.cost) - (2 + 2 * n * m) * price, 2 * (deaf.cost - own.cost) - 2 * n * (m - 1) * price
+    )
+    _describe(window, found, at, c, deaf)
+    likelihood, jackknife = window.covariance(found)
+    own_two = slice(2 * at, 2 * at + 2)
+    c.likelihood, c.jackknife = likelihood[own_two, own_two], jackknife[own_two, own_two]
+
+
+def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Projected) -> None:
+    """Shape, share of the energy and what is left at the mode's frequency; `deaf`: the fit where inputs do not excite
+    the mode, which leaves what nothing else explains.
+    """
+    fitted, lines, m = window.project(poles), window.lines, window.lines.U.shape[1]
+    residues = fitted.c[:, at * m : (at + 1) * m]
+    near = np.abs(lines.omega - c.pole.imag) <= max(1.5 * abs(c.pole.real), 1.5 * lines.step)
+    energy = np.maximum(np.sum(np.abs(lines.Y[near]) ** 2, axis=0), 1e-300)
+    left, deprived = (np.sum((np.abs(x.e) ** 2 * window.variance.T)[:, near], axis=1) for x in (fitted, deaf))
+    shares = np.maximum(deprived - left, 0.0) / energy
+    c.share = float(np.max(shares))
+    c.misfit = float(np.sum(left / energy * shares) / max(np.sum(shares), 1e-300))
+    wide = np.abs(lines.omega - c.pole.imag) <= max(4 * abs(c.pole.real), 8 * lines.step)
+    e = fitted.e[:, wide]
+    c.correlation = float(abs(np.sum(e[:, 1:] * e[:, :-1].conj())) / max(np.sum(np.abs(e) ** 2), 1e-300))
+    c.shape = _principal(residues[None, :, 1:])[0]
+    covariance = np.sum(np.abs(fitted.root) ** 2, axis=2)[:, at * m + 1 : (at + 1) * m]
+    c.shape_variance = np.mean(covariance, axis=1)
+
+
+def _kept(candidates: list[_Candidate], lines: _Lines, *, judged: bool) -> list[_Candidate]:
+    """Candidates that are modes: damped, in the band, not twice, and where judged worth their numbers and energy."""
+    low, high = lines.omega[0], lines.omega[-1]
+    kept = list[_Candidate]()
+    for c in sorted(candidates, key=lambda c: -c.gain if judged else abs(c.pole.real)):
+        damped = c.pole.real < 0 and c.damping <= (_MOST_DAMPED if judged else 2 * _MOST_DAMPED)
+        worth = not judged or (c.gain > 0 and c.share >= _SHARE)
+        if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in kept):
+            kept.append(c)
+    return sorted(kept, key=lambda c: c.pole.imag)
+
+
+def _same(one: _Candidate, other: _Candidate, step: float) -> bool:
+    """Whether two poles are one resonance: nearer than they are wide, and alike in shape where that is known."""
+    width = abs(one.pole.real) + abs(other.pole.real)
+    apart = abs(one.pole - other.pole)
+    if apart < max(0.1 * width, 0.2 * step):
+        return True
+    if one.shape.size < 2 or other.shape.size < 2:
+        return apart < (0.1 if not one.shape.size else 0.5) * width
+    return apart < width and assurance(one.shape.tolist(), other.shape.tolist()) > 0.9
+
+
+# --- the result -----------------------------------------------------------------------------------------------------
+
+
+def find_modes(
+    data: IOData,
+    count: int | Literal["auto"] = "auto",
+    *,
+    band: tuple[float, float] | None = None,
+    tick: Callable[[str, float], object] | None = None,
+) -> Modal:
+    """Estimate the modes that inputs excite and outputs show.
+
+    `count`: "auto", or how many, of which the most significant are taken; `band`: Hz, default where the inputs have
+    power. EstimationError where the band has too few lines.
+    """
+
+    def say(stage: str, share: float) -> None:
+        if tick is not None:
+            tick(stage, share)
+
+    with one_thread():
+        lines = _lines(data, band)
+        starts, tried = _starts(lines, lambda x: say("modes: starts", x))
+        unique = _kept([_Candidate(pole=p) for p in starts], lines, judged=False)
+        found = _refine(lines, unique, lambda x: say("modes: likelihood", x)) if unique else []
+    if count != "auto":
+        found = sorted(sorted(found, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
+    limits = float(lines.omega[0] / (2 * np.pi)), float(lines.omega[-1] / (2 * np.pi))
+    return Modal(
+        status="converged" if found else "failed",
+        method="maximum likelihood on the record's spectrum, transients included",
+        modes=tuple(_mode(c, data.outputs) for c in found),
+        checks=_checks(found, count, limits),
+        inputs=data.inputs,
+        outputs=data.outputs,
+        units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
+        band_hz=limits,
+        poles=tuple(tried),
+        record=data.record,
+        details={
+            "energy_share": [c.share for c in found],
+            "misfit": [c.misfit for c in found],
+            "residual_correlation": [c.correlation for c in found],
+            "gain": [c.gain for c in found],
+        },
+    )
+
+
+def _mode(c: _Candidate, outputs: tuple[str, ...]) -> Mode:
+    """A candidate as a mode; the larger of the likelihood's interval and the jackknife's over outputs."""
+    p, size = c.pole, abs(c.pole)
+    gradients = np.array([[p.real, p.imag], [-(p.imag**2) / size, p.real * p.imag / size]]) / size
+    gradients[0] /= 2 * np.pi
+    gradients[1] /= size
+    one, two = (np.sqrt(np.maximum(np.einsum("ia,ab,ib->i", gradients, C, gradients), 0.0)) for C in _both(c))
+    n = len(outputs)
+    widening = float(_student(n - 1)) if n > 1 else 0.0
+    sd, half = np.maximum(one, two), np.maximum(1.959964 * one, widening * two)
+    quantile = half / np.maximum(sd, 1e-300)
+    shown = c.misfit < _LOST
+    wide = 4 * abs(p.real) / (2 * np.pi)
+    frequency = EstimatedNumber.of(size / (2 * np.pi), sd[0], quantile=quantile[0], size=wide, shown=shown)
+    damping = EstimatedNumber.of(c.damping, sd[1], quantile=quantile[1], shown=shown)
+    largest = int(np.argmax(np.abs(c.shape)))
+    shape = c.shape / c.shape[largest]
+    variance = (c.shape_variance + np.abs(shape) ** 2 * c.shape_variance[largest]) / np.abs(c.shape[largest]) ** 2
+    variance[largest] = 0.0
+    real, late = (
+        {
+            name: EstimatedNumber.of(float(x), float(np.sqrt(v / 2)), size=1.0)
+            for name, x, v in zip(outputs, part, variance, strict=True)
+        }
+        for part in (shape.real, shape.imag)
+    )
+    return Mode(frequency_hz=frequency, damping=damping, shape=real, shape_quadrature=late)
+
+
+def _both(c: _Candidate) -> tuple[Array, Array]:
+    return c.likelihood, c.jackknife
+
+
+def _student(freedom: int) -> float:
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.975))
+
+
+def _checks(found: list[_Candidate], count: int | str, band: tuple[float, float]) -> dict[str, Check]:
+    """Whether modes were found, fit the lines about them, and are shown by the data."""
+    inside = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
+    enough = len(found) >= (1 if count == "auto" else int(count))
+    detail = f"{len(found)} modes {inside}" + (
+        ""
+        if enough
+        else f", {'one' if count == 'auto' else count} at least wanted. Excite more, longer, or give --band"
+    )
+    checks = {"modes_found": Check(passed=enough, detail=detail)}
+    if not found:
+        return checks
+    poor = [c for c in found if c.misfit > _LOST or (c.misfit > _MISFIT and c.correlation > _COLOURED)]
+    names = ", ".join(f"{c.frequency_hz:.4g} Hz ({100 * c.misfit:.0f} %)" for c in poor)
+    detail = (
+        f"what linear modes leave of the energy at {names} is not noise: a nonlinear or drifting resonance, or two "
+        "modes in one place. Excite less, or record more outputs"
+        if poor
+        else f"at most {100 * max(c.misfit for c in found):.2g} % of the energy at a mode is left"
+    )
+    return checks | {"modes_fit": Check(passed=not poor, detail=detail)}
