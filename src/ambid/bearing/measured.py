@@ -41,6 +41,7 @@ Complex = NDArray[np.complex128]
 _CLEAR = 0.25  # standard deviation over magnitude up to which a line is clear
 _LINES, _SHARE = 10, 0.1  # clear lines, and share of all, that a response wants
 _FEWEST = 3  # without which nothing is to be seen
+_MOST_WRITTEN = 200_000  # entries of covariances in a file
 _STEP = 1e-3  # standard deviations of a coefficient over which a difference is taken
 
 
@@ -306,7 +307,7 @@ def _by_pair(frf: FrequencyResponse, values: Any) -> dict[str, dict[str, Any]] |
 
 
 def _covariance_json(frf: FrequencyResponse) -> dict[str, Any] | None:
-    """With one entry `sd` says it all."""
-    if frf.n_inputs * frf.n_outputs == 1:
+    """With one entry `sd` says it all; matrices of many outputs on many lines would fill tens of megabytes."""
+    if frf.n_inputs * frf.n_outputs == 1 or frf.covariance.size > _MOST_WRITTEN:
         return None
     return {"entries": [[o, i] for o in frf.outputs for i in frf.inputs], "matrix": frf.covariance}

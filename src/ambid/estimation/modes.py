@@ -94,42 +94,19 @@ def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Modal(Judged):
-    """Modes of a record, file schema ``ambid.modes/1``; as ``modal`` beside ``modes`` in a frequency response's file.
+    """Modes of a record, file schema ``ambid.modes/1``; in a response's file ``modes``, and the rest as ``modal``."""
 
-    Attributes
-    ----------
-    status : {"converged", "failed"}
-        "failed" where no mode was found.
-    method : str
-        How they were estimated.
-    modes : tuple of Mode
-        In order of frequency.
-    checks : Mapping[str, Check]
-    inputs, outputs : tuple of str
-        No inputs: operational modes.
-    units : Mapping[str, str]
-        SI unit by name.
-    band_hz : (float, float), Hz
-        Band that was searched.
-    poles : tuple of TrialPole
-        Poles of all models that the search began from: the stabilisation diagram.
-    record : Mapping[str, object]
-    warnings : tuple of str
-    timing_s : Mapping[str, float]
-    details : Mapping[str, object]
-        By mode (same order): ``energy_share``, ``misfit``, ``residual_correlation``; ``rejected`` poles with reasons.
-    """
-
-    status: Literal["converged", "failed"]
+    status: Literal["converged", "failed"]  # "failed" where no mode was found
     method: str
-    modes: tuple[Mode, ...]
+    modes: tuple[Mode, ...]  # in order of frequency
     checks: Mapping[str, Check]
-    inputs: tuple[str, ...]
+    inputs: tuple[str, ...]  # none: operational modes
     outputs: tuple[str, ...]
     units: Mapping[str, str]
-    band_hz: tuple[float, float]
-    poles: tuple[TrialPole, ...] = ()
+    band_hz: tuple[float, float]  # that was searched
+    poles: tuple[TrialPole, ...] = ()  # of all models that the search began from: the stabilisation diagram
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    # by mode, in the same order: ``energy_share``, ``misfit``, ``residual_correlation``, ``gain``
     details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))

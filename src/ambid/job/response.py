@@ -126,7 +126,7 @@ def frf(
         clock.lap("modes")
         band = modal.band_hz
     say("measure")
-    response = _measure(data, method, hold, band)
+    response = _measure(data, method, hold, band, leave_out=modes is not None)
     clock.lap("measure")
     found: BlackBoxFit | None = None
     estimate: FrequencyEstimate | None = None
@@ -173,14 +173,18 @@ def _check_modes(modes: object) -> None:
         raise EstimationError(f"{modes!r} modes were requested; it must be at least 1, or 'auto'. Correct --modes")
 
 
-def _measure(data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None) -> FrequencyResponse:
+def _measure(
+    data: IOData, method: Method, hold: Hold, band: tuple[float, float] | None, *, leave_out: bool
+) -> FrequencyResponse:
     """Measure the response by the wanted method, in the wanted band."""
     r = data.reference if data.references else None
     if method == "auto":
         method = "periodic" if repeats(data.u if r is None else r) else "local"
     options: dict[str, object] = {"drop_periods": "auto"} if method == "periodic" else {}
-    if method == "local" and band is not None:
-        options["band"] = band
+    if method == "local":
+        options["leave_out"] = leave_out
+        if band is not None:
+            options["band"] = band
     units = {x: data.units[x] for x in (*data.inputs, *data.outputs)}
     with one_thread():
         found = frequency_response(

@@ -88,7 +88,7 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], 
     for x, color, label in levels:
         seen = np.where(x > 0, x, np.nan)
         axes.plot(f, seen, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
-    axes.set_xscale("log")
+    axes.set_xscale("linear" if measured.modal else "log")  # modes want room above, where they lie
     axes.set_yscale("log")
     if f.size > 1:
         axes.set_xlim(f[0], f[-1])
@@ -115,7 +115,7 @@ def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair
         phase_axis(axes, m, pair, near=near, colors=(line, band), style=style)
     axes.fill_between(f, angle - spread, angle + spread, color=_RANGE, linewidth=0, zorder=0.5)
     axes.plot(f, angle, ".", color=MEASURED, markersize=_marker(f.size), zorder=1.8)
-    axes.set_xscale("log")
+    axes.set_xscale("linear" if measured.modal else "log")
     lines = [np.rad2deg(unwrapped(m.G[:, *pair], near)) for m in models]
     angle_ticks(axes, np.concatenate([angle, *lines]))
 

@@ -8,7 +8,7 @@ what it leaves gives the noise and the covariance of G. X are the inputs, or wit
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -44,6 +44,16 @@ class _Fitted:
     condition: Array
     lines_per_independent: float
 
+    def at(self, lines: np.ndarray) -> _Fitted:
+        """Return the fits at some of the lines."""
+        return replace(
+            self,
+            Z=self.Z[lines],
+            covariance=self.covariance[lines],
+            weight=self.weight[lines],
+            condition=self.condition[lines],
+        )
+
 
 def frf_local(
     u: Array,
@@ -55,6 +65,7 @@ def frf_local(
     band: tuple[float, float] | None = None,
     open_loop: bool = False,
     hold: Hold = "zoh",
+    leave_out: bool = False,
     inputs: Sequence[str] | None = None,
     outputs: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
@@ -83,6 +94,8 @@ def frf_local(
         Whether the record is known to be open loop.
     hold : {"zoh", "band-limited"}
         What the input does between samples; kept with the result.
+    leave_out : bool
+        Whether lines at which the excitation does not tell G from leakage are left out, and told, instead of refused.
     inputs, outputs : sequence of str, optional
         Names.
     units : Mapping[str, str], optional
@@ -91,7 +104,7 @@ def frf_local(
     Returns
     -------
     FrequencyResponse
-        At every line of the record in the band, 0 and half the rate left out.
+        At every line of the record in the band, 0 and half the rate left out, and with `leave_out` those not told.
 
     Raises
     ------
@@ -106,7 +119,9 @@ def frf_local(
     frequency = np.arange(1, X.shape[0] + 1) * (rate_hz / n)
     wanted = _in_band(frequency, band)
     fitted = _fitted(X, Z, wanted, plan)
-    _refuse_smooth(fitted.condition, frequency[wanted])
+    told = _refuse_smooth(fitted.condition, frequency[wanted], leave_out=leave_out)
+    left = () if told.all() else (_smooth(~told, frequency[wanted]) + "; they are left out",)
+    wanted, fitted = wanted[told], fitted.at(told)
     warnings: tuple[str, ...]
     if r is None:
         G, covariance = fitted.Z, fitted.covariance
@@ -126,7 +141,7 @@ def frf_local(
         hold=hold,
         degrees_of_freedom=2.0 * plan.free,
         lines_per_independent=fitted.lines_per_independent,
-        warnings=warnings,
+        warnings=(*left, *warnings),
         details=MappingProxyType(
             {
                 "degree": _DEGREE,
@@ -225,11 +240,18 @@ def _solved(columns: Complex, Z: Complex, n_x: int) -> tuple[Complex, Complex, A
     return L, Z - Q @ (Qh @ Z), np.where(singular, np.inf, condition)
 
 
-def _refuse_smooth(condition: Array, frequency: Array) -> None:
-    bad = ~(condition < _WORST)
-    if bad.any():
+def _refuse_smooth(condition: Array, frequency: Array, *, leave_out: bool) -> np.ndarray:
+    """Return which lines the excitation tells from leakage; refuse others, where they are not to be left out."""
+    told = condition < _WORST
+    if not (told.all() or (leave_out and told.any())):
         raise EstimationError(
-            f"at {int(bad.sum())} of {bad.size} lines, {frequency[bad][0]:g} to {frequency[bad][-1]:g} Hz, the "
-            "excitation is absent or too smooth to separate its response from leakage. Give a band without them, "
-            "or excite with noise or a multisine"
+            f"{_smooth(~told, frequency)}. Give a band without them, or excite with noise or a multisine"
         )
+    return told
+
+
+def _smooth(bad: np.ndarray, frequency: Array) -> str:
+    return (
+        f"at {int(bad.sum())} of {bad.size} lines, {frequency[bad][0]:g} to {frequency[bad][-1]:g} Hz, the "
+        "excitation is absent or too smooth to separate its response from leakage"
+    )
