@@ -253,14 +253,14 @@ class Shaft:
 
     Examples
     --------
-    A uniform steel shaft without bearings bends at 22.37 sqrt(EI/(rho A)) / L² rad/s, less a little for shear:
+    A uniform steel shaft without bearings bends at 22.37 sqrt(EI/(rho A))/L² rad/s, less a little for shear:
 
     >>> from ambid.physics import Material, Shaft, Step
     >>> steel = Material(E=2.11e11, rho=7810.0, nu=0.3)
     >>> shaft = Shaft(steps=(Step(length=1.0, diameter=0.02),), material=steel)
     >>> rotor = shaft.free_rotor(modes=2)
     >>> [round(float(w) / 6.2831853, 1) for w in rotor.omega]
-    [0.0, 0.0, 92.5, 254.5]
+    [0.0, 0.0, 92.4, 254.3]
     >>> round(float(rotor.mass[0]), 4), round(rotor.z_cg, 3)
     (2.4536, 0.5)
     """

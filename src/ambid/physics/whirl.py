@@ -2,7 +2,7 @@
 
 The eigenvalues of both planes at each speed W (Friswell et al., Dynamics of Rotating Machines (2010), ch. 6; Genta,
 Dynamics of Rotating Systems (2005), ch. 2), in modal coordinates. A mode is followed from speed to speed by its shape;
-where two shapes come too close to be told apart, speeds between are computed until they are. A whirl is forward where
+where two shapes come too close for that, speeds between are computed until they differ. A whirl is forward where
 its orbits turn with the shaft, from x to y.
 """
 
@@ -162,7 +162,7 @@ def campbell(
     >>> shaft = Shaft(steps=(Step(length=1.2, diameter=0.05),), discs=(disc,), material=steel)
     >>> whirl = campbell(shaft, [0.0, 400.0], [Support(z=0.0, stiffness=1e7), Support(z=1.2, stiffness=1e7)], lines=2)
     >>> [[round(float(f), 1) for f in row] for row in whirl.frequency]
-    [[228.3, 228.3], [223.5, 232.8]]
+    [[225.0, 225.0], [218.8, 230.7]]
     """
     speed = np.asarray(speeds, dtype=float)
     if (
