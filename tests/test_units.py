@@ -20,6 +20,7 @@ from ambid.units import parse_unit
         ("H", "H", 1), ("mH", "H", 1e-3), ("uH", "H", 1e-6),
         ("ohm", "ohm", 1), ("Ω", "ohm", 1), ("mohm", "ohm", 1e-3), ("kΩ", "ohm", 1e3),
         ("Hz", "Hz", 1), ("kHz", "Hz", 1e3), ("rad/s", "rad/s", 1), ("rpm", "rad/s", 2 * math.pi / 60),
+        ("Pa", "Pa", 1), ("GPa", "Pa", 1e9), ("N/mm^2", "Pa", 1e6), ("kg/m^3", "kg/m^3", 1),
         ("1", "1", 1), ("%", "1", 0.01), ("T", "T", 1), ("Wb", "Wb", 1),
         ("N/m", "N/m", 1), ("N/mm", "N/m", 1e3), ("N/um", "N/m", 1e6), ("N/A", "N/A", 1), ("N/mA", "N/A", 1e3),
         ("N s/m", "N s/m", 1), ("N·s/m", "N s/m", 1), ("N s / mm", "N s/m", 1e3),

@@ -39,6 +39,7 @@ _BASE: dict[str, tuple[float, _Powers]] = {
     "N": (1.0, (1, 1, -2, 0, 0)),
     "V": (1.0, (1, 2, -3, -1, 0)),
     "W": (1.0, (1, 2, -3, 0, 0)),
+    "Pa": (1.0, (1, -1, -2, 0, 0)),
     "ohm": (1.0, (1, 2, -3, -2, 0)),
     "H": (1.0, (1, 2, -2, -2, 0)),
     "Wb": (1.0, (1, 2, -2, -1, 0)),
@@ -56,6 +57,8 @@ _ATOMS: dict[str, tuple[float, _Powers]] = dict(_BASE) | {
 _ATOMS |= {
     "MHz": (1e6, _BASE["Hz"][1]),
     "Mohm": (1e6, _BASE["ohm"][1]),
+    "MPa": (1e6, _BASE["Pa"][1]),
+    "GPa": (1e9, _BASE["Pa"][1]),
     "cm": (1e-2, (0, 1, 0, 0, 0)),
     "kg": (1.0, (1, 0, 0, 0, 0)),
     "mg": (1e-6, (1, 0, 0, 0, 0)),
@@ -70,7 +73,7 @@ _ATOMS = {
 _SUGGESTED = (
     "s", "ms", "us", "V", "mV", "uV", "kV", "A", "mA", "uA", "m", "mm", "um", "nm",
     "N", "mN", "kN", "kg", "g", "H", "mH", "uH", "ohm", "mohm", "kohm",
-    "Hz", "kHz", "rpm", "1", "%", "T", "mT", "Wb",
+    "Hz", "kHz", "rpm", "1", "%", "T", "mT", "Wb", "Pa", "GPa",
 )
 # fmt: on
 _KNOWN_COMPOUNDS = (
@@ -86,6 +89,7 @@ _KNOWN_COMPOUNDS = (
     "A/V",
     "V s/m",
     "kg m^2",
+    "kg/m^3",
     "H/m",
 )
 _SI_NAMES: dict[_Powers, str] = {

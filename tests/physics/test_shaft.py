@@ -125,7 +125,7 @@ def test_the_shaft_of_the_independent_simulator_comes_out_alike() -> None:
     modal = truth.modal_of(
         truth.Bench("fine", shaft=fine, modes=4, zeta=(0.004,) * 4, z_bearing=(0.1, 0.65), z_sensor=(0.13, 0.62))
     )
-    rotor = TWO_SLEEVES.free_rotor(4, zeta=0.004, planes=(0.1, 0.13, 0.62, 0.65))
+    rotor = replace(TWO_SLEEVES, zeta=(0.004,)).free_rotor(4, planes=(0.1, 0.13, 0.62, 0.65))
     np.testing.assert_allclose(rotor.omega, modal.omega, rtol=1e-4)
     np.testing.assert_allclose(rotor.mass, modal.mass, rtol=1e-10)
     np.testing.assert_allclose(rotor.zeta, modal.zeta)

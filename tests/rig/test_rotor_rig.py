@@ -70,10 +70,75 @@ def test_an_axis_without_a_voltage_is_driven_by_its_current() -> None:
         ('axes = ["bx", "by"]', 'axes = ["ax", "by"]', "'ax' is named twice"),
         ("axial = true", "axiel = true", "Did you mean 'axial'"),
         ('z = { value = 72.0, unit = "mm" }', "", "bearings.A.z is missing"),
-        ('"ax.k_i"', '"ax.k_j"', "Did you mean 'ax.k_i'"),
+        ('"ax.k_i"', '"ax.k_ii"', "Did you mean 'ax.k_i'"),
         ('{ value = 72.0, unit = "mm" }', '{ value = 72.0, unit = "kg" }', "measured in"),
     ],
 )
 def test_a_slip_is_named(old: str, new: str, says: str) -> None:
     with pytest.raises(RigError, match=says):
         rig_from_text(TEXT.replace(old, new), "bench.toml")
+
+
+SHAFT = """
+[shaft]
+z = { value = -10.0, unit = "mm" }
+material = { E = { value = 211, unit = "GPa" }, rho = { value = 7810, unit = "kg/m^3" }, nu = 0.3 }
+damping = 0.004
+[[shaft.steps]]
+length = { value = 200, unit = "mm" }
+diameter = { value = 30, unit = "mm" }
+[[shaft.steps]]
+length = { value = 0.22, unit = "m" }
+diameter = { value = 36, unit = "mm" }
+bore = { value = 10, unit = "mm" }
+material = { E = { value = 70, unit = "GPa" }, rho = { value = 2.7, unit = "g/cm^3" } }
+[[shaft.discs]]
+z = { value = 100, unit = "mm" }
+m = { value = 0.9, unit = "kg" }
+Id = { value = 6.0, unit = "kg cm^2" }
+Ip = { value = 9.0, unit = "kg cm^2" }
+[[shaft.discs]]
+z = { value = 300, unit = "mm" }
+outer = { value = 140, unit = "mm" }
+inner = { value = 36, unit = "mm" }
+width = { value = 20, unit = "mm" }
+"""
+
+
+def test_a_drawing_is_read_in_si_and_written_back() -> None:
+    rig = rig_from_text(TEXT + SHAFT, "bench.toml")
+    shaft = rig.shaft
+    assert shaft is not None
+    assert (shaft.z, shaft.length, shaft.material.E, *shaft.zeta) == pytest.approx((-0.01, 0.42, 2.11e11, 0.004))
+    assert shaft.steps[1].bore == pytest.approx(0.01)
+    assert shaft.steps[1].material is not None
+    assert shaft.steps[1].material.rho == pytest.approx(2700.0)
+    assert shaft.discs[0].Id == pytest.approx(6e-4)
+    assert shaft.discs[1].m == pytest.approx(7810 * 3.14159265 * (0.14**2 - 0.036**2) / 4 * 0.02)
+    again = rig_from_text(rig_text(rig, Path()), "bench.toml")
+    assert (again.shaft, again.rotor) == (shaft, rig.rotor)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"GPa"', '"N"', r"shaft.material.E is in \[N\]; it is measured in \[Pa\]"),
+        ('"GPa"', '"GPx"', "shaft.material.E.unit: unit 'GPx' is unknown; nearest: GPa"),
+        ('diameter = { value = 36, unit = "mm" }', "", "shaft.steps.2.diameter is missing"),
+        ("bore", "boer", r"unknown key 'boer' in \[shaft.steps.2\]; known: length.* Did you mean 'bore'"),
+        ("value = 10,", "value = 40,", "shaft.steps.2: a step of the shaft has a bore of 0.04 m"),
+        ('Ip = { value = 9.0, unit = "kg cm^2" }', "", "shaft.discs.1 has m, Id; a disc has m, or m, Id and Ip"),
+        ("value = 300", "value = 500", "shaft: a disc lies at 0.5 m, outside the shaft"),
+        ("value = -10.0", "value = 80.0", "shaft goes from 0.08 to 0.5 m, but A.z is at 0.072 m"),
+        ("damping = 0.004", "damping = [0.01, 1.5]", "damping ratios of the shaft"),
+        ("value = 211", 'value = "211"', "shaft.material.E.value is '211'; it must be a number"),
+    ],
+)  # fmt: skip
+def test_a_slip_in_the_drawing_is_named(old: str, new: str, says: str) -> None:
+    with pytest.raises(RigError, match=says):
+        rig_from_text(TEXT + SHAFT.replace(old, new, 1), "bench.toml")
+
+
+def test_a_drawing_without_bearings_is_refused() -> None:
+    with pytest.raises(RigError, match="shaft is given, but no"):
+        rig_from_text('schema = "ambid.rig/1"\nmodel = "one-axis"\n' + SHAFT, "bench.toml")

@@ -240,6 +240,8 @@ class Shaft:
         Of the steps that name none.
     z : float
         Left end, m from the datum of all planes.
+    zeta : tuple of float
+        Damping ratios of its bending modes, the last one for all that follow; none: undamped.
     elements : int
         About how many beam elements it is cut into; every step has at least one.
     shear : bool
@@ -249,7 +251,7 @@ class Shaft:
     Raises
     ------
     ModelError
-        If there is no step, or a disc lies outside the shaft.
+        If there is no step, a disc lies outside the shaft, or a damping ratio outside 0 to 1.
 
     Examples
     --------
@@ -269,12 +271,15 @@ class Shaft:
     discs: tuple[Disc, ...] = ()
     material: Material
     z: float = 0.0
+    zeta: tuple[float, ...] = ()
     elements: int = ELEMENTS
     shear: bool = True
 
     def __post_init__(self) -> None:
         if not self.steps:
             raise ModelError("the shaft has no steps. Give at least one")
+        if any(not 0 <= ratio < 1 for ratio in self.zeta):
+            raise ModelError(f"damping ratios of the shaft are {list(self.zeta)}; they lie from 0 to 1. Correct them")
         for disc in self.discs:
             _inside("a disc", disc.z, self.z, self.z + self.length)
 
@@ -283,17 +288,13 @@ class Shaft:
         """Length in m."""
         return math.fsum(step.length for step in self.steps)
 
-    def free_rotor(
-        self, modes: int, *, zeta: float | Sequence[float] = 0.0, planes: Sequence[float] = (), residual: bool = False
-    ) -> FreeRotor:
+    def free_rotor(self, modes: int, *, planes: Sequence[float] = (), residual: bool = False) -> FreeRotor:
         """Return the rotor without bearings in modal coordinates.
 
         Parameters
         ----------
         modes : int
             Bending modes that are kept.
-        zeta : float or sequence of float
-            Their damping ratios; the last one goes on.
         planes : sequence of float
             Planes in m from the datum that get a node, so that the mode shapes are exact there.
         residual : bool
@@ -330,13 +331,13 @@ class Shaft:
             )
         basis = basis * np.where(basis[0] < 0, -1.0, 1.0)
         T = np.column_stack([rigid, basis])
-        ratios = np.atleast_1d(np.asarray(zeta, dtype=float))
-        ratios = np.concatenate([[0.0, 0.0], ratios, np.full(omega.size, ratios[-1])])[: T.shape[1]]
+        ratios = [0.0, 0.0, *(self.zeta or (0.0,))]
+        ratios += ratios[-1:] * T.shape[1]
         return FreeRotor(
             z_cg=z_cg,
             mass=np.concatenate([np.diag(rigid.T @ M @ rigid), np.ones(omega.size)]),
             omega=np.concatenate([[0.0, 0.0], omega]),
-            zeta=ratios,
+            zeta=np.array(ratios[: T.shape[1]]),
             gyro=T.T @ P @ T,
             z=z,
             shape=T.reshape(z.size, 2, -1),

@@ -31,6 +31,7 @@ from ambid.rig.rig import (
     role_units,
 )
 from ambid.rig.rotor import modes_of, planes_of, rotor_of
+from ambid.rig.shaft import shaft_of
 from ambid.units import UNKNOWN, Unit, parse_unit
 
 if TYPE_CHECKING:
@@ -124,8 +125,8 @@ def _build(file: RigFile, path: Path) -> Rig:
         plant = rotor_of(file, where) if file.bearings else model(file.model)
     except ModelError as error:
         raise RigError(f"{where}: {error}") from None
-    if not file.bearings and (file.modes or file.speed):
-        key = "modes" if file.modes else "speed"
+    key = next((x for x in ("modes", "speed", "shaft") if getattr(file, x) is not None), None)
+    if key and not file.bearings:
         raise RigError(
             f"{where}: {key} is given, but no [bearings.X]; only a rotor on many axes has it. Add its bearings"
         )
@@ -134,13 +135,15 @@ def _build(file: RigFile, path: Path) -> Rig:
         raise RigError(f"{where}: record.to is {record.to} s, not after record.from = {record.from_} s. Correct one")
     channels = _channels(file.channels, plant, path) if file.channels else _default_channels(plant)
     limits = _limits(file.loop.limits, where) if file.loop and file.loop.limits else None
+    parameters = _parameters({**file.parameters, **planes_of(file)}, plant, where)
     return Rig(
         name=file.name,
         model=file.model,
         channels=channels,
-        parameters=_parameters({**file.parameters, **planes_of(file)}, plant, where),
+        parameters=parameters,
         rotor=plant if isinstance(plant, RotorModel) else None,
         modes=modes_of(file),
+        shaft=None if file.shaft is None else shaft_of(file.shaft, parameters, where),
         magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop) if file.loop else None,

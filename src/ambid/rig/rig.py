@@ -15,8 +15,10 @@ from ambid.errors import RigError, nearest
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
+from ambid.physics.shaft import Shaft
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
+from ambid.rig.shaft import shaft_lines
 
 TRIP_SHARE = 0.9
 """Share of ``loop.limits.position`` in which the controller holds the rotor, unless ``[daq.trip]`` says otherwise."""
@@ -223,6 +225,8 @@ class Rig:
         Bearings, axes, planes and speed of a rotor on many axes (``[bearings.X]``).
     modes : RigModes
         What is known of its bending modes.
+    shaft : Shaft or None
+        Its drawing, for expected modes, start values and simulation.
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
@@ -248,6 +252,7 @@ class Rig:
     magnet: RigMagnet | None = None
     rotor: RotorModel | None = None
     modes: RigModes = field(default_factory=RigModes)
+    shaft: Shaft | None = None
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
     limits: Limits | None = None
@@ -475,7 +480,7 @@ def _rotor_lines(rig: Rig) -> list[str]:
         count = '"auto"' if rig.modes.count is None else rig.modes.count
         lines += ["", "[modes]", f"count = {count}"]
         lines += [f"frequency_hz = {list(rig.modes.frequency_hz)}"] if rig.modes.frequency_hz else []
-    return lines
+    return lines + (["", *shaft_lines(rig.shaft)] if rig.shaft else [])
 
 
 def _magnet_lines(magnet: RigMagnet) -> list[str]:

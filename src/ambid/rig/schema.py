@@ -187,6 +187,46 @@ class ModesEntry(_Entry):
     frequency_hz: list[Positive] = Field(default_factory=list)
 
 
+class MaterialEntry(_Entry):
+    """A material of ``[shaft]``: modulus, density, Poisson's ratio."""
+
+    E: QuantityEntry
+    rho: QuantityEntry
+    nu: Number = 0.3
+
+
+class StepEntry(_Entry):
+    """``[[shaft.steps]]``: a cylinder of the shaft, from left to right."""
+
+    length: QuantityEntry
+    diameter: QuantityEntry
+    bore: QuantityEntry | None = None
+    material: MaterialEntry | None = None
+
+
+class DiscEntry(_Entry):
+    """``[[shaft.discs]]``: a rigid disc, by its mass and moments of inertia or by its sizes."""
+
+    z: QuantityEntry
+    m: QuantityEntry | None = None
+    Id: QuantityEntry | None = None
+    Ip: QuantityEntry | None = None
+    outer: QuantityEntry | None = None
+    inner: QuantityEntry | None = None
+    width: QuantityEntry | None = None
+    rho: QuantityEntry | None = None
+
+
+class ShaftEntry(_Entry):
+    """``[shaft]``: the drawing of the rotor; see :class:`ambid.physics.Shaft`."""
+
+    z: QuantityEntry | None = None
+    material: MaterialEntry
+    damping: Number | list[Number] = Field(default_factory=list)
+    steps: list[StepEntry] = Field(default_factory=list)
+    discs: list[DiscEntry] = Field(default_factory=list)
+
+
 class RigFile(_Entry):
     """The whole file."""
 
@@ -198,6 +238,7 @@ class RigFile(_Entry):
     magnet: MagnetEntry | None = None
     bearings: dict[AxisName, BearingEntry] = Field(default_factory=dict)
     modes: ModesEntry | None = None
+    shaft: ShaftEntry | None = None
     speed: QuantityEntry | None = None
     operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
     loop: LoopEntry | None = None
@@ -217,6 +258,14 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("bearings", "*", "z"): PlaneEntry,
     ("bearings", "*", "z_sensor"): PlaneEntry,
     ("modes",): ModesEntry,
+    ("shaft",): ShaftEntry,
+    ("shaft", "material"): MaterialEntry,
+    ("shaft", "steps", "*"): StepEntry,
+    ("shaft", "steps", "*", "material"): MaterialEntry,
+    ("shaft", "discs", "*"): DiscEntry,
+    ("shaft", "*"): QuantityEntry,
+    ("shaft", "*", "*"): QuantityEntry,
+    ("shaft", "*", "*", "*"): QuantityEntry,
     ("speed",): QuantityEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,
@@ -321,6 +370,9 @@ def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
     for part in loc:
         if isinstance(content, dict) and part in content:
             keys.append(str(part))
+            content = content[part]
+        elif isinstance(content, list) and isinstance(part, int) and part < len(content):
+            keys.append(str(part + 1))  # people count from 1
             content = content[part]
         elif isinstance(content, dict) and part == loc[-1] and isinstance(part, str) and part.isidentifier():
             keys.append(part)

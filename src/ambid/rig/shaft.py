@@ -1,0 +1,108 @@
+"""``[shaft]`` of a rig file: from its tables to the drawing of a rotor, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from ambid.errors import ModelError, RigError, UnitError
+from ambid.physics.linear_model import Parameter
+from ambid.physics.shaft import Disc, Material, Shaft, Step
+from ambid.units import parse_unit
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import DiscEntry, MaterialEntry, QuantityEntry, ShaftEntry, StepEntry
+
+_DISC = {"m": "kg", "Id": "kg m^2", "Ip": "kg m^2", "outer": "m", "inner": "m", "width": "m", "rho": "kg/m^3"}
+
+
+def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> Shaft:
+    """Return the shaft of a rig file, on which the planes among `parameters` lie; `where`: the file, for messages."""
+    place = f"{where}: shaft"
+    try:
+        material = _material(entry.material, f"{place}.material")
+        shaft = Shaft(
+            steps=tuple(_step(x, f"{place}.steps.{k}") for k, x in enumerate(entry.steps, 1)),
+            discs=tuple(_disc(x, material, f"{place}.discs.{k}") for k, x in enumerate(entry.discs, 1)),
+            material=material,
+            z=_si(entry.z, "m", f"{place}.z"),
+            zeta=tuple(entry.damping) if isinstance(entry.damping, list) else (entry.damping,),
+        )
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+    for p in parameters:
+        if p.unit == "m" and p.value is not None and not shaft.z <= p.value <= shaft.z + shaft.length:
+            raise RigError(
+                f"{place} goes from {shaft.z:g} to {shaft.z + shaft.length:g} m, but {p.name} is at {p.value:g} m. "
+                "Correct shaft.z, which is its left end from the datum of the planes, or that plane"
+            )
+    return shaft
+
+
+def shaft_lines(shaft: Shaft) -> list[str]:
+    """Return a shaft as lines of TOML, in SI units."""
+    lines = ["[shaft]", f"z = {_quantity(shaft.z, 'm')}", f"material = {_material_text(shaft.material)}"]
+    lines += [f"damping = {list(shaft.zeta)}"] if shaft.zeta else []
+    for step in shaft.steps:
+        sizes = {"length": step.length, "diameter": step.diameter} | ({"bore": step.bore} if step.bore else {})
+        lines += ["[[shaft.steps]]", *(f"{name} = {_quantity(size, 'm')}" for name, size in sizes.items())]
+        lines += [f"material = {_material_text(step.material)}"] if step.material else []
+    for disc in shaft.discs:
+        lines += ["[[shaft.discs]]", f"z = {_quantity(disc.z, 'm')}"]
+        lines += [f"{name} = {_quantity(getattr(disc, name), _DISC[name])}" for name in ("m", "Id", "Ip")]
+    return lines
+
+
+def _material(entry: MaterialEntry, place: str) -> Material:
+    return Material(E=_si(entry.E, "Pa", f"{place}.E"), rho=_si(entry.rho, "kg/m^3", f"{place}.rho"), nu=entry.nu)
+
+
+def _step(entry: StepEntry, place: str) -> Step:
+    try:
+        return Step(
+            length=_si(entry.length, "m", f"{place}.length"),
+            diameter=_si(entry.diameter, "m", f"{place}.diameter"),
+            bore=_si(entry.bore, "m", f"{place}.bore"),
+            material=None if entry.material is None else _material(entry.material, f"{place}.material"),
+        )
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+
+
+def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
+    z = _si(entry.z, "m", f"{place}.z")
+    given = {name: getattr(entry, name) for name in _DISC if getattr(entry, name) is not None}
+    sizes = {name: _si(x, _DISC[name], f"{place}.{name}") for name, x in given.items()}
+    try:
+        if set(sizes) in ({"m"}, {"m", "Id", "Ip"}):
+            return Disc(z=z, **sizes)
+        if {"outer", "width"} <= set(sizes) <= {"outer", "inner", "width", "rho"}:
+            return Disc.of_geometry(z=z, **{"inner": 0.0, "rho": material.rho, **sizes})
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+    raise RigError(
+        f"{place} has {', '.join(sizes) or 'a plane alone'}; a disc has m, or m, Id and Ip, or outer and width (and "
+        "inner, rho). Give one of these sets"
+    )
+
+
+def _si(given: QuantityEntry | None, unit: str, place: str) -> float:
+    """Return a quantity in an SI unit, 0 where none is given."""
+    if given is None:
+        return 0.0
+    try:
+        found = parse_unit(given.unit)
+    except UnitError as error:
+        raise RigError(f"{place}.unit: {error}") from None
+    if found.si != parse_unit(unit).si:
+        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{unit}]. Correct unit")
+    return found.to_si(given.value)
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f'{{ value = {value!r}, unit = "{unit}" }}'
+
+
+def _material_text(material: Material) -> str:
+    E, rho = _quantity(material.E, "Pa"), _quantity(material.rho, "kg/m^3")
+    return f"{{ E = {E}, rho = {rho}, nu = {material.nu!r} }}"
