@@ -29,17 +29,18 @@ def command() -> None:
 
     The record: 0.4 s of an unstable bearing levitated by a PID controller, simulated with noise. No parameter is given.
     """
-    from ambid.job import identify
+    from ambid.job.identification import identify_axis
     from ambid.physics.presets import preset
     from ambid.report.estimate_text import delay_lines, header_lines, output_rows
     from ambid.report.text import check_lines, columns, verdict_lines
+    from ambid.rig import load_rig
 
     with (
         as_file(demo_file("demo.csv.gz")) as record,
         as_file(demo_file("demo.toml")) as rig,
         progress("identify") as tick,
     ):
-        estimate = identify(record, rig, tick=tick)
+        estimate = identify_axis(record, load_rig(rig), tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
     typer.echo("\n".join([*verdict_lines(estimate.verdict, paint=paint), ""]))

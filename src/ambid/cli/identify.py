@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from math import isfinite
 from pathlib import Path
@@ -20,6 +19,7 @@ from ambid.errors import AmbidError, refuse_given
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.estimation.estimate import Estimate
+    from ambid.rotor.estimate import RotorEstimate
 
 
 def command(
@@ -96,12 +96,15 @@ def command(
                 raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
             opt.refuse_twice([*records, *kept])
         else:
-            _check_linear(records, {"held": kept, **own})
+            refuse_given(
+                {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
+                "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
+            )
         with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
-            estimate: Estimate | NonlinearBearingEstimate = (
+            estimate: Estimate | NonlinearBearingEstimate | RotorEstimate = (
                 job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
-                else job.identify(records[0], rig, tick=show, **how)
+                else job.identify(list(records), rig, tick=show, **how)
             )
             stop.torn()
             outputs.give(estimate, show)
@@ -110,16 +113,3 @@ def command(
     if stop.wished() or (search is not None and search["interrupted"]):
         raise typer.Exit(stop.code or INTERRUPTED)
     end(failed=strict and not estimate.passed)
-
-
-def _check_linear(records: Sequence[Path], given: Mapping[str, object]) -> None:
-    """Refuse what only the nonlinear magnet has."""
-    refuse_given(
-        {f"--{name.replace('_', '-')}": x for name, x in given.items()},
-        "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
-    )
-    if len(records) > 1:
-        raise AmbidError(
-            f"{len(records)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
-            "operating point to the next. Give --nonlinear for one model of all, or one record"
-        )

@@ -25,7 +25,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Plan, StepName
-from ambid.job.identification import identify
+from ambid.job.identification import identify_axis
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
@@ -306,7 +306,7 @@ class _Guide:
         self._told(stage, done)
 
     def _identify(self) -> Step:
-        self.estimate = identify(
+        self.estimate = identify_axis(
             self._place / "record.h5", self._rig, validate=self._place / "second.h5", tick=self._tick
         )
         write_text(self._place / "estimate.json", self.estimate.dumps())

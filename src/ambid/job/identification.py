@@ -9,7 +9,7 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, Unpack
 
 import numpy as np
 
@@ -18,7 +18,6 @@ from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
-from ambid.physics.linear_model import model
 from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
 
@@ -27,10 +26,11 @@ if TYPE_CHECKING:
     from ambid.bearing.multistart import Signals
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
+    from ambid.rotor.estimate import RotorEstimate
 
 
 def identify(
-    record: Source,
+    record: Source | Sequence[Source],
     rig: Rig | str | Path | None = None,
     *,
     validate: Source | None = None,
@@ -40,12 +40,14 @@ def identify(
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-) -> Estimate:
+) -> Estimate | RotorEstimate:
     """Identify the physical parameters of a bench from one record, and check the result.
+
+    Of a rotor on many axes (a rig with ``[bearings.X]``) several records give one machine.
 
     Parameters
     ----------
-    record : file, Record, DataFrame, Dataset or dict of arrays
+    record : file, Record, DataFrame, Dataset or dict of arrays; of a rotor also a sequence of these
         In the rig's columns. A table is one of pandas or polars, with columns ``name [unit]`` (or `units`) and time as
         index, as a column ``time [s]`` or told by `rate_hz`; a Dataset one of xarray.
     rig : Rig, str or Path, optional
@@ -65,7 +67,7 @@ def identify(
 
     Returns
     -------
-    Estimate
+    Estimate or RotorEstimate
         With `checks` made and `warnings` set; see ``passed``.
 
     Raises
@@ -85,11 +87,35 @@ def identify(
 
     A table takes the place of the record: ``ambid.identify(record.to_dataframe(), "bench.toml")``.
     """
+    bench, sources = known_rig(rig), sources_of(record)
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
+    if bench.rotor is not None:
+        from ambid.job.rotor import identify_rotor
+
+        if validate is not None:
+            raise EstimationError("a second record validates one axis only; a rotor takes all records at once. Omit it")
+        return identify_rotor(sources, bench, tick=tick, **reading)
+    if len(sources) != 1:
+        raise EstimationError(
+            f"{len(sources)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
+            "operating point to the next. Give --nonlinear for one model of all, or one record"
+        )
+    return identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
+
+
+def identify_axis(
+    record: Source,
+    rig: Rig,
+    *,
+    validate: Source | None = None,
+    tick: Tick | None = None,
+    **reading: Unpack[Reading],
+) -> Estimate:
+    """Identify one axis, as `identify` does."""
     from ambid.bearing.linear import greybox
 
-    say, clock, rig = tick or silent, Clock(), known_rig(rig)
-    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
-    bench, plant = load_bench(record, rig, **reading), model(rig.model)
+    say, clock = tick or silent, Clock()
+    bench, plant = load_bench(record, rig, **reading), rig.plant
     clock.lap("read")
     say("identify")
     delay = rig.channel(plant.inputs[0]).delay

@@ -451,7 +451,24 @@ def _modal() -> View:
     )  # fmt: skip
 
 
+def _rotor() -> View:
+    from ambid.report.drawing import stacked
+    from ambid.report.rotor_text import rotor_text
+
+    def title(e: Any) -> str:
+        return f"{e.record.get('file') or 'record'}, rotor on {len(e.delay)} axes"
+
+    return View(
+        text=rotor_text,
+        figure=lambda e, _, width: stacked(title(e), [], width),
+        document=lambda e: str(e.dumps()),
+        table=lambda e: parameter_columns(e.parameters),
+        title=title,
+    )
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
+    "RotorEstimate": _rotor,
     "Estimate": _estimate,
     "NonlinearBearingEstimate": _bearing,
     "BlackBoxFit": _fit,

@@ -74,9 +74,13 @@ def load(path: str | Path) -> Any:
     return read(document, str(path))
 
 
-def _estimate(document: Mapping[str, Any], path: str) -> AnyEstimate:
+def _estimate(document: Mapping[str, Any], path: str) -> Any:
     nonlinear = isinstance(document, dict) and "law" in document
     where = f"estimate {path}"
+    if isinstance(document, dict) and "modes" in document:
+        from ambid.rotor.estimate import rotor_estimate_from_json
+
+        return rotor_estimate_from_json(document, where)
     return bearing_from_json(document, where) if nonlinear else estimate_from_json(document, where)
 
 
@@ -252,7 +256,7 @@ def info(
         return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units))
     bench = known_rig(rig)
     found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units)
-    return inspect(found, inputs=model(bench.model).inputs)
+    return inspect(found, inputs=bench.plant.inputs)
 
 
 def rig_of(estimate: AnyEstimate, where: str) -> Rig:

@@ -14,7 +14,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError, RecordError, counted
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, known_rig, load_bench
-from ambid.job.identification import identify
+from ambid.job.identification import identify_axis
 from ambid.job.results import read_linear_estimate
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
@@ -251,7 +251,7 @@ def _identify_beginning(source: BenchRows, rig: Rig, start_s: float | None) -> t
             f"a start of {wanted:g} s leaves nothing of the {length:g} s to track. Give a shorter one, or an estimate"
         )
     part, first = source.clean_part(n, begin_anywhere=start_s is None)
-    return identify(part, rig), first
+    return identify_axis(part, rig), first
 
 
 def _read(path: object) -> Estimate:

@@ -1,0 +1,130 @@
+"""The job of a rotor on many axes: records and a rig in, one estimate of the machine out.
+
+Read -> periods -> estimate -> judge. Records at several speeds, or with one bearing excited at a time, give one
+machine.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Unpack
+
+import numpy as np
+
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
+from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
+from ambid.job.data import Clock, Reading, Source, load_bench, origin, rig_entry
+from ambid.record import Record
+from ambid.rig import Rig
+from ambid.rotor.estimate import RotorEstimate
+
+_LEAST = 200  # samples
+
+
+def identify_rotor(
+    records: Sequence[Source], rig: Rig, *, tick: Tick | None = None, **reading: Unpack[Reading]
+) -> RotorEstimate:
+    """Identify a rotor from one or several records.
+
+    `rig`: with bearings; `reading`: how files are read. EstimationError where nothing can be identified.
+    """
+    from ambid.rotor.conclusion import conclude, experiments_hint
+    from ambid.rotor.estimator import estimate_rotor
+    from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.spectra import find_excitation, period_spectra
+
+    say, clock, model = tick or silent, Clock(), rig.rotor
+    assert model is not None
+    benches = []
+    for source in records:
+        say("read")
+        benches.append(load_bench(source, rig, **reading))
+    for bench in benches:
+        _check(bench, rig)
+    clock.lap("read")
+    experiments, remembered, warnings = [], [], []
+    for bench in benches:
+        say("periods")
+        speed, excitation = speed_of(bench, rig), find_excitation(bench, model)
+        if excitation is None:
+            raise EstimationError(
+                f"{name_of(bench)} is not periodic or has less than two whole periods; the estimator of rotors needs "
+                "them. Excite with a multisine of whole periods"
+            )
+        spectra = period_spectra(bench, model, excitation, speed)
+        experiments.append(Experiment(spectra=spectra, speed=speed))
+        remembered.append(
+            {**origin(bench), "speed": speed, "periods": spectra.n_periods, "period_s": spectra.period / bench.rate_hz}
+        )
+        if spectra.dropped:
+            lost = spectra.dropped / bench.rate_hz
+            warnings.append(f"{name_of(bench)}: the first {lost:.4g} s were left out: a transient, or part of a period")
+    clock.lap("periods")
+    given = [rig.channel(role).delay for role in model.inputs]
+    with one_thread():
+        fit = estimate_rotor(
+            experiments, model, rig.parameters, delays=[None if d == "auto" else float(d) for d in given],
+            n_modes=rig.modes.count, tick=say,
+        )  # fmt: skip
+        clock.lap("fit")
+        say("check")
+        hint = experiments_hint(experiments, model)
+        estimate = conclude(
+            fit, rig.parameters, remembered, delay_how=["estimated" if d == "auto" else "given" for d in given],
+            more_checks=_record_checks(benches, rig), rig=rig_entry(rig),
+            warnings=[*warnings, *([hint] if hint else [])],
+        )  # fmt: skip
+    clock.lap("checks")
+    return replace(estimate, timing_s=clock.laps, used=tuple(benches))
+
+
+def name_of(bench: Record) -> str:
+    """Return the name of a record's file."""
+    return str(bench.provenance.get("file") or "record")
+
+
+def speed_of(bench: Record, rig: Rig) -> float:
+    """Return the speed of a record in rad/s: of its angle or speed channel, else as the rig says."""
+    if "angle" in bench:
+        turned = np.unwrap(bench["angle"].values)
+        seconds = (bench.n_samples - 1) / bench.rate_hz
+        return float((turned[-1] - turned[0]) / seconds)
+    if "speed" in bench:
+        return float(np.mean(bench["speed"].values))
+    return 0.0 if rig.rotor is None else rig.rotor.speed
+
+
+def _check(bench: Record, rig: Rig) -> None:
+    """Refuse what no number can come from."""
+    if bench.n_samples < _LEAST:
+        raise EstimationError(
+            f"{name_of(bench)} has {bench.n_samples} samples; a rotor needs {_LEAST}. Give a longer record"
+        )
+    for role in (*rig.plant.inputs, *rig.plant.outputs):
+        if not np.ptp(bench[role].values) > 0.0:
+            raise EstimationError(
+                f"{name_of(bench)}: channel {role!r} is constant in the whole record. Check its column and unit"
+            )
+
+
+def _record_checks(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:
+    """Judge the records themselves: saturation of the voltages."""
+    if rig.limits is None:
+        return {}
+    low, high = rig.limits.voltage
+    for bench in benches:
+        for role in rig.plant.inputs:
+            if not role.endswith("_voltage"):
+                continue
+            at = float(np.mean((bench[role].values <= low) | (bench[role].values >= high)))
+            if at > 0.0:
+                return {
+                    "saturation": Check(
+                        passed=False, values={"share": at},
+                        detail=f"{role} of {name_of(bench)} is at its limit in {at:.2%} of the samples. Excite less",
+                    )
+                }  # fmt: skip
+    return {"saturation": Check(passed=True, detail="no voltage reaches its limit")}

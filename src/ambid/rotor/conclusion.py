@@ -1,0 +1,270 @@
+"""From the end of a search to the estimate of a rotor: covariance, modes, checks."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.linear import directions
+from ambid.estimation.modes import EstimatedNumber, Mode
+from ambid.physics.linear_model import Parameter
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.estimator import RotorFit
+from ambid.rotor.likelihood import Experiment, sampled
+
+_BANDS = 24  # parts of the excited band whose residuals are judged
+_FAR = 4.5  # standard deviations from which residuals are above the noise
+_LIMIT_SHARE = 0.05  # of the mean square, above which they matter
+_LENGTH_SEEN = 0.25
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Numbers:
+    """All numbers of a fit with their covariance: `names` are those that were estimated, then delays."""
+
+    theta: Mapping[str, float]
+    names: tuple[str, ...]
+    covariance: Array
+    weakest: Mapping[str, float]
+    condition: float
+
+    def sd(self, name: str) -> float:
+        """Return the standard deviation of a number, 0 where it was not estimated."""
+        return float(np.sqrt(self.covariance[k, k])) if (k := self._at(name)) is not None else 0.0
+
+    def _at(self, name: str) -> int | None:
+        return self.names.index(name) if name in self.names else None
+
+
+def numbers_of(fit: RotorFit) -> Numbers:
+    """Return numbers and covariance by the names of the model."""
+    unknowns, point = fit.problem.unknowns, fit.point
+    named, chain = unknowns.chain(fit.vector)
+    roles = [f"{role}.delay" for role in unknowns.model.inputs]
+    keep = [*range(len(named)), *(len(named) + k for k in unknowns.free_delays)]
+    half = chain[keep] @ fit.seen.root()
+    data = directions(fit.triangle[:, :-1])
+    last = data.Vt[-1] if data.Vt.size else np.zeros(0)
+    heavy = np.argsort(-np.abs(last))[:4]
+    return Numbers(
+        theta=point.theta,
+        names=(*named, *(roles[k] for k in unknowns.free_delays)),
+        covariance=half @ half.T,
+        weakest={unknowns.names[k]: float(last[k]) for k in heavy},
+        condition=data.condition,
+    )
+
+
+def conclude(
+    fit: RotorFit,
+    parameters: Sequence[Parameter],
+    records: Sequence[Mapping[str, object]],
+    *,
+    delay_how: Sequence[str],
+    more_checks: Mapping[str, Check],
+    rig: Mapping[str, object],
+    warnings: Sequence[str] = (),
+) -> RotorEstimate:
+    """Return the estimate of a search; `delay_how`: by input, "given" or "estimated"."""
+    numbers, model = numbers_of(fit), fit.model
+    found = _parameters(model, parameters, numbers)
+    checks = {**_residual_checks(fit), "identifiable": _identifiable(found, numbers), **more_checks}
+    speed = max((e.speed for e in fit.problem.experiments), key=abs)
+    turned = model.at_speed(speed)
+    space = turned.matrices(numbers.theta)
+    modes, above = _modes(model, numbers, fit.band_hz)
+    checks |= _mode_checks(modes, above)
+    return RotorEstimate(
+        status=fit.status,
+        method="periods",
+        record=records[0],
+        records=tuple(records),
+        parameters=found,
+        modes=modes,
+        numbers={p.name: numbers.theta[p.name] for p in turned.parameters},
+        n_modes=model.n_modes,
+        speed=speed,
+        covariance_names=numbers.names,
+        covariance=numbers.covariance,
+        delay=_delays(model, fit.point.delays, numbers, delay_how),
+        continuous=Continuous(
+            states=turned.states, A=space.A, B=space.B, C=space.C,
+            poles=np.linalg.eigvals(space.A).astype(np.complex128),
+        ),
+        noise=_noise(fit),
+        fit=_fits(fit),
+        checks=checks,
+        warnings=tuple(warnings),
+        information={"condition": numbers.condition, "weakest": numbers.weakest, "band_hz": fit.band_hz},
+        rig=rig,
+    )  # fmt: skip
+
+
+def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Numbers) -> tuple[EstimatedParameter, ...]:
+    sizes = model.references(numbers.theta)
+    found = []
+    for p in parameters:
+        sd = numbers.sd(p.name)
+        value = numbers.theta[p.name]
+        size = sizes.get(p.name, abs(value))
+        seen = {p.name: p.role == "fixed" or bool(sd <= _LENGTH_SEEN * size)}
+        found.append(EstimatedParameter.of(p, numbers.theta, {p.name: sd}, seen))
+    return tuple(found)
+
+
+def _delays(model: RotorModel, delays: Array, numbers: Numbers, how: Sequence[str]) -> dict[str, Delay]:
+    found: dict[str, Delay] = {}
+    for k, role in enumerate(model.inputs):
+        whole = float(np.floor(delays[k] + 1e-9))
+        sd = numbers.sd(f"{role}.delay")
+        found[role] = Delay(
+            samples=int(whole), fraction=max(float(delays[k] - whole), 0.0), sd=sd or None,
+            how="given" if how[k] == "given" else "estimated",
+        )  # fmt: skip
+    return found
+
+
+def _modes(model: RotorModel, numbers: Numbers, band: tuple[float, float]) -> tuple[tuple[Mode, ...], tuple[int, ...]]:
+    """Return the modes within the band, and which stand above it."""
+    found, above = [], []
+    for r in range(1, model.n_modes + 1):
+        f = numbers.theta[f"mode{r}.omega"] / (2.0 * np.pi)
+        if not f <= band[1]:
+            above.append(r)
+            continue
+        shape = {
+            place: EstimatedNumber.of(numbers.theta[f"mode{r}.{place}"], numbers.sd(f"mode{r}.{place}"))
+            for place in model.places
+        }
+        found.append(
+            Mode(
+                frequency_hz=EstimatedNumber.of(f, numbers.sd(f"mode{r}.omega") / (2.0 * np.pi)),
+                damping=EstimatedNumber.of(numbers.theta[f"mode{r}.zeta"], numbers.sd(f"mode{r}.zeta")),
+                shape=shape,
+            )
+        )
+    return tuple(found), tuple(above)
+
+
+def _noise(fit: RotorFit) -> dict[str, float]:
+    """Return the rms of every source in the first experiment."""
+    weight, experiment = fit.problem.weights[0], fit.problem.experiments[0]
+    assert weight.noise is not None
+    sd = weight.noise.sd(experiment.spectra.period)
+    return dict(zip((*fit.model.outputs, *fit.model.disturbances), sd.tolist(), strict=True))
+
+
+def _fits(fit: RotorFit) -> dict[str, OutputFit]:
+    """Return by output how much of the excited lines the model explains, over all experiments."""
+    left, whole = np.zeros(len(fit.model.outputs)), np.zeros(len(fit.model.outputs))
+    for e in fit.problem.experiments:
+        of = sampled(e, fit.model, fit.point)
+        difference = e.spectra.mean_y - np.einsum("kyu,ku->ky", of.transfer(), e.spectra.mean_u)
+        left += np.sum(np.abs(difference) ** 2, axis=0)
+        whole += np.sum(np.abs(e.spectra.mean_y) ** 2, axis=0)
+    rms = np.sqrt(2.0 * left / len(fit.problem.experiments))
+    share = 1.0 - np.sqrt(left / np.maximum(whole, 1e-300))
+    return {
+        role: OutputFit(one_step=float(share[k]), simulation=None, innovation_sd=float(rms[k]))
+        for k, role in enumerate(fit.model.outputs)
+    }
+
+
+# --- checks ---------------------------------------------------------------------------------------------------------
+
+
+def _residual_checks(fit: RotorFit) -> dict[str, Check]:
+    """Judge the mean residuals against the noise between periods: of all lines, and band by band for each output.
+
+    2|r|² of a whitened residual has two degrees of freedom; the noise's own levels come from P - 1 periods.
+    """
+    worst: dict[str, Any] = {"z": 0.0, "where": ""}
+    total, count, spread = 0.0, 0, 0.0
+    for e, r in zip(fit.problem.experiments, fit.problem.residuals(fit.vector), strict=True):
+        power, periods = 2.0 * np.abs(r) ** 2, e.spectra.n_periods
+        total, count = total + float(power.sum()), count + 2 * power.size
+        spread += 2.0 * 2 * power.size * (1.0 + 1.0 / (periods - 1))
+        parts = np.array_split(np.arange(power.shape[0]), min(_BANDS, max(1, power.shape[0] // 10)))
+        for part in parts:
+            freedom = 2.0 * part.size
+            z = (power[part].sum(axis=0) - freedom) / np.sqrt(2.0 * freedom * (1.0 + 1.0 / (periods - 1)))
+            k = int(np.argmax(z))
+            if z[k] > worst["z"]:
+                f = e.spectra.frequency_hz[part]
+                worst = {"z": float(z[k]), "where": f"{fit.model.outputs[k]}, {f[0]:.4g} to {f[-1]:.4g} Hz"}
+    freedom = max(count - fit.vector.size, 1)
+    ratio, z_all = total / freedom, (total - freedom) / np.sqrt(spread)
+    whole = bool(ratio < 1.0 + _LIMIT_SHARE or z_all < _FAR)
+    white = bool(worst["z"] < _FAR + 1.0)
+    detail = "the model leaves no more at the excited lines than the scatter between periods"
+    return {
+        "residuals_white": Check(
+            passed=white, values={"z": worst["z"]},
+            detail=detail + ", in every band" if white else f"the model misses part of {worst['where']} "
+            f"(z = {worst['z']:.3g}"
+            "). A mode, a delay or a sensor's pole may be missing, a plane be wrong",
+        ),
+        "residuals_uncorrelated": Check(
+            passed=whole, values={"mean_square": ratio, "z": float(z_all)},
+            detail=detail if whole else f"residuals at the excited lines are {ratio:.3g} times the noise: the model is "
+            "incomplete. Check planes, modes, saturation of the voltage; excite less (the magnets are nonlinear)",
+        ),
+    }  # fmt: skip
+
+
+def _identifiable(found: Sequence[EstimatedParameter], numbers: Numbers) -> Check:
+    """Name what the data do not show, and the experiment that would."""
+    unseen = [p.name for p in found if not p.identifiable]
+    if not unseen:
+        return Check(passed=True, detail="the data show all parameters", values={"condition": numbers.condition})
+    return Check(
+        passed=False, detail=f"the data do not show {', '.join(unseen)}. {_hint(unseen)}",
+        values={"condition": numbers.condition},
+    )  # fmt: skip
+
+
+def _hint(unseen: Sequence[str]) -> str:
+    kinds = {name.split(".")[-1] for name in unseen}
+    if {"m", "k_i"} <= kinds and "R" not in kinds:
+        return "Without voltages only ratios to m show: log the coil voltages, or give m as fixed"
+    if kinds & {"z_sensor", "z"}:
+        return "Give one length between planes"
+    if kinds == {"Ip"}:
+        return "Ip shows at speed only: record while the rotor turns, or give it as fixed"
+    if kinds <= {"a", "sensor_pole"}:
+        return "Excite higher frequencies"
+    return "Excite every axis, with more lines or a larger amplitude"
+
+
+def _mode_checks(modes: Sequence[Mode], above: Sequence[int]) -> dict[str, Check]:
+    """Judge the modes within the band."""
+    found: dict[str, Check] = {}
+    weak = [m for m in modes if not m.identifiable]
+    if modes:
+        names = ", ".join(f"{m.frequency_hz.value:.5g} Hz" for m in weak)
+        found["modes"] = Check(
+            passed=not weak,
+            detail=f"bending modes at {', '.join(f'{m.frequency_hz.value:.5g}' for m in modes)} Hz" if not weak else
+            f"the data hardly show the bending mode at {names}. Excite around it, or set modes.count",
+            values={"above_band": float(len(above))},
+        )  # fmt: skip
+    return found
+
+
+def experiments_hint(experiments: Sequence[Experiment], model: RotorModel) -> str | None:
+    """Return a warning where some axes are not excited in any record."""
+    moved = np.zeros(len(model.axes), dtype=bool)
+    for e in experiments:
+        if e.spectra.R is None:
+            return None
+        moved |= np.max(np.abs(e.spectra.R), axis=0) > 0.0
+    idle = [axis for axis, on in zip(model.axes, moved, strict=True) if not on]
+    if not idle:
+        return None
+    return f"no excitation of {', '.join(idle)}: their coils and the rotor's modes show through the coupling only"

@@ -1,0 +1,156 @@
+"""The estimate of a rotor: parameters of the machine, its bending modes, and what was found beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import (
+    SCHEMA,
+    Check,
+    Continuous,
+    Delay,
+    EstimatedParameter,
+    Judged,
+    OutputFit,
+    Parametric,
+    check_schema,
+    covariance_apart,
+    covariance_together,
+    fields_json,
+    json_text,
+    read_as,
+    read_whole,
+)
+from ambid.estimation.modes import Mode
+from ambid.estimation.result import Linear
+
+_EMPTY: Mapping[str, Any] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class RotorEstimate(Parametric, Judged, Linear):
+    """Physical parameters of a rotor in magnetic bearings, with its bending modes.
+
+    Attributes
+    ----------
+    status : {"converged", "stalled", "failed"}
+    model : str
+        ``"rotor"``.
+    method : {"periods", "predictor"}
+        Maximum likelihood on period spectra, or innovations-form predictor.
+    record : Mapping[str, object]
+        ``samples``, ``rate_hz``, ``sha256``, ``file`` and history of the first record.
+    records : tuple of Mapping
+        The same of every record, with ``speed`` in rad/s, and ``periods`` where the excitation is periodic.
+    parameters : tuple of EstimatedParameter
+        Of the machine, under the rig's names, SI.
+    modes : tuple of Mode
+        Bending modes within the excited band, in order of frequency, at rest; shape by bearing and sensor plane,
+        modal mass 1 kg.
+    numbers : Mapping[str, float]
+        All numbers of `ambid.physics.rotor_model.RotorModel`, modes above the band included, SI.
+    n_modes : int
+        Modes of that model.
+    speed : float
+        Of `continuous`, rad/s.
+    covariance_names : tuple of str
+        Estimated numbers, modes and delays included; order of `covariance`.
+    covariance : ndarray, shape (n, n), SI
+    delay : Mapping[str, Delay]
+        By input.
+    continuous : Continuous
+        The plant at `speed`.
+    noise : Mapping[str, float]
+        Standard deviation of each source of noise by name, SI: sensors by output, ``<axis>_force``, ``<axis>_voltage``.
+    fit : Mapping[str, OutputFit]
+        By output.
+    checks : Mapping[str, Check]
+    sensitivity : Mapping[str, Any]
+        Peak of the sensitivity by axis, where a loop is known or a reference is logged.
+    synchronous : Mapping[str, Any]
+        Unbalance, run-out and synchronous response, of records at speed.
+    validation : Mapping[str, object] or None
+    warnings : tuple of str
+    timing_s : Mapping[str, float]
+    information : Mapping[str, object]
+        Condition number and the weakest direction.
+    rig : Mapping[str, object]
+        Name and text of the rig.
+    """
+
+    status: Literal["converged", "stalled", "failed"]
+    model: str = "rotor"
+    method: Literal["periods", "predictor"]
+    record: Mapping[str, object]
+    records: tuple[Mapping[str, object], ...]
+    parameters: tuple[EstimatedParameter, ...]
+    modes: tuple[Mode, ...]
+    numbers: Mapping[str, float]
+    n_modes: int
+    speed: float
+    covariance_names: tuple[str, ...]
+    covariance: Array
+    delay: Mapping[str, Delay]
+    continuous: Continuous
+    noise: Mapping[str, float]
+    fit: Mapping[str, OutputFit]
+    checks: Mapping[str, Check]
+    sensitivity: Mapping[str, Any] = field(default_factory=lambda: _EMPTY)
+    synchronous: Mapping[str, Any] = field(default_factory=lambda: _EMPTY)
+    validation: Mapping[str, object] | None = None
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
+    information: Mapping[str, object] = field(default_factory=lambda: _EMPTY)
+    rig: Mapping[str, object] = field(default_factory=lambda: _EMPTY)
+
+    def dumps(self) -> str:
+        """Return the estimate as JSON text, schema ``ambid.estimate/1``.
+
+        Returns
+        -------
+        str
+        """
+        return json_text({"schema": SCHEMA, **covariance_together(fields_json(self))})
+
+    def covariance_of(self, names: tuple[str, ...]) -> Array:
+        """Return the covariance of some numbers; what was not estimated has none.
+
+        Parameters
+        ----------
+        names : tuple of str
+
+        Returns
+        -------
+        ndarray, shape (n, n), SI
+        """
+        found = np.zeros((len(names), len(names)))
+        at = {name: k for k, name in enumerate(self.covariance_names)}
+        known = [k for k, name in enumerate(names) if name in at]
+        index = [at[names[k]] for k in known]
+        found[np.ix_(known, known)] = self.covariance[np.ix_(index, index)]
+        return found
+
+
+def rotor_estimate_from_json(document: Mapping[str, Any], where: str) -> RotorEstimate:
+    """Read an estimate of a rotor back; `where` is the name of its file, for messages."""
+    check_schema(document, SCHEMA, where, "an estimate", "identify")
+
+    def read() -> RotorEstimate:
+        found = read_as(RotorEstimate, covariance_apart(document))
+        size = len(found.covariance_names)
+        if found.covariance.shape != (size, size):
+            raise ValueError("the covariance is not of the numbers")
+        if found.continuous.A.shape != (len(found.continuous.states),) * 2:
+            raise ValueError("the continuous plant is not of its states' size")
+        if any(p.sd < 0 for p in found.parameters):
+            raise EstimationError("a standard deviation is negative")
+        return found
+
+    return read_whole(read, where, "estimate", "identify")

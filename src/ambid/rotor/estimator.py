@@ -1,0 +1,291 @@
+"""The estimator of a rotor from periodic excitation: rigid start, modes one after the other, noise, feedback.
+
+1. A rigid rotor is fitted below the first mode: linear least squares in several bands, the widest that fits.
+2. The band grows; where the fit breaks, a scan of the residuals says which mode is missing (`modes.scan`).
+3. On all lines the noise model takes over from the relative error, the likelihood decides on further modes, and the
+   feedback is corrected for (`likelihood.Likelihood.corrected`).
+4. Delays that agree with whole samples are held there, and the last search is repeated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.linear import Directions, directions
+from ambid.estimation.progress import Tick, silent
+from ambid.estimation.search import Status
+from ambid.physics.linear_model import Parameter
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
+from ambid.rotor.modes import scan
+from ambid.rotor.start import rigid_start
+from ambid.rotor.unknowns import Unknowns
+
+_RELATIVE = 0.03  # error of the model beside noise while it is incomplete
+_FITS = 1.6  # mean square of residuals up to which a band is explained
+_WIDER = 1.5  # by which the band grows
+_ABOVE = 1.5  # how far above the band a mode may be that shows in it
+_LEAST_LINES = 24
+_MOST_MODES = 9
+_WHOLE = 2e-3  # samples by which a delay may miss a whole number however exact it is
+_EDDY_STARTS = tuple(2.0 * np.pi * f for f in (300.0, 1000.0, 3000.0))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RotorFit:
+    """Where the search ended."""
+
+    problem: Likelihood
+    vector: Array
+    cost: float
+    status: Status
+    last_step: float  # squared length of the last step, in standard deviations
+    triangle: Array  # of [J | r], priors included
+    band_hz: tuple[float, float]
+
+    @property
+    def model(self) -> RotorModel:
+        """The model with its modes."""
+        return self.problem.unknowns.model
+
+    @property
+    def point(self) -> Point:
+        """Numbers by name and delays."""
+        return self.problem.point(self.vector)
+
+    @property
+    def seen(self) -> Directions:
+        """Singular directions of the information, priors included."""
+        return directions(self.triangle[:, :-1])
+
+
+def estimate_rotor(
+    experiments: Sequence[Experiment],
+    model: RotorModel,
+    parameters: Sequence[Parameter],
+    *,
+    delays: Sequence[float | None],
+    n_modes: int | None = None,
+    tick: Tick = silent,
+) -> RotorFit:
+    """Estimate a rotor from records with periodic excitation, the slowest first.
+
+    `parameters`: what the rig knows; `delays`: of each input in samples, None where it is searched; `n_modes`: bending
+    modes within the excited band, None: the likelihood decides.
+    """
+    ordered = sorted(experiments, key=lambda e: abs(e.speed))
+    work = _Work(model=model, parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes, tick=tick)
+    first = [ordered[0]]
+    edge, at = work.begin(first)
+    current, at = work.grow(first, edge, at)
+    if len(ordered) > 1:
+        at = work.turn(ordered, current, at)
+    return work.finish(ordered, current, at)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Work:
+    model: RotorModel
+    parameters: tuple[Parameter, ...]
+    delays: tuple[float | None, ...]
+    wanted: int | None
+    tick: Tick
+
+    def problem(
+        self, experiments: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]
+    ) -> Likelihood:
+        """Return the criterion at a model; sizes of numbers are those of the point."""
+        span = model.span(at.theta)
+        lengths = {p.name for p in model.parameters if p.unit == "m"}
+        gyro = {p.name for p in model.mode_parameters if p.name.startswith("gyro.")}
+        scales = {n: span if n in lengths else 0.1 if n in gyro else max(abs(x), 1e-9) for n, x in at.theta.items()}
+        free = tuple(k for k, d in enumerate(self.delays) if d is None)
+        unknowns = Unknowns(model=model, known=self.parameters, scales=scales, free_delays=free)
+        return Likelihood(unknowns=unknowns, base=at, experiments=experiments, weights=weights)
+
+    def rough(
+        self, experiments: Sequence[Experiment], model: RotorModel, at: Point, most: int = 25
+    ) -> tuple[Point, float]:
+        """Search with a relative error; return the point, and the mean square of the residuals."""
+        cost = np.inf
+        for _ in range(2):  # the weights follow the scatter at the model
+            weights = [rough_weight(e, model, at, _RELATIVE) for e in experiments]
+            problem = self.problem(experiments, model, at, weights)
+            at, found = minimise(problem, at, most=most, tolerance=1e-3)
+            cost = found.cost / problem.n_real
+        return at, cost
+
+    def begin(self, experiments: Sequence[Experiment]) -> tuple[float, Point]:
+        """Return the band in Hz that a rigid rotor explains, and its numbers."""
+        f = experiments[0].spectra.frequency_hz
+        edges = sorted(
+            {float(f[min(_LEAST_LINES, f.size - 1)]), *np.geomspace(f[min(_LEAST_LINES, f.size - 1)], f[-1], 7)}
+        )
+        tried: list[tuple[float, float, Point]] = []
+        eddies = _EDDY_STARTS if "a" in self.model.extras else (None,)
+        for edge in edges:
+            band = [e.between(0.0, edge * (1.0 + 1e-9)) for e in experiments]
+            for eddy in eddies:
+                start = rigid_start(band[0], self.model, self.parameters, eddy=eddy)
+                known = [s if d is None else d for d, s in zip(self.delays, start.delays, strict=True)]
+                start = replace(start, delays=np.array(known, dtype=np.float64))
+                at, cost = self.rough(band, self.model, start, most=8)
+                if np.isfinite(cost):
+                    tried.append((edge, cost, at))
+            if tried and tried[-1][1] > 30.0 * min(c for _, c, _ in tried):
+                break  # far beyond the first mode
+        if not tried:
+            raise EstimationError(
+                "no rigid rotor explains the lowest lines of the record. Check columns, signs, units and planes"
+            )
+        fits = [t for t in tried if t[1] < _FITS] or [min(tried, key=lambda t: t[1])]
+        widest = max(edge for edge, *_ in fits)
+        edge, _, at = min((t for t in fits if t[0] == widest), key=lambda t: t[1])
+        return edge, at
+
+    def grow(self, experiments: Sequence[Experiment], edge: float, at: Point) -> tuple[RotorModel, Point]:
+        """Widen the band to all lines; where the fit breaks, add the mode that the residuals show."""
+        model, last = self.model, float(experiments[0].spectra.frequency_hz[-1])
+        while True:
+            band = [e.between(0.0, edge * (1.0 + 1e-9)) for e in experiments]
+            self.tick("modes", min(1.0, edge / last))
+            at, cost = self.rough(band, model, at)
+            while cost > _FITS and model.n_modes < self._most:
+                weight = rough_weight(band[0], model, at, _RELATIVE)
+                low = float(band[0].spectra.frequency_hz[0])
+                found = scan(band[0], model, at, weight, (low, _ABOVE * edge))
+                if found is None:
+                    break
+                more = model.with_modes(model.n_modes + 1)
+                trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
+                trial, lower = self.rough(band, more, trial)
+                if not lower < 0.9 * cost:
+                    break
+                model, at, cost = more, trial, lower
+            if edge >= last:
+                return _in_order(model, at)
+            above = [r for r in range(1, model.n_modes + 1) if at.theta[f"mode{r}.omega"] > 2.0 * np.pi * edge]
+            edge = min(edge * _WIDER, last)
+            model, at = _without(model, at, above)  # what was seen from below is found again from within
+
+    def turn(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
+        """Find polar inertia and gyroscopic terms of records at higher speeds by scans of the criterion."""
+        theta = dict(at.theta)
+        fast = [e for e in experiments if e.speed]
+        theta.setdefault("Ip", 0.2 * theta["Id"])
+        theta |= {p.name: theta.get(p.name, 0.0) for p in model.at_speed(1.0).mode_parameters}
+        at = replace(at, theta=theta)
+        for name in ["Ip", *(f"gyro.{r}{r}" for r in range(1, model.n_modes + 1))] * 2:
+            W = abs(fast[-1].speed)
+            size = theta["Id"] if name == "Ip" else theta[f"mode{name[5:][: len(name[5:]) // 2]}.omega"] / W
+            costs = []
+            for x in size * np.concatenate([[0.0], np.geomspace(0.01, 1.0, 30)]):
+                trial = replace(at, theta={**at.theta, name: float(x) if x else 1e-6 * size})
+                problem = self.problem(fast, model, trial, [rough_weight(e, model, trial, _RELATIVE) for e in fast])
+                costs.append((problem.cost(problem.pack(trial)), trial))
+            at = min(costs, key=lambda c: c[0])[1]
+        return at
+
+    def finish(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> RotorFit:
+        """Search on all lines with the noise model, decide on further modes, settle the delays."""
+        if len(experiments) > 1:
+            model = model.at_speed(max((e.speed for e in experiments), key=abs))
+            at, _ = self.rough(experiments, model, at)
+        fit = self.likely(experiments, model, at)
+        while fit.model.n_modes < self._most:
+            more = self._one_more(experiments, fit)
+            if more is None:
+                break
+            fit = more
+        whole = self._whole(fit)
+        if whole is not None:
+            delays = tuple(float(x) for x in whole)
+            held = replace(self, delays=delays)
+            fit = held.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)))
+        return fit
+
+    def likely(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> RotorFit:
+        """Search with the noise model, which follows it twice, and correct for feedback."""
+        self.tick("fit", 0.0)
+        converged, cost = False, np.inf
+        for k in range(3):
+            weights = [noise_weight(e, model, at) for e in experiments]
+            problem = self.problem(experiments, model, at, weights)
+            self.tick("fit", 0.3 * (k + 1))
+            at, found = minimise(problem, at, most=40, tolerance=1e-7)
+            changed = abs(found.cost / cost - 1.0) if np.isfinite(cost) else np.inf
+            converged, cost = found.converged, found.cost
+            if changed < 1e-3:
+                break
+        v, triangle, last = problem.corrected(problem.pack(at))
+        f = [e.spectra.frequency_hz for e in experiments]
+        return RotorFit(
+            problem=problem, vector=v, cost=cost, status="converged" if converged and last < 0.1 else "stalled",
+            last_step=last, triangle=triangle, band_hz=(min(float(x[0]) for x in f), max(float(x[-1]) for x in f)),
+        )  # fmt: skip
+
+    def _one_more(self, experiments: Sequence[Experiment], fit: RotorFit) -> RotorFit | None:
+        """Return the fit with the mode that the residuals ask for most, None where the likelihood does not want it."""
+        e, w = experiments[0], fit.problem.weights[0]
+        low, high = float(e.spectra.frequency_hz[0]), float(e.spectra.frequency_hz[-1])
+        found = scan(e, fit.model, fit.point, w, (low, 2.0 * high))
+        price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
+        if found is None or found.gain < price:
+            return None
+        more = fit.model.with_modes(fit.model.n_modes + 1)
+        theta = _with_mode(fit.point.theta, more, found.named(more.n_modes))
+        trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)))
+        # Weights follow the model: both are judged by those of the larger one.
+        before = replace(fit.problem, weights=trial.problem.weights)
+        return trial if before.cost(fit.vector) - trial.cost > price else None
+
+    def _whole(self, fit: RotorFit) -> Array | None:
+        """Return the delays where all that are searched agree with whole samples."""
+        free = fit.problem.unknowns.free_delays
+        if not free:
+            return None
+        sd = np.sqrt(np.sum(fit.seen.root() ** 2, axis=1))[-len(free) :]
+        delays = fit.point.delays
+        near = np.abs(delays - np.round(delays))[list(free)]
+        return np.round(delays) if np.all(near <= np.maximum(3.0 * sd, _WHOLE)) and np.all(sd < 0.1) else None
+
+    @property
+    def _most(self) -> int:
+        return _MOST_MODES if self.wanted is None else self.wanted
+
+
+def _with_mode(theta: Mapping[str, float], model: RotorModel, named: Mapping[str, float]) -> dict[str, float]:
+    """Return the numbers with those of one more mode; gyroscopic terms with others begin at zero."""
+    missing = {p.name: 0.0 for p in model.mode_parameters if p.name not in theta}
+    return {**theta, **missing, **{n: x for n, x in named.items() if n in missing}}
+
+
+def _in_order(model: RotorModel, at: Point) -> tuple[RotorModel, Point]:
+    """Return the same machine with its modes in order of frequency."""
+    order = sorted(range(1, model.n_modes + 1), key=lambda r: at.theta[f"mode{r}.omega"])
+    return model, _kept(at, order)
+
+
+def _without(model: RotorModel, at: Point, modes: Sequence[int]) -> tuple[RotorModel, Point]:
+    """Return the machine without some of its modes."""
+    order = [r for r in range(1, model.n_modes + 1) if r not in modes]
+    return model.with_modes(len(order)), _kept(at, order)
+
+
+def _kept(at: Point, order: Sequence[int]) -> Point:
+    new = {0: 0, **{r: k for k, r in enumerate(order, 1)}}
+    theta = {n: x for n, x in at.theta.items() if not n.startswith(("mode", "gyro."))}
+    for r in order:
+        for n, x in at.theta.items():
+            if n.startswith(f"mode{r}."):
+                theta[f"mode{new[r]}.{n.split('.', 1)[1]}"] = x
+        for s in [0, *order]:
+            old = f"gyro.{min(r, s)}{max(r, s)}"
+            if old in at.theta:
+                theta[f"gyro.{min(new[r], new[s])}{max(new[r], new[s])}"] = at.theta[old]
+    return replace(at, theta=theta)

@@ -1,0 +1,187 @@
+"""Frequency-domain maximum likelihood of a rotor on period spectra: its criterion, search and information.
+
+e(k) = Y(k) - H(k; theta) U(k) at the excited lines, mean over the periods; no frequency response is formed (Pintelon
+and Schoukens 2012, sec. 9.11). Under feedback the inputs hold a part Q e of the residuals; the likelihood's slope is
+that of H (U - Q e), and without it weak excitation is biased.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.search import Found, search
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.noise import Noise, feedback, fit_noise, rough_covariance
+from ambid.rotor.response import Sampled
+from ambid.rotor.spectra import PeriodSpectra
+from ambid.rotor.unknowns import Unknowns
+
+_ROOT_2 = np.sqrt(2.0)
+_CORRECTIONS = 6
+_SETTLED = 1e-3  # squared length of a corrected step, in standard deviations, below which it is over
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Experiment:
+    """A record as the estimator sees it: its spectra, and the speed at which it was taken, rad/s."""
+
+    spectra: PeriodSpectra
+    speed: float
+
+    def between(self, low_hz: float, high_hz: float) -> Experiment:
+        """Return the lines of a band."""
+        f = self.spectra.frequency_hz
+        return replace(self, spectra=self.spectra.lines((f >= low_hz) & (f <= high_hz)))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Point:
+    """Numbers by the names of the model, and delays in samples."""
+
+    theta: Mapping[str, float]
+    delays: Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Weight:
+    """How residuals of one experiment count: whitening (n_lines, n_y, n_y), and Q of the feedback."""
+
+    whiten: Complex
+    back: Complex | None = None
+    noise: Noise | None = None
+
+
+def sampled(experiment: Experiment, model: RotorModel, at: Point) -> Sampled:
+    """Return the model at the lines and the speed of an experiment."""
+    spectra = experiment.spectra
+    return Sampled(
+        space=model.at_speed(experiment.speed).matrices(at.theta), omega=spectra.omega, rate_hz=spectra.rate_hz,
+        delays=at.delays, held=tuple(model.drive(j) == "voltage" for j in range(len(model.axes))),
+    )  # fmt: skip
+
+
+def rough_weight(experiment: Experiment, model: RotorModel, at: Point, relative: float) -> Weight:
+    """Return weights by scatter and a relative error of the model."""
+    H = sampled(experiment, model, at).transfer()
+    variance = np.real(np.diagonal(rough_covariance(experiment.spectra, H, relative), axis1=1, axis2=2))
+    return Weight(whiten=(np.eye(variance.shape[1]) / np.sqrt(variance)[:, :, None]).astype(np.complex128))
+
+
+def noise_weight(experiment: Experiment, model: RotorModel, at: Point) -> Weight:
+    """Return weights by the noise model, with the feedback."""
+    of, spectra = sampled(experiment, model, at), experiment.spectra
+    H = of.transfer()
+    noise = fit_noise(spectra, of, H)
+    factor = np.linalg.cholesky(noise.covariance / spectra.n_periods)
+    back = feedback(spectra, H)
+    return Weight(whiten=np.linalg.inv(factor).astype(np.complex128), back=back, noise=noise)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Likelihood:
+    """The criterion over several experiments, as `ambid.estimation.search.Problem`."""
+
+    unknowns: Unknowns
+    base: Point  # what does not move
+    experiments: Sequence[Experiment]
+    weights: Sequence[Weight]
+
+    def point(self, v: Array) -> Point:
+        """Return the numbers at a vector."""
+        theta, delays = self.unknowns.unpack(v, self.base.theta, self.base.delays)
+        return Point(theta=theta, delays=delays)
+
+    def pack(self, at: Point) -> Array:
+        """Return the vector of numbers."""
+        return self.unknowns.pack(at.theta, at.delays)
+
+    def residuals(self, v: Array) -> list[Complex]:
+        """Return the whitened mean residuals of each experiment, (n_lines, n_y)."""
+        at = self.point(v)
+        return [
+            _whitened(w, e.spectra.mean_y - _applied(sampled(e, self.unknowns.model, at).transfer(), e.spectra.mean_u))
+            for e, w in zip(self.experiments, self.weights, strict=True)
+        ]
+
+    def cost(self, theta: Array) -> float:
+        """Return the sum of squares of whitened residuals and priors."""
+        if not np.all(np.isfinite(theta)) or np.any(np.abs(theta[: len(self.unknowns.logs)]) > 200.0):
+            return np.inf
+        with np.errstate(all="ignore"):
+            try:
+                parts = [2.0 * float(np.sum(np.abs(e) ** 2)) for e in self.residuals(theta)]
+            except np.linalg.LinAlgError:
+                return np.inf
+        found = sum(parts) + float(np.sum(self.unknowns.priors(theta)[1] ** 2))
+        return found if np.isfinite(found) else np.inf
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of slopes and residuals."""
+        return triangle_of([*self.rows(theta, corrected=False), self._prior_rows(theta)])
+
+    def rows(self, v: Array, *, corrected: bool) -> list[Array]:
+        """Return [J | r] of each experiment; `corrected`: slopes are those at inputs freed of what feedback put in."""
+        at, model = self.point(v), self.unknowns.model
+        named, chain = self.unknowns.chain(v)
+        n_d = chain.shape[0] - len(named)
+        found = []
+        for e, w in zip(self.experiments, self.weights, strict=True):
+            of, turned = sampled(e, model, at), model.at_speed(e.speed)
+            mean = e.spectra.mean_u
+            left = e.spectra.mean_y - _applied(of.transfer(), mean)
+            if corrected and w.back is not None:
+                mean = mean - _applied(w.back, left)
+            steps = [turned.derivative(at.theta, name) for name in named]
+            slopes = w.whiten @ (of.slopes(mean, steps, n_d) @ chain)
+            r = _whitened(w, left)
+            block = np.concatenate([slopes, r[:, :, None]], axis=2).reshape(-1, chain.shape[1] + 1)
+            found.append(_ROOT_2 * np.concatenate([block.real, block.imag]))
+        return found
+
+    def _prior_rows(self, v: Array) -> Array:
+        slopes, left = self.unknowns.priors(v)
+        return np.column_stack([slopes, left])
+
+    def corrected(self, v: Array) -> tuple[Array, Array, float]:
+        """Return the vector where the likelihood's slope vanishes, the triangle of [J | r] there, and its last step.
+
+        Full Gauss-Newton steps from the least squares; the last step's squared length is in standard deviations.
+        """
+        length = np.inf
+        for k in range(_CORRECTIONS):
+            R = triangle_of([*self.rows(v, corrected=True), self._prior_rows(v)])
+            found = directions(R[:, :-1])
+            length = found.explain(R[:, -1])
+            if length < _SETTLED or k == _CORRECTIONS - 1:
+                break
+            step = found.solve(R[:, -1])
+            v = v + step * min(1.0, 10.0 / np.sqrt(length))
+        return v, R, length
+
+    @property
+    def n_real(self) -> int:
+        """Number of real residuals."""
+        return sum(2 * e.spectra.mean_y.size for e in self.experiments)
+
+
+def minimise(
+    problem: Likelihood, at: Point, *, most: int = 40, tolerance: float = 1e-6, damping: float = 1e-3
+) -> tuple[Point, Found]:
+    """Search from a point; return where it ended."""
+    found = search(
+        problem, problem.pack(at), most=most, tolerance=tolerance, damping=damping, settled=1e-3, longest=1.0
+    )
+    return problem.point(found.theta), found
+
+
+def _applied(H: Complex, U: Complex) -> Complex:
+    return np.asarray((H @ U[:, :, None])[:, :, 0])
+
+
+def _whitened(w: Weight, e: Complex) -> Complex:
+    return _applied(w.whiten, e)

@@ -1,0 +1,168 @@
+"""Where a bending mode is missing: a scan of the residuals for one more pole pair, all at once by linear least squares.
+
+A mode (w, zeta) with shape b at the bearings and s at the sensors adds x_s = s D(jw) Σ b f to the positions, f the
+force of each magnet. At speed W a gyroscopic term g splits it: for the circular motions x ± jy
+
+    D± = 1/(w² - W_l² ± g W W_l + 2 j zeta w W_l),   W_l: frequency of the line.
+
+The products s bᵀ are linear in the residuals; the best rank-one part is the start of a search. Beside it stands a
+static compliance, so that modes above the band do not look like one within. The magnets' stiffness moves the pole that
+is seen: w² = seen² - Σ k_x b².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.likelihood import Experiment, Point, Weight, sampled
+
+_STEP = 0.004  # of the frequencies that are tried, relative
+_DAMPINGS = (0.002, 0.006, 0.02, 0.06)
+_SPLITS = np.concatenate([[0.0], np.geomspace(0.005, 0.6, 24)])  # g W over w
+_START_DAMPING = (0.001, 0.05)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Candidate:
+    """A mode that the residuals ask for: `gain` is by how much it lowers the sum of squares, roughly."""
+
+    omega: float
+    zeta: float
+    gyro: float
+    bearings: Mapping[str, float]  # shape at the bearings, by place
+    sensors: Mapping[str, float]
+    gain: float
+
+    def named(self, r: int) -> dict[str, float]:
+        """Return its numbers as those of mode `r` of the model."""
+        shape = {f"mode{r}.{place}": x for place, x in {**self.bearings, **self.sensors}.items()}
+        return {f"mode{r}.omega": self.omega, f"mode{r}.zeta": self.zeta, f"gyro.{r}{r}": self.gyro, **shape}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Motion:
+    """Residuals and forces as circular motions, or of one plane: by direction (+1, -1, 0)."""
+
+    direction: int
+    force: Complex  # (n_lines, n_bearings)
+    left: Complex  # (n_lines, n_sensors)
+    weight: Array  # (n_lines, n_sensors), inverse variances
+
+
+def scan(
+    experiment: Experiment, model: RotorModel, at: Point, weight: Weight, band: tuple[float, float]
+) -> Candidate | None:
+    """Return the mode within a band in Hz that explains most of what the model leaves over; None without one."""
+    motions, places = _motions(experiment, model, at, weight)
+    line = experiment.spectra.omega
+    omega = 2.0 * np.pi * np.exp(np.arange(np.log(band[0]), np.log(band[1]), _STEP))
+    turning = model.at_speed(experiment.speed).turning
+    splits = _SPLITS if turning else _SPLITS[:1]
+    best: tuple[float, float, float, float, Array] | None = None
+    for zeta in _DAMPINGS:
+        for split in splits:
+            gains, products = _tried(motions, line, omega, zeta, split)
+            k = int(np.argmax(gains))
+            if best is None or gains[k] > best[0]:
+                best = float(gains[k]), float(omega[k]), zeta, float(split), products[k]
+    if best is None or not best[0] > 0.0:
+        return None
+    gain, seen, zeta, split, product = best
+    U, size, Vt = np.linalg.svd(product)  # (n_sensors, n_bearings)
+    shape_b, shape_s = Vt[0] * np.sqrt(size[0]), U[:, 0] * np.sqrt(size[0])
+    at_b, at_s = places
+    pulled = 0.0
+    for b, x in zip(at_b, shape_b, strict=True):
+        axis = next(j for j, (bearing, plane) in enumerate(model.placed) if f"{bearing.name}.z" == b and plane < 2)
+        pulled += at.theta[f"{model.axes[axis]}.k_x"] * x**2
+    own = seen**2 - pulled
+    own = own if 0.5 * seen**2 < own < 2.0 * seen**2 else seen**2
+    return Candidate(
+        omega=float(np.sqrt(own)), zeta=float(np.clip(zeta, *_START_DAMPING)),
+        gyro=split * seen / experiment.speed if turning else 0.0,
+        bearings=dict(zip(at_b, shape_b.tolist(), strict=True)), sensors=dict(zip(at_s, shape_s.tolist(), strict=True)),
+        gain=gain,
+    )  # fmt: skip
+
+
+def _motions(
+    experiment: Experiment, model: RotorModel, at: Point, weight: Weight
+) -> tuple[list[_Motion], tuple[Sequence[str], Sequence[str]]]:
+    """Return residuals and forces by direction of whirl, and the places of bearings and sensors."""
+    spectra, turned = experiment.spectra, model.at_speed(experiment.speed)
+    of = sampled(experiment, model, at)
+    x = of.states(spectra.mean_u)
+    left = spectra.mean_y - x @ of.space.C.T
+    variance = np.real(
+        np.diagonal(np.linalg.inv(np.conj(np.swapaxes(weight.whiten, 1, 2)) @ weight.whiten), axis1=1, axis2=2)
+    )
+    magnets, _ = turned.rows(at.theta)
+    n, states = len(turned.coordinates), list(turned.states)
+    force = np.zeros((x.shape[0], len(model.axes)), dtype=complex)
+    for j, axis in enumerate(model.axes):
+        name = f"{axis}_effective_current" if "a" in model.extras else f"{axis}_current"
+        current = x[:, states.index(name)] if name in states else spectra.mean_u[:, j]
+        force[:, j] = at.theta[f"{axis}.k_i"] * current - at.theta[f"{axis}.k_x"] * (x[:, :n] @ magnets[j])
+    radial = [b for b in model.bearings if not b.axial]
+    at_b = [f"{b.name}.z" for b in radial]
+    at_s = [b.sensor_parameter(k) for b in radial for k in range(len(b.z_sensors))]
+
+    def of_plane(plane: int) -> tuple[Complex, Complex, Array] | None:
+        f = np.zeros((x.shape[0], len(at_b)), dtype=complex)
+        e, w = np.zeros((x.shape[0], len(at_s)), dtype=complex), np.zeros((x.shape[0], len(at_s)))
+        if plane not in model.planes:
+            return None
+        for j, (b, p) in enumerate(model.placed):
+            if p == plane:
+                f[:, at_b.index(f"{b.name}.z")] = force[:, j]
+        for k, (j, number) in enumerate(model.sensors):
+            if model.placed[j][1] == plane:
+                s = at_s.index(model.placed[j][0].sensor_parameter(number))
+                e[:, s], w[:, s] = left[:, k], 1.0 / variance[:, k]
+        return f, e, w
+
+    one, other = of_plane(0), of_plane(1)
+    if one is None or other is None or not turned.turning:
+        alone = [_Motion(direction=0, force=m[0], left=m[1], weight=m[2]) for m in (one, other) if m is not None]
+        return alone, (at_b, at_s)
+    half = np.sqrt(0.5)
+    return [
+        _Motion(
+            direction=sign, force=half * (one[0] + 1j * sign * other[0]), left=half * (one[1] + 1j * sign * other[1]),
+            weight=2.0 / (1.0 / np.maximum(one[2], 1e-300) + 1.0 / np.maximum(other[2], 1e-300)),
+        )
+        for sign in (1, -1)
+    ], (at_b, at_s)  # fmt: skip
+
+
+def _tried(motions: Sequence[_Motion], line: Array, omega: Array, zeta: float, split: float) -> tuple[Array, Array]:
+    """Return what a mode at each frequency explains, (n_omega,), and its products s bᵀ there."""
+    n_b, n_s = motions[0].force.shape[1], motions[0].left.shape[1]
+    G = np.zeros((omega.size, n_s, 2 * n_b, 2 * n_b))
+    r = np.zeros((omega.size, n_s, 2 * n_b))
+    for m in motions:
+        D = 1.0 / (omega[:, None] ** 2 - line**2 + line * omega[:, None] * (m.direction * split + 2j * zeta))
+        q = np.conj(m.force)[:, :, None] * m.force[:, None, :]  # (n_lines, n_b, n_b)
+        for s in range(n_s):
+            w = m.weight[:, s]
+            weighed = (q * w[:, None, None]).reshape(line.size, -1)
+            p = np.conj(m.force) * (w * m.left[:, s])[:, None]
+            G[:, s, :n_b, :n_b] += (np.abs(D) ** 2 @ weighed.real).reshape(-1, n_b, n_b)
+            cross = (np.conj(D) @ weighed).real.reshape(-1, n_b, n_b)
+            G[:, s, :n_b, n_b:] += cross
+            G[:, s, n_b:, :n_b] += cross.transpose(0, 2, 1)
+            G[:, s, n_b:, n_b:] += weighed.real.sum(axis=0).reshape(n_b, n_b)
+            r[:, s, :n_b] += (np.conj(D) @ p).real
+            r[:, s, n_b:] += p.real.sum(axis=0)
+    size = np.sqrt(np.maximum(np.einsum("fsii->fsi", G), 1e-300))
+    scaled = G / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(2 * n_b)
+    b = r / size
+    full = np.linalg.solve(scaled, b[..., None])[..., 0]
+    fixed = np.linalg.solve(scaled[..., n_b:, n_b:], b[..., n_b:, None])[..., 0]
+    gain = np.einsum("fsi,fsi->f", full, b) - np.einsum("fsi,fsi->f", fixed, b[..., n_b:])
+    return 2.0 * gain, (full / size)[..., :n_b]

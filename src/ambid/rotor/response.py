@@ -1,0 +1,148 @@
+"""The exact sampled response of a linear model at many lines, and its derivatives, through one eigendecomposition.
+
+With x' = A x + B u, u held over a sample and f samples late, every line z has H = C h_z(A) B, where
+
+    h_z(s) = (exp(s (1-f) T) - 1 + (exp(s T) - exp(s (1-f) T))/z) / (s (z - exp(s T)))
+
+(Astrom and Wittenmark 1997, sec. 2.3); a band-limited input has h_z(s) = exp(-jw f T)/(jw - s). In the eigenvectors
+A = V diag(s) V⁻¹ the derivative of h_z(A) along dA is V [(V⁻¹ dA V) ∘ D] V⁻¹ with the divided differences
+D_ij = (h_z(s_i) - h_z(s_j))/(s_i - s_j) (Daleckii and Krein 1965; Higham 2008, th. 3.11).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.physics.linear_model import StateSpace
+
+_SAME = 1e-7  # distance of eigenvalues, over their size, from which the divided difference is the derivative
+_REST = 1e-9  # an eigenvalue at 0 stands here, 1/s
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Sampled:
+    """A model at lines: `delays` (n_u,) in samples, `held` (n_u,) whether an input is held over a sample."""
+
+    space: StateSpace
+    omega: Array  # (n_lines,), rad/s
+    rate_hz: float
+    delays: Array
+    held: tuple[bool, ...]
+
+    @cached_property
+    def eigen(self) -> tuple[Complex, Complex, Complex]:
+        """Eigenvalues, right eigenvectors and their inverse."""
+        values, V = np.linalg.eig(self.space.A)
+        values = np.where(np.abs(values) < _REST, _REST, values).astype(complex)
+        return values, V, np.linalg.inv(V)
+
+    @cached_property
+    def condition(self) -> float:
+        """Condition number of the eigenvectors."""
+        return float(np.linalg.cond(self.eigen[1]))
+
+    @cached_property
+    def groups(self) -> tuple[tuple[Array, bool, float], ...]:
+        """Inputs that are treated alike: which, whether held, and their fraction of a sample."""
+        fraction = self.delays - np.floor(self.delays)
+        keys = list(zip(self.held, fraction.tolist(), strict=True))
+        return tuple(
+            (np.array([k for k, x in enumerate(keys) if x == key]), key[0], key[1]) for key in dict.fromkeys(keys)
+        )
+
+    def scalar(self, held: bool, fraction: float) -> Complex:
+        """Return h_z at the eigenvalues, (n_lines, n_states)."""
+        s, T = self.eigen[0], 1.0 / self.rate_hz
+        if not held:
+            return np.asarray(np.exp(-1j * self.omega * fraction * T)[:, None] / (1j * self.omega[:, None] - s))
+        z = np.exp(1j * self.omega * T)[:, None]
+        part, whole = np.expm1(s * (1.0 - fraction) * T), np.expm1(s * T)
+        return np.asarray((part + (whole - part) / z) / (s * (z - 1.0 - whole)))
+
+    def scalar_slopes(self, held: bool, fraction: float) -> tuple[Complex, Complex]:
+        """Return the derivatives of h_z by the eigenvalue and by the fraction, (n_lines, n_states)."""
+        s, T = self.eigen[0], 1.0 / self.rate_hz
+        h = self.scalar(held, fraction)
+        if not held:
+            late = np.exp(-1j * self.omega * fraction * T)[:, None]
+            return h**2 / late, -1j * (self.omega * T)[:, None] * h
+        z, a = np.exp(1j * self.omega * T)[:, None], (1.0 - fraction) * T
+        E, part = np.exp(s * T), np.exp(s * a)
+        below = z - E
+        by_value = (a * part + (T * E - a * part) / z) / (s * below) - h / s + h * T * E / below
+        return by_value, -T * part * (1.0 - 1.0 / z) / below
+
+    def late(self) -> Complex:
+        """Return what the whole samples of the delays do to each input, (n_lines, n_u)."""
+        return np.exp(-1j * np.outer(self.omega / self.rate_hz, np.floor(self.delays)))
+
+    def transfer(self) -> Complex:
+        """Return H from the inputs, (n_lines, n_y, n_u)."""
+        _, V, inverse = self.eigen
+        left, right, late = self.space.C @ V, inverse @ self.space.B, self.late()
+        H = np.empty((self.omega.size, left.shape[0], right.shape[1]), dtype=complex)
+        for columns, held, fraction in self.groups:
+            h = self.scalar(held, fraction)
+            H[:, :, columns] = (h[:, None, :] * left) @ right[:, columns] * late[:, None, columns]
+        return H
+
+    def disturbed(self) -> Complex:
+        """Return H from the disturbances, held over a sample, (n_lines, n_y, n_d)."""
+        _, V, inverse = self.eigen
+        h = self.scalar(True, 0.0)
+        return np.asarray((h[:, None, :] * (self.space.C @ V)) @ (inverse @ self.space.E))
+
+    def states(self, U: Complex) -> Complex:
+        """Return the states at spectra of the inputs `U` (n_lines, n_u): (n_lines, n_states)."""
+        return np.asarray(self._modal(U) @ self.eigen[1].T)
+
+    def _modal(self, U: Complex) -> Complex:
+        _, _, inverse = self.eigen
+        right, late = inverse @ self.space.B, U * self.late()
+        parts = [self.scalar(held, f) * (late[:, cols] @ right[:, cols].T) for cols, held, f in self.groups]
+        return np.asarray(np.sum(parts, axis=0))
+
+    def slopes(self, U: Complex, directions: Sequence[StateSpace], n_delays: int = 0) -> Complex:
+        """Return the derivative of H U along directions (dA, dB, dC), then by the first `n_delays` delays.
+
+        `U`: (n_lines, n_u). Returns (n_lines, n_y, n_directions + n_delays).
+        """
+        s, V, inverse = self.eigen
+        n, left, late = s.size, self.space.C @ V, U * self.late()
+        right = inverse @ self.space.B
+        gap = s[:, None] - s[None, :]
+        same = np.abs(gap) <= _SAME * (np.abs(s[:, None]) + np.abs(s[None, :]))
+        gap = np.where(same, 1.0, gap)
+        weights = np.zeros((self.omega.size, n, n), dtype=complex)  # divided differences times the modal input
+        modal = np.zeros((self.omega.size, n), dtype=complex)
+        d_B = [inverse @ d.B for d in directions]
+        through = np.zeros((self.omega.size, n, len(directions) + n_delays), dtype=complex)
+        for columns, held, fraction in self.groups:
+            h = self.scalar(held, fraction)
+            by_value, by_fraction = self.scalar_slopes(held, fraction)
+            into = late[:, columns] @ right[:, columns].T
+            differences = (h[:, :, None] - h[:, None, :]) / gap
+            differences[:, same] = (0.5 * (by_value[:, :, None] + by_value[:, None, :]))[:, same]
+            weights += differences * into[:, None, :]
+            modal += h * into
+            for k, d in enumerate(d_B):
+                if np.any(d[:, columns]):
+                    through[:, :, k] += h * (late[:, columns] @ d[:, columns].T)
+            for m in columns:
+                if m < n_delays:
+                    through[:, :, len(directions) + m] = by_fraction * (late[:, [m]] @ right[:, [m]].T)
+        d_A = np.array([inverse @ d.A @ V for d in directions])  # (n_directions, n, n)
+        if len(directions):
+            moved = np.matmul(weights.transpose(1, 0, 2), d_A.transpose(1, 2, 0))  # (n, n_lines, n_directions)
+            through[:, :, : len(directions)] += moved.transpose(1, 0, 2)
+        found = np.tensordot(through, left, axes=(1, 1)).transpose(0, 2, 1)
+        x = modal @ V.T
+        for k, direction in enumerate(directions):
+            if np.any(direction.C):
+                found[:, :, k] += x @ direction.C.T
+        return np.asarray(found)
