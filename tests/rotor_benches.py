@@ -7,13 +7,19 @@ from __future__ import annotations
 
 import importlib.util
 import sys
+from collections.abc import Iterator
+from dataclasses import replace
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 import pytest
 
+from ambid.physics.linear_model import Parameter
+from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.rotor_model import Bearing, RotorModel
+from ambid.rig import Rig
+from ambid.rig.rig import RecordSettings, RigChannel, RigModes, Turning
 from tests.measured import RECORDS
 
 DATUM = 0.2
@@ -35,6 +41,42 @@ def _simulator() -> ModuleType | None:
 
 truth: Any = _simulator()
 needs_simulator = pytest.mark.skipif(truth is None, reason="the independent simulator ../shared/checks is not here")
+
+
+def rig_of(bench: Any) -> Rig:
+    """Return the rig that simulates as a bench of the independent simulator does, with every number fixed.
+
+    Its controller adds to the integral before it uses it, and its derivative forgets by 1 - c a sample.
+    """
+    model, theta = model_of(bench)
+    modal, period = truth.modal_of(bench), 1.0 / bench.rate
+    c = 1.0 - np.exp(-2.0 * np.pi * bench.kd_pole_hz * period)
+    n, rigid = modal.mass.size - 2, replace(model, n_modes=0)
+    numbers = {name: x for name, x in theta.items() if name.startswith(("mode", "gyro"))}
+    numbers |= {f"mode{r}.unbalance.u": float(modal.unbalance[r + 1]) for r in range(1, n + 1)}
+    of = {"phase": bench.phase_unbalance, "z": DATUM + float(modal.unbalance[1])}
+    return Rig(
+        name=bench.name, model="rotor", rotor=rigid, channels=tuple(_channels(rigid)),
+        parameters=tuple(
+            Parameter(name=p.name, unit=p.unit, role="fixed", value=theta[p.name]) for p in rigid.parameters
+        ),
+        modes=RigModes(count=n, frequency_hz=tuple((modal.omega[2:] / (2 * np.pi)).tolist()), numbers=numbers),
+        unbalance=(Turning(name="u", value=bench.unbalance, **of),),
+        runout=tuple(Turning(name=x, value=bench.runout, phase=1.1) for x in "AB"),
+        loop=Loop(kp=bench.kc * (bench.kp + bench.ki * period), ki=bench.kc * bench.ki, kd=bench.kc * bench.kd,
+                  kc=bench.kc, derivative_cutoff_hz=float(c / (2 * np.pi * period * (1.0 - c))), delay=bench.delay),
+        limits=Limits(voltage=(-bench.volts_max, bench.volts_max)),
+        noise=Noise.held(rate_hz=bench.rate, force=bench.force_noise, voltage=bench.voltage_noise,
+                         position=bench.position_noise, current=bench.current_noise),
+        record=RecordSettings(rate_hz=bench.rate),
+    )  # fmt: skip
+
+
+def _channels(model: RotorModel) -> Iterator[RigChannel]:
+    for role in model.inputs:
+        yield RigChannel(role=role, column=role, delay="auto")
+    for role in (*model.outputs, *(f"{axis}_reference" for axis in model.axes)):
+        yield RigChannel(role=role, column=role)
 
 
 def model_and_truth(name: str) -> tuple[RotorModel, dict[str, float]]:
@@ -63,4 +105,4 @@ def model_of(bench: Any) -> tuple[RotorModel, dict[str, float]]:
         for j, x in enumerate("AB"):
             theta |= {f"mode{r}.{x}.z": modal.bearing[j, r + 1], f"mode{r}.{x}.z_sensor": modal.sensor[j, r + 1]}
         theta |= {f"gyro.{s}{r}": modal.gyro[s + 1, r + 1] for s in range(r + 1)}
-    return model, theta
+    return model, {name: float(x) for name, x in theta.items()}

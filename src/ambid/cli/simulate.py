@@ -45,8 +45,25 @@ def command(
         str | None, option("--band LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
     ] = None,
     periods: Annotated[
-        int, option("--periods N", "Number of repetitions of the excitation, for 'ambid frf'.", True, min=1)
-    ] = 1,
+        int | None,
+        option(
+            "--periods N",
+            "Number of repetitions of the excitation, for 'ambid frf'.",
+            "1; of a rotor about one a second, at least 4",
+            min=1,
+        ),
+    ] = None,
+    axes: Annotated[
+        str | None, option("--axes AX,...", "Axes of a rotor that are excited, with commas between.", "all")
+    ] = None,
+    settle: Annotated[
+        int | None,
+        option("--settle N", "Periods that a rotor runs before the record begins, in steady state.", "1", min=0),
+    ] = None,
+    excitation_only: Annotated[
+        bool,
+        switch("--excitation-only", "Write only what is to be added to the controllers' outputs of a rotor."),
+    ] = False,
     log_excitation: Annotated[
         bool, switch("--log-excitation", "Add a column 'excitation': the reference for 'ambid frf'.")
     ] = False,
@@ -72,14 +89,15 @@ def command(
 
     With --scenario something changes on the way, and the record holds the truth of it in columns true_...
     """
-    from ambid.job.simulation import simulate_used
+    from ambid.job.simulation import only_references, simulate_used
     from ambid.record import write_record
 
     preset = preset_of(rig)
     closed, source = None if loop is None else loop == "closed", None if preset else Path(rig)
     if scenario is not None:
         of_excitation = {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear,
-                         "--position": position, "--periods": periods != 1}  # fmt: skip
+                         "--position": position, "--periods": periods, "--axes": axes, "--settle": settle,
+                         "--excitation-only": excitation_only}  # fmt: skip
         refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
                  "closed": closed, "log_excitation": log_excitation, "force": force}  # fmt: skip
@@ -92,21 +110,24 @@ def command(
         outputs.claim(record, "-o", _ENDINGS, force=force)
         done, told = simulate_used(
             preset or Path(rig), duration=1.0 if duration is None else duration, rate_hz=rate,
-            excitation=excitation or "multisine", amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
-            closed=closed, nonlinear=nonlinear, position=position, log_excitation=log_excitation,
-            force=force,
+            excitation=excitation, amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
+            axes=None if axes is None else axes.split(","), settle=settle, closed=closed, nonlinear=nonlinear,
+            position=position, log_excitation=log_excitation, force=force,
         )  # fmt: skip
+        made = only_references(done.record) if excitation_only else done.record
         comments: tuple[str, ...] = ()
         if record.suffix not in (".h5", ".hdf5"):
             between = "" if band is None else f" in {band} Hz"
             comments = (
-                _recipe(rig, f"{told.kind} of {told.peak:.6g} V{between}", seed),
+                _recipe(rig, f"{told.kind} of {told.peak:.6g} {told.unit}{between}", seed),
                 f"truth: {truth_words(done)}",
             )
-        outputs.stage(record, lambda path: write_record(done.record, path, comments=comments))
+        outputs.stage(record, lambda path: write_record(made, path, comments=comments))
     warn(done)
     n, rate_hz = done.record.n_samples, done.record.rate_hz
-    typer.echo(f"{record}: {counted(n, 'sample')} at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} V, seed {seed}")
+    typer.echo(
+        f"{record}: {counted(n, 'sample')} at {rate_hz:g} Hz, {told.kind} of {told.peak:.4g} {told.unit}, seed {seed}"
+    )
     typer.echo("truth: " + truth_words(done))
 
 

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, nearest
 from ambid.estimation.estimate import Estimate
 from ambid.job.results import read_linear_estimate, rig_of
 from ambid.physics.loop import Loop
@@ -18,12 +18,16 @@ from ambid.physics.presets import Preset, preset, preset_names
 from ambid.record import Channel, Record
 from ambid.rig import Rig, load_rig
 from ambid.signals import excitation as make_excitation
+from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
 from ambid.simulation.rig_bench import Bench
+from ambid.simulation.rotor_bench import RotorBench
 
 BenchSource = str | Path | Rig | Preset | Estimate
 """Who has the numbers of a bench: a preset by name, a rig, a linear estimate, or a file of one of these."""
 
+_LEAST_PERIODS = 4  # of a rotor's record: their scatter is its noise
+_REACH = 10.0  # of the rate over the highest line of a rotor's excitation
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
@@ -32,7 +36,8 @@ class Excited:
     """The excitation of a simulated record."""
 
     kind: str
-    peak: float  # V; rms of a gaussian
+    peak: float  # in the unit of the input; rms of a gaussian
+    unit: str = "V"
 
 
 def simulate(
@@ -40,10 +45,12 @@ def simulate(
     *,
     duration: float = 1.0,
     rate_hz: float | None = None,
-    excitation: str = "multisine",
+    excitation: str | None = None,
     amplitude: float | None = None,
     band: tuple[float, float] | None = None,
-    periods: int = 1,
+    periods: int | None = None,
+    axes: Sequence[str] | None = None,
+    settle: int | None = None,
     seed: int = 0,
     closed: bool | None = None,
     nonlinear: bool = False,
@@ -62,13 +69,19 @@ def simulate(
     rate_hz : float, optional
         Sampling rate in Hz; default the bench's.
     excitation : str, optional
-        One of `ambid.signals.EXCITATIONS`.
+        One of `ambid.signals.EXCITATIONS`, or for a rotor of `ambid.signals.AXES_EXCITATIONS`; default ``multisine``,
+        for a rotor ``zippered``.
     amplitude : float, optional
         Peak in V (rms for ``gaussian``); default: what half of the limits allows.
     band : (float, float), optional
-        Band of the excitation in Hz; default: one period over the record to a fifth of the rate.
+        Band of the excitation in Hz; default: one period over the record to a fifth of the rate, of a rotor from its
+        first line to a tenth.
     periods : int, optional
-        Number of repetitions of the excitation.
+        Number of repetitions of the excitation; default 1, for a rotor about one a second and at least 4.
+    axes : sequence of str, optional
+        Of a rotor: the axes that are excited; default all.
+    settle : int, optional
+        Of a rotor: periods that run before the record begins, so that it begins in steady state; default 1.
     seed : int, optional
         Seed of excitation and noise.
     closed : bool, optional
@@ -78,7 +91,7 @@ def simulate(
     position : float, optional
         With `nonlinear`: position at which the loop holds the rotor, m.
     log_excitation : bool, optional
-        Add a channel ``excitation``, the reference for `ambid.frf`.
+        Add a channel ``excitation``, the reference for `ambid.frf`. A rotor always has ``<axis>_reference``.
     force : bool, optional
         Simulate a loop that is predicted unstable too.
 
@@ -101,7 +114,7 @@ def simulate(
     """
     done, _ = simulate_used(
         source, duration=duration, rate_hz=rate_hz, excitation=excitation, amplitude=amplitude, band=band,
-        periods=periods, seed=seed, closed=closed, nonlinear=nonlinear, position=position,
+        periods=periods, axes=axes, settle=settle, seed=seed, closed=closed, nonlinear=nonlinear, position=position,
         log_excitation=log_excitation, force=force,
     )  # fmt: skip
     for line in done.warnings:
@@ -114,10 +127,12 @@ def simulate_used(
     *,
     duration: float = 1.0,
     rate_hz: float | None = None,
-    excitation: str = "multisine",
+    excitation: str | None = None,
     amplitude: float | None = None,
     band: tuple[float, float] | None = None,
-    periods: int = 1,
+    periods: int | None = None,
+    axes: Sequence[str] | None = None,
+    settle: int | None = None,
     seed: int = 0,
     closed: bool | None = None,
     nonlinear: bool = False,
@@ -130,19 +145,68 @@ def simulate_used(
     n = _samples(duration, bench.rate_hz)
     if not force:
         bench.refuse_unstable()
-    shape = _repeat(
-        lambda part: make_excitation(excitation, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods
-    )
     if amplitude is None and bench.rig is not None and bench.rig.limits is None:
         raise AmbidError(
             "no amplitude was given, and the rig has no limits to derive one from. Give --amplitude A in V"
         )
+    if isinstance(bench, RotorBench):
+        if log_excitation:
+            raise AmbidError("--log-excitation is for one axis; a rotor's record has <axis>_reference. Omit it")
+        kind, held = excitation or "zippered", 1 if settle is None else settle
+        shape, period = _of_axes(bench, kind, n, periods, axes, band, seed)
+        trial = shape[: 2 * period]  # begins at rest: what it needs is no less than later
+        peak = bench.largest(trial, seed, _FRACTION) if amplitude is None else amplitude
+        before = np.tile(shape[:period], (held, 1))
+        done = bench.simulate(peak * np.vstack([before, shape]), seed=seed, settle=held * period)
+        return done, Excited(kind=kind, peak=peak, unit=bench.model.units[bench.model.inputs[0]])
+    if axes is not None or settle is not None:
+        raise AmbidError("--axes and --settle are for a rotor on many axes. Omit them")
+    kind = excitation or "multisine"
+    shape = _repeat(
+        lambda part: make_excitation(kind, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods or 1
+    )
     peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
     if log_excitation:
         logged = Channel(name="excitation", unit="V", values=peak * shape)
         done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
-    return done, Excited(kind=excitation, peak=peak)
+    return done, Excited(kind=kind, peak=peak)
+
+
+def _of_axes(
+    bench: RotorBench,
+    kind: str,
+    n: int,
+    periods: int | None,
+    axes: Sequence[str] | None,
+    band: tuple[float, float] | None,
+    seed: int,
+) -> tuple[Array, int]:
+    """Return the excitation of a rotor of peak one, (n_samples, n_axes), and the samples of its period."""
+    known = bench.model.axes
+    for axis in axes or ():
+        if axis not in known:
+            raise AmbidError(f"--axes has {axis!r}; the rotor has {', '.join(known)}.{nearest(axis, known)} Correct it")
+    excited = [known.index(axis) for axis in axes or known]
+    blocks = len(excited) if kind == "orthogonal" else 1
+    if periods is None:
+        periods = max(_LEAST_PERIODS, round(n / bench.rate_hz / blocks))
+        while n % (periods * blocks) and periods > 1:
+            periods -= 1
+    period = n // (periods * blocks)
+    shape = excitation_of_axes(
+        kind, n, bench.rate_hz, axes=len(known), excited=excited, amplitude=1.0, periods=periods, seed=seed,
+        band=band or (None if kind == "steps" else (bench.rate_hz / max(period, 1), bench.rate_hz / _REACH)),
+    )  # fmt: skip
+    return shape, period
+
+
+def only_references(record: Record) -> Record:
+    """Return the excitation of a rotor's record alone, to be played by its own controller."""
+    kept = tuple(c for c in record.channels if c.name.endswith("_reference"))
+    if not kept:
+        raise AmbidError("--excitation-only is for a rotor on many axes. Omit it")
+    return replace(record, channels=kept)
 
 
 def bench_of_source(source: BenchSource) -> Rig | Preset:
@@ -158,7 +222,7 @@ def bench_of_source(source: BenchSource) -> Rig | Preset:
 
 def _bench(
     given: BenchSource, rate: float | None, closed: bool | None, nonlinear: bool, position: float | None
-) -> Bench:
+) -> Bench | RotorBench:
     """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
     source = bench_of_source(given)
     if isinstance(source, Preset):
@@ -172,6 +236,10 @@ def _bench(
             f"rig {source.source or source.name} gives no rate; a simulation needs one. Give --rate HZ, or "
             "record.rate_hz"
         )
+    if source.rotor is not None:
+        if position is not None:
+            raise AmbidError("--position is for one axis. Omit it")
+        return RotorBench.of(source, rate, closed)
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
 

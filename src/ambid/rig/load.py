@@ -30,7 +30,7 @@ from ambid.rig.rig import (
     optional_roles,
     role_units,
 )
-from ambid.rig.rotor import modes_of, planes_of, rotor_of
+from ambid.rig.rotor import modes_of, planes_of, rotor_of, turning_of
 from ambid.rig.shaft import shaft_of
 from ambid.units import UNKNOWN, Unit, parse_unit
 
@@ -125,7 +125,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         plant = rotor_of(file, where) if file.bearings else model(file.model)
     except ModelError as error:
         raise RigError(f"{where}: {error}") from None
-    key = next((x for x in ("modes", "speed", "shaft") if getattr(file, x) is not None), None)
+    key = next((x for x in ("modes", "speed", "shaft", "unbalance") if getattr(file, x)), None)
     if key and not file.bearings:
         raise RigError(
             f"{where}: {key} is given, but no [bearings.X]; only a rotor on many axes has it. Add its bearings"
@@ -136,14 +136,17 @@ def _build(file: RigFile, path: Path) -> Rig:
     channels = _channels(file.channels, plant, path) if file.channels else _default_channels(plant)
     limits = _limits(file.loop.limits, where) if file.loop and file.loop.limits else None
     parameters = _parameters({**file.parameters, **planes_of(file)}, plant, where)
+    unbalance, runout = turning_of(file, where)
     return Rig(
         name=file.name,
         model=file.model,
         channels=channels,
         parameters=parameters,
         rotor=plant if isinstance(plant, RotorModel) else None,
-        modes=modes_of(file),
+        modes=modes_of(file, plant, where),
         shaft=None if file.shaft is None else shaft_of(file.shaft, parameters, where),
+        unbalance=unbalance,
+        runout=runout,
         magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
         loop=_loop(file.loop) if file.loop else None,

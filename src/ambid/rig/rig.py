@@ -30,6 +30,7 @@ OPTIONAL_ROLES: Mapping[str, str] = MappingProxyType({"reference": "m", "speed":
 """Roles that every model may have beside its own, with their units: set point, speed and angle of a turning rotor."""
 _TURNING_ROLES = {role: OPTIONAL_ROLES[role] for role in ("speed", "angle")}
 _EMPTY: Mapping[str, float] = MappingProxyType({})
+_NOTE = "  # one number a mode, modal mass 1 kg"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,6 +203,19 @@ class RigModes:
 
     count: int | None = None  # how many are in the excited band; None: the record decides
     frequency_hz: tuple[float, ...] = ()  # where they may be found; searched everywhere without
+    # for simulation, under the names of the rotor's model: ``mode1.omega``, ``mode1.zeta``, ``mode1.A.z`` …,
+    # ``mode1.unbalance.<name>``, ``gyro.01`` …; SI
+    numbers: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Turning:
+    """What turns with the rotor, for simulation: unbalance in a plane in kg m, or run-out of sensors in m."""
+
+    name: str  # of the unbalance, or of the bearing whose sensors run out
+    value: float
+    phase: float = 0.0  # rad against the mark of the angle
+    z: float = 0.0  # plane of an unbalance from the datum, m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,6 +241,8 @@ class Rig:
         What is known of its bending modes.
     shaft : Shaft or None
         Its drawing, for expected modes, start values and simulation.
+    unbalance, runout : tuple of Turning
+        What turns with it, for simulation.
     operating_point : Mapping[str, float]
         Declared values of roles, SI; a role that is absent takes the mean of the record.
     loop : Loop or None
@@ -253,6 +269,8 @@ class Rig:
     rotor: RotorModel | None = None
     modes: RigModes = field(default_factory=RigModes)
     shaft: Shaft | None = None
+    unbalance: tuple[Turning, ...] = ()
+    runout: tuple[Turning, ...] = ()
     operating_point: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     loop: Loop | None = None
     limits: Limits | None = None
@@ -470,6 +488,7 @@ def _rotor_lines(rig: Rig) -> list[str]:
 
     for b in rig.rotor.bearings:
         lines += ["", f"[bearings.{b.name}]", f"axes = {json.dumps(list(b.axes))}"]
+        lines += [f"runout = {_turning(r, 'm')}" for r in rig.runout if r.name == b.name]
         if b.axial:
             lines.append("axial = true")
             continue
@@ -480,7 +499,24 @@ def _rotor_lines(rig: Rig) -> list[str]:
         count = '"auto"' if rig.modes.count is None else rig.modes.count
         lines += ["", "[modes]", f"count = {count}"]
         lines += [f"frequency_hz = {list(rig.modes.frequency_hz)}"] if rig.modes.frequency_hz else []
+        lines += _mode_lines(rig.modes.numbers, len(rig.modes.frequency_hz)) if rig.modes.numbers else []
+    for u in rig.unbalance:
+        lines += ["", f"[unbalance.{u.name}]", f"value = {u.value!r}", 'unit = "kg m"', f"phase = {u.phase!r}"]
+        lines.append(f'z = {{ value = {u.z!r}, unit = "m" }}')
     return lines + (["", *shaft_lines(rig.shaft)] if rig.shaft else [])
+
+
+def _turning(found: Turning, unit: str) -> str:
+    return f'{{ value = {found.value!r}, unit = "{unit}", phase = {found.phase!r} }}'
+
+
+def _mode_lines(numbers: Mapping[str, float], n: int) -> list[str]:
+    places = [name.removeprefix("mode1.") for name in numbers if name.startswith("mode1.")]
+    of = {place: [numbers[f"mode{r}.{place}"] for r in range(1, n + 1)] for place in places if place != "omega"}
+    lines = [f"damping = {of.pop('zeta')}", f"[modes.shapes]{_NOTE}"]
+    lines += [f"{toml_text(place)} = {shape}" for place, shape in of.items()]
+    terms = {name.removeprefix("gyro."): x for name, x in numbers.items() if name.startswith("gyro.")}
+    return [*lines, "[modes.gyroscopic]", *(f'"{name}" = {x!r}' for name, x in terms.items())] if terms else lines
 
 
 def _magnet_lines(magnet: RigMagnet) -> list[str]:

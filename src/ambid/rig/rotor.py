@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.errors import RigError, UnitError
+from ambid.errors import RigError, UnitError, nearest
 from ambid.physics.rotor_model import Bearing, Drive, RotorModel
-from ambid.rig.rig import RigModes
+from ambid.rig.rig import RigModes, Turning
 from ambid.units import parse_unit
 
 if TYPE_CHECKING:
-    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, RigFile
+    from ambid.physics.linear_model import LinearModel
+    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, QuantityEntry, RigFile, TurningEntry
 
-_SPEEDS = {"rad/s": 1.0, "Hz": 6.283185307179586}
+TURN = 2.0 * math.pi
+_SPEEDS = {"rad/s": 1.0, "Hz": TURN}
 """SI units in which a speed may be given, and what makes rad/s of them."""
 
 
@@ -65,12 +69,59 @@ def planes_of(file: RigFile) -> Mapping[str, ParameterEntry]:
     return found
 
 
-def modes_of(file: RigFile) -> RigModes:
-    """Return what a rig file says of bending modes."""
-    if file.modes is None:
+def modes_of(file: RigFile, plant: LinearModel, where: str) -> RigModes:
+    """Return what a rig file says of bending modes; with shapes, all numbers that a simulation needs."""
+    given = file.modes
+    if given is None or not isinstance(plant, RotorModel):
         return RigModes()
-    count = None if file.modes.count == "auto" else int(file.modes.count)
-    return RigModes(count=count, frequency_hz=tuple(file.modes.frequency_hz))
+    count = None if given.count == "auto" else int(given.count)
+    n, numbers = len(given.frequency_hz), dict[str, float]()
+    if given.gyroscopic and not given.shapes:
+        raise RigError(f"{where}: modes.gyroscopic is given without modes.shapes. Give the shapes, or remove it")
+    damping = given.damping if isinstance(given.damping, list) else [given.damping or 0.0] * n
+    if given.shapes:
+        places = {*plant.places, *(f"unbalance.{name}" for name in file.unbalance)}
+        wrong = next((p for p in [*given.shapes, *places] if (p in places) != (p in given.shapes)), None)
+        if wrong is not None:
+            what = "is missing" if wrong in places else "is no plane of this rotor"
+            raise RigError(
+                f"{where}: modes.shapes.{wrong!r} {what}; shapes are given at {', '.join(sorted(places))}."
+                f"{nearest(wrong, sorted(places - {wrong}))} Correct it"
+            )
+        for key, values in {"damping": damping, **{f"shapes.{p!r}": v for p, v in given.shapes.items()}}.items():
+            if len(values) != n:
+                raise RigError(
+                    f"{where}: modes.{key} has {len(values)} numbers, modes.frequency_hz {n}; give one for each mode"
+                )
+        for r in range(n):
+            numbers |= {f"mode{r + 1}.omega": TURN * given.frequency_hz[r], f"mode{r + 1}.zeta": damping[r]}
+            numbers |= {f"mode{r + 1}.{place}": shape[r] for place, shape in given.shapes.items()}
+    terms = [p.name.removeprefix("gyro.") for p in plant.at_speed(1.0).with_modes(n).parameters if "gyro." in p.name]
+    for term, value in given.gyroscopic.items():
+        if term not in terms:
+            raise RigError(
+                f"{where}: modes.gyroscopic.{term!r} is no pair of modes; they are {', '.join(terms)}, 0 the rigid "
+                "slope. Correct it"
+            )
+        numbers[f"gyro.{term}"] = value
+    return RigModes(count=count, frequency_hz=tuple(given.frequency_hz), numbers=MappingProxyType(numbers))
+
+
+def turning_of(file: RigFile, where: str) -> tuple[tuple[Turning, ...], tuple[Turning, ...]]:
+    """Return unbalances and run-outs of a rig file."""
+    unbalance = tuple(
+        Turning(
+            name=name, phase=u.phase, value=_si(u, "kg m", f"{where}: unbalance.{name}"),
+            z=_si(u.z, "m", f"{where}: unbalance.{name}.z"),
+        )
+        for name, u in file.unbalance.items()
+    )  # fmt: skip
+    runout = tuple(
+        Turning(name=name, phase=b.runout.phase, value=_si(b.runout, "m", f"{where}: bearings.{name}.runout"))
+        for name, b in file.bearings.items()
+        if b.runout is not None
+    )
+    return unbalance, runout
 
 
 def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
@@ -89,11 +140,11 @@ def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
         raise RigError(
             f"{place}.z_sensor is missing; it is the plane of the sensor. Give it, equal to z if they are one"
         )
-    values = [None if plane.value is None else _metres(plane, place) for plane in sensors]
+    values = [None if plane.value is None else _si(plane, "m", place) for plane in sensors]
     return Bearing(
         name=name,
         axes=tuple(given.axes),
-        z=None if given.z.value is None else _metres(given.z, place),
+        z=None if given.z.value is None else _si(given.z, "m", place),
         z_sensors=tuple(values),
     )
 
@@ -103,15 +154,16 @@ def _read_at(given: BearingEntry) -> list[PlaneEntry]:
     return given.z_sensors or ([] if given.z_sensor is None else [given.z_sensor])
 
 
-def _metres(plane: PlaneEntry, place: str) -> float:
+def _si(given: PlaneEntry | QuantityEntry | TurningEntry, si: str, place: str) -> float:
+    """Return a quantity in its SI unit."""
     try:
-        unit = parse_unit(plane.unit)
+        unit = parse_unit(given.unit)
     except UnitError as error:
         raise RigError(f"{place}: {error}") from None
-    if unit.si != "m":
-        raise RigError(f"{place} has a plane in [{plane.unit}]; it is measured in [m]. Correct unit")
-    assert plane.value is not None
-    return unit.to_si(plane.value)
+    if unit.si != si:
+        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{si}]. Correct unit")
+    assert given.value is not None
+    return unit.to_si(given.value)
 
 
 def _speed(file: RigFile, where: str) -> float:

@@ -170,6 +170,20 @@ class PlaneEntry(_Entry):
     sd: Number | None = None
 
 
+class TurningEntry(_Entry):
+    """Something that turns with the rotor: its size, and its phase in rad against the mark of the angle."""
+
+    value: Number
+    unit: Text
+    phase: Number = 0.0
+
+
+class UnbalanceEntry(TurningEntry):
+    """``[unbalance.<name>]``: mass times eccentricity in a plane, for simulation."""
+
+    z: QuantityEntry
+
+
 class BearingEntry(_Entry):
     """``[bearings.<name>]``: a radial bearing with its planes and axes, or an axial one."""
 
@@ -178,13 +192,17 @@ class BearingEntry(_Entry):
     z_sensors: list[PlaneEntry] | None = None
     axes: Annotated[list[AxisName], Field(min_length=1, max_length=2)]
     axial: Annotated[bool, Field(strict=True)] = False
+    runout: TurningEntry | None = None
 
 
 class ModesEntry(_Entry):
-    """``[modes]``: how many bending modes a rotor has, and where they may be."""
+    """``[modes]``: how many bending modes a rotor has, and where they may be; for simulation all their numbers."""
 
     count: Literal["auto"] | Whole = "auto"
     frequency_hz: list[Positive] = Field(default_factory=list)
+    damping: NotNegative | list[NotNegative] | None = None
+    shapes: dict[Text, list[Number]] = Field(default_factory=dict)
+    gyroscopic: dict[Text, Number] = Field(default_factory=dict)
 
 
 class MaterialEntry(_Entry):
@@ -240,6 +258,7 @@ class RigFile(_Entry):
     modes: ModesEntry | None = None
     shaft: ShaftEntry | None = None
     speed: QuantityEntry | None = None
+    unbalance: dict[AxisName, UnbalanceEntry] = Field(default_factory=dict)
     operating_point: Literal["auto"] | dict[str, Literal["auto"] | QuantityEntry] = "auto"
     loop: LoopEntry | None = None
     noise: NoiseEntry | None = None
@@ -257,6 +276,7 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("bearings", "*"): BearingEntry,
     ("bearings", "*", "z"): PlaneEntry,
     ("bearings", "*", "z_sensor"): PlaneEntry,
+    ("bearings", "*", "runout"): TurningEntry,
     ("modes",): ModesEntry,
     ("shaft",): ShaftEntry,
     ("shaft", "material"): MaterialEntry,
@@ -266,6 +286,8 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("shaft", "*"): QuantityEntry,
     ("shaft", "*", "*"): QuantityEntry,
     ("shaft", "*", "*", "*"): QuantityEntry,
+    ("unbalance", "*"): UnbalanceEntry,
+    ("unbalance", "*", "z"): QuantityEntry,
     ("speed",): QuantityEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,

@@ -18,10 +18,12 @@ if TYPE_CHECKING:
     from ambid.signals.delay import PersistentExcitation as PersistentExcitation
     from ambid.signals.delay import find_delay as find_delay
     from ambid.signals.delay import persistent_excitation as persistent_excitation
+    from ambid.signals.excitations import AXES_EXCITATIONS as AXES_EXCITATIONS
     from ambid.signals.excitations import EXCITATIONS as EXCITATIONS
     from ambid.signals.excitations import chirp as chirp
     from ambid.signals.excitations import crest_factor as crest_factor
     from ambid.signals.excitations import excitation as excitation
+    from ambid.signals.excitations import excitation_of_axes as excitation_of_axes
     from ambid.signals.excitations import gaussian as gaussian
     from ambid.signals.excitations import multisine as multisine
     from ambid.signals.excitations import prbs as prbs

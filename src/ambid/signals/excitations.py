@@ -456,6 +456,106 @@ def _prbs_in_band(
     return prbs(n_samples, rate_hz, **options)  # type: ignore[arg-type]
 
 
+AXES_EXCITATIONS = ("zippered", "orthogonal")
+"""Multisines over the axes of a rotor, by name; see `excitation_of_axes`."""
+
+
+def excitation_of_axes(
+    name: str,
+    n_samples: int,
+    rate_hz: float,
+    *,
+    axes: int,
+    excited: Sequence[int] | None = None,
+    amplitude: float,
+    band: tuple[float, float] | None = None,
+    periods: int = 1,
+    seed: int = 0,
+) -> Array:
+    """Make an excitation of several axes at once.
+
+    ``zippered``: the lines of a multisine are dealt out, line k to axis k mod n, so that each line excites one axis and
+    one experiment shows the whole response matrix, at every n-th line. ``orthogonal``: every axis has all lines, in n
+    experiments one after the other; from one to the next the phases turn by 2 pi b j/n on axis j, so that those of all
+    experiments, a discrete Fourier matrix at each line, are orthogonal over the axes (Dobrowiecki and Schoukens 2007).
+    Every other name: an excitation of its own on each axis.
+
+    Parameters
+    ----------
+    name : str
+        One of `AXES_EXCITATIONS`, or of `EXCITATIONS` with random numbers in it.
+    n_samples : int
+        Samples; a multiple of `periods`, for ``orthogonal`` of `periods` times the excited axes.
+    rate_hz : float
+        Sampling rate in Hz.
+    axes : int
+        Axes there are.
+    excited : sequence of int, optional
+        Those that are excited, counted from 0; default all.
+    amplitude : float
+        Peak of each excited axis (rms for ``gaussian``), in the unit of the result.
+    band : (float, float), optional
+        Band in Hz; default: from one line on to a fifth of the rate.
+    periods : int
+        Whole periods; of ``orthogonal`` in each experiment.
+    seed : int
+        Of the random phases.
+
+    Returns
+    -------
+    ndarray, shape (n_samples, axes), unit of `amplitude`
+        Zero on axes that are not excited.
+
+    Raises
+    ------
+    AmbidError
+        If a setting is out of range, or all axes would have the same signal.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from ambid.signals import excitation_of_axes
+    >>> u = excitation_of_axes("zippered", 1000, 1000.0, axes=2, amplitude=1.0, band=(1.0, 100.0))
+    >>> lines = np.abs(np.fft.rfft(u, axis=0)) > 1e-6
+    >>> np.flatnonzero(lines[:, 0])[:3].tolist(), np.flatnonzero(lines[:, 1])[:3].tolist()
+    ([2, 4, 6], [1, 3, 5])
+    """
+    checked(n_samples, rate_hz)
+    moved = tuple(range(axes)) if excited is None else tuple(excited)
+    blocks = len(moved) if name == "orthogonal" else 1
+    if not moved or periods < 1 or n_samples % (periods * blocks):
+        several = f" in each of {blocks} experiments" if blocks > 1 else ""
+        raise AmbidError(
+            f"excitation {name!r} of {n_samples} samples in {periods} periods{several}: they do not divide. Give "
+            "another duration, or other periods"
+        )
+    period = n_samples // (periods * blocks)
+    found = np.zeros((n_samples, axes))
+    if name not in AXES_EXCITATIONS:
+        if name in ("steps", "chirp", "schroeder") and len(moved) > 1:
+            raise AmbidError(
+                f"excitation {name!r} is the same on every axis, which tells them not apart. Give {AXES_EXCITATIONS[0]}"
+            )
+        for j in moved:
+            x = excitation(name, period, rate_hz, amplitude=amplitude, band=band, seed=np.random.default_rng([seed, j]))
+            found[:, j] = np.tile(x, periods)
+        return found
+    low, high = checked_band(band or (rate_hz / period, rate_hz / 5.0), rate_hz)
+    numbers = _line_numbers(period, rate_hz, low, high, "all")
+    for k, j in enumerate(moved):
+        own = numbers if blocks > 1 else numbers[numbers % len(moved) == k]
+        if not own.size:
+            raise AmbidError(
+                f"{numbers.size} lines between {low:g} and {high:g} Hz are too few for {len(moved)} axes. Widen the "
+                "band, or make the period longer"
+            )
+        angle = np.random.default_rng([seed, j]).uniform(0.0, 2.0 * np.pi, own.size)
+        turned = [angle + 2.0 * np.pi * b * k / blocks for b in range(blocks)]
+        parts = [np.tile(_flattened(period, own, np.ones(own.size), phases, 0), periods) for phases in turned]
+        found[:, j] = scaled(np.concatenate(parts), amplitude, "peak")
+    return found
+
+
 EXCITATIONS: Mapping[str, Callable[..., Array]] = MappingProxyType(
     {
         "steps": steps,

@@ -317,7 +317,7 @@ def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.rand
     of, plant = standing.model, standing.plant
     named = "a generator" if isinstance(seed, np.random.Generator) else str(seed)
     made = {"plant": f"{of.name}, {'linear' if isinstance(plant, LinearPlant) else 'nonlinear'}", "seed": named}
-    settings = {name: _acting(getattr(running, name)) for name in ("loop", "noise", "limits")}
+    settings = {name: acting(getattr(running, name)) for name in ("loop", "noise", "limits")}
     begin = {name: float(s.at(np.zeros(1), rate_hz)[0]) for name, s in running.variation.parameters.items()}
     truth = {**standing.parameters(), **begin, "delay": loop.delay}
     truth |= {} if isinstance(plant, LinearPlant) else nonlinear_truth(plant)
@@ -357,7 +357,7 @@ def _channels(running: VaryingLoop, stretches: Sequence[Stretch]) -> tuple[Chann
     return tuple(found)
 
 
-def _acting(values: Loop | Noise | Limits) -> dict[str, object]:
+def acting(values: Loop | Noise | Limits) -> dict[str, object]:
     """Return the settings that act, as JSON-able values: zeros and infinite limits are left out."""
     found: dict[str, object] = {}
     for name, value in asdict(values).items():
@@ -503,10 +503,13 @@ def _first_guess(unit: Array, limits: Limits, point: OperatingPoint) -> float:
 def _within(done: Simulation, limits: Limits, point: OperatingPoint, fraction: float) -> bool:
     if not done.within_limits:
         return False
-    signals = {name: done.states[:, j] for j, name in enumerate(done.state_names) if name != "velocity"}
+    signals = {name: done.states[:, j] for j, name in enumerate(done.state_names)}
     signals |= {name: done.record[name].values for name in done.record.names if name not in signals}
     for name, values in signals.items():
-        (low, high), rest = getattr(limits, name), getattr(point, name)
+        kind = name.rsplit("_", 1)[-1]  # of an axis of a rotor: ``ax_position``
+        if kind not in OperatingPoint._fields:
+            continue
+        (low, high), rest = getattr(limits, kind), getattr(point, kind)
         if values.min() < rest + fraction * (low - rest) or values.max() > rest + fraction * (high - rest):
             return False
     return True

@@ -104,6 +104,33 @@ def quantise(value: float, step: float) -> float:
     return math.floor(value / step + 0.5) * step if step > 0.0 else value
 
 
+@compiled(error_model="numpy", inline="always")
+def order(
+    feed: float,
+    error: float,
+    moved: float,
+    carried: float,
+    integral: float,
+    derivative: float,
+    gains: Array,
+    limits: tuple[float, float, float],
+) -> tuple[float, float, float, bool]:
+    """Return command, next integral and derivative of the law of `Loop` on one axis, and whether it was limited.
+
+    `feed`: what is ordered without feedback; `error`: of the position; `moved`: since the last sample; `carried`:
+    current beyond that at rest; `gains`: kp, ki T, kd, kc, tau, T; `limits`: low, high and resolution of the command.
+    """
+    derivative = (gains[4] * derivative - gains[2] * moved) / (gains[4] + gains[5])
+    wanted = feed + (gains[0] * error + integral + derivative) - gains[3] * carried
+    low, high, step = limits
+    beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
+    # Anti-windup: while the command is limited the integral may only move back.
+    growth = gains[1] * error
+    if beyond * growth <= 0.0:
+        integral += growth
+    return min(max(quantise(wanted, step), low), high), integral, derivative, beyond != 0.0
+
+
 @compiled(error_model="numpy")
 def advance_nonlinear(
     x: Array,
@@ -242,7 +269,6 @@ def run(
     """
     at, current_at = roles
     integral, derivative, last = memory[0], memory[1], memory[2]
-    low, high, step = limits
     whole, n_outputs, n = line.size - 2, outputs.size, command.size
     disturbance, room = np.empty(noise.shape[1] - n_outputs), np.empty(x.size)
     for piece in range(edges.size - 1):
@@ -259,26 +285,22 @@ def run(
                 measured[k, j] = quantise(gain[j] * truth + noise[k, j], resolution[j])
             for j in range(x.size):
                 states[k, j] = x[j]
-            wanted, error = centre_input + excitation[k], 0.0
+            error, moved, carried = 0.0, 0.0, 0.0
             if at >= 0:
                 y = measured[k, at]
                 error = setpoint[k] - y
                 moved = y - last if counts[0] > 0 else 0.0
-                derivative = (gains[4] * derivative - gains[2] * moved) / (gains[4] + gains[5])
                 last = y
-                wanted += gains[0] * error + integral + derivative
             if current_at >= 0:
-                wanted -= gains[3] * (measured[k, current_at] - centre[outputs[current_at]])
-            beyond = max(wanted - high, 0.0) + min(wanted - low, 0.0)
-            if beyond != 0.0:
+                carried = measured[k, current_at] - centre[outputs[current_at]]
+            feed = centre_input + excitation[k]
+            command[k], integral, derivative, limited = order(
+                feed, error, moved, carried, integral, derivative, gains, limits
+            )
+            if limited:
                 counts[3] += 1
                 if counts[2] < 0:
                     counts[2] = counts[0]
-            # Anti-windup: while the command is limited the integral may only move back.
-            growth = gains[1] * error
-            if beyond * growth <= 0.0:
-                integral += growth
-            command[k] = min(max(quantise(wanted, step), low), high)
             for j in range(whole + 1, 0, -1):
                 line[j] = line[j - 1]
             line[0] = command[k]

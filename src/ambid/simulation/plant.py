@@ -136,7 +136,9 @@ def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
     return {"R": plant.R, **{n: found[n] for n in names if found[n] != 0.0 or n in kept}}
 
 
-def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> Array:
+def closed_loop_matrix(
+    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
+) -> Array:
     """Return the matrix that carries [plant states, u[k-1], u[k-2], ..., I, D, x[k-1]] over one sample.
 
     Parameters
@@ -144,57 +146,73 @@ def closed_loop_matrix(parameters: Mapping[str, float], loop: Loop, rate_hz: flo
     parameters : Mapping[str, float]
         Parameters of the model in SI units.
     loop : Loop
-        Controller and delay.
+        Controller and delay, the same on every axis.
     rate_hz : float
         Sampling rate in Hz.
-    of : str
-        Name of the linear model.
+    of : str or LinearModel
+        The linear model, or its name; commands u and controller states I, D, x[k-1] are one for each of its inputs.
 
     Returns
     -------
-    ndarray, shape (n_states + n_delayed + 3, ...)
+    ndarray, shape (n_states + (n_delayed + 3) n_inputs, ...)
         The loop's matrix; limits and quantisation are left out.
     """
     return excited_loop(parameters, loop, rate_hz, of=of)[0]
 
 
-def excited_loop(
-    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis"
-) -> tuple[Array, Array, Array]:
-    """Return the matrix of `closed_loop_matrix`, the row that gives the command, and what an excitation of it does.
+def fed_back(of: LinearModel) -> NDArray[np.int64]:
+    """Return the outputs of position and current that the controller of each input feeds back, -1: none.
 
-    The excitation is added to the command: the states become z x + excited e, what is ordered is command x + e.
+    ``ax_voltage`` is that of ``ax_position`` (its first sensor) and ``ax_current``. Shape (n_inputs, 2).
     """
-    plant, period = model(of), 1.0 / rate_hz
+
+    def place(name: str) -> int:
+        return of.outputs.index(name) if name in of.outputs else -1
+
+    axes = [name.removesuffix(name.rsplit("_", 1)[-1]) for name in of.inputs]
+    return np.array([[place(f"{axis}position"), place(f"{axis}current")] for axis in axes], dtype=np.int64)
+
+
+def excited_loop(
+    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
+) -> tuple[Array, Array, Array]:
+    """Return the matrix of `closed_loop_matrix`, the rows that give the commands, and what an excitation of them does.
+
+    The excitation is added to the command: the states become z x + excited e, what is ordered is command x + e. Of a
+    model with one input, rows and columns are vectors.
+    """
+    plant, period = model(of) if isinstance(of, str) else of, 1.0 / rate_hz
     whole = math.floor(loop.delay)
     d, _ = discretise(plant.matrices(parameters), period, fraction=loop.delay - whole)
-    n, line = d.A.shape[0], whole + (loop.delay > whole)
-    total = n + line + 3
-    i, dd, last = n + line, n + line + 1, n + line + 2
+    n, line, inputs = d.A.shape[0], whole + (loop.delay > whole), d.B.shape[1]
+    total = n + (line + 3) * inputs
     unit = np.eye(total)
-    position = unit[plant.states.index("position")] if "position" in plant.outputs else np.zeros(total)
-    current = unit[plant.states.index("current")] if "current" in plant.outputs else np.zeros(total)
+    slots = [slice(n + j * inputs, n + (j + 1) * inputs) for j in range(line + 3)]
+    i, dd, last = slots[line:]
+    measured = np.zeros((d.C.shape[0] + 1, total))
+    measured[:-1, :n] = d.C  # the last row is what is not fed back
+    position, current = measured[fed_back(plant).T]
     derivative = (loop.filter_s * unit[dd] - loop.kd * (position - unit[last])) / (loop.filter_s + period)
     command = -loop.kp * position + unit[i] + derivative - loop.kc * current
-    history = [command, *unit[n : n + line]]  # rows that give u[k], u[k-1], ...
-    z = np.zeros((total, total))
+    history = [command, *(unit[s] for s in slots[:line])]  # rows that give u[k], u[k-1], ...
+    z, excited = np.zeros((total, total)), np.zeros((total, inputs))
     z[:n, :n] = d.A
-    z[:n] += np.outer(d.B[:, 0], history[whole])
+    z[:n] += d.B @ history[whole]
     if line > whole:
-        z[:n] += np.outer(d.B_late[:, 0], history[whole + 1])
-    excited = np.zeros(total)
+        z[:n] += d.B_late @ history[whole + 1]
     if whole == 0:
-        excited[:n] = d.B[:, 0]
-    excited[n : n + min(line, 1)] = 1.0
+        excited[:n] = d.B
+    if line:
+        excited[slots[0]] = np.eye(inputs)
     for j in range(line):
-        z[n + j] = history[j]
+        z[slots[j]] = history[j]
     z[i] = unit[i] - loop.ki * period * position
     z[dd], z[last] = derivative, position
-    return z, command, excited
+    return (z, command[0], excited[:, 0]) if inputs == 1 else (z, command, excited)
 
 
 def closed_loop_poles(
-    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis"
+    parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
 ) -> NDArray[np.complex128]:
     """Return the poles of the sampled loop in the z plane; stable where all lie inside the unit circle.
 
@@ -208,8 +226,8 @@ def closed_loop_poles(
         Controller and delay.
     rate_hz : float
         Sampling rate in Hz.
-    of : str
-        Name of the linear model.
+    of : str or LinearModel
+        The linear model, or its name.
 
     Returns
     -------
@@ -227,7 +245,8 @@ def closed_loop_poles(
         given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
         raise ModelError(f"the loop at {rate_hz:g} Hz diverges ({given}). Correct the parameters")
     if loop.ki == 0.0:
-        keep = np.arange(z.shape[0]) != z.shape[0] - 3
+        count = len((model(of) if isinstance(of, str) else of).inputs)
+        keep = np.r_[: z.shape[0] - 3 * count, z.shape[0] - 2 * count : z.shape[0]]
         z = z[np.ix_(keep, keep)]
     poles = np.linalg.eigvals(z).astype(np.complex128)
     return poles[np.argsort(-np.abs(poles))]

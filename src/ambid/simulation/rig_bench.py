@@ -307,6 +307,11 @@ class Bench:
                 name=source.name, plant=plant, loop=loop, limits=source.limits, noise=source.noise,
                 point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
             )  # fmt: skip
+        if source.rotor is not None:
+            raise RigError(
+                f"rig {source.name!r} has a rotor on {len(source.rotor.axes)} axes; this needs one axis. Give a rig "
+                "without [bearings]"
+            )
         plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
         rate = source.record.rate_hz if rate_hz is None else rate_hz
         if rate is None:
@@ -380,11 +385,7 @@ def parts_of_rig(
     `simulate_rig`. Returns `plant`: with the rig's parameters; `loop`: the controller, or its delay alone; `point`: a
     value that the rig does not give is zero; a voltage that it does not give is R times the current.
     """
-    loop = rig.loop
-    if closed and (loop is None or not loop.closed):
-        raise RigError(f"rig {rig.name!r} has no [loop] with a gain; a closed loop needs one. Add it, or simulate open")
-    if loop is not None and (rig.open_loop if closed is None else not closed):
-        loop = loop.opened()
+    loop = loop_of_rig(rig, closed)
     if nonlinear:
         body = plant_of_rig(rig)
         return body, loop, rest_of_rig(rig, body)
@@ -403,16 +404,26 @@ def parts_of_rig(
     return plant, loop, point
 
 
-def as_columns(record: Record, rig: Rig, setpoint: Array) -> Record:
+def loop_of_rig(rig: Rig, closed: bool | None) -> Loop | None:
+    """Return the controller of a rig, or its delay alone where the loop is open."""
+    loop = rig.loop
+    if closed and (loop is None or not loop.closed):
+        raise RigError(f"rig {rig.name!r} has no [loop] with a gain; a closed loop needs one. Add it, or simulate open")
+    return loop.opened() if loop is not None and (rig.open_loop if closed is None else not closed) else loop
+
+
+def as_columns(record: Record, rig: Rig, setpoint: Array | None = None) -> Record:
     """Name the roles by the rig's columns and undo their calibrations.
 
-    `setpoint`: (n_samples,), in m, the role ``reference``. Returns the rig's columns, then what has no role.
+    `setpoint`: (n_samples,), in m, the role ``reference`` of one axis. Returns the rig's columns, then what has no
+    role.
     """
     roles = {c.name: c for c in record.channels}
-    roles["reference"] = Channel(name="reference", unit="m", values=setpoint)
+    if setpoint is not None:
+        roles["reference"] = Channel(name="reference", unit="m", values=setpoint)
     for name, unit in TURNING.items():
         roles.setdefault(name, Channel(name=name, unit=unit, values=np.zeros(record.n_samples)))
-    of = model(rig.model)
+    of = rig.plant
     taken = {c.role for c in rig.channels} | set(of.inputs) | set(of.outputs)
     others = [c for c in record.channels if c.name not in taken]
     channels = tuple(_raw(roles[c.role], c) for c in rig.channels)

@@ -1,0 +1,242 @@
+"""Simulation of a rotor in its bearings: all axes in one loop, each with the rig's controller.
+
+The plant is stepped with its exact zero-order-hold matrices. Unbalance is exact: two states turn with the rotor.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from types import MappingProxyType
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ambid.arrays import Array
+from ambid.errors import ModelError, RigError
+from ambid.physics.linear_model import DiscreteSpace, StateSpace, discretise
+from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.nonlinear import OperatingPoint
+from ambid.physics.rotor_model import RotorModel
+from ambid.record.record import Channel, Record, Step
+from ambid.rig.rig import Rig, Turning
+from ambid.simulation.bench import Simulation, acting, largest_amplitude
+from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back
+from ambid.simulation.rig_bench import as_columns, loop_of_rig
+
+
+@dataclass(frozen=True, kw_only=True)
+class RotorBench:
+    """A rotor with numbers, and what stands around it."""
+
+    rig: Rig
+    plant: LinearPlant  # a `RotorModel` with its modes
+    loop: Loop
+    rate_hz: float
+    shapes: Mapping[str, Array]  # what a force in the plane of each unbalance does: (n_coordinates / planes,)
+
+    @classmethod
+    def of(cls, rig: Rig, rate_hz: float | None, closed: bool | None) -> RotorBench:
+        """Return the bench of a rig with ``[bearings.X]``, as its records are taken unless `closed` says otherwise."""
+        assert rig.rotor is not None
+        numbers, rate = rig.modes.numbers, rig.record.rate_hz if rate_hz is None else rate_hz
+        if rate is None:
+            raise RigError(f"rig {rig.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz")
+        n = sum(name.endswith(".omega") for name in numbers)
+        of = rig.rotor.with_modes(n)
+        values = {**{p.name: p.value for p in rig.parameters if p.value is not None}, **numbers}
+        missing = [p.name for p in of.parameters if p.name not in values and p.default is None]
+        if missing:
+            raise RigError(
+                f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a simulation needs every parameter. "
+                "Give value = ... (of modes: [modes] with frequency_hz, damping, shapes, gyroscopic)"
+            )
+        shapes = {
+            u.name: np.array([1.0, u.z - values["z_cg"], *(values[f"mode{r}.unbalance.{u.name}"] for r in modes)])
+            for modes in [range(1, n + 1)]
+            for u in rig.unbalance
+        }
+        plant = LinearPlant(model=of, parameters={p.name: values[p.name] for p in of.parameters if p.name in values})
+        return cls(rig=rig, plant=plant, loop=loop_of_rig(rig, closed) or Loop(), rate_hz=rate, shapes=shapes)
+
+    @property
+    def model(self) -> RotorModel:
+        """The rotor with its modes, at its speed."""
+        assert isinstance(self.plant.model, RotorModel)
+        return self.plant.model
+
+    @property
+    def limits(self) -> Limits:
+        """Of every axis."""
+        return self.rig.limits or Limits()
+
+    @property
+    def noise(self) -> Noise:
+        """Of every axis."""
+        return self.rig.noise or Noise()
+
+    @cached_property
+    def largest_pole(self) -> float:
+        """Largest modulus of the sampled loop's poles."""
+        return float(np.abs(closed_loop_poles(self.plant.parameters, self.loop, self.rate_hz, of=self.model)[0]))
+
+    def refuse_unstable(self) -> None:
+        """Refuse a closed loop that is predicted unstable."""
+        if self.loop.closed and self.largest_pole > 1.0 + 1e-9:
+            raise ModelError(
+                f"the loop is unstable on {self.rig.name!r} at {self.rate_hz:g} Hz with a delay of "
+                f"{self.loop.delay:.2g} samples: largest pole {self.largest_pole:.4f}. Correct [loop] or the "
+                "parameters, or go on with --force"
+            )
+
+    def simulate(self, excitation: ArrayLike, *, seed: int, columns: bool = True, settle: int = 0) -> Simulation:
+        """Simulate the bench from rest, excited at the controllers' outputs, (n_samples, n_axes).
+
+        Of `settle` samples at the beginning nothing is logged but that limits were met. The record holds voltage,
+        current, position and reference of each axis and, of a rotor that turns, its angle.
+        """
+        of, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
+        if u.ndim != 2 or u.shape[1] != len(of.inputs) or u.shape[0] <= settle:
+            raise ModelError(
+                f"the excitation has shape {u.shape}; it must be (n_samples, {len(of.inputs)}), one column an axis, "
+                f"with more samples than the {settle} that settle. Reshape it"
+            )
+        n = u.shape[0]
+        measured, command, truth = (np.empty((n, m)) for m in (len(of.outputs), u.shape[1], len(of.axes)))
+        truth = np.empty((n, len(of.axes) + len(of.coils)))
+        counts = np.array([-1, -1, 0], dtype=np.int64)
+        angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
+        lost = self._run(u, np.random.default_rng(seed), angle, counts, measured, command, truth)
+        if lost >= 0:
+            raise ModelError(
+                f"the simulation diverges at sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s); an "
+                "unstable plant needs a loop that holds it. Give limits.position, or another loop"
+            )
+        names = (*(f"{axis}_position" for axis in of.axes), *(f"{of.axes[j]}_current" for j in of.coils))
+        low, high = self.limits.current
+        currents = truth[settle:, len(of.axes) :]
+        values = dict(zip(of.inputs, command[settle:].T, strict=True))
+        values |= dict(zip(of.outputs, measured[settle:].T, strict=True))
+        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(of.axes)}
+        units = {**of.units, **dict.fromkeys((f"{axis}_reference" for axis in of.axes), of.units[of.inputs[0]])}
+        order = sorted(values, key=lambda name: of.axes.index(name.split("_")[0]))  # an axis after the other
+        channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
+        channels += [Channel(name="angle", unit="rad", values=angle[settle:])] if of.speed else []
+        made = {"plant": f"{of.name}, linear", "seed": str(seed)}
+        settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
+        record = Record(
+            rate_hz=self.rate_hz,
+            channels=tuple(channels),
+            history=(Step(name="simulate", settings={**made, "rate_hz": self.rate_hz, **settings}),),
+            provenance=MappingProxyType({"simulator": "ambid.simulation", **made}),
+        )
+        first = [None if k < 0 else max(0, int(k) - settle) for k in counts[:2]]
+        return Simulation(
+            record=as_columns(record, self.rig) if columns else record,
+            states=truth[settle:],
+            state_names=names,
+            truth=MappingProxyType({**self.plant.parameters, "delay": self.loop.delay}),
+            first_contact=first[0],
+            first_saturated=first[1],
+            n_saturated=int(counts[2]),
+            n_over_current=int(np.count_nonzero(((currents < low) | (currents > high)).any(axis=1))),
+            largest_pole=self.largest_pole,
+        )
+
+    def largest(self, shape: Array, seed: int, fraction: float) -> float:
+        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits."""
+        found = largest_amplitude(
+            lambda u: self.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
+            operating_point=OperatingPoint(), fraction=fraction,
+        )  # fmt: skip
+        return float(f"{found:.3g}")
+
+    def _run(
+        self,
+        u: Array,
+        rng: np.random.Generator,
+        angle: Array,
+        counts: NDArray[np.int64],
+        measured: Array,
+        command: Array,
+        truth: Array,
+    ) -> int:
+        from ambid.simulation.rotor_kernels import run_rotor
+
+        of, period, whole = self.model, 1.0 / self.rate_hz, math.floor(self.loop.delay)
+        d, c, kinds = (
+            self._discrete(self.loop.delay - whole),
+            self.loop,
+            [name.rsplit("_", 1)[-1] for name in of.inputs],
+        )
+        if len(set(kinds)) > 1:
+            raise ModelError(
+                f"axes are driven by {', '.join(sorted(set(kinds)))}; one loop drives all alike. Correct it"
+            )
+        steps = [getattr(self.noise, f"{_kind(name)}_resolution") for name in (*of.outputs, of.inputs[0])]
+        magnets, _ = of.rows(self.plant.parameters)
+        mass, _, _ = of.rotor_matrices(self.plant.parameters)
+        pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
+        x = np.zeros(d.A.shape[0])
+        x[len(of.states) :: 2] = 1.0
+        states = [of.states.index(f"{of.axes[j]}_current") for j in of.coils]
+        return int(
+            run_rotor(
+                u, self._noise(rng, u.shape[0]), self._runout(angle),
+                (d.A, d.B, d.B_late, d.E), d.C, fed_back(of),
+                np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]), np.array(steps[:-1]),
+                (*getattr(self.limits, _kind(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
+                self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), x, counts,
+                measured, command, truth,
+            )
+        )  # fmt: skip
+
+    def _discrete(self, fraction: float) -> DiscreteSpace:
+        """Return the sampled plant; after its states cos and sin of the angle, from which unbalance pushes."""
+        of, space = self.model, self.plant.model.matrices(self.plant.parameters)
+        n, speed = len(of.states), of.speed
+        A, C = np.zeros((n + 2, n + 2)), np.zeros((space.C.shape[0], n + 2))
+        A[:n, :n], C[:, :n] = space.A, space.C
+        A[n, n + 1], A[n + 1, n] = -speed, speed
+        A[:n, n:] = sum((self._unbalance(u) for u in self.rig.unbalance), np.zeros((n, 2)))
+        B, E = (np.vstack([x, np.zeros((2, x.shape[1]))]) for x in (space.B, space.E))
+        d, *_ = discretise(StateSpace(A=A, B=B, E=E, C=C), 1.0 / self.rate_hz, fraction=fraction)
+        return DiscreteSpace(
+            **{name: np.ascontiguousarray(getattr(d, name)) for name in ("A", "B", "B_late", "E", "C")}
+        )
+
+    def _unbalance(self, u: Turning) -> Array:
+        """Return what cos and sin of the angle do to the states: U W² (cos, sin)(angle + phase) in the planes x, y."""
+        of, found = self.model, np.zeros((len(self.model.states), 2))
+        mass, _, _ = of.rotor_matrices(self.plant.parameters)
+        n, size = len(of.coordinates), u.value * of.speed**2
+        turned = np.array([[math.cos(u.phase), -math.sin(u.phase)], [math.sin(u.phase), math.cos(u.phase)]])
+        for plane in (p for p in (0, 1) if p in of.planes):
+            at = [k for k, q in enumerate(of.coordinates) if q.endswith("xy"[plane])]
+            found[[n + k for k in at]] = size * np.outer(self.shapes[u.name] / mass[at], turned[plane])
+        return found
+
+    def _noise(self, rng: np.random.Generator, n: int) -> Array:
+        of = self.model
+        force, voltage = self.noise.held_rms(self.rate_hz)
+        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
+        size = np.array([sizes[_kind(name)] for name in (*of.outputs, *of.disturbances)])
+        return np.asarray(rng.standard_normal((n, size.size)) * size)
+
+    def _runout(self, angle: Array) -> Array:
+        """Return what the sensors see beside the rotor's motion: (n_samples, n_outputs), or (0, n_outputs)."""
+        of, found = self.model, np.zeros((angle.size if self.rig.runout else 0, len(self.model.outputs)))
+        for r in self.rig.runout:
+            for k, (j, _) in enumerate(of.sensors):
+                bearing, plane = of.placed[j]
+                if bearing.name == r.name and plane < 2:
+                    found[:, k] += r.value * np.cos(angle + r.phase - 0.5 * np.pi * plane)
+        return found
+
+
+def _kind(name: str) -> str:
+    """Return what a role of an axis is: ``ax_position2`` is a position; a command is a voltage."""
+    kind = name.rsplit("_", 1)[-1].rstrip("0123456789")
+    return "voltage" if kind == "command" else kind

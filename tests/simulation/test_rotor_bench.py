@@ -1,0 +1,63 @@
+"""Rotors on many axes: our simulator against the independent one, contact and limits, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ambid.errors import ModelError, RigError
+from ambid.physics.loop import Limits, Noise
+from ambid.simulation.rotor_bench import RotorBench
+from tests.rotor_benches import needs_simulator, rig_of, truth
+
+QUIET = {"position_noise": 0.0, "current_noise": 0.0, "voltage_noise": 0.0, "force_noise": 0.0}
+
+
+@needs_simulator
+@pytest.mark.parametrize("name", ["rigid", "rigid-spin", "utrc"])
+def test_without_noise_the_records_are_those_of_the_independent_simulator(name: str) -> None:
+    bench = replace(truth.BENCHES[name], **QUIET, period=0.6, settle=3, periods=1)
+    theirs, period = truth.simulate(bench, 1), truth.multisine(bench, np.random.default_rng(1))
+    rotor = RotorBench.of(rig_of(bench), None, None)
+    assert rotor.largest_pole < 1.0
+    done = rotor.simulate(bench.kc * np.tile(period, (4, 1)), seed=1, settle=3 * len(period))
+    assert done.within_limits
+    for what in ("voltage", "position", "current"):
+        ours = np.column_stack([done.record[f"{axis}_{what}"] for axis in truth.AXES])
+        # they begin in different ways, which the loop forgets: 1e-9 is left after three periods
+        assert np.abs(ours - theirs[what]).max() < 1e-9 * np.abs(theirs[what]).max()
+
+
+@needs_simulator
+def test_noise_has_the_spread_of_the_independent_simulator() -> None:
+    bench = replace(truth.BENCHES["rigid"], amplitude=1e-9, settle=1, periods=2)
+    theirs = truth.simulate(bench, 1)
+    done = RotorBench.of(rig_of(bench), None, None).simulate(np.zeros((30_000, 4)), seed=2, settle=10_000)
+    for what in ("voltage", "position", "current"):
+        ours = np.column_stack([done.record[f"{axis}_{what}"] for axis in truth.AXES])
+        np.testing.assert_allclose(ours.std(axis=0), theirs[what].std(axis=0), rtol=0.08)
+
+
+@needs_simulator
+def test_a_rotor_stops_at_the_stops_and_says_so() -> None:
+    rig = replace(rig_of(truth.BENCHES["rigid"]), limits=Limits(position=(-1e-5, 1e-5)), noise=Noise(force=0.1))
+    done = RotorBench.of(rig, None, False).simulate(np.ones((20_000, 4)), seed=1)
+    held = done.states[:, :4]
+    assert done.first_contact is not None
+    assert np.abs(held).max() < 1.2e-5  # an axis moves another one a little, within a sample
+    assert np.abs(held[-1]).min() > 0.9e-5  # unstable: every axis ends at a stop
+
+
+@needs_simulator
+def test_what_cannot_be_simulated_is_refused() -> None:
+    rig = rig_of(truth.BENCHES["flexible"])
+    numbers = {name: x for name, x in rig.modes.numbers.items() if name != "mode1.zeta"}
+    with pytest.raises(RigError, match=r"there is no value for mode1\.zeta"):
+        RotorBench.of(replace(rig, modes=replace(rig.modes, numbers=numbers)), None, None)
+    assert rig.loop is not None
+    with pytest.raises(ModelError, match="the loop is unstable on 'flexible'"):
+        RotorBench.of(replace(rig, loop=replace(rig.loop, kd=0.0)), None, None).refuse_unstable()
+    with pytest.raises(ModelError, match="one column an axis"):
+        RotorBench.of(rig, None, None).simulate(np.zeros(100), seed=1)
+    with pytest.raises(ModelError, match="diverges at sample"):
+        RotorBench.of(replace(rig, limits=Limits()), None, False).simulate(np.full((60_000, 4), 1e300), seed=1)
