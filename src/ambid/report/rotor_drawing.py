@@ -1,0 +1,235 @@
+"""Panels of a rotor: its side view with bearing and sensor planes, mode shapes along it, and its Campbell diagram."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.modes import Mode
+from ambid.physics.shaft import FreeRotor, Shaft
+from ambid.physics.whirl import Campbell
+from ambid.report.drawing import (
+    BOUND,
+    GREEN,
+    MEASURED,
+    NORMAL_95,
+    ORANGE,
+    PREDICTED,
+    SKY,
+    Block,
+    Panel,
+    head,
+    panel,
+)
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+_STEEL, _DISC = "#d9dde2", "#b9c2cc"
+_WIDEST = 0.45  # of the length: what a disc given by its mass alone is drawn like, at most
+_FORWARD, _BACKWARD = PREDICTED, ORANGE
+_PLANAR = 0.02  # of a circular orbit, under which a whirl has no direction
+
+
+def shapes_block(
+    planes: Mapping[str, float], modes: Sequence[Mode] = (), *, shaft: Shaft | None = None, title: str = ""
+) -> Block:
+    """Draw a rotor from the side, and below it each mode: identified at the planes, with a drawing along the shaft.
+
+    `planes`: of bearings and sensors by the names of the model (``A.z``, ``A.z_sensor``), m from the datum; the shapes
+    of `modes` have the same names and modal mass 1 kg. With a drawing, modes it expects beyond these follow.
+    """
+    drawn = None if shaft is None else shaft.free_rotor(max(len(modes), 3), planes=list(planes.values()))
+    ends = _ends(planes, shaft)
+    rows = [panel(_side, planes, shaft, drawn, ends, height=1.7)]
+    for k in range(max(len(modes), 0 if drawn is None else drawn.omega.size - 2)):
+        mode = modes[k] if k < len(modes) else None
+        rows.append(panel(_shape, k, planes, mode, drawn, ends, k + 1, height=1.35))
+    return Block(columns=[rows], title=title)
+
+
+def campbell_panel(
+    identified: Campbell | None = None,
+    *,
+    drawn: Campbell | None = None,
+    sd: Array | None = None,
+    speeds: Sequence[float] = (),
+) -> Panel:
+    """Draw whirl frequencies over speed: identified lines, with 95 % bands from `sd`; those of a drawing dashed.
+
+    `sd`: standard deviations of the identified frequencies in rad/s, (n_speeds, n_lines); `speeds`: at which records
+    were taken, rad/s. Where a line meets the speed itself (1x), a critical speed is marked.
+    """
+    return panel(_campbell, identified, drawn, sd, speeds, height=4.2)
+
+
+def _ends(planes: Mapping[str, float], shaft: Shaft | None) -> tuple[float, float]:
+    """Left and right end of what is drawn, m."""
+    low, high = min(planes.values()), max(planes.values())
+    room = 0.08 * (high - low) or 0.1
+    if shaft is None:
+        return low - room, high + room
+    return min(low - room, shaft.z), max(high + room, shaft.z + shaft.length)
+
+
+def _side(
+    axes: Axes, planes: Mapping[str, float], shaft: Shaft | None, drawn: FreeRotor | None, ends: tuple[float, float]
+) -> None:
+    """The rotor from the side, in millimetres, with its planes and centre of gravity."""
+    widest = _body(axes, shaft) if shaft is not None else 0.06 * (ends[1] - ends[0])
+    half = 0.5 * widest
+    if shaft is None:
+        axes.plot([1e3 * x for x in ends], [0, 0], color=MEASURED, linewidth=3, solid_capstyle="round")
+    for name, z in planes.items():
+        bearing = name.endswith(".z")
+        color, mark = (BOUND, "s") if bearing else (GREEN, "v")
+        label = "bearing plane" if bearing else "sensor plane"
+        reach = 1e3 * half * 1.25
+        axes.vlines(1e3 * z, -reach, reach, color=color, linewidth=0.9, linestyle="-" if bearing else ":", zorder=3)
+        axes.plot(1e3 * z, reach, mark, color=color, markersize=6, label=label, linestyle="none", zorder=4)
+        if bearing:
+            axes.text(
+                1e3 * z, 1e3 * half * 1.45, name.removesuffix(".z"), ha="center", va="bottom", fontsize=8, color=color
+            )
+    if drawn is not None:
+        axes.plot(
+            1e3 * drawn.z_cg, 0, "o", color="black", markersize=5, markerfacecolor="white", linestyle="none",
+            label="centre of gravity (drawing)", zorder=5,
+        )  # fmt: skip
+    axes.axhline(0, color=MEASURED, linewidth=0.6, linestyle="-.", zorder=2)
+    axes.set_xlim(*(1e3 * x for x in ends))
+    axes.set_ylim(-1e3 * half * 1.3, 1e3 * half * 1.95)
+    axes.set_ylabel("radius [mm]")
+    axes.grid(visible=False)
+    said = "" if shaft is None or drawn is None else f", {drawn.mass[0]:.3g} kg, {1e3 * shaft.length:.0f} mm long"
+    head(axes, f"rotor from the side{said}")
+
+
+def _body(axes: Axes, shaft: Shaft) -> float:
+    """Draw steps and discs, bores left white; return the largest diameter drawn, m."""
+    from matplotlib.patches import Rectangle
+
+    def ring(z: float, width: float, outer: float, inner: float, color: str, order: float) -> None:
+        for low, high in ((inner / 2, outer / 2), (-outer / 2, -inner / 2)):
+            corner, size = (1e3 * z, 1e3 * low), (1e3 * width, 1e3 * (high - low))
+            axes.add_patch(Rectangle(corner, *size, facecolor=color, edgecolor=MEASURED, linewidth=0.5, zorder=order))
+
+    z, widest = shaft.z, max(step.diameter for step in shaft.steps)
+    for step in shaft.steps:
+        ring(z, step.length, step.diameter, step.bore, _STEEL, 1.0)
+        z += step.length
+    for disc in shaft.discs:  # a ring of the same mass and polar moment, as a drawing gives neither size
+        inner = _diameter_at(shaft, disc.z)
+        outer = math.sqrt(max(8 * disc.Ip / disc.m - inner**2, 0.0)) if disc.m else 0.0
+        outer = min(max(outer, 1.5 * inner), _WIDEST * shaft.length)
+        volume = disc.m / shaft.material.rho
+        width = min(4 * volume / (math.pi * max(outer**2 - inner**2, 1e-12)), 0.2 * shaft.length)
+        ring(disc.z - width / 2, width, outer, inner, _DISC, 0.9)
+        widest = max(widest, outer)
+    return widest
+
+
+def _diameter_at(shaft: Shaft, z: float) -> float:
+    ends = shaft.z + np.cumsum([step.length for step in shaft.steps])
+    return shaft.steps[min(int(np.searchsorted(ends, z)), len(shaft.steps) - 1)].diameter
+
+
+def _shape(
+    axes: Axes,
+    k: int,
+    planes: Mapping[str, float],
+    mode: Mode | None,
+    drawn: FreeRotor | None,
+    ends: tuple[float, float],
+    number: int,
+) -> None:
+    """One mode along the shaft: the drawing's turned to the side of the identified one."""
+    said = [f"mode {number}"]
+    at = [name for name in planes if mode is not None and name in mode.shape]
+    z = np.array([planes[name] for name in at])
+    value = np.array([mode.shape[name].value for name in at]) if mode is not None else np.zeros(0)
+    if mode is not None:
+        f, damping = mode.frequency_hz, mode.damping
+        said.append(f"{f.value:.5g} Hz ± {NORMAL_95 * f.sd:.2g}, damping {100 * damping.value:.3g} %")
+        sd = np.array([mode.shape[name].sd for name in at])
+        axes.errorbar(
+            1e3 * z, value, NORMAL_95 * sd, fmt="o", color=PREDICTED, markersize=4.5, elinewidth=1.0, capsize=2.5,
+            label="identified, 95 %", zorder=4,
+        )  # fmt: skip
+    if drawn is not None and k + 2 < drawn.omega.size:
+        along = np.linspace(drawn.z[0], drawn.z[-1], 301)
+        line = drawn.deflection(along)[:, k + 2]
+        side = float(value @ drawn.deflection(z)[:, k + 2]) if z.size else 1.0
+        axes.plot(
+            1e3 * along, math.copysign(1.0, side) * line, color=MEASURED, linestyle="--", label="from the drawing"
+        )
+        said.append(f"drawing {drawn.omega[k + 2] / (2 * np.pi):.5g} Hz")
+    for name, plane in planes.items():
+        axes.axvline(1e3 * plane, color=BOUND if name.endswith(".z") else GREEN, linewidth=0.7, linestyle=":", zorder=1)
+    axes.axhline(0, color=MEASURED, linewidth=0.6)
+    axes.set_xlim(*(1e3 * x for x in ends))
+    axes.set_ylabel("shape [kg$^{-1/2}$]")
+    axes.set_xlabel("along the shaft, from the datum [mm]")
+    head(axes, ": ".join(said[:2]) + "".join(f"; {x}" for x in said[2:]))
+
+
+def _campbell(
+    axes: Axes, identified: Campbell | None, drawn: Campbell | None, sd: Array | None, speeds: Sequence[float]
+) -> None:
+    """Frequencies in Hz over speed in 1/min."""
+    given = [x for x in (identified, drawn) if x is not None]
+    most = max(float(x.speed[-1]) for x in given)
+    criticals: list[str] = []
+    for which, dashed in ((drawn, True), (identified, False)):
+        if which is None:
+            continue
+        _lines(axes, which, None if dashed else sd, dashed=dashed)
+        if which is identified or identified is None:
+            criticals = _criticals(axes, which)
+    at = np.array([0.0, most])
+    axes.plot(at * 30 / np.pi, at / (2 * np.pi), color=MEASURED, linewidth=0.9, label="speed itself (1x)")
+    for speed in speeds:
+        axes.axvline(speed * 30 / np.pi, color=GREEN, linewidth=0.9, linestyle=":", label="speed of a record")
+    axes.set_xlim(0, most * 30 / np.pi)
+    axes.set_ylim(0, None)
+    axes.set_xlabel("speed [1/min]")
+    axes.set_ylabel("frequency of whirl [Hz]")
+    many = "speed" if len(criticals) == 1 else "speeds"
+    head(axes, f"critical {many} {', '.join(criticals)} 1/min" if criticals else "no critical speed up to here")
+
+
+def _lines(axes: Axes, which: Campbell, sd: Array | None, *, dashed: bool) -> None:
+    """The lines of one diagram, by their direction over the upper half of the speeds, with bands."""
+    x, f = which.speed * 30 / np.pi, which.frequency / (2 * np.pi)
+    for k in range(f.shape[1]):
+        known = np.isfinite(f[:, k])
+        if not known.any():
+            continue
+        way = float(np.mean(which.direction[known, k][-max(1, int(known.sum()) // 2) :]))
+        color = _FORWARD if way > _PLANAR else _BACKWARD if way < -_PLANAR else SKY
+        name = "forward" if way > _PLANAR else "backward" if way < -_PLANAR else "in a plane"
+        label = f"{name}, from the drawing" if dashed else name
+        style = {"linestyle": "--", "linewidth": 1.0, "alpha": 0.75} if dashed else {"linewidth": 1.6}
+        axes.plot(x, f[:, k], color=color, label=label, **style)
+        if sd is not None:
+            half = NORMAL_95 * sd[:, k] / (2 * np.pi)
+            axes.fill_between(x, f[:, k] - half, f[:, k] + half, color=color, alpha=0.25, linewidth=0)
+
+
+def _criticals(axes: Axes, which: Campbell) -> list[str]:
+    """Mark where lines meet the speed; return the forward ones, which unbalance excites, in 1/min."""
+    found = []
+    for c in which.critical_speeds():
+        forward = c.direction > -_PLANAR
+        axes.plot(
+            c.speed * 30 / np.pi, c.speed / (2 * np.pi), "o", markersize=6, markeredgecolor=BOUND, linestyle="none",
+            markerfacecolor=BOUND if forward else "white", zorder=5,
+            label="critical speed" if forward else "backward whirl at 1x",
+        )  # fmt: skip
+        if forward:
+            found.append(f"{c.speed * 30 / np.pi:.0f}")
+    return found
