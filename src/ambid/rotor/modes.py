@@ -3,7 +3,9 @@
 A mode (w, zeta) with shape b at the bearings and s at the sensors adds x_s = s D(jw) Σ b f to the positions, f the
 force of each magnet. At speed W a gyroscopic term g splits it: for the circular motions x ± jy
 
-    D± = 1/(w² - W_l² ± g W W_l + 2 j zeta w W_l),   W_l: frequency of the line.
+    D± = 1/(w² - W_l² ± g W W_l + 2 j zeta w W_l),   W_l: frequency of the line,
+
+whose resonances stand at w exp(±d), 2 sinh d = g W/w: they are tried as pairs of modes at rest.
 
 The products s bᵀ are linear in the residuals; the best rank-one part is the start of a search. Beside it stands a
 static compliance, so that modes above the band do not look like one within. The magnets' stiffness moves the pole that
@@ -23,7 +25,7 @@ from ambid.rotor.likelihood import Experiment, Point, Weight, sampled
 
 _STEP = 0.004  # of the frequencies that are tried, relative
 _DAMPINGS = (0.002, 0.006, 0.02, 0.06)
-_SPLITS = np.concatenate([[0.0], np.geomspace(0.005, 0.6, 24)])  # g W over w
+_SPLITS = (0, 1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85)  # steps from a mode at rest to its two whirls
 _START_DAMPING = (0.001, 0.05)
 
 
@@ -59,17 +61,22 @@ def scan(
 ) -> Candidate | None:
     """Return the mode within a band in Hz that explains most of what the model leaves over; None without one."""
     motions, places = _motions(experiment, model, at, weight)
-    line = experiment.spectra.omega
     omega = 2.0 * np.pi * np.exp(np.arange(np.log(band[0]), np.log(band[1]), _STEP))
-    turning = model.at_speed(experiment.speed).turning
-    splits = _SPLITS if turning else _SPLITS[:1]
+    turning = motions[0].direction != 0
     best: tuple[float, float, float, float, Array] | None = None
     for zeta in _DAMPINGS:
-        for split in splits:
-            gains, products = _tried(motions, line, omega, zeta, split)
+        sums = [_sums(m, experiment.spectra.omega, omega, zeta) for m in motions]
+        for n in [k for k in _SPLITS if 2 * k < omega.size] if turning else (0,):
+            middle = np.arange(n, omega.size - n)
+            ways = [middle + n * m.direction for m in motions]
+            gains, products = _explained(
+                sum(G[w] for (G, _), w in zip(sums, ways, strict=True)),
+                sum(r[w] for (_, r), w in zip(sums, ways, strict=True)),
+            )
             k = int(np.argmax(gains))
             if best is None or gains[k] > best[0]:
-                best = float(gains[k]), float(omega[k]), zeta, float(split), products[k]
+                split = 2.0 * float(np.sinh(n * _STEP))
+                best = float(gains[k]), float(omega[middle[k]]), zeta, split, products[k]
     if best is None or not best[0] > 0.0:
         return None
     gain, seen, zeta, split, product = best
@@ -140,25 +147,38 @@ def _motions(
     ], (at_b, at_s)  # fmt: skip
 
 
-def _tried(motions: Sequence[_Motion], line: Array, omega: Array, zeta: float, split: float) -> tuple[Array, Array]:
-    """Return what a mode at each frequency explains, (n_omega,), and its products s bᵀ there."""
-    n_b, n_s = motions[0].force.shape[1], motions[0].left.shape[1]
-    G = np.zeros((omega.size, n_s, 2 * n_b, 2 * n_b))
-    r = np.zeros((omega.size, n_s, 2 * n_b))
-    for m in motions:
-        D = 1.0 / (omega[:, None] ** 2 - line**2 + line * omega[:, None] * (m.direction * split + 2j * zeta))
-        q = np.conj(m.force)[:, :, None] * m.force[:, None, :]  # (n_lines, n_b, n_b)
-        for s in range(n_s):
-            w = m.weight[:, s]
-            weighed = (q * w[:, None, None]).reshape(line.size, -1)
-            p = np.conj(m.force) * (w * m.left[:, s])[:, None]
-            G[:, s, :n_b, :n_b] += (np.abs(D) ** 2 @ weighed.real).reshape(-1, n_b, n_b)
-            cross = (np.conj(D) @ weighed).real.reshape(-1, n_b, n_b)
-            G[:, s, :n_b, n_b:] += cross
-            G[:, s, n_b:, :n_b] += cross.transpose(0, 2, 1)
-            G[:, s, n_b:, n_b:] += weighed.real.sum(axis=0).reshape(n_b, n_b)
-            r[:, s, :n_b] += (np.conj(D) @ p).real
-            r[:, s, n_b:] += p.real.sum(axis=0)
+def _sums(m: _Motion, line: Array, omega: Array, zeta: float) -> tuple[Array, Array]:
+    """Return the normal equations of a mode at each frequency and of a static compliance beside it.
+
+    (n_omega, n_sensors, 2 n_bearings, 2 n_bearings) and (n_omega, n_sensors, 2 n_bearings). With D = 1/(a + jb) the
+    real part of D* q is |D|² (a Re q - b Im q), so that one real matrix |D|² serves all.
+    """
+    n_b, n_s = m.force.shape[1], m.left.shape[1]
+    reach = omega[:, None] ** 2 - line**2
+    power = 1.0 / (reach**2 + (2.0 * zeta * omega[:, None] * line) ** 2)
+
+    def through(q: Complex) -> Array:
+        """Return Re Σ D* q over the lines."""
+        lagged = (2.0 * zeta * omega)[:, None] * (power @ (line[:, None] * q.imag))
+        return np.asarray(omega[:, None] ** 2 * (power @ q.real) - power @ (line[:, None] ** 2 * q.real) - lagged)
+
+    q = (np.conj(m.force)[:, :, None] * m.force[:, None, :]).reshape(line.size, -1)
+    G, r = np.zeros((omega.size, n_s, 2 * n_b, 2 * n_b)), np.zeros((omega.size, n_s, 2 * n_b))
+    for s in range(n_s):
+        weighed = q * m.weight[:, s, None]
+        p = np.conj(m.force) * (m.weight[:, s] * m.left[:, s])[:, None]
+        G[:, s, :n_b, :n_b] = (power @ weighed.real).reshape(-1, n_b, n_b)
+        G[:, s, :n_b, n_b:] = through(weighed).reshape(-1, n_b, n_b)
+        G[:, s, n_b:, :n_b] = G[:, s, :n_b, n_b:].transpose(0, 2, 1)
+        G[:, s, n_b:, n_b:] = weighed.real.sum(axis=0).reshape(n_b, n_b)
+        r[:, s, :n_b] = through(p)
+        r[:, s, n_b:] = p.real.sum(axis=0)
+    return G, r
+
+
+def _explained(G: Array, r: Array) -> tuple[Array, Array]:
+    """Return what a mode explains beyond a static compliance, (n_omega,), and its products s bᵀ."""
+    n_b = r.shape[2] // 2
     size = np.sqrt(np.maximum(np.einsum("fsii->fsi", G), 1e-300))
     scaled = G / size[..., :, None] / size[..., None, :] + 1e-9 * np.eye(2 * n_b)
     b = r / size
