@@ -41,7 +41,8 @@ _NEAR = Tolerance(frequency=0.001, damping=0.25, least=0.002, shape=0.9)
 _SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
 _LEVERAGE = 0.9  # most that a line's own share in its fit counts
 _PASSES = 2
-_SHARE = 0.01  # least part of an output's energy at a mode's frequency that must be the mode's
+_SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's frequency that must be the mode's ...
+_CLEAR = 10.0  # ... the less where it stands so many times out of what is left
 _MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
 _LOST = 0.5  # energy left from which a mode's numbers are not shown
 _DROP_DB = 15.0  # between the excitation's band and the floor beside it
@@ -149,21 +150,21 @@ def _h(x: Complex) -> Complex:
 def _starts(lines: _Lines, say: Callable[[float], None]) -> tuple[list[complex], list[TrialPole]]:
     """Poles that stay as the order grows, band by band, and all that were tried."""
     found, tried = list[complex](), list[TrialPole]()
-    first, n = 0, lines.omega.size
+    first, begin, n = 0, 0, lines.omega.size
     while True:
         size = max(_BAND_LINES, int(_BAND_SHARE * lines.omega[first] / lines.step))
         last = min(first + size, n)
         if n - last < size // 4:
             last = n
-        begin, end = first if first == 0 else first + (last - first) // 4, last if last == n else last - size // 4
-        low, high = lines.omega[begin], lines.omega[end - 1]
+        end = last if last == n else last - size // 4  # each band counts but for its borders
+        low, high = lines.omega[begin], lines.omega[end - 1] + lines.step
         poles = _followed_poles(lines.part(first, last))
         tried += [p for p in poles[0] if low <= p.pole.imag < high]
         found += [c for c in poles[1] if low <= c.imag < high]
         say(last / n)
         if last == n:
             return found, tried
-        first += size // 2
+        first, begin = first + size // 2, end
 
 
 def _followed_poles(lines: _Lines) -> tuple[list[TrialPole], list[complex]]:
@@ -373,6 +374,7 @@ class _Candidate:
     pole: complex
     gain: float = 0.0  # of -2 log likelihood over what its numbers cost (BIC), the lesser of pole and input
     share: float = 0.0  # most of an output's energy at its frequency
+    clear: float = 0.0  # its energy over what is left there, in the same output
     misfit: float = 0.0  # energy left there
     correlation: float = 0.0  # of what is left, from line to line
     shape: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
@@ -459,7 +461,8 @@ def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Pr
     energy = np.maximum(np.sum(np.abs(lines.Y[near]) ** 2, axis=0), 1e-300)
     left, deprived = (np.sum((np.abs(x.e) ** 2 * window.variance.T)[:, near], axis=1) for x in (fitted, deaf))
     shares = np.maximum(deprived - left, 0.0) / energy
-    c.share = float(np.max(shares))
+    best = int(np.argmax(shares))
+    c.share, c.clear = float(shares[best]), float(shares[best] * energy[best] / max(left[best], 1e-300))
     c.misfit = float(np.sum(left / energy * shares) / max(np.sum(shares), 1e-300))
     wide = np.abs(lines.omega - c.pole.imag) <= max(4 * abs(c.pole.real), 8 * lines.step)
     e = fitted.e[:, wide]
@@ -475,7 +478,8 @@ def _kept(candidates: list[_Candidate], lines: _Lines, *, judged: bool) -> list[
     kept = list[_Candidate]()
     for c in sorted(candidates, key=lambda c: -c.gain if judged else abs(c.pole.real)):
         damped = c.pole.real < 0 and c.damping <= (_MOST_DAMPED if judged else 2 * _MOST_DAMPED)
-        worth = not judged or (c.gain > 0 and c.share >= _SHARE)
+        wanted = _LEAST_SHARE if c.clear >= _CLEAR else _SHARE
+        worth = not judged or (c.gain > 0 and c.share >= wanted)
         if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in kept):
             kept.append(c)
     return sorted(kept, key=lambda c: c.pole.imag)
