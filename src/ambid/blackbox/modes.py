@@ -7,16 +7,12 @@ for everything farther away, are linear (Pintelon and Schoukens 2012, sec. 6.3.2
 delay or a sensor multiply this by what is smooth about the mode: they change a, P and Q, not p. So each mode is fitted
 in a window of its own, with its neighbours, by variable projection (Golub and Pereyra 1973); no smoothed response is
 formed. The noise V is what the fit leaves about each line, model errors included.
-
-Starts: a common denominator in a basis of z^k on bands of the record (Guillaume et al. 2003, least-squares complex
-frequency, with leakage), of all orders up to 32, of which the stable poles are followed (Cauberghe 2004: with the
-lowest coefficient 1, poles of noise come out unstable).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -24,20 +20,15 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.blackbox.data import IOData
-from ambid.errors import EstimationError
+from ambid.blackbox.mode_starts import DEGREE, MOST_DAMPED, Spectra, conjugate, principal, spectra, starting_poles
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import EstimatedNumber, Modal, Mode
+from ambid.estimation.modes import NORMAL_95, Modal, Mode, mode_of, student
 from ambid.estimation.search import Rows, search
-from ambid.estimation.stable_poles import Tolerance, TrialPole, assurance, clusters, followed, trial_poles
+from ambid.estimation.stable_poles import assurance
 
-_DEGREE = 2  # of the polynomials P and Q
 _REACH = 10.0  # of a window to either side, in half bandwidths of its mode
 _FEWEST = 24  # lines of a window to either side, at least
-_MOST_DAMPED = 0.15  # above, a resonance is no line: rigid and control modes go into P
-_BAND_LINES, _BAND_SHARE = 600, 0.15  # lines, and part of its frequency, that a band of the start has at least
-_ORDERS = (2, 32)
-_NEAR = Tolerance(frequency=0.001, damping=0.25, least=0.002, shape=0.9)
 _SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
 _LEVERAGE = 0.9  # most that a line's own share in its fit counts
 _PASSES = 2
@@ -45,188 +36,6 @@ _SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's fre
 _CLEAR = 10.0  # ... the less where it stands so many times out of what is left
 _MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
 _LOST = 0.5  # energy left from which a mode's numbers are not shown
-_DROP_DB = 15.0  # between the excitation's band and the floor beside it
-_LEAST_LINES = 60
-
-
-# --- lines ----------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Lines:
-    """Spectra of a record in a band, and the variance of the noise of each output."""
-
-    omega: Array  # (n_lines,), rad/s
-    U: Complex  # (n_lines, 1 + n_inputs), a column of ones for the leakage, then the inputs
-    Y: Complex  # (n_lines, n_outputs)
-    variance: Array  # (n_lines, n_outputs)
-    step: float  # rad/s from line to line
-
-    def part(self, first: int, last: int) -> _Lines:
-        s = slice(first, last)
-        return replace(self, omega=self.omega[s], U=self.U[s], Y=self.Y[s], variance=self.variance[s])
-
-    def between(self, low_hz: float, high_hz: float) -> _Lines:
-        first, last = np.searchsorted(self.omega, [2 * np.pi * low_hz, 2 * np.pi * high_hz])
-        return self.part(int(first), int(last))
-
-
-def _lines(data: IOData, band: tuple[float, float] | None) -> _Lines:
-    n, rate = data.y.shape[0], 1.0 / data.dt
-    U, Y = (np.fft.rfft(x - x.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for x in (data.u, data.y))
-    f = np.arange(1, U.shape[0] + 1) * (rate / n)
-    low, high = excited_band(U, f) if band is None else band
-    keep = (f >= low) & (f <= high)
-    if np.count_nonzero(keep) < _LEAST_LINES:
-        raise EstimationError(
-            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; modes want {_LEAST_LINES}. "
-            "Use a longer record or a wider --band"
-        )
-    U, Y, f = U[keep], Y[keep], f[keep]
-    silent = [name for name, x in zip(data.inputs, U.T, strict=True) if not np.any(x)]
-    if silent:
-        raise EstimationError(f"input {silent[0]!r} does not move between {low:g} and {high:g} Hz. Omit it")
-    size = np.sqrt(np.mean(np.abs(U) ** 2, axis=0))
-    ones = np.full((f.size, 1), 1.0 + 0j)
-    columns = np.hstack([ones, U / size])
-    return _Lines(omega=2 * np.pi * f, U=columns, Y=Y, variance=_local_noise(columns, Y), step=2 * np.pi * rate / n)
-
-
-def excited_band(U: Complex, frequency_hz: Array) -> tuple[float, float]:
-    """Return the band in which inputs have power: the upper of two classes of their level over the logarithm of the
-    frequency (Otsu 1979); all lines where there is no floor beside it.
-
-    `U`: (n_lines, n_inputs), spectra. Returns lowest and highest frequency, Hz.
-    """
-    width = max(frequency_hz.size // 2000, 16)
-    n = frequency_hz.size // width
-    if n < 8:
-        return float(frequency_hz[0]), float(frequency_hz[-1])
-    power = np.abs(U[: n * width]) ** 2
-    level = np.median(power.reshape(n, width, -1), axis=1)  # a line of the mains does not move a median
-    level = 10 * np.log10(np.sum(level / np.maximum(level.max(axis=0), 1e-300), axis=1) + 1e-30)
-    centre = frequency_hz[: n * width].reshape(n, width).mean(axis=1)
-    weight = np.diff(np.log(np.r_[centre[0] / 2, centre]))
-    order = np.argsort(level)
-    x, w = level[order], weight[order]
-    below, total = np.cumsum(w), np.sum(w)
-    mean_below = np.cumsum(w * x) / below
-    mean_above = (np.sum(w * x) - np.cumsum(w * x))[:-1] / (total - below)[:-1]
-    between = (below * (total - below))[:-1] * (mean_above - mean_below[:-1]) ** 2
-    k = int(np.argmax(between))
-    if mean_above[k] - mean_below[k] < _DROP_DB:
-        return float(frequency_hz[0]), float(frequency_hz[-1])
-    inside = np.flatnonzero(level > 0.5 * (x[k] + x[k + 1]))
-    edges = inside[0] * width, min((inside[-1] + 1) * width, frequency_hz.size) - 1
-    return float(frequency_hz[edges[0]]), float(frequency_hz[edges[1]])
-
-
-def _local_noise(U: Complex, Y: Complex) -> Array:
-    """Variance that polynomials of response and leakage leave in short stretches; medians pass over resonances."""
-    n_unknown = (_DEGREE + 1) * U.shape[1]
-    width = n_unknown + 12
-    n = max(Y.shape[0] // width, 1)
-    x = np.linspace(-1, 1, width)[:, None] ** np.arange(_DEGREE + 1)
-    u, y = (a[: n * width].reshape(n, width, -1) for a in (U, Y))
-    columns = (u[:, :, :, None] * x[:, None, :]).reshape(n, width, -1)
-    Q = np.linalg.qr(columns)[0]
-    left = y - Q @ (_h(Q) @ y)
-    level = np.log(np.sum(np.abs(left) ** 2, axis=1) / 12 + 1e-300)
-    half = min(7, n - 1)
-    wide = np.pad(level, ((half, half), (0, 0)), mode="reflect")
-    smooth = np.median(np.lib.stride_tricks.sliding_window_view(wide, 2 * half + 1, axis=0), axis=-1)
-    at = (np.arange(n) + 0.5) * width
-    lines = np.arange(Y.shape[0])
-    return np.asarray(np.exp(np.column_stack([np.interp(lines, at, column) for column in smooth.T])))
-
-
-def _h(x: Complex) -> Complex:
-    return np.asarray(np.conj(np.swapaxes(x, -1, -2)))
-
-
-# --- starts ---------------------------------------------------------------------------------------------------------
-
-
-def _starts(lines: _Lines, say: Callable[[float], None]) -> tuple[list[complex], list[TrialPole]]:
-    """Poles that stay as the order grows, band by band, and all that were tried."""
-    found, tried = list[complex](), list[TrialPole]()
-    first, begin, n = 0, 0, lines.omega.size
-    while True:
-        size = max(_BAND_LINES, int(_BAND_SHARE * lines.omega[first] / lines.step))
-        last = min(first + size, n)
-        if n - last < size // 4:
-            last = n
-        end = last if last == n else last - size // 4  # each band counts but for its borders
-        low, high = lines.omega[begin], lines.omega[end - 1] + lines.step
-        poles = _followed_poles(lines.part(first, last))
-        tried += [p for p in poles[0] if low <= p.pole.imag < high]
-        found += [c for c in poles[1] if low <= c.imag < high]
-        say(last / n)
-        if last == n:
-            return found, tried
-        first, begin = first + size // 2, end
-
-
-def _followed_poles(lines: _Lines) -> tuple[list[TrialPole], list[complex]]:
-    """Poles of all orders in one band, and the centres of stable clusters."""
-    n_lines, columns = lines.U.shape
-    most = min(_ORDERS[1], int(0.5 * n_lines / columns) - 1)
-    models = list(range(_ORDERS[0], most + 1, 2))
-    rows = []
-    for order, p, shapes in _common_denominators(lines, models):
-        lightly = (p.real < 0) & (-p.real < 2 * _MOST_DAMPED * np.abs(p))
-        inside = lightly & (p.imag > lines.omega[0]) & (p.imag < lines.omega[-1])
-        rows.append(trial_poles(order, p[inside], shapes[inside]))
-    poles = followed(rows, _NEAR)
-    return poles, [c.pole for c in clusters(poles, models, _NEAR)]
-
-
-def _common_denominators(lines: _Lines, models: Sequence[int]) -> list[tuple[int, Complex, Complex]]:
-    """Order, poles (n,) and shapes (n, n_outputs) of common denominators by linear least squares.
-
-    All products of powers of x = exp(s T) depend on their difference alone: the normal equations of all orders are
-    parts of a few sums over the lines.
-    """
-    n, (n_lines, m), n_y = max(models), lines.U.shape, lines.Y.shape[1]
-    angle = 0.9 * 2 * np.pi / n_lines
-    period, centre = angle / lines.step, lines.omega[n_lines // 2]
-    x = np.exp(1j * angle * (np.arange(n_lines) - n_lines // 2))
-    powers = x[None, :] ** np.arange(-n, n + 1)[:, None]
-    weight = 1.0 / lines.variance
-    both = lines.U.conj()[:, :, None, None] * lines.U[:, None, :, None] * weight[:, None, None, :]
-    R, S, T = (
-        (powers @ g.reshape(n_lines, -1)).reshape(2 * n + 1, *g.shape[1:])
-        for g in (
-            both,
-            lines.U.conj()[:, :, None] * (lines.Y * weight)[:, None, :],
-            np.abs(lines.Y) ** 2 * weight,
-        )
-    )
-    at = np.arange(n + 1)
-    lag = at[None, :] - at[:, None] + n
-    out = []
-    for order in models:
-        k, size = lag[: order + 1, : order + 1], m * (order + 1)
-        own = R[k].transpose(4, 2, 0, 3, 1).reshape(n_y, size, size)
-        cross = S[k].transpose(3, 2, 0, 1).reshape(n_y, size, order + 1)
-        scale = np.einsum("jaa->j", own).real / size
-        solved = np.linalg.solve(own + 1e-12 * scale[:, None, None] * np.eye(size), cross)
-        M = np.sum(T[k].transpose(2, 0, 1) - _h(cross) @ solved, axis=0)
-        a = np.r_[1.0, np.linalg.lstsq(M[1:, 1:], -M[1:, 0], rcond=1e-14)[0]]
-        roots = np.roots(a[::-1])
-        roots = roots[np.abs(roots) > 1e-3]
-        numerator = (solved @ a).reshape(n_y, m, order + 1)[:, 1:]
-        residues = np.einsum("jum,pm->pju", numerator, roots[:, None] ** at[: order + 1])
-        out.append((order, 1j * centre + np.log(roots) / period, _principal(residues)))
-    return out
-
-
-def _principal(residues: Complex) -> Complex:
-    """Shape (n, n_outputs) that residues (n, n_outputs, n_inputs) of all inputs share most."""
-    if residues.shape[2] == 1:
-        return np.asarray(residues[:, :, 0])
-    u, s, _ = np.linalg.svd(residues, full_matrices=False)
-    return np.asarray(u[:, :, 0] * s[:, :1])
 
 
 # --- the likelihood about one mode ----------------------------------------------------------------------------------
@@ -256,12 +65,12 @@ class _Projected:
 class _Window:
     """Lines about a mode: poles that are searched, poles beside them that are known, polynomials."""
 
-    def __init__(self, lines: _Lines, fixed: Complex) -> None:
+    def __init__(self, lines: Spectra, fixed: Complex) -> None:
         self.lines, self.fixed = lines, fixed
         self.variance = lines.variance
         omega = lines.omega
         x = (omega - omega.mean()) / max(np.ptp(omega) / 2, 1e-300)
-        powers = x[:, None] ** np.arange(_DEGREE + 1)
+        powers = x[:, None] ** np.arange(DEGREE + 1)
         self.smooth = (lines.U[:, :, None] * powers[:, None, :]).reshape(omega.size, -1)
         self._at: tuple[bytes, _Projected] | None = None
 
@@ -285,7 +94,7 @@ class _Window:
         R[np.any(diagonal < 1e-13, axis=1)] += 1e-13 * np.eye(R.shape[1])  # two poles in one place
         root = np.linalg.inv(R) / np.swapaxes(size, 1, 2)
         y = (weight * lines.Y.T)[:, :, None]
-        along = _h(Q) @ y
+        along = conjugate(Q) @ y
         found = _Projected(inverse=inverse, Q=Q, root=root, c=(root @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
         if without_input is None:
             self._at = key, found
@@ -299,7 +108,7 @@ class _Window:
         weight, out = 1.0 / np.sqrt(self.variance.T), []
         for r in range(poles.size):
             d = weight * (at.c[:, r * m : (r + 1) * m] @ self.lines.U.T) * at.inverse[:, r] ** 2
-            d = d - (at.Q @ (_h(at.Q) @ d[:, :, None]))[:, :, 0]
+            d = d - (at.Q @ (conjugate(at.Q) @ d[:, :, None]))[:, :, 0]
             out += [-d, -1j * d]
         return np.array(out)
 
@@ -396,19 +205,19 @@ def _half_width(pole: complex, step: float) -> float:
     return max(min(_REACH * abs(pole.real), 0.25 * pole.imag), _FEWEST * step)
 
 
-def _window(lines: _Lines, k: int, poles: Complex) -> tuple[_Window, Complex, int]:
+def _window(lines: Spectra, k: int, poles: Complex) -> tuple[_Window, Complex, int]:
     """Window of pole k: lines, the poles that are searched (pole k and those inside), and where pole k stands."""
     own, width = poles[k], _half_width(complex(poles[k]), lines.step)
     distance = np.abs(poles.imag - own.imag)
     part = lines.between((own.imag - width) / (2 * np.pi), (own.imag + width) / (2 * np.pi))
-    most = max(int(part.omega.size / (2.5 * lines.U.shape[1])) - _DEGREE - 1, 1)  # columns that its lines tell apart
+    most = max(int(part.omega.size / (2.5 * lines.U.shape[1])) - DEGREE - 1, 1)  # columns that its lines tell apart
     near = [j for j in np.argsort(distance) if distance[j] < 3 * width][:most]
     inside = [j for j in near if distance[j] < width][:5]
     beside = [j for j in near if j not in inside]
     return _Window(part, poles[beside]), poles[inside], inside.index(k)
 
 
-def _refine(lines: _Lines, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
+def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
     """Fit each candidate in its window, drop what is no mode, and again with those that are left."""
     for turn in range(_PASSES + 2):
         poles = np.array([c.pole for c in candidates])
@@ -424,7 +233,7 @@ def _refine(lines: _Lines, candidates: list[_Candidate], say: Callable[[float], 
     return candidates
 
 
-def _fit(lines: _Lines, k: int, poles: Complex, c: _Candidate, *, judge: bool) -> None:
+def _fit(lines: Spectra, k: int, poles: Complex, c: _Candidate, *, judge: bool) -> None:
     """Fit pole k in its window and, where asked, see what speaks for it; `poles` is brought up to date."""
     window, inside, at = _window(lines, k, poles)
     if window.lines.omega.size < 2 * window.smooth.shape[1]:
@@ -467,17 +276,17 @@ def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Pr
     wide = np.abs(lines.omega - c.pole.imag) <= max(4 * abs(c.pole.real), 8 * lines.step)
     e = fitted.e[:, wide]
     c.correlation = float(abs(np.sum(e[:, 1:] * e[:, :-1].conj())) / max(np.sum(np.abs(e) ** 2), 1e-300))
-    c.shape = _principal(residues[None, :, 1:])[0]
+    c.shape = principal(residues[None, :, 1:])[0]
     covariance = np.sum(np.abs(fitted.root) ** 2, axis=2)[:, at * m + 1 : (at + 1) * m]
     c.shape_variance = np.mean(covariance, axis=1)
 
 
-def _kept(candidates: list[_Candidate], lines: _Lines, *, judged: bool) -> list[_Candidate]:
+def _kept(candidates: list[_Candidate], lines: Spectra, *, judged: bool) -> list[_Candidate]:
     """Candidates that are modes: damped, in the band, not twice, and where judged worth their numbers and energy."""
     low, high = lines.omega[0], lines.omega[-1]
     kept = list[_Candidate]()
     for c in sorted(candidates, key=lambda c: -c.gain if judged else abs(c.pole.real)):
-        damped = c.pole.real < 0 and c.damping <= (_MOST_DAMPED if judged else 2 * _MOST_DAMPED)
+        damped = c.pole.real < 0 and c.damping <= (MOST_DAMPED if judged else 2 * MOST_DAMPED)
         wanted = _LEAST_SHARE if c.clear >= _CLEAR else _SHARE
         worth = not judged or (c.gain > 0 and c.share >= wanted)
         if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in kept):
@@ -517,8 +326,8 @@ def find_modes(
             tick(stage, share)
 
     with one_thread():
-        lines = _lines(data, band)
-        starts, tried = _starts(lines, lambda x: say("modes: starts", x))
+        lines = spectra(data, band)
+        starts, tried = starting_poles(lines, lambda x: say("modes: starts", x))
         unique = _kept([_Candidate(pole=p) for p in starts], lines, judged=False)
         found = _refine(lines, unique, lambda x: say("modes: likelihood", x)) if unique else []
     if count != "auto":
@@ -546,41 +355,10 @@ def find_modes(
 
 def _mode(c: _Candidate, outputs: tuple[str, ...]) -> Mode:
     """A candidate as a mode; the larger of the likelihood's interval and the jackknife's over outputs."""
-    p, size = c.pole, abs(c.pole)
-    gradients = np.array([[p.real, p.imag], [-(p.imag**2) / size, p.real * p.imag / size]]) / size
-    gradients[0] /= 2 * np.pi
-    gradients[1] /= size
-    one, two = (np.sqrt(np.maximum(np.einsum("ia,ab,ib->i", gradients, C, gradients), 0.0)) for C in _both(c))
-    n = len(outputs)
-    widening = float(_student(n - 1)) if n > 1 else 0.0
-    sd, half = np.maximum(one, two), np.maximum(1.959964 * one, widening * two)
-    quantile = half / np.maximum(sd, 1e-300)
-    shown = c.misfit < _LOST
-    wide = 4 * abs(p.real) / (2 * np.pi)
-    frequency = EstimatedNumber.of(size / (2 * np.pi), sd[0], quantile=quantile[0], size=wide, shown=shown)
-    damping = EstimatedNumber.of(c.damping, sd[1], quantile=quantile[1], shown=shown)
-    largest = int(np.argmax(np.abs(c.shape)))
-    shape = c.shape / c.shape[largest]
-    variance = (c.shape_variance + np.abs(shape) ** 2 * c.shape_variance[largest]) / np.abs(c.shape[largest]) ** 2
-    variance[largest] = 0.0
-    real, late = (
-        {
-            name: EstimatedNumber.of(float(x), float(np.sqrt(v / 2)), size=1.0)
-            for name, x, v in zip(outputs, part, variance, strict=True)
-        }
-        for part in (shape.real, shape.imag)
-    )
-    return Mode(frequency_hz=frequency, damping=damping, shape=real, shape_quadrature=late)
-
-
-def _both(c: _Candidate) -> tuple[Array, Array]:
-    return c.likelihood, c.jackknife
-
-
-def _student(freedom: int) -> float:
-    from scipy.special import stdtrit
-
-    return float(stdtrit(freedom, 0.975))
+    spreads = [(c.likelihood, NORMAL_95)]
+    if len(outputs) > 1:
+        spreads.append((c.jackknife, student(len(outputs) - 1)))
+    return mode_of(c.pole, spreads, outputs, c.shape, c.shape_variance, shown=c.misfit < _LOST)
 
 
 def _checks(found: list[_Candidate], count: int | str, band: tuple[float, float]) -> dict[str, Check]:

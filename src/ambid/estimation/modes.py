@@ -13,7 +13,7 @@ from typing import Literal
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.stable_poles import TrialPole, assurance
@@ -70,6 +70,50 @@ class Mode:
     def identifiable(self) -> bool:
         """Whether the data show both frequency and damping."""
         return self.frequency_hz.identifiable and self.damping.identifiable
+
+
+def mode_of(
+    pole: complex,
+    spreads: Sequence[tuple[Array, float]],
+    outputs: Sequence[str],
+    shape: Complex,
+    variance: Array,
+    *,
+    shown: bool = True,
+) -> Mode:
+    """Return a pole, rad/s, as a mode, its shape scaled so that the largest output is 1.
+
+    `spreads`: covariances of real and imaginary part, (2, 2), with the quantile that makes an interval of a standard
+    deviation; the widest counts; `shape`, `variance`: (n_outputs,), variance of the complex number; `shown`: False
+    where something says that the data do not show the mode.
+    """
+    size = abs(pole)
+    of_frequency = np.array([pole.real, pole.imag]) / (2 * np.pi * size)
+    of_damping = np.array([-(pole.imag**2), pole.real * pole.imag]) / size**3
+    wide = 4 * abs(pole.real) / (2 * np.pi)  # a frequency is known where its sd is less than half a bandwidth
+    asked = (size / (2 * np.pi), of_frequency, wide), (-pole.real / size, of_damping, None)
+    numbers = list[EstimatedNumber]()
+    for value, slope, width in asked:
+        found = [(max(float(slope @ C @ slope), 0.0) ** 0.5, q) for C, q in spreads]
+        sd, half = max(s for s, _ in found), max(s * q for s, q in found)
+        quantile = half / sd if sd > 0 else NORMAL_95
+        numbers.append(EstimatedNumber.of(value, sd, quantile=quantile, size=width, shown=shown))
+    largest = int(np.argmax(np.abs(shape)))
+    scaled = shape / shape[largest]
+    spread = np.sqrt((variance + np.abs(scaled) ** 2 * variance[largest]) / 2) / abs(shape[largest])
+    spread[largest] = 0.0
+    in_step, late = (
+        {o: EstimatedNumber.of(float(x), float(sd), size=1.0) for o, x, sd in zip(outputs, part, spread, strict=True)}
+        for part in (scaled.real, scaled.imag)
+    )
+    return Mode(frequency_hz=numbers[0], damping=numbers[1], shape=in_step, shape_quadrature=late)
+
+
+def student(freedom: int) -> float:
+    """Return Student's quantile for 95 % intervals."""
+    from scipy.special import stdtrit
+
+    return float(stdtrit(freedom, 0.975))
 
 
 def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
