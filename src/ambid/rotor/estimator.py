@@ -239,7 +239,10 @@ class _Work:
             return None
         more = fit.model.with_modes(fit.model.n_modes + 1)
         theta = _with_mode(fit.point.theta, more, found.named(more.n_modes))
-        trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)))
+        try:
+            trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)))
+        except np.linalg.LinAlgError:  # ran off
+            return None
         # Weights follow the model: both are judged by those of the larger one.
         before = replace(fit.problem, weights=trial.problem.weights)
         return trial if before.cost(fit.vector) - trial.cost > price else None

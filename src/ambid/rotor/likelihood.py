@@ -78,7 +78,7 @@ def noise_weight(experiment: Experiment, model: RotorModel, at: Point) -> Weight
     H = of.transfer()
     noise = fit_noise(spectra, of, H)
     factor = np.linalg.cholesky(noise.covariance / spectra.n_periods)
-    back = feedback(spectra, H)
+    back = feedback(spectra, H, measured=not all(of.held))
     return Weight(whiten=np.linalg.inv(factor).astype(np.complex128), back=back, noise=noise)
 
 

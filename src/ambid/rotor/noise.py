@@ -7,7 +7,8 @@ model,
 
 whose levels s_j maximise the likelihood of the scatter of e_p about its mean (Fisher scoring; Pintelon and Schoukens
 2012, ch. 10 and 12). Feedback carries that noise back into the inputs: with U = R - K Y the inputs hold -(I + K H)⁻¹ K
-e; K follows from the scatter of U and Y, which a controller binds line by line.
+e; K follows from the scatter of U and Y, which a controller binds line by line. Inputs that are measured themselves,
+such as currents without voltages, hold noise of their own: there Q follows from the scatter of U and e.
 """
 
 from __future__ import annotations
@@ -79,13 +80,14 @@ def _covariance(g: Complex, levels: Array) -> Complex:
     return np.asarray((g * levels) @ np.conj(np.swapaxes(g, 1, 2)))
 
 
-def feedback(spectra: PeriodSpectra, H: Complex) -> Complex | None:
-    """Return Q(k), what the residuals bring about in the inputs by feedback, (n_lines, n_u, n_y); None: too few lines.
+def feedback(spectra: PeriodSpectra, H: Complex, *, measured: bool) -> Complex | None:
+    """Return Q(k), what goes with the residuals in the inputs, (n_lines, n_u, n_y); None: too few lines.
 
-    K is constant with a slope over as many neighbouring lines as its rows have unknowns, three equations for each.
+    K (or Q) is constant with a slope over as many neighbouring lines as its rows have unknowns, three equations for
+    each. `measured`: some inputs are no commands of a controller.
     """
     n_u, n_y = spectra.U.shape[2], spectra.Y.shape[2]
-    d_u, d_y = (x - x.mean(axis=0) for x in (spectra.U, spectra.Y))
+    d_u, d_y = (x - x.mean(axis=0) for x in (spectra.U, residuals(spectra, H) if measured else spectra.Y))
     window = int(np.ceil(_LINES_PER_UNKNOWN * 2 * n_y / (spectra.n_periods - 1)))
     n = spectra.frequency_hz.size
     if window > n:
@@ -104,7 +106,8 @@ def feedback(spectra: PeriodSpectra, H: Complex) -> Complex | None:
         K[j] = (found[:n_y] / size[:, None]).T
     at = spectra.frequency_hz
     every = np.stack([np.interp(at, at[centres], x) for x in K.reshape(centres.size, -1).T], axis=1)
-    return closed(every.reshape(n, n_u, n_y).astype(np.complex128), H)
+    found = every.reshape(n, n_u, n_y).astype(np.complex128)
+    return -found if measured else closed(found, H)
 
 
 def closed(K: Complex, H: Complex) -> Complex:

@@ -4,8 +4,9 @@ With x' = A x + B u, u held over a sample and f samples late, every line z has H
 
     h_z(s) = (exp(s (1-f) T) - 1 + (exp(s T) - exp(s (1-f) T))/z) / (s (z - exp(s T)))
 
-(Astrom and Wittenmark 1997, sec. 2.3); a band-limited input has h_z(s) = exp(-jw f T)/(jw - s). In the eigenvectors
-A = V diag(s) V⁻¹ the derivative of h_z(A) along dA is V [(V⁻¹ dA V) ∘ D] V⁻¹ with the divided differences
+(Astrom and Wittenmark 1997, sec. 2.3). A measured current is the integral of a held voltage, and linear between the
+samples: h_z(s) = (g0 - g1 + g1 z)/(z - exp(s T)), g0 = (exp(s T) - 1)/s, g1 = (exp(s T) - 1 - s T)/(s² T). In the
+eigenvectors A = V diag(s) V⁻¹ the derivative of h_z(A) along dA is V [(V⁻¹ dA V) ∘ D] V⁻¹ with the divided differences
 D_ij = (h_z(s_i) - h_z(s_j))/(s_i - s_j) (Daleckii and Krein 1965; Higham 2008, th. 3.11).
 """
 
@@ -21,12 +22,13 @@ from ambid.arrays import Array, Complex
 from ambid.physics.linear_model import StateSpace
 
 _SAME = 1e-7  # distance of eigenvalues, over their size, from which the divided difference is the derivative
+_SMALL = 1e-5  # s T below which series are taken
 _REST = 1e-9  # an eigenvalue at 0 stands here, 1/s
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sampled:
-    """A model at lines: `delays` (n_u,) in samples, `held` (n_u,) whether an input is held over a sample."""
+    """A model at lines: `delays` (n_u,) in samples, `held` (n_u,) whether an input is held over a sample, or linear."""
 
     space: StateSpace
     omega: Array  # (n_lines,), rad/s
@@ -58,9 +60,10 @@ class Sampled:
     def scalar(self, held: bool, fraction: float) -> Complex:
         """Return h_z at the eigenvalues, (n_lines, n_states)."""
         s, T = self.eigen[0], 1.0 / self.rate_hz
-        if not held:
-            return np.asarray(np.exp(-1j * self.omega * fraction * T)[:, None] / (1j * self.omega[:, None] - s))
         z = np.exp(1j * self.omega * T)[:, None]
+        if not held:
+            (g0, g1), _ = _ramp(s, T)
+            return np.asarray((g0 - g1 + g1 * z) / (z - np.exp(s * T)) * z**-fraction)
         part, whole = np.expm1(s * (1.0 - fraction) * T), np.expm1(s * T)
         return np.asarray((part + (whole - part) / z) / (s * (z - 1.0 - whole)))
 
@@ -68,10 +71,12 @@ class Sampled:
         """Return the derivatives of h_z by the eigenvalue and by the fraction, (n_lines, n_states)."""
         s, T = self.eigen[0], 1.0 / self.rate_hz
         h = self.scalar(held, fraction)
-        if not held:
-            late = np.exp(-1j * self.omega * fraction * T)[:, None]
-            return h**2 / late, -1j * (self.omega * T)[:, None] * h
         z, a = np.exp(1j * self.omega * T)[:, None], (1.0 - fraction) * T
+        if not held:
+            _, (d0, d1) = _ramp(s, T)
+            E = np.exp(s * T)
+            by_value = (d0 - d1 + d1 * z) / (z - E) * z**-fraction + h * T * E / (z - E)
+            return by_value, -1j * (self.omega * T)[:, None] * h
         E, part = np.exp(s * T), np.exp(s * a)
         below = z - E
         by_value = (a * part + (T * E - a * part) / z) / (s * below) - h / s + h * T * E / below
@@ -146,3 +151,15 @@ class Sampled:
             if np.any(direction.C):
                 found[:, :, k] += x @ direction.C.T
         return np.asarray(found)
+
+
+def _ramp(s: Complex, T: float) -> tuple[tuple[Complex, Complex], tuple[Complex, Complex]]:
+    """Return g0, g1 of an input that is linear between the samples, and their derivatives by s."""
+    x, whole = s * T, np.expm1(s * T)
+    small = np.abs(x) < _SMALL
+    safe = np.where(small, 1.0, s)
+    g0 = whole / s
+    g1 = np.where(small, T * (0.5 + x / 6.0), (whole - x) / (safe**2 * T))
+    d0 = np.where(small, T**2 * (0.5 + x / 3.0), (T * (whole + 1.0) - g0) / safe)
+    d1 = np.where(small, T**2 * (1.0 / 6.0 + x / 12.0), whole / safe**2 - 2.0 * g1 / safe)
+    return (g0, g1), (d0, d1)

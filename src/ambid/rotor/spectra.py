@@ -94,7 +94,8 @@ def find_excitation(record: Record, model: RotorModel) -> Excitation | None:
     Leading periods with a transient are left out.
     """
     roles = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
-    x = np.column_stack([record[role].values for role in (roles or model.inputs)])
+    signals = (record[role].values for role in (roles or model.inputs))
+    x = np.column_stack([s for s in signals if np.ptp(s) > 0.0] or [np.zeros(record.n_samples)])
     try:
         period = find_period(x)
     except EstimationError:
