@@ -17,9 +17,10 @@ import pytest
 
 from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.named_bench import Turning
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.rig import Rig
-from ambid.rig.rig import RecordSettings, RigChannel, RigModes, Turning
+from ambid.rig.rig import RecordSettings, RigChannel, RigModes
 from tests.measured import RECORDS
 
 DATUM = 0.2

@@ -65,7 +65,7 @@ def test_what_the_rig_has_is_kept():
     assert scale_of(rig, "position").to_si([0.0, 1023.0]) == pytest.approx([-1.25e-3, 1.25e-3])
 
 
-@pytest.mark.parametrize("name", ["prototype", "unstable-bearing", "rmit", "thesis"])
+@pytest.mark.parametrize("name", ["prototype", "unstable-bearing", "rmit-axis", "thesis"])
 def test_every_preset_gets_settings(name):
     rig = of_preset(name)
     settings = controller_settings(with_default_daq(rig))

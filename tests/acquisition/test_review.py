@@ -18,7 +18,7 @@ def test_a_sound_rig_gives_no_line():
     assert lines() == ()
 
 
-@pytest.mark.parametrize("name", ["prototype", "unstable-bearing", "rmit"])
+@pytest.mark.parametrize("name", ["prototype", "unstable-bearing", "rmit-axis"])
 def test_presets_are_stable_as_their_controllers_close_the_loop(name):
     rig = with_default_daq(of_preset(name))
     assert not [line for line in review(rig, controller_settings(rig)) if "stable" in line or "damps" in line]

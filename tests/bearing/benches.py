@@ -19,7 +19,7 @@ from tests.estimation.reference import riccati, sampled
 
 THESIS = dict(preset("thesis").parameters)
 BEARING = dict(preset("unstable-bearing").parameters)
-RMIT = dict(preset("rmit").parameters)
+RMIT = dict(preset("rmit-axis").parameters)
 COIL = {"R": 0.86 * 1.818, "L": 1.818e-3}
 SPRUNG = {"m": 0.5, "k_x": 8.0e4, "k_i": 40.0, "c": 6.0}
 FALLING = {"m": 4.0, "k_x": -1.29e5, "k_i": 55.7, "c": 0.0}
@@ -59,7 +59,7 @@ SETTINGS = {
     "bearing": Setting(model="one-axis", truth=BEARING, rate_hz=20_000.0, rms=6.0, band=(5.0, 2000.0),
                        loop=preset("unstable-bearing").loop, noise=_BEARING_NOISE),
     "rmit": Setting(model="one-axis", truth=RMIT, rate_hz=20_000.0, rms=8.0, band=(5.0, 2000.0),
-                    loop=preset("rmit").loop, noise={**_BEARING_NOISE, "current": 1e-3, "force": 0.5}),
+                    loop=preset("rmit-axis").loop, noise={**_BEARING_NOISE, "current": 1e-3, "force": 0.5}),
     "coil": Setting(model="coil", truth=COIL, rate_hz=10_000.0, rms=2.0, band=(1.0, 3000.0), loop=Loop(),
                     noise={"current": 5e-3, "voltage": 0.02}),
     "sprung rotor": Setting(model="rotor", truth=SPRUNG, rate_hz=5000.0, rms=1.0, band=(2.0, 500.0), loop=Loop(),

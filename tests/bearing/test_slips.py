@@ -179,7 +179,7 @@ def test_sizes_scale_as_the_model_does():
         assert size.possible[0] < low < high < size.possible[1]
 
 
-@pytest.mark.parametrize("name", ["thesis", "unstable-bearing", "rmit", "levitated-ball", "prototype"])
+@pytest.mark.parametrize("name", ["thesis", "unstable-bearing", "rmit-axis", "levitated-ball", "prototype"])
 def test_the_presets_lie_inside_the_usual_ranges(name):
     bench = preset(name)
     largest = signals(bench.limits.voltage[1], bench.limits.current[1], bench.limits.position[1])

@@ -67,12 +67,12 @@ def test_time_printed_too_coarsely_does_not_halve_the_rate(ambid, bench, record_
 
 @pytest.mark.parametrize("name", ["steady", "quiet"])
 def test_a_scenario_in_which_nothing_begins_takes_no_time(ambid, bench, name):
-    refused(ambid("simulate", "rmit", "--scenario", name, "--at", "0.1", "-o", "s.csv"), "has no beginning")
+    refused(ambid("simulate", "rmit-axis", "--scenario", name, "--at", "0.1", "-o", "s.csv"), "has no beginning")
     assert not (bench / "s.csv").exists()
 
 
 def test_a_scenario_that_no_memory_holds_is_refused_at_once(ambid, bench):
-    found = ambid("simulate", "rmit", "--scenario", "change", "--duration", "1e9", "-o", "s.csv")
+    found = ambid("simulate", "rmit-axis", "--scenario", "change", "--duration", "1e9", "-o", "s.csv")
     refused(found, "2e+13 samples")
     assert not (bench / "s.csv").exists()
 

@@ -128,6 +128,6 @@ def test_what_does_not_fit_is_refused_on_one_line(here, ambid, case):
 
 def test_lost_samples_want_a_text_file_and_options_of_a_scenario_want_one(here, ambid):
     assert ".csv.gz" in simulated(ambid, "dropped", out="r.h5").err
-    found = ambid("simulate", "rmit", "-o", "r.csv", "--at", "1")
+    found = ambid("simulate", "rmit-axis", "-o", "r.csv", "--at", "1")
     assert (found.code, found.out) == (2, "")
     assert "--at is for --scenario" in found.err

@@ -61,7 +61,7 @@ def test_the_prototypes_rig_simulates_in_its_counts(tmp_path, monkeypatch, ambid
     [
         ("levitated-ball", 'kind = "single"\n', "", ("--nonlinear",), "magnet.kind is 'auto'"),
         ("levitated-ball", "k = { value = 0.00013043767313019396, ", "k = { ", ("--nonlinear",), "no value for k;"),
-        ("rmit", "", "", ("--nonlinear",), "has no [magnet]"),
+        ("rmit-axis", "", "", ("--nonlinear",), "has no [magnet]"),
         ("levitated-ball", "", "", ("--nonlinear", "--position", "-0.01"), "closes an air gap"),
         ("levitated-ball", "", "", ("--position", "0.01"), "--position is for --nonlinear"),
         ("levitated-ball", "", "", ("--scenario", "none", "--position", "0.01"), "--scenario takes no --position"),

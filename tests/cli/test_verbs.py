@@ -126,7 +126,7 @@ def test_init_writes_a_rig_that_is_read_and_never_writes_over_one(bench, ambid):
 
 
 def test_simulate_gives_equal_records_for_equal_seeds_and_says_the_truth(bench, ambid):
-    words = ("simulate", "rmit", "--duration", "0.05", "--amplitude", "5", "--band", "10:1000")
+    words = ("simulate", "rmit-axis", "--duration", "0.05", "--amplitude", "5", "--band", "10:1000")
     one = ambid(*words, "--seed", "7", "-o", "one.csv")
     assert (one.code, one.err) == (0, "")
     assert "k_i 61" in one.out
@@ -136,12 +136,12 @@ def test_simulate_gives_equal_records_for_equal_seeds_and_says_the_truth(bench, 
     assert (bench / "one.csv").read_bytes() != (bench / "three.csv").read_bytes()
     record = read_record(bench / "one.csv")
     assert record.n_samples == 1000
-    assert record.rate_hz == preset("rmit").rate_hz
+    assert record.rate_hz == preset("rmit-axis").rate_hz
     assert "seed 7" in record.provenance["comment"]
 
 
 def test_simulate_warns_of_limits_and_an_unstable_loop(bench, ambid):
-    found = ambid("simulate", "rmit", "-o", "x.h5", "--duration", "0.05", "--amplitude", "200", "--loop", "open")
+    found = ambid("simulate", "rmit-axis", "-o", "x.h5", "--duration", "0.05", "--amplitude", "200", "--loop", "open")
     assert found.code == 0
     assert "ambid: warning: the loop is unstable" in found.err
     assert "the rotor touched a stop" in found.err

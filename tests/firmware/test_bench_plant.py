@@ -15,7 +15,7 @@ from tests.firmware.conftest import BENCH
 TICK_HZ = 16e6
 DRIVEN, OFF = 0, 1
 POSITION, CURRENT, THIRD = 0, 1, 2
-LINEAR = ("thesis", "unstable-bearing", "rmit", "levitated-ball")
+LINEAR = ("thesis", "unstable-bearing", "rmit-axis", "levitated-ball")
 STAGE = {"high_voltage": 24.0, "low_voltage": -24.0}
 
 

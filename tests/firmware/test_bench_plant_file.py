@@ -38,7 +38,7 @@ def calibrated(rig, role, calibration):
     return dataclasses.replace(rig, channels=tuple(channels))
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", preset_names(rotors=False))
 def test_the_emulated_bench_takes_every_preset(bench_program, rig, tmp_path, name):
     path = tmp_path / "bench.plant"
     path.write_text(plant_text(rig, bench=preset(name)))

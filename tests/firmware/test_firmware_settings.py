@@ -16,7 +16,7 @@ from tests.acquisition.rigs import bench
 from tests.acquisition.test_default_daq import of_preset
 from tests.firmware.native.console import FIRMWARE, Console, build, code, command
 
-TOLD = ("prototype", "unstable-bearing", "rmit", "thesis")
+TOLD = ("prototype", "unstable-bearing", "rmit-axis", "thesis")
 
 
 @pytest.fixture(scope="module")

@@ -104,7 +104,7 @@ def test_unstable_bearing_has_the_numbers_of_its_geometry():
 
 
 def test_rmit_axis():
-    p = preset("rmit").parameters
+    p = preset("rmit-axis").parameters
     assert (p["k_i"], p["k_x"]) == (61.0, -150_000.0)
     # printed there as F = k_x x + k_i i; here f = k_i i - k_x x, so the number changes its sign
     s = model("one-axis").matrices(p)

@@ -13,7 +13,7 @@ from ambid.simulation import Simulation, damage, losses, simulate_scenario
 
 @pytest.fixture(scope="module")
 def steady() -> Simulation:
-    return simulate_scenario("change", preset("rmit"), duration_s=0.2, seed=2, amplitude=10.0)
+    return simulate_scenario("change", preset("rmit-axis"), duration_s=0.2, seed=2, amplitude=10.0)
 
 
 def test_losses_are_apart_of_every_kind_and_as_many_as_asked() -> None:

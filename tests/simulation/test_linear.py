@@ -89,7 +89,7 @@ def test_command_is_the_documented_law_of_the_logged_outputs() -> None:
     assert done.record["voltage"] == pytest.approx(wanted, rel=1e-9)
 
 
-@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("name", preset_names(rotors=False))
 @pytest.mark.parametrize("nonlinear", [False, True])
 def test_presets_stay_levitated(name: str, nonlinear: bool) -> None:
     p = preset(name)

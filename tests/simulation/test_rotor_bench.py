@@ -5,8 +5,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ambid import simulate
 from ambid.errors import ModelError, RigError
+from ambid.job.simulation import simulate_used
 from ambid.physics.loop import Limits, Noise
+from ambid.physics.presets import preset, preset_names
+from ambid.rig import preset_text, rig_from_text
 from ambid.simulation.rotor_bench import RotorBench
 from tests.rotor_benches import needs_simulator, rig_of, truth
 
@@ -61,3 +65,31 @@ def test_what_cannot_be_simulated_is_refused() -> None:
         RotorBench.of(rig, None, None).simulate(np.zeros(100), seed=1)
     with pytest.raises(ModelError, match="diverges at sample"):
         RotorBench.of(replace(rig, limits=Limits()), None, False).simulate(np.full((60_000, 4), 1e300), seed=1)
+
+
+@pytest.mark.parametrize("name", preset_names(rotors=True))
+def test_presets_levitate_within_their_limits_and_their_rig_gives_the_same_record(name: str) -> None:
+    done, told = simulate_used(name, duration=0.8, periods=4, seed=3)
+    assert done.within_limits
+    assert done.largest_pole < 0.9995  # what is left of the start falls below 1e-4 in a second
+    rig = rig_from_text(preset_text(preset(name)), "bench.toml")
+    again = simulate(rig, duration=0.8, periods=4, seed=3, amplitude=told.peak)
+    assert again.names == done.record.names
+    assert rig.rotor is not None
+    axis = rig.rotor.axes[-1]
+    for column in (f"{axis}_voltage", f"{axis}_current", f"{axis}_position"):
+        np.testing.assert_allclose(again[column], done.record[column], rtol=1e-6, atol=1e-9)
+    assert ("angle" in again.names) == (rig.rotor.speed > 0)
+    positions = np.array([again[f"{axis}_position"] for axis in rig.rotor.axes])
+    # moved by a fair part of the room, and held in it
+    assert 0.01 < np.abs(positions).max() / preset(name).limits.position[1] < 0.5
+
+
+def test_records_begin_in_steady_state_and_excite_the_axes_that_are_asked_for() -> None:
+    quiet = replace(preset("rmit"), noise=Noise())
+    record = simulate(quiet, duration=1.0, periods=2, settle=2, axes=["xL"], amplitude=1.0, band=(10.0, 400.0))
+    assert np.ptp(record["yL_reference"]) == 0.0
+    x = record["xL_position"]
+    assert np.abs(x[:10_000] - x[10_000:]).max() < 1e-3 * np.abs(x).max()
+    assert np.abs(record["xR_position"]).max() > 1e-3 * np.abs(x).max()  # through the rotor
+    assert np.abs(record["yR_position"]).max() < 1e-6 * np.abs(x).max()  # at rest, planes do not couple

@@ -13,15 +13,15 @@ def _structures() -> Iterable[str]:
 
 
 def _excitations() -> Iterable[str]:
-    from ambid.signals import EXCITATIONS
+    from ambid.signals import AXES_EXCITATIONS, EXCITATIONS
 
-    return EXCITATIONS
+    return (*EXCITATIONS, *AXES_EXCITATIONS)
 
 
-def _presets() -> Iterable[str]:
+def _presets(*, rotors: bool | None = None) -> Iterable[str]:
     from ambid.physics.presets import preset_names
 
-    return preset_names()
+    return preset_names(rotors=rotors)
 
 
 def _scenarios() -> Iterable[str]:
@@ -41,7 +41,7 @@ _NAMES: dict[str, Callable[[], Iterable[str]]] = {
     "STRUCTURE:ORDERS...": _structures,
     "--excitation NAME": _excitations,
     "--preset NAME": _presets,
-    "--bench PRESET|RIG": _presets,
+    "--bench PRESET|RIG": lambda: _presets(rotors=False),
     "RIG|PRESET": _presets,
     "--scenario NAME": _scenarios,
     "--method NAME": _methods,

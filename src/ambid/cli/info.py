@@ -42,7 +42,7 @@ def models() -> None:
     from ambid.physics.linear_model import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.report.text import columns
-    from ambid.signals import EXCITATIONS
+    from ambid.signals import AXES_EXCITATIONS, EXCITATIONS
     from ambid.simulation import scenario, scenario_names
 
     paint = painter()
@@ -72,7 +72,8 @@ def models() -> None:
     typer.echo(f"\n{paint('structures from a frequency response', 'strong')}  for 'ambid frf'")
     for x in RESPONSE_STRUCTURES.values():
         _entries([(f"  {x.name.ljust(14)}{' '.join(x.orders)}", x.summary)])
-    typer.echo(f"\n{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}\n")
+    typer.echo(f"\n{paint('excitations', 'strong')}  {', '.join(EXCITATIONS)}")
+    typer.echo(f"  over the axes of a rotor: {', '.join(AXES_EXCITATIONS)}\n")
     typer.echo(f"{paint('scenarios', 'strong')}  changes with known truth for 'ambid simulate --scenario'")
     _entries((f"  {name}", scenario(name).summary) for name in scenario_names())
     typer.echo(f"\n{paint('presets', 'strong')}  benches for 'ambid simulate'")

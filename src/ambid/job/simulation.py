@@ -16,7 +16,7 @@ from ambid.job.results import read_linear_estimate, rig_of
 from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.record import Channel, Record
-from ambid.rig import Rig, load_rig
+from ambid.rig import Rig, load_rig, rig_of_preset
 from ambid.signals import excitation as make_excitation
 from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
@@ -225,6 +225,8 @@ def _bench(
 ) -> Bench | RotorBench:
     """Return the bench of a preset or a rig, its rotor held at a position where one is given."""
     source = bench_of_source(given)
+    if isinstance(source, Preset) and source.rotor is not None:
+        source = rig_of_preset(source)
     if isinstance(source, Preset):
         if position is not None and source.plant is not None:
             source = replace(source, operating_point=source.plant.equilibrium(position))

@@ -5,34 +5,14 @@ What a source prints is given with its source; everything else is chosen, and `P
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from types import MappingProxyType
 
 from ambid.errors import ModelError, nearest
-from ambid.physics.loop import Limits, Loop, Noise, placed_loop
+from ambid.physics.loop import Limits, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
-from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Preset:
-    """A named bench."""
-
-    name: str  # name for the command line, and one line that describes it
-    summary: str
-    parameters: Mapping[str, float]  # truth of the linear model `model` in SI units: m, k_x, k_i, R, L, c
-    loop: Loop  # controller and delay; stable on the linear plant at `rate_hz`
-    usually_closed: bool  # whether a record is taken in closed loop unless told otherwise
-    noise: Noise  # sensor and process noise
-    limits: Limits  # voltage, current and stops
-    rate_hz: float  # sampling rate in Hz that the loop is designed for
-    sources: Mapping[str, str]  # where each number comes from, or that it is chosen
-    model: str = "one-axis"  # name of the linear model
-    plant: NonlinearPlant | None = None  # the nonlinear plant whose linearisation `parameters` is, where there is one
-    operating_point: OperatingPoint = field(default_factory=OperatingPoint)  # where the bench rests: m, A, V
-    # gains of sensors and amplifiers with their units, where the source gives them
-    instruments: Mapping[str, tuple[float, str]] = field(default_factory=lambda: MappingProxyType({}))
+from ambid.physics.named_bench import Preset as Preset
+from ambid.physics.nonlinear import NonlinearPlant
+from ambid.physics.rotor_presets import ROTOR_MAKERS
 
 
 def _thesis() -> Preset:
@@ -88,11 +68,11 @@ def _unstable_bearing() -> Preset:
     )
 
 
-def _rmit() -> Preset:
+def _rmit_axis() -> Preset:
     parameters = {"m": 2.0, "k_x": -150_000.0, "k_i": 61.0, "R": 2.0, "L": 30e-3, "c": 0.0}
     source = "thesis sec. 1.4"
     return Preset(
-        name="rmit",
+        name="rmit-axis",
         summary="one axis of the RMIT bearing: 61 N/A, -150 000 N/m, air gap 0.35 mm",
         parameters=MappingProxyType(parameters),
         loop=placed_loop(parameters, (-800, -180 + 180j, -180 - 180j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
@@ -191,21 +171,27 @@ def _prototype() -> Preset:
 _MAKERS = {
     "thesis": _thesis,
     "unstable-bearing": _unstable_bearing,
-    "rmit": _rmit,
+    "rmit-axis": _rmit_axis,
     "levitated-ball": _levitated_ball,
     "prototype": _prototype,
+    **ROTOR_MAKERS,
 }
 
 
-def preset_names() -> tuple[str, ...]:
+def preset_names(*, rotors: bool | None = None) -> tuple[str, ...]:
     """Return the names of all presets.
+
+    Parameters
+    ----------
+    rotors : bool, optional
+        Only those with a rotor on many axes, or only those without; default both.
 
     Returns
     -------
     tuple of str
         Names for the command line.
     """
-    return tuple(_MAKERS)
+    return tuple(name for name in _MAKERS if rotors in (None, name in ROTOR_MAKERS))
 
 
 def preset(name: str) -> Preset:

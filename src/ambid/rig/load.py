@@ -443,11 +443,20 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
 
     `entry`: as written; `plant`: the rig's model; `where`: the file, for messages. Returns SI.
     """
-    if plant.name != "one-axis":
+    if plant.name != "one-axis" and not isinstance(plant, RotorModel):
         raise RigError(
             f"{where}: [magnet] is given; model {plant.name!r} has no nonlinear magnet. Remove it, or take 'one-axis'"
         )
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
+    if isinstance(plant, RotorModel):
+        specs = {n: specs[n] for n in ("s", "sigma")}  # the others follow from k_i, k_x and L of each axis
+        if entry.kind == "single" or entry.cone >= 0.5 * math.pi:
+            raise RigError(
+                f"{where}: magnet.kind is {entry.kind!r} and magnet.cone {entry.cone:g} rad; a rotor has pairs, with a "
+                "cone below pi/2. Correct them"
+            )
+    elif entry.cone:
+        raise RigError(f"{where}: magnet.cone is given, but no [bearings.X]. Remove it, or add its bearings")
     for name, given in entry.parameters.items():
         place = f"{where}: magnet.parameters.{name}"
         if name in ("m", "R", "c"):
@@ -471,6 +480,7 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
             eddy=entry.eddy,
             drift=entry.drift,
             off_below=entry.off_below,
+            cone=entry.cone,
             parameters=known,
         )
     except RigError as error:

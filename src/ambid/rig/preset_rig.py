@@ -9,9 +9,9 @@ from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.magnet import CoEnergy
+from ambid.physics.named_bench import Preset, RotorBody
 from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.presets import Preset
-from ambid.rig.rig import RecordSettings, Rig, RigChannel, RigMagnet, rig_text
+from ambid.rig.rig import RecordSettings, Rig, RigChannel, RigMagnet, RigModes, rig_text
 
 _FIXED = frozenset({"m", "c", "g", "i0"})  # what is weighed or set on a bench; the rest is to be found
 
@@ -25,7 +25,8 @@ _HEAD = """\
 def rig_of_preset(bench: Preset) -> Rig:
     """Return the rig that simulates as a preset does, the linear and the nonlinear plant.
 
-    Mass, damping, gravity and bias are fixed, all other numbers free with their values.
+    Mass, damping, gravity and bias are fixed, all other numbers free with their values. Of a rotor the planes, the
+    poles of its sensors and the gap are fixed, and what follows from its drawing has no value beside it.
 
     Parameters
     ----------
@@ -37,6 +38,8 @@ def rig_of_preset(bench: Preset) -> Rig:
     Rig
         Columns are called like the roles; ``[magnet]`` stands there if the preset has a nonlinear plant.
     """
+    if bench.rotor is not None:
+        return _rig_of_rotor(bench, bench.rotor)
     of = model(bench.model)
     point = {"position": bench.operating_point.position, "current": bench.operating_point.current,
              "voltage": bench.operating_point.voltage}  # fmt: skip
@@ -56,6 +59,39 @@ def rig_of_preset(bench: Preset) -> Rig:
         record=RecordSettings(rate_hz=bench.rate_hz),
         open_loop=not bench.usually_closed,
     )
+
+
+def _rig_of_rotor(bench: Preset, body: RotorBody) -> Rig:
+    of = body.model.with_modes(0)
+    values = {**{p.name: p.default for p in of.parameters}, **bench.parameters}
+    known = {*of.places, *(p.name for p in of.parameters if p.name.endswith(".sensor_pole"))}
+    turning = ("angle",) if of.speed else ()
+    roles = (*of.inputs, *of.outputs, *turning, *of.optional_roles)
+    numbers = {"s": body.gap, **({"sigma": body.sigma} if body.sigma else {})}
+    specs = {spec.name: spec for spec in BEARING_NUMBERS}
+    return Rig(
+        name=bench.summary,
+        model=bench.model,
+        channels=tuple(RigChannel(role=r, column=r, delay="auto" if r in of.inputs else 0) for r in roles),
+        rotor=of,
+        parameters=tuple(
+            Parameter(name=p.name, unit=p.unit, value=values[p.name], role="fixed" if p.name in known else "free")
+            for p in of.parameters
+        ),
+        modes=RigModes(count=body.model.n_modes or None) if body.shaft else RigModes(),
+        shaft=body.shaft,
+        unbalance=body.unbalance,
+        runout=body.runout,
+        magnet=RigMagnet(
+            kind="pair", gap="hyperbolic", saturation=body.sigma != 0.0, cone=body.cone,
+            parameters=tuple(Parameter(name=n, unit=specs[n].unit, value=x, role="fixed") for n, x in numbers.items()),
+        ),
+        loop=bench.loop,
+        limits=bench.limits,
+        noise=bench.noise,
+        record=RecordSettings(rate_hz=bench.rate_hz),
+        open_loop=not bench.usually_closed,
+    )  # fmt: skip
 
 
 def preset_text(bench: Preset) -> str:

@@ -14,6 +14,7 @@ from typing import Literal
 from ambid.errors import RigError, nearest
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
+from ambid.physics.named_bench import Turning
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Shaft
 from ambid.record.calibration import Calibration
@@ -145,6 +146,8 @@ class RigMagnet:
         Whether the force has a pole a/(s + a), and whether a slowly walking force takes up what the law leaves over.
     off_below : float or None
         Voltage in V at or below which the power stage is off, so that the coil's voltage is not known.
+    cone : float
+        Of a rotor: angle of its pole faces to the shaft in rad, by which radial magnets act on the axial axis too.
     parameters : tuple of Parameter
         Numbers of which something is known, SI; a number that is absent takes its default role.
     """
@@ -157,6 +160,7 @@ class RigMagnet:
     eddy: bool = False
     drift: bool = False
     off_below: float | None = None
+    cone: float = 0.0
     parameters: tuple[Parameter, ...] = ()
 
     def __post_init__(self) -> None:
@@ -206,16 +210,6 @@ class RigModes:
     # for simulation, under the names of the rotor's model: ``mode1.omega``, ``mode1.zeta``, ``mode1.A.z`` …,
     # ``mode1.unbalance.<name>``, ``gyro.01`` …; SI
     numbers: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Turning:
-    """What turns with the rotor, for simulation: unbalance in a plane in kg m, or run-out of sensors in m."""
-
-    name: str  # of the unbalance, or of the bearing whose sensors run out
-    value: float
-    phase: float = 0.0  # rad against the mark of the angle
-    z: float = 0.0  # plane of an unbalance from the datum, m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -532,6 +526,7 @@ def _magnet_lines(magnet: RigMagnet) -> list[str]:
     choices = {"asymmetric": magnet.asymmetric, "rise": magnet.rise}
     lines += [f"{name} = {str(on).lower()}" for name, on in choices.items() if on is not None]
     lines += [] if magnet.off_below is None else [f"off_below = {magnet.off_below!r}"]
+    lines += [f"cone = {magnet.cone!r}"] if magnet.cone else []
     return [*lines, "[magnet.parameters]", *map(_parameter_line, magnet.parameters)] if magnet.parameters else lines
 
 

@@ -8,8 +8,9 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ambid.errors import RigError, UnitError, nearest
+from ambid.physics.named_bench import Turning
 from ambid.physics.rotor_model import Bearing, Drive, RotorModel
-from ambid.rig.rig import RigModes, Turning
+from ambid.rig.rig import RigModes
 from ambid.units import parse_unit
 
 if TYPE_CHECKING:

@@ -521,6 +521,7 @@ def excitation_of_axes(
     ([2, 4, 6], [1, 3, 5])
     """
     checked(n_samples, rate_hz)
+    _refuse_unknown(name, (*EXCITATIONS, *AXES_EXCITATIONS))
     moved = tuple(range(axes)) if excited is None else tuple(excited)
     blocks = len(moved) if name == "orthogonal" else 1
     if not moved or periods < 1 or n_samples % (periods * blocks):
@@ -611,10 +612,9 @@ def excitation(
     AmbidError
         If the name or an option is unknown (the message names the nearest), or a setting is out of range.
     """
-    if name not in EXCITATIONS:
-        near = get_close_matches(name, EXCITATIONS, n=1, cutoff=0.4)
-        hint = f"Did you mean {near[0]!r}?" if near else "Give one of these"
-        raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(EXCITATIONS)}. {hint}")
+    if name in AXES_EXCITATIONS:
+        raise AmbidError(f"excitation {name!r} is over the axes of a rotor; this bench has one axis. Give multisine")
+    _refuse_unknown(name, tuple(EXCITATIONS))
     checked(n_samples, rate_hz)
     known = _options(name)
     for option in options:
@@ -634,6 +634,13 @@ def excitation(
     if name not in ("steps", "chirp"):
         settings["seed"] = seed
     return EXCITATIONS[name](n_samples, rate_hz, **settings)
+
+
+def _refuse_unknown(name: str, known: Sequence[str]) -> None:
+    if name not in known:
+        near = get_close_matches(name, known, n=1, cutoff=0.4)
+        hint = f"Did you mean {near[0]!r}?" if near else "Give one of these"
+        raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(known)}. {hint}")
 
 
 def _options(name: str) -> list[str]:

@@ -20,9 +20,9 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.named_bench import Preset, RotorBody
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import IDEAL, PowerStage
-from ambid.physics.presets import Preset
 from ambid.record.record import Channel, Record, Step
 from ambid.simulation.bench import Simulation, largest_amplitude, simulate
 from ambid.simulation.margins import loop_margins
@@ -293,6 +293,12 @@ class Bench:
     @classmethod
     def of(cls, source: Preset | Rig, rate_hz: float | None, closed: bool | None, *, nonlinear: bool = False) -> Bench:
         """Return the bench of a preset, closed unless `closed` is False, or of a rig as its records are taken."""
+        body = source.rotor
+        if body is not None:
+            axes = (body.model if isinstance(body, RotorBody) else body).axes
+            raise ModelError(
+                f"{source.name!r} has a rotor on {len(axes)} axes; this needs one axis. Give another bench"
+            )
         if isinstance(source, Preset):
             plant: LinearPlant | NonlinearPlant | None = source.plant
             if not nonlinear:
@@ -307,11 +313,6 @@ class Bench:
                 name=source.name, plant=plant, loop=loop, limits=source.limits, noise=source.noise,
                 point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
             )  # fmt: skip
-        if source.rotor is not None:
-            raise RigError(
-                f"rig {source.name!r} has a rotor on {len(source.rotor.axes)} axes; this needs one axis. Give a rig "
-                "without [bearings]"
-            )
         plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
         rate = source.record.rate_hz if rate_hz is None else rate_hz
         if rate is None:

@@ -16,15 +16,20 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
+from ambid.physics.drawn_rotor import drawn_numbers
 from ambid.physics.linear_model import DiscreteSpace, StateSpace, discretise
 from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.named_bench import Turning
 from ambid.physics.nonlinear import OperatingPoint
 from ambid.physics.rotor_model import RotorModel
+from ambid.physics.shaft import Shaft
 from ambid.record.record import Channel, Record, Step
-from ambid.rig.rig import Rig, Turning
+from ambid.rig.rig import Rig
 from ambid.simulation.bench import Simulation, acting, largest_amplitude
 from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back
 from ambid.simulation.rig_bench import as_columns, loop_of_rig
+
+_MOST_MODES = 12  # of a drawing that are looked at
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,9 +49,12 @@ class RotorBench:
         numbers, rate = rig.modes.numbers, rig.record.rate_hz if rate_hz is None else rate_hz
         if rate is None:
             raise RigError(f"rig {rig.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz")
-        n = sum(name.endswith(".omega") for name in numbers)
-        of = rig.rotor.with_modes(n)
-        values = {**{p.name: p.value for p in rig.parameters if p.value is not None}, **numbers}
+        values = {p.name: p.value for p in rig.parameters if p.value is not None}
+        if rig.shaft is None:
+            n = sum(name.endswith(".omega") for name in numbers)
+        else:
+            n, numbers = _drawn(rig, rig.rotor, rig.shaft, values, rate)
+        of, values = rig.rotor.with_modes(n), {**numbers, **values}
         missing = [p.name for p in of.parameters if p.name not in values and p.default is None]
         if missing:
             raise RigError(
@@ -234,6 +242,30 @@ class RotorBench:
                 if bearing.name == r.name and plane < 2:
                     found[:, k] += r.value * np.cos(angle + r.phase - 0.5 * np.pi * plane)
         return found
+
+
+def _drawn(
+    rig: Rig, rotor: RotorModel, shaft: Shaft, known: Mapping[str, float], rate_hz: float
+) -> tuple[int, Mapping[str, float]]:
+    """Return how many bending modes a simulation keeps, and what follows from the drawing.
+
+    As many as ``modes.count`` says; else those below a quarter of the rate.
+    """
+    missing = [place for place in rotor.places if place not in known]
+    if missing:
+        raise RigError(f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a shape needs it. Give it")
+    n = rig.modes.count
+    if n is None:
+        omega = shaft.free_rotor(_MOST_MODES).omega[2:]
+        n = int(np.count_nonzero(omega < 0.5 * np.pi * rate_hz))
+    planes = {place: known[place] for place in rotor.places}
+    found = drawn_numbers(rotor.with_modes(n), shaft, planes)
+    if rig.unbalance:
+        at = [u.z for u in rig.unbalance]
+        rows = shaft.free_rotor(n, planes=[*planes.values(), *at]).deflection(at)
+        for u, row in zip(rig.unbalance, rows, strict=True):
+            found |= {f"mode{r}.unbalance.{u.name}": float(row[r + 1]) for r in range(1, n + 1)}
+    return n, found
 
 
 def _kind(name: str) -> str:

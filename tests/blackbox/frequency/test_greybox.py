@@ -61,7 +61,7 @@ def test_intervals_are_honest(name, freedom):
     assert abs(np.mean(cost)) < 3.3 / np.sqrt(runs)
 
 
-@pytest.mark.parametrize(("name", "rms"), [("unstable-bearing", 3.0), ("rmit", 6.0)])
+@pytest.mark.parametrize(("name", "rms"), [("unstable-bearing", 3.0), ("rmit-axis", 6.0)])
 def test_unstable_bearings_in_closed_loop(name, rms):
     truth = preset(name).parameters
     frf = closed_loop(name, 4, period=8000, periods=10, rms=rms)

@@ -35,7 +35,7 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
     its k_i: a bench does not follow what is believed of it.
     """
     truth = _named(rig) if bench is None else bench
-    if isinstance(truth, Preset) and model(truth.model).inputs != ("voltage",):
+    if isinstance(truth, Preset) and truth.rotor is None and model(truth.model).inputs != ("voltage",):
         raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
     found = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
     plant = found.plant
@@ -76,11 +76,11 @@ def _named(rig: Rig) -> Preset | Rig:
     name = rig.daq.bench if rig.daq else None
     if name is None:
         return rig
-    if name in preset_names():
+    if name in preset_names(rotors=False):
         return preset(name)
     path = Path(name) if rig.source is None else rig.source.parent / name
     if path.suffix != ".toml":
-        known = preset_names()
+        known = preset_names(rotors=False)
         raise DeviceError(
             f"rig {rig.name!r}: daq.bench is {name!r}; it is a preset ({', '.join(known)}) or a rig file (.toml)."
             f"{nearest(name, known)} Correct it"

@@ -25,6 +25,12 @@ def open_device(
     `port`: ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port; `rig`: of the bench; `pace`:
     of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
     """
+    if rig.rotor is not None:
+        raise DeviceError(
+            f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. Write the excitation by "
+            "'ambid simulate RIG --excitation zippered --excitation-only -o FILE.csv', play it on the rotor's own "
+            "controllers, and read their record"
+        )
     if bench is not None and port not in ("emulated", "simulated"):
         raise DeviceError(f"a bench is chosen for ports emulated and simulated only; {port!r} has its own. Omit it")
     if not port.strip():
