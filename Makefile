@@ -31,7 +31,7 @@ ifneq ($(strip $(PYTHON)),)
 endif
 $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools/venv.sh
 	@sh tools/venv.sh $(VENV) "$(PYTHON)"
-	@echo "Installing the pinned packages into $(VENV) (a minute or two, once) ..." >&2
+	@echo "Installing the pinned packages into $(VENV) (some minutes, once) ..." >&2
 	@$(PIP) install -qq --require-hashes -r requirements/build.txt
 	@$(PIP) install -qq --require-hashes -r requirements/dev.txt
 	@$(PIP) install -qq --no-build-isolation --no-deps --no-index --editable .
@@ -60,7 +60,7 @@ firmware:  ## build the controller's firmware and the emulated bench into firmwa
 	@sh tools/firmware_tools.sh
 	@$(MAKE) --no-print-directory -C firmware all
 
-peers: bench/.venv/linear/.setup bench/.venv/tracking/.setup  ## make the environments of the packages that the benchmarks compare with
+peers: bench/.venv/linear/.setup bench/.venv/tracking/.setup bench/.venv/rotor/.setup  ## make the environments of the packages that the benchmarks compare with
 
 bench/.venv/%/.setup: requirements/peers-%.txt tools/venv.sh
 	@mkdir -p bench/.venv

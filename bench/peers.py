@@ -28,7 +28,7 @@ from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpa
 from ambid.errors import EstimationError
 
 HERE = Path(__file__).resolve().parent
-ENVIRONMENT, TRACKING = (HERE / ".venv" / name / "bin" / "python" for name in ("linear", "tracking"))
+ENVIRONMENT, TRACKING, ROTOR = (HERE / ".venv" / name / "bin" / "python" for name in ("linear", "tracking", "rotor"))
 Array = np.ndarray
 Model = PolynomialModel | StateSpaceModel
 
@@ -58,6 +58,7 @@ WAYS = (
 )
 PACKAGES = ("pysib", "sippy-unipi", "sysidentpy", "nfoursid", "numpy", "scipy", "casadi")
 TRACKERS = ("padasip", "filterpy", "statsmodels")
+ROTORS = ("ross-rotordynamics",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -118,7 +119,8 @@ class Bench:
 
     def _child(self, program: str) -> subprocess.Popen[str]:
         if program not in self.children:
-            python = Path(sys.executable) if program == "scipy" else TRACKING if program in TRACKERS else ENVIRONMENT
+            own = {"scipy": Path(sys.executable), "ross": ROTOR} | dict.fromkeys(TRACKERS, TRACKING)
+            python = own.get(program, ENVIRONMENT)
             self.children[program] = subprocess.Popen(
                 [str(python), str(HERE / f"peer_{program}.py")],
                 stdin=subprocess.PIPE,
@@ -143,7 +145,7 @@ class Bench:
 @contextmanager
 def bench() -> Iterator[Bench]:
     """Open a bench whose children end with it."""
-    if not (ENVIRONMENT.exists() and TRACKING.exists()):
+    if not all(python.exists() for python in (ENVIRONMENT, TRACKING, ROTOR)):
         raise SystemExit("the peers are not installed: make peers")
     with tempfile.TemporaryDirectory() as folder:
         found = Bench(folder=Path(folder))
@@ -161,7 +163,7 @@ def versions() -> dict[str, str]:
     """Of the peers and of what they compute with."""
     code = "import sys; from importlib.metadata import version; [print(version(x)) for x in sys.argv[1:]]"
     found: dict[str, str] = {}
-    for python, packages in ((ENVIRONMENT, PACKAGES), (TRACKING, TRACKERS)):
+    for python, packages in ((ENVIRONMENT, PACKAGES), (TRACKING, TRACKERS), (ROTOR, ROTORS)):
         done = subprocess.run([str(python), "-c", code, *packages], capture_output=True, text=True, check=True)
         found |= dict(zip(packages, done.stdout.split(), strict=True))
     return found

@@ -18,7 +18,7 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection", "nonlinear")
+PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection", "nonlinear", "rotor")
 
 
 def main(wanted: list[str]) -> None:
@@ -97,6 +97,10 @@ def _measured(part: str) -> Iterator[Any]:
         from nonlinear import nonlinear_tables
 
         return nonlinear_tables()
+    if part == "rotor":
+        from rotor_ross import rotor_tables
+
+        return rotor_tables()
     from records import record_tables
 
     return record_tables()

@@ -25,6 +25,7 @@ compile requirements/dev.txt pyproject.toml requirements/dev.in
 compile requirements/docs.txt requirements/docs.in
 compile requirements/peers-linear.txt requirements/peers-linear.in
 compile requirements/peers-tracking.txt requirements/peers-tracking.in
+compile requirements/peers-rotor.txt requirements/peers-rotor.in
 if grep -n '://' requirements/*; then
     echo "ambid: an address got into the requirements (above)" >&2
     exit 1
