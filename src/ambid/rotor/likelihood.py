@@ -136,8 +136,11 @@ class Likelihood:
             left = e.spectra.mean_y - _applied(of.transfer(), mean)
             if corrected and w.back is not None:
                 mean = mean - _applied(w.back, left)
-            steps = [turned.derivative(at.theta, name) for name in named]
-            slopes = w.whiten @ (of.slopes(mean, steps, n_d) @ chain)
+            of_turned = {p.name for p in turned.parameters}  # a record at rest shows no gyroscopic term
+            seen = [k for k, name in enumerate(named) if name in of_turned]
+            steps = [turned.derivative(at.theta, named[k]) for k in seen]
+            moved = chain[[*seen, *range(len(named), len(named) + n_d)]]
+            slopes = w.whiten @ (of.slopes(mean, steps, n_d) @ moved)
             r = _whitened(w, left)
             block = np.concatenate([slopes, r[:, :, None]], axis=2).reshape(-1, chain.shape[1] + 1)
             found.append(_ROOT_2 * np.concatenate([block.real, block.imag]))
