@@ -23,6 +23,7 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
 from ambid.rotor.modes import scan
+from ambid.rotor.spectra import joined
 from ambid.rotor.start import rigid_start
 from ambid.rotor.unknowns import Unknowns
 
@@ -33,6 +34,7 @@ _ABOVE = 1.5  # how far above the band a mode may be that shows in it
 _LEAST_LINES = 24
 _MOST_MODES = 9
 _WHOLE = 2e-3  # samples by which a delay may miss a whole number however exact it is
+_SAME_SPEED = 0.01  # relative difference of speeds that count as one for the start
 _EDDY_STARTS = tuple(2.0 * np.pi * f for f in (300.0, 1000.0, 3000.0))
 
 
@@ -73,18 +75,22 @@ def estimate_rotor(
     n_modes: int | None = None,
     tick: Tick = silent,
 ) -> RotorFit:
-    """Estimate a rotor from records with periodic excitation, the slowest first.
+    """Estimate a rotor from records with periodic excitation, the slowest first: their lines together give the start.
 
     `parameters`: what the rig knows; `delays`: of each input in samples, None where it is searched; `n_modes`: bending
     modes within the excited band, None: the likelihood decides.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
-    work = _Work(model=model, parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes, tick=tick)
-    first = [ordered[0]]
+    slowest = _slowest(ordered)
+    work = _Work(
+        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
+        tick=tick,
+    )  # fmt: skip
+    first = [_together(slowest)]
     edge, at = work.begin(first)
     current, at = work.grow(first, edge, at)
-    if len(ordered) > 1:
-        at = work.turn(ordered, current, at)
+    if len(ordered) > len(slowest):
+        at = work.turn(ordered[len(slowest) :], current, at)
     return work.finish(ordered, current, at)
 
 
@@ -122,7 +128,7 @@ class _Work:
 
     def begin(self, experiments: Sequence[Experiment]) -> tuple[float, Point]:
         """Return the band in Hz that a rigid rotor explains, and its numbers."""
-        f = experiments[0].spectra.frequency_hz
+        f = np.sort(experiments[0].spectra.frequency_hz)
         edges = sorted(
             {float(f[min(_LEAST_LINES, f.size - 1)]), *np.geomspace(f[min(_LEAST_LINES, f.size - 1)], f[-1], 7)}
         )
@@ -150,14 +156,14 @@ class _Work:
 
     def grow(self, experiments: Sequence[Experiment], edge: float, at: Point) -> tuple[RotorModel, Point]:
         """Widen the band to all lines; where the fit breaks, add the mode that the residuals show."""
-        model, last = self.model, float(experiments[0].spectra.frequency_hz[-1])
+        model, last = self.model, float(experiments[0].spectra.frequency_hz.max())
         while True:
             band = [e.between(0.0, edge * (1.0 + 1e-9)) for e in experiments]
             self.tick("modes", min(1.0, edge / last))
             at, cost = self.rough(band, model, at)
             while cost > _FITS and model.n_modes < self._most:
                 weight = rough_weight(band[0], model, at, _RELATIVE)
-                low = float(band[0].spectra.frequency_hz[0])
+                low = float(band[0].spectra.frequency_hz.min())
                 found = scan(band[0], model, at, weight, (low, _ABOVE * edge))
                 if found is None:
                     break
@@ -173,10 +179,9 @@ class _Work:
             edge = min(edge * _WIDER, last)
             model, at = _without(model, at, above)  # what was seen from below is found again from within
 
-    def turn(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
+    def turn(self, fast: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
         """Find polar inertia and gyroscopic terms of records at higher speeds by scans of the criterion."""
         theta = dict(at.theta)
-        fast = [e for e in experiments if e.speed]
         theta.setdefault("Ip", 0.2 * theta["Id"])
         theta |= {p.name: theta.get(p.name, 0.0) for p in model.at_speed(1.0).mode_parameters}
         at = replace(at, theta=theta)
@@ -193,7 +198,7 @@ class _Work:
 
     def finish(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> RotorFit:
         """Search on all lines with the noise model, decide on further modes, settle the delays."""
-        if len(experiments) > 1:
+        if len(experiments) > 1:  # the start knows the slowest alone
             model = model.at_speed(max((e.speed for e in experiments), key=abs))
             at, _ = self.rough(experiments, model, at)
         fit = self.likely(experiments, model, at)
@@ -231,8 +236,10 @@ class _Work:
 
     def _one_more(self, experiments: Sequence[Experiment], fit: RotorFit) -> RotorFit | None:
         """Return the fit with the mode that the residuals ask for most, None where the likelihood does not want it."""
-        e, w = experiments[0], fit.problem.weights[0]
-        low, high = float(e.spectra.frequency_hz[0]), float(e.spectra.frequency_hz[-1])
+        slowest = _slowest(experiments)
+        e = _together(slowest)
+        w = Weight(whiten=np.concatenate([w.whiten for w in fit.problem.weights[: len(slowest)]]))
+        low, high = float(e.spectra.frequency_hz.min()), float(e.spectra.frequency_hz.max())
         found = scan(e, fit.model, fit.point, w, (low, 2.0 * high))
         price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
         if found is None or found.gain < price:
@@ -260,6 +267,17 @@ class _Work:
     @property
     def _most(self) -> int:
         return _MOST_MODES if self.wanted is None else self.wanted
+
+
+def _slowest(ordered: Sequence[Experiment]) -> list[Experiment]:
+    """Return the first of the experiments, and those at its speed."""
+    speed = abs(ordered[0].speed)
+    return [e for e in ordered if abs(e.speed) - speed <= _SAME_SPEED * speed]
+
+
+def _together(experiments: Sequence[Experiment]) -> Experiment:
+    """Return experiments at one speed as one."""
+    return replace(experiments[0], spectra=joined([e.spectra for e in experiments]))
 
 
 def _with_mode(theta: Mapping[str, float], model: RotorModel, named: Mapping[str, float]) -> dict[str, float]:

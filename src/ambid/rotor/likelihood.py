@@ -162,8 +162,10 @@ class Likelihood:
             length = found.explain(R[:, -1])
             if length < _SETTLED or k == _CORRECTIONS - 1:
                 break
-            step = found.solve(R[:, -1])
-            v = v + step * min(1.0, 10.0 / np.sqrt(length))
+            moved = v + found.solve(R[:, -1]) * min(1.0, 10.0 / np.sqrt(length))
+            if not np.isfinite(self.cost(moved)):
+                break
+            v = moved
         return v, R, length
 
     @property

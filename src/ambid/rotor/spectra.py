@@ -80,6 +80,21 @@ class PeriodSpectra:
         )  # fmt: skip
 
 
+def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
+    """Return the lines of several records one after the other, with as many periods as all have."""
+    first, n = spectra[0], min(s.n_periods for s in spectra)
+    if len(spectra) == 1:
+        return first
+    references = [s.R for s in spectra]
+    logged = [r for r in references if r is not None]
+    return PeriodSpectra(
+        frequency_hz=np.concatenate([s.frequency_hz for s in spectra]),
+        U=np.concatenate([s.U[-n:] for s in spectra], axis=1), Y=np.concatenate([s.Y[-n:] for s in spectra], axis=1),
+        R=np.concatenate(logged) if len(logged) == len(references) else None, rate_hz=first.rate_hz,
+        period=first.period, dropped=first.dropped, left_out_hz=np.concatenate([s.left_out_hz for s in spectra]),
+    )  # fmt: skip
+
+
 def smoothed(power: Array, half: int = 12) -> Array:
     """Return powers averaged over neighbouring lines, (n_lines, n)."""
     width = min(2 * half + 1, power.shape[0])
