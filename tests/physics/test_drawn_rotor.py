@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.physics import Support, campbell
-from ambid.physics.drawn_rotor import drawn_numbers, free_rotor_of
+from ambid.physics.drawn_rotor import drawn_numbers, free_rotor_of, whirl_sd
 from ambid.physics.rotor_model import Bearing, RotorModel
 from tests.physics.test_shaft import TWO_SLEEVES
 
@@ -41,3 +41,23 @@ def test_a_plane_with_two_names_is_one_node() -> None:
     planes = {**PLANES, "A.z_sensor": 0.10}
     rotor = free_rotor_of(MODEL, drawn_numbers(MODEL, TWO_SLEEVES, planes) | planes)
     np.testing.assert_array_equal(rotor.z, [0.10, 0.62, 0.65])
+
+
+def test_the_spread_of_whirl_is_that_of_drawn_parameters() -> None:
+    model = MODEL.with_modes(2)
+    theta = drawn_numbers(model, TWO_SLEEVES, PLANES) | PLANES | {"mode1.zeta": 0.01, "mode2.zeta": 0.02}
+    names = ["Id", "Ip", "mode1.omega", "mode2.zeta", "gyro.12", "gyro.01", "gyro.22"]
+    speeds = [50.0, 500.0, 2000.0]
+    whirl = campbell(free_rotor_of(model, theta), speeds)
+    for name in names:  # of each alone: the change of frequency by a small step
+        h = 1e-3 * max(abs(theta[name]), 1e-3)
+        up, down = (campbell(free_rotor_of(model, theta | {name: theta[name] + d}), speeds) for d in (h, -h))
+        wanted = abs(up.frequency - down.frequency) / (2 * h)
+        found = whirl_sd(model, theta, [name], np.ones((1, 1)), whirl)
+        np.testing.assert_allclose(found, wanted, rtol=1e-4, atol=1e-14 * whirl.frequency.max() / h)
+    at_rest = campbell(free_rotor_of(model, theta), [0.0])  # double poles
+    found = whirl_sd(model, theta, ["mode1.omega"], np.ones((1, 1)), at_rest)
+    np.testing.assert_allclose(found[0, 1:3], math.sqrt(1 - 0.01**2), rtol=1e-6)
+    both = whirl_sd(model, theta, ["Ip", "mode1.omega"], np.diag([1e-8, 4.0]), whirl)
+    alone = [whirl_sd(model, theta, [n], np.array([[v]]), whirl) for n, v in (("Ip", 1e-8), ("mode1.omega", 4.0))]
+    np.testing.assert_allclose(both, np.hypot(*alone), rtol=1e-12)

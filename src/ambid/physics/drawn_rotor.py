@@ -1,13 +1,15 @@
-"""Between a drawing and the numbers of a rotor in its bearings, both ways."""
+"""Between a drawing and the numbers of a rotor in its bearings, both ways; how well its whirl is known."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import FreeRotor, Shaft
+from ambid.physics.whirl import Campbell
 
 
 def drawn_numbers(model: RotorModel, shaft: Shaft, planes: Mapping[str, float]) -> dict[str, float]:
@@ -56,3 +58,46 @@ def free_rotor_of(model: RotorModel, theta: Mapping[str, float]) -> FreeRotor:
         z=z,
         shape=shape,
     )
+
+
+def whirl_sd(
+    model: RotorModel, theta: Mapping[str, float], names: Sequence[str], covariance: Array, whirl: Campbell
+) -> Array:
+    """Return standard deviations of the frequencies of `whirl`, (n_speeds, n_lines), rad/s.
+
+    `whirl`: of `free_rotor_of(model, theta)` without supports; `covariance`: of the parameters `names`. To first order,
+    from the exact derivative of a pole: with D = s² + s (C - j d W G) + K for circular whirl in direction d = ±1, and
+    its null vectors l, r, ds = -l* dD r / (l* D' r).
+    """
+    rotor = free_rotor_of(model, theta)
+    root = np.sqrt(rotor.mass)
+    K, C, G = np.diag(rotor.omega**2), np.diag(2 * rotor.zeta * rotor.omega), rotor.gyro / np.outer(root, root)
+    parts = [_moved(rotor, G, name) for name in names]
+    sd = np.full(whirl.frequency.shape, np.nan)
+    for k, speed in enumerate(whirl.speed):
+        for line in np.flatnonzero(np.isfinite(whirl.frequency[k])):
+            s, turn = whirl.poles[k, line], 1j * np.sign(whirl.direction[k, line]) * speed
+            rate = C - turn * G
+            left, _, right = np.linalg.svd(s**2 * np.eye(root.size) + s * rate + K)
+            of, by = left[:, -1].conj(), right[-1].conj()
+            slope = of @ (2 * s * by + rate @ by)
+            g = [(-(of @ (dK + s * (dC - turn * dG)) @ by) / slope).imag for dK, dC, dG in parts]
+            sd[k, line] = np.sqrt(max(float(np.array(g) @ covariance @ np.array(g)), 0.0))
+    return sd
+
+
+def _moved(rotor: FreeRotor, G: Array, name: str) -> tuple[Array, Array, Array]:
+    """Derivatives by a parameter of stiffness, damping and gyroscopic matrix, all scaled with the masses."""
+    dK, dC, dG = np.zeros_like(G), np.zeros_like(G), np.zeros_like(G)
+    place, _, what = name.partition(".")
+    if what in ("omega", "zeta"):
+        r = int(place.removeprefix("mode")) + 1
+        dC[r, r] = 2 * (rotor.zeta[r] if what == "omega" else rotor.omega[r])
+        dK[r, r] = 2 * rotor.omega[r] if what == "omega" else 0.0
+    elif name == "Id":
+        dG[1], dG[:, 1] = -G[1] / (2 * rotor.mass[1]), -G[:, 1] / (2 * rotor.mass[1])
+        dG[1, 1] *= 2
+    elif name == "Ip" or place == "gyro":
+        r, s = (1, 1) if name == "Ip" else (int(what[0]) + 1, int(what[1:]) + 1)
+        dG[r, s] = dG[s, r] = 1.0 / np.sqrt(rotor.mass[r] * rotor.mass[s])
+    return dK, dC, dG
