@@ -264,7 +264,8 @@ def covariance_together(document: dict[str, Any]) -> dict[str, Any]:
 
 def covariance_apart(document: Mapping[str, Any]) -> dict[str, Any]:
     """Return a document whose fields of the covariance stand as the dataclass has them."""
-    return {**document, **{name: document["covariance"][key] for key, name in COVARIANCE.items()}}
+    together = document["covariance"]
+    return {**document, **{name: together[key] for key, name in COVARIANCE.items() if key in together}}
 
 
 def by_output(document: dict[str, Any]) -> dict[str, Any]:

@@ -456,7 +456,7 @@ def _rotor() -> View:
     from ambid.report.rotor_text import rotor_text
 
     def title(e: Any) -> str:
-        return f"{e.record.get('file') or 'record'}, rotor on {len(e.delay)} axes"
+        return f"{e.record.get('file') or 'record'}, rotor on {len(e.plant.axes)} axes"
 
     return View(
         text=rotor_text,

@@ -30,6 +30,7 @@ from ambid.estimation.estimate import (
 )
 from ambid.estimation.modes import Mode
 from ambid.estimation.result import Linear
+from ambid.physics.rotor_model import RotorModel
 
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
@@ -54,12 +55,10 @@ class RotorEstimate(Parametric, Judged, Linear):
     modes : tuple of Mode
         Bending modes within the excited band, in order of frequency, at rest; shape by bearing and sensor plane,
         modal mass 1 kg.
+    plant : RotorModel
+        The model that was identified: bearings, axes, modes, at the speed of `continuous`.
     numbers : Mapping[str, float]
-        All numbers of `ambid.physics.rotor_model.RotorModel`, modes above the band included, SI.
-    n_modes : int
-        Modes of that model.
-    speed : float
-        Of `continuous`, rad/s.
+        All its numbers, modes above the band included, SI.
     covariance_names : tuple of str
         Estimated numbers, modes and delays included; order of `covariance`.
     covariance : ndarray, shape (n, n), SI
@@ -92,9 +91,8 @@ class RotorEstimate(Parametric, Judged, Linear):
     records: tuple[Mapping[str, object], ...]
     parameters: tuple[EstimatedParameter, ...]
     modes: tuple[Mode, ...]
+    plant: RotorModel
     numbers: Mapping[str, float]
-    n_modes: int
-    speed: float
     covariance_names: tuple[str, ...]
     covariance: Array
     delay: Mapping[str, Delay]
@@ -109,6 +107,16 @@ class RotorEstimate(Parametric, Judged, Linear):
     timing_s: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     information: Mapping[str, object] = field(default_factory=lambda: _EMPTY)
     rig: Mapping[str, object] = field(default_factory=lambda: _EMPTY)
+
+    @property
+    def n_modes(self) -> int:
+        """Bending modes of the model."""
+        return self.plant.n_modes
+
+    @property
+    def speed(self) -> float:
+        """Speed of `continuous`, rad/s."""
+        return self.plant.speed
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.
