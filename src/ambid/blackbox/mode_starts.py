@@ -134,13 +134,15 @@ def starting_poles(lines: Spectra, say: Callable[[float], None]) -> tuple[list[c
     return found, tried
 
 
-def overlapping_bands(omega: Array, step: float) -> Iterator[tuple[int, int, int, int]]:
+def overlapping_bands(
+    omega: Array, step: float, lines: int = _BAND_LINES, share: float = _BAND_SHARE
+) -> Iterator[tuple[int, int, int, int]]:
     """Yield first and last line of bands that overlap by half, and of the part of each that counts: these follow on
-    each other.
+    each other. `lines`, `share`: lines, and part of its frequency, that a band has at least.
     """
     first, begin, n = 0, 0, omega.size
     while True:
-        size = max(_BAND_LINES, int(_BAND_SHARE * omega[first] / step))
+        size = max(lines, int(share * omega[first] / step))
         last = min(first + size, n)
         if n - last < size // 4:
             last = n

@@ -23,7 +23,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.mode_starts import DEGREE, MOST_DAMPED, Spectra, conjugate, principal, spectra, starting_poles
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import NORMAL_95, Modal, Mode, mode_of, student
+from ambid.estimation.modes import NORMAL_95, Modal, Mode, mode_of, modes_checks, student
 from ambid.estimation.search import Rows, search
 from ambid.estimation.stable_poles import assurance
 
@@ -333,11 +333,13 @@ def find_modes(
     if count != "auto":
         found = sorted(sorted(found, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
     limits = float(lines.omega[0] / (2 * np.pi)), float(lines.omega[-1] / (2 * np.pi))
+    modes = tuple(_mode(c, data.outputs) for c in found)
+    checks = modes_checks(modes, count, limits, "Excite more, longer, or give --band")
     return Modal(
         status="converged" if found else "failed",
         method="maximum likelihood on the record's spectrum, transients included",
-        modes=tuple(_mode(c, data.outputs) for c in found),
-        checks=_checks(found, count, limits),
+        modes=modes,
+        checks={**checks, "modes_fit": _fit_check(found)},
         inputs=data.inputs,
         outputs=data.outputs,
         units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
@@ -361,24 +363,15 @@ def _mode(c: _Candidate, outputs: tuple[str, ...]) -> Mode:
     return mode_of(c.pole, spreads, outputs, c.shape, c.shape_variance, shown=c.misfit < _LOST)
 
 
-def _checks(found: list[_Candidate], count: int | str, band: tuple[float, float]) -> dict[str, Check]:
-    """Whether modes were found, fit the lines about them, and are shown by the data."""
-    inside = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
-    enough = len(found) >= (1 if count == "auto" else int(count))
-    detail = f"{len(found)} modes {inside}" + (
-        ""
-        if enough
-        else f", {'one' if count == 'auto' else count} at least wanted. Excite more, longer, or give --band"
-    )
-    checks = {"modes_found": Check(passed=enough, detail=detail)}
-    if not found:
-        return checks
+def _fit_check(found: list[_Candidate]) -> Check:
+    """Whether linear modes fit the lines about them."""
     poor = [c for c in found if c.misfit > _LOST or (c.misfit > _MISFIT and c.correlation > _COLOURED)]
     names = ", ".join(f"{c.frequency_hz:.4g} Hz ({100 * c.misfit:.0f} %)" for c in poor)
-    detail = (
-        f"what linear modes leave of the energy at {names} is not noise: a nonlinear or drifting resonance, or two "
-        "modes in one place. Excite less, or record more outputs"
-        if poor
-        else f"at most {100 * max(c.misfit for c in found):.2g} % of the energy at a mode is left"
+    if not poor:
+        most = 100 * max((c.misfit for c in found), default=0.0)
+        return Check(passed=True, detail=f"at most {most:.2g} % of the energy at a mode is left")
+    return Check(
+        passed=False,
+        detail=f"what linear modes leave of the energy at {names} is not noise: a nonlinear or drifting resonance, or "
+        "two modes in one place. Excite less, or record more outputs",
     )
-    return checks | {"modes_fit": Check(passed=not poor, detail=detail)}

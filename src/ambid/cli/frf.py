@@ -48,7 +48,8 @@ def command(
         str | None,
         option(
             "--modes auto|N",
-            "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so many.",
+            "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so many. "
+            "Without --input: operational modes.",
         ),
     ] = None,
     domain: Annotated[

@@ -109,6 +109,22 @@ def mode_of(
     return Mode(frequency_hz=numbers[0], damping=numbers[1], shape=in_step, shape_quadrature=late)
 
 
+def modes_checks(
+    modes: Sequence[Mode], count: int | Literal["auto"], band_hz: tuple[float, float], remedy: str
+) -> dict[str, Check]:
+    """Return whether as many modes were found as were wanted, and whether the data show their numbers."""
+    least = 1 if count == "auto" else count
+    detail = f"{len(modes)} found between {band_hz[0]:.4g} and {band_hz[1]:.4g} Hz"
+    if len(modes) < least:
+        detail += f", at least {least} wanted. {remedy}"
+    hidden = ", ".join(f"{m.frequency_hz.value:.4g} Hz" for m in modes if not m.identifiable)
+    shown = f"frequency or damping of {hidden} has a standard deviation over a quarter of its size. {remedy}"
+    return {
+        "modes_found": Check(passed=len(modes) >= least, detail=detail),
+        "identifiable": Check(passed=not hidden, detail=shown if hidden else "the data show every mode"),
+    }
+
+
 def student(freedom: int) -> float:
     """Return Student's quantile for 95 % intervals."""
     from scipy.special import stdtrit

@@ -18,6 +18,7 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets
 from ambid.blackbox.modes import find_modes
+from ambid.blackbox.operational import operational_modes
 from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
@@ -56,7 +57,7 @@ def frf(
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
     tick: Tick | None = None,
-) -> Measured:
+) -> Measured | Modal:
     """Measure a frequency response from one record, and fit models to it; find the modes of vibration.
 
     Parameters
@@ -83,7 +84,8 @@ def frf(
         Whether that state space has a direct path D; in z, one within a sample.
     modes : int or "auto", optional
         Find so many modes, or all that the record shows: poles common to all outputs, by maximum likelihood on the
-        record's own spectrum. Without `band`, those where the input has power.
+        record's own spectrum. Without an input: operational modes, by stochastic subspace. Without `band`, those where
+        the input (without one, the outputs) has power.
     domain : {"s", "z"}, optional
         Of that model; default z for transfer functions of a held input, else s.
     delay : float or "auto", s, optional
@@ -99,6 +101,7 @@ def frf(
     Returns
     -------
     Measured
+        Without an input: a Modal, modes alone.
 
     Raises
     ------
@@ -116,11 +119,18 @@ def frf(
         raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)
     _check_modes(modes)
-    if bench is None and not channels.inputs:
+    alone = bench is None and not channels.inputs
+    if alone and modes is None:
         raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
+    if alone and (orders is not None or state_space is not None):
+        raise EstimationError("a model was requested, and no input was named. Give --input COLUMN")
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
     modal: Modal | None = None
+    if modes is not None and not data.inputs:
+        modal = operational_modes(data, modes, band=band, tick=say)
+        clock.lap("modes")
+        return replace(modal, timing_s=clock.laps)
     if modes is not None:
         modal = find_modes(data, modes, band=band, tick=say)
         clock.lap("modes")

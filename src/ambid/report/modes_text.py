@@ -22,6 +22,7 @@ from ambid.report.text import (
 )
 
 _OUTPUTS = 8  # whose shape a terminal shows
+_FIELDS = {"frequency": "frequency_hz", "damping": "damping"}
 _ALIKE = 0.8  # assurance from which two shapes are called alike
 
 
@@ -56,7 +57,8 @@ def mode_lines(modes: Sequence[Mode]) -> list[str]:
         return []
     rows: list[tuple[str, ...]] = [("", "frequency", "damping", "")]
     for k, m in enumerate(modes, 1):
-        said = "" if m.identifiable else "not identifiable"
+        hidden = [name for name in ("frequency", "damping") if not getattr(m, _FIELDS[name]).identifiable]
+        said = f"{' and '.join(hidden)} not identifiable" if hidden else ""
         rows.append((str(k), _number(m.frequency_hz, "Hz"), _number(m.damping, "%", 100.0), said))
     return columns(rows, right=(0,))
 

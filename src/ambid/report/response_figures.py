@@ -64,7 +64,7 @@ def frf_figure(measured: Measured, width: float = WIDE) -> Figure:
         frf.inputs, frf.outputs, frf.units,
     )  # fmt: skip
     name = measured.record.get("file") or "record"
-    modal = [] if measured.modal is None else [modal_panel(measured.modal)]
+    modal = [] if measured.modal is None else [modal_panel(measured.modal, "modes")]
     return stacked(f"{name}: frequency response, {frf.method}", [block, *modal], width)
 
 
@@ -159,9 +159,16 @@ def stabilisation_figure(found: Stabilisation, width: float = WIDE) -> Figure:
 
 
 def pole_panels(
-    poles: Sequence[TrialPole], modes: Sequence[PoleCluster], *, logarithmic: bool = False
+    poles: Sequence[TrialPole],
+    modes: Sequence[PoleCluster],
+    *,
+    logarithmic: bool = False,
+    most: float | None = None,
 ) -> tuple[Panel, Panel]:
-    """Return damping over frequency of stable poles, with the modes' names, and below it all poles by order."""
+    """Return damping over frequency of stable poles, with the modes' names, and below it all poles by order.
+
+    `most`: damping up to which it is drawn.
+    """
 
     def over_frequency(axes: Axes) -> None:
         for mode in modes:
@@ -180,6 +187,8 @@ def pole_panels(
             axes.annotate(words, at, textcoords="offset points", xytext=(4, 4), fontsize=8)
         axes.axhline(0, color=_NEW, linewidth=0.8)
         axes.set_ylabel("damping")
+        if most is not None:
+            axes.set_ylim(-0.1 * most, most)
         head(axes, "damping (under 0: unstable)")
 
     def diagram(axes: Axes) -> None:
@@ -204,18 +213,18 @@ def _orders(axes: Axes) -> None:
 # --- modes ----------------------------------------------------------------------------------------------------------
 
 
-def modal_panel(modal: Modal) -> Block:
+def modal_panel(modal: Modal, title: str = "") -> Block:
     """Return the poles that the search for modes began from, with the modes it ended in, and the modes' shapes."""
     found = [
         PoleCluster(pole=2 * np.pi * m.frequency_hz.value * complex(-m.damping.value, 1.0), orders=())
         for m in modal.modes
     ]
-    damping, diagram = pole_panels(modal.poles, found)
+    damping, diagram = pole_panels(modal.poles, found, most=2 * max((c.damping for c in found), default=0.5))
     columns = [[damping, diagram]]
     if modal.modes and len(modal.outputs) > 1:
         empty = Panel(draw=lambda axes: axes.axis("off"), height=2.0)
         columns.append([empty, panel(_shapes, modal, height=3.6)])
-    return Block(columns=columns, widths=(3, 2)[: len(columns)] if len(columns) > 1 else (), title="modes")
+    return Block(columns=columns, widths=(3, 2)[: len(columns)] if len(columns) > 1 else (), title=title)
 
 
 def _shapes(axes: Axes, modal: Modal) -> None:

@@ -1,0 +1,260 @@
+"""Modes from outputs alone by covariance-driven stochastic subspace (SSI-COV; Peeters and De Roeck 1999).
+
+White excitation that nobody measured makes covariances R(l) = C A^(l-1) G of the outputs. The block Toeplitz matrix of
+R(1) ... R(2i-1) is O_i times a controllability matrix; its singular vectors give O_i, its shift A, and A the poles.
+Each band of the record is shifted to zero and taken alone, as a complex signal at the band's own rate: a mode is one
+pole there, and few lags reach far. Orders are followed as everywhere; standard deviations are from the jackknife over
+stretches of the record (Efron and Tibshirani 1993, ch. 11).
+
+A harmonic (mains, unbalance) looks like a mode without damping. Its envelope is steady, where that of a mode that noise
+drives has the distribution of a Gaussian's: E|z|^4 = 2 (E|z|^2)^2 (Jacobsen, Andersen and Brincker 2007).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.blackbox.data import IOData
+from ambid.blackbox.mode_starts import MOST_DAMPED, excited_band, overlapping_bands
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
+from ambid.estimation.linear import one_thread
+from ambid.estimation.modes import Modal, Mode, mode_of, modes_checks, student
+from ambid.estimation.stable_poles import PoleCluster, Tolerance, TrialPole, clusters, followed, trial_poles
+
+_NEAR = Tolerance(frequency=0.002, damping=0.5, least=0.004, shape=0.9)
+_BANDS, _SHARE = 8, 0.25  # at most so many bands, each so wide beside its frequency
+_PEAK = 4.0  # power at a mode's frequency over that beside it
+_ROWS = 160  # of the Toeplitz matrix, about: lags times outputs
+_LAGS = (12, 60)
+_ORDERS = 20
+_STRETCHES = 12  # of the jackknife
+_STEADY = 1.5  # fourth moment of an envelope over its squared second: 2 for noise, 1 for a harmonic
+_LEAST_LINES = 120
+
+
+@dataclass(slots=True, eq=False)
+class _Band:
+    """Covariances of one band of the record, by stretch."""
+
+    centre: float  # rad/s, of the shift: of the first line
+    period: float  # s, between samples of the shifted signal
+    R: Complex  # (n_stretches, n_lags + 1, n_outputs, n_outputs), sums
+    counts: Array  # (n_stretches, n_lags + 1)
+
+    def covariances(self, without: int | None = None) -> Complex:
+        """Return them (n_lags + 1, n_outputs, n_outputs), `without` a stretch."""
+        use = np.ones(self.R.shape[0], dtype=bool)
+        if without is not None:
+            use[without] = False
+        return np.asarray(np.sum(self.R[use], axis=0) / np.sum(self.counts[use], axis=0)[:, None, None])
+
+
+@dataclass(slots=True, eq=False)
+class _Found:
+    """A mode of one band with what its stretches say."""
+
+    pole: complex
+    shape: Complex
+    covariance: Array
+    variance: Array
+    steadiness: float
+
+    @property
+    def frequency_hz(self) -> float:
+        return abs(self.pole) / (2 * np.pi)
+
+    @property
+    def harmonic(self) -> bool:
+        return self.steadiness < _STEADY
+
+
+def operational_modes(
+    data: IOData,
+    count: int | Literal["auto"] = "auto",
+    *,
+    band: tuple[float, float] | None = None,
+    tick: Callable[[str, float], object] | None = None,
+) -> Modal:
+    """Estimate modes that unmeasured broadband noise excites.
+
+    `count`: "auto", or how many, the best known; `band`: Hz, default where the outputs have power. EstimationError
+    where the band has too few lines.
+    """
+    n, rate = data.y.shape[0], 1.0 / data.dt
+    Y = np.fft.rfft(data.y - data.y.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n)
+    f = np.arange(1, Y.shape[0] + 1) * (rate / n)
+    low, high = excited_band(Y, f) if band is None else band
+    keep = (f >= low) & (f <= high)
+    if np.count_nonzero(keep) < _LEAST_LINES:
+        raise EstimationError(
+            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; operational modes want "
+            f"{_LEAST_LINES}. Use a longer record or a wider --band"
+        )
+    Y, omega = Y[keep], 2 * np.pi * f[keep]
+    size = np.sqrt(np.mean(np.abs(Y) ** 2, axis=0))
+    found, tried = list[_Found](), list[TrialPole]()
+    with one_thread():
+        for first, last, begin, end in overlapping_bands(
+            omega, 2 * np.pi * rate / n, max(omega.size // _BANDS, 600), _SHARE
+        ):
+            inside = omega[begin], omega[end - 1] + 2 * np.pi * rate / n
+            own, poles = _of_band(Y[first:last] / size, omega[first:last], inside)
+            found, tried = found + own, tried + poles
+            if tick is not None:
+                tick("modes: stochastic subspace", last / omega.size)
+    for x in found:
+        x.shape, x.variance = x.shape * size, x.variance * size**2
+    found = _separate(found)
+    if count != "auto":
+        best = sorted(found, key=lambda x: (x.harmonic, np.trace(x.covariance) / x.pole.real**2))[:count]
+        found = sorted(best, key=lambda x: x.pole.imag)
+    limits = float(f[keep][0]), float(f[keep][-1])
+    modes = tuple(_mode(x, data.outputs) for x in found)
+    checks = modes_checks(modes, count, limits, "Record longer, or give --band")
+    return Modal(
+        status="converged" if found else "failed",
+        method="covariance-driven stochastic subspace, broadband excitation not measured",
+        modes=modes,
+        checks={**checks, "modes_random": _random_check(found)},
+        inputs=(),
+        outputs=data.outputs,
+        units={x: data.units[x] for x in data.outputs},
+        band_hz=limits,
+        poles=tuple(tried),
+        record=data.record,
+        details={"envelope": [x.steadiness for x in found]},
+    )
+
+
+def _of_band(Y: Complex, omega: Array, inside: tuple[float, float]) -> tuple[list[_Found], list[TrialPole]]:
+    """Modes of one band and all poles that were tried, inside the part that counts."""
+    band = _shifted(Y, omega)
+    R = band.covariances()
+    models = list(range(1, _ORDERS + 1))
+    rows = []
+    for order, (p, shapes) in zip(models, _poles(R, band, models), strict=True):
+        lightly = (p.real < 0) & (-p.real < 2 * MOST_DAMPED * np.abs(p))
+        use = lightly & (p.imag >= inside[0]) & (p.imag < inside[1])
+        rows.append(trial_poles(order, p[use], shapes[use]))
+    poles = followed(rows, _NEAR)
+    stable = clusters(poles, models, _NEAR)
+    return _known(stable, poles, band, Y, omega), poles
+
+
+def _shifted(Y: Complex, omega: Array) -> _Band:
+    """Covariances of a band as a complex signal at the band's own rate."""
+    n, n_y = Y.shape
+    lags = 2 * min(max(_ROWS // n_y, _LAGS[0]), _LAGS[1])
+    z = np.fft.ifft(Y, axis=0) * np.sqrt(n)
+    edges = np.linspace(0, n, _STRETCHES + 1).astype(int)
+    R = np.zeros((_STRETCHES, lags, n_y, n_y), dtype=np.complex128)
+    counts = np.zeros((_STRETCHES, lags))
+    for s, (a, b) in enumerate(pairwise(edges)):
+        for k in range(lags):
+            late = z[a + k : min(b + k, n)]
+            R[s, k] = late.T @ z[a : a + late.shape[0]].conj()
+            counts[s, k] = late.shape[0]
+    step = (omega[-1] - omega[0]) / (n - 1)
+    return _Band(centre=float(omega[0]), period=2 * np.pi / (n * step), R=R, counts=counts)
+
+
+def _poles(R: Complex, band: _Band, models: Sequence[int]) -> list[tuple[Complex, Complex]]:
+    """Poles (n,), rad/s, and shapes (n, n_outputs) of all orders from one Toeplitz matrix."""
+    n_y, i = R.shape[1], R.shape[0] // 2
+    toeplitz = np.block([[R[i + a - b] for b in range(i)] for a in range(i)])
+    U, s, _ = np.linalg.svd(toeplitz)
+    out = []
+    for order in models:
+        observed = U[:, :order] * np.sqrt(s[:order])
+        A = np.linalg.lstsq(observed[:-n_y], observed[n_y:], rcond=None)[0]
+        z, vectors = np.linalg.eig(A)
+        angle = np.mod(np.angle(z), 2 * np.pi)  # the band is one turn, from its first line
+        p = (np.log(np.maximum(np.abs(z), 1e-300)) + 1j * angle) / band.period + 1j * band.centre
+        out.append((p, (observed[:n_y] @ vectors).T))
+    return out
+
+
+def _known(
+    stable: Sequence[PoleCluster], poles: Sequence[TrialPole], band: _Band, Y: Complex, omega: Array
+) -> list[_Found]:
+    """Clusters at the order that is nearest to their centre, with the spread over stretches left out in turn."""
+    nearest = [min((p for p in poles if p.order in c.orders), key=lambda p: abs(p.pole - c.pole)) for c in stable]
+    at = [p for p in nearest if _stands_out(Y, omega, p)]
+    orders = sorted({p.order for p in at})
+    if not at:
+        return []
+    again = [dict(zip(orders, _poles(band.covariances(s), band, orders), strict=True)) for s in range(_STRETCHES)]
+    out = []
+    for trial in at:
+        own = np.array(trial.shape)
+        largest = int(np.argmax(np.abs(own)))
+        moved = []
+        for found in again:
+            p, shapes = found[trial.order]
+            k = int(np.argmin(np.abs(p - trial.pole)))
+            shape = shapes[k] / shapes[k, largest]
+            moved.append(np.r_[p[k].real, p[k].imag, shape.real, shape.imag])
+        spread = np.array(moved) - np.mean(moved, axis=0)
+        factor = (_STRETCHES - 1) / _STRETCHES
+        variance = np.sum(spread[:, 2:] ** 2, axis=0) * factor
+        out.append(
+            _Found(
+                pole=trial.pole, shape=own / own[largest], covariance=spread[:, :2].T @ spread[:, :2] * factor,
+                variance=variance[: own.size] + variance[own.size :],
+                steadiness=_steadiness(Y, omega, trial),
+            )
+        )  # fmt: skip
+    return out
+
+
+def _stands_out(Y: Complex, omega: Array, p: TrialPole) -> bool:
+    """Whether the power along a mode's shape has a peak at its frequency, more than chance makes."""
+    power = np.abs(Y @ np.conj(np.array(p.shape))) ** 2
+    away, width = np.abs(omega - p.pole.imag), abs(p.pole.real)
+    step = omega[1] - omega[0]
+    near = away <= max(width, 1.5 * step)
+    beside = (away > max(4 * width, 6 * step)) & (away < max(12 * width, 60 * step))
+    if not beside.any():
+        return True
+    level = np.median(power[beside]) / np.log(2)
+    return bool(np.mean(power[near]) > _PEAK * (1 + 2 / np.sqrt(np.count_nonzero(near))) * level)
+
+
+def _steadiness(Y: Complex, omega: Array, p: TrialPole) -> float:
+    """Fourth moment over squared second of the envelope of the mode's lines, along its shape."""
+    step = omega[1] - omega[0]
+    near = np.abs(omega - p.pole.imag) <= max(3 * abs(p.pole.real), 4 * step)
+    along = Y[near] @ np.conj(np.array(p.shape))
+    power = np.abs(np.fft.ifft(along, 4 * along.size)) ** 2
+    return float(np.mean(power**2) / np.mean(power) ** 2)
+
+
+def _separate(found: list[_Found]) -> list[_Found]:
+    """Modes that are damped, known, and not twice, in order of frequency."""
+    kept = list[_Found]()
+    for x in sorted(found, key=lambda x: float(np.trace(x.covariance))):
+        damped = 0 < -x.pole.real <= MOST_DAMPED * abs(x.pole)
+        known = x.harmonic or max(x.covariance[0, 0], x.covariance[1, 1]) < x.pole.real**2
+        near = any(abs(x.pole - y.pole) < 0.3 * (abs(x.pole.real) + abs(y.pole.real)) for y in kept)
+        if damped and known and not near:
+            kept.append(x)
+    return sorted(kept, key=lambda x: x.pole.imag)
+
+
+def _mode(x: _Found, outputs: tuple[str, ...]) -> Mode:
+    spreads = [(x.covariance, student(_STRETCHES - 1))]
+    return mode_of(x.pole, spreads, outputs, x.shape, x.variance, shown=not x.harmonic)
+
+
+def _random_check(found: list[_Found]) -> Check:
+    """Whether a mode is a harmonic of a machine or the mains."""
+    steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in found if x.harmonic)
+    said = f"{steady}: the envelope is steady, as a harmonic's is. Take it for no mode, or record at another speed"
+    return Check(passed=not steady, detail=said if steady else "no mode is a harmonic")
