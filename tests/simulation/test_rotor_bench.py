@@ -8,9 +8,17 @@ import pytest
 from ambid import simulate
 from ambid.errors import ModelError, RigError
 from ambid.job.simulation import simulate_used
+from ambid.physics.coenergy_law import MagnetLaw
+from ambid.physics.law_magnet import LawMagnet
+from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Noise
+from ambid.physics.named_bench import Preset
+from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import preset, preset_names
-from ambid.rig import preset_text, rig_from_text
+from ambid.rig import preset_text, rig_from_text, rig_of_preset
+from ambid.signals import multisine
+from ambid.simulation import LinearPlant
+from ambid.simulation import simulate as simulate_plant
 from ambid.simulation.rotor_bench import RotorBench
 from tests.rotor_benches import needs_simulator, rig_of, truth
 
@@ -93,3 +101,75 @@ def test_records_begin_in_steady_state_and_excite_the_axes_that_are_asked_for() 
     assert np.abs(x[:10_000] - x[10_000:]).max() < 1e-3 * np.abs(x).max()
     assert np.abs(record["xR_position"]).max() > 1e-3 * np.abs(x).max()  # through the rotor
     assert np.abs(record["yR_position"]).max() < 1e-6 * np.abs(x).max()  # at rest, planes do not couple
+
+
+AXIAL = """
+schema = "ambid.rig/1"
+name = "a mass on one axial axis"
+model = "rotor"
+[bearings.T]
+axial = true
+axes = ["az"]
+[parameters]
+m = { value = 4.0, unit = "kg" }
+"az.k_i" = { value = 55.7, unit = "N/A" }
+"az.k_x" = { value = -129000.0, unit = "N/m" }
+"az.R" = { value = 1.6, unit = "ohm" }
+"az.L" = { value = 27.0, unit = "mH" }
+[magnet]
+saturation = true
+[magnet.parameters]
+s = { value = 0.432, unit = "mm" }
+sigma = { value = 0.0, unit = "1/A^2", role = "fixed" }
+[record]
+rate_hz = 20000.0
+"""
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.3])
+def test_one_axial_axis_is_the_one_axis_bench_linear_and_nonlinear(sigma: float) -> None:
+    bearing = preset("unstable-bearing")
+    rig = rig_from_text(AXIAL.replace("sigma = { value = 0.0", f"sigma = {{ value = {sigma}"), "axial.toml")
+    rig = replace(rig, loop=replace(bearing.loop, delay=1.3), limits=bearing.limits)
+    u = multisine(4000, 20_000.0, amplitude=18.0, band=(10.0, 1000.0), seed=1)
+    linear = RotorBench.of(rig, None, None)
+    theta = {**{name.removeprefix("az."): x for name, x in linear.plant.parameters.items()}, "c": 0.0}
+    bent = RotorBench.of(rig, None, None, nonlinear=True)
+    assert bent.poles is not None
+    k, s, bias = bent.poles.numbers[0, :3]
+    values = {"k": k, "s": s, "i0": bias, "sigma": sigma, "L_leak": bent.poles.leakage[0]}
+    magnet = LawMagnet(law=MagnetLaw(gap="hyperbolic", pair=True, saturation=True), values=values)
+    plants = [LinearPlant(model=model("one-axis"), parameters=theta), NonlinearPlant(magnet=magnet, m=4.0, R=1.6)]
+    assert plants[1].linearise(0.0) == pytest.approx(theta, rel=1e-12)
+    for bench, plant in zip((linear, bent), plants, strict=True):
+        many = bench.simulate(u[:, None], seed=1).record
+        one = simulate_plant(plant, u, rate_hz=20_000.0, seed=1, loop=rig.loop, limits=rig.limits, substeps=8).record
+        for what in ("voltage", "current", "position"):
+            assert np.abs(many[f"az_{what}"] - one[what]).max() < 1e-6 * np.abs(one[what]).max()
+    bows = np.abs(bent.simulate(u[:, None], seed=1).states - linear.simulate(u[:, None], seed=1).states).max(axis=0)
+    assert bows[0] > 0.01 * np.abs(one["position"]).max()
+
+
+@pytest.mark.parametrize("name", preset_names(rotors=True))
+def test_nonlinear_magnets_levitate_and_are_linear_for_small_motion(name: str) -> None:
+    quiet = replace(preset(name), noise=Noise())
+    assert quiet.rotor is not None
+    quiet = replace(quiet, rotor=replace(quiet.rotor, unbalance=(), runout=()))
+    told = {"duration": 0.1, "periods": 2, "settle": 0, "amplitude": 0.01}
+    linear, bent = simulate(quiet, **told), simulate(quiet, **told, nonlinear=True)
+    for role in linear.names:
+        assert np.abs(bent[role] - linear[role]).max() <= 2e-4 * np.abs(linear[role]).max()
+    done, _ = simulate_used(name, duration=0.2, periods=2, nonlinear=True)
+    assert done.within_limits
+
+
+def test_magnets_that_cannot_be_are_refused() -> None:
+    def refuse(bench: Preset, says: str, **theta: float) -> None:
+        with pytest.raises(RigError, match=says):
+            simulate(replace(bench, parameters={**bench.parameters, **theta}), duration=0.1, nonlinear=True)
+
+    refuse(preset("rmit"), "L of yR is below", **{"yR.L": 24e-3})
+    refuse(preset("rmit"), "has k_i > 0 > k_x", **{"yR.k_x": 1e5})
+    refuse(preset("camb"), r"az\.k_i is 50; with this cone", **{"az.k_i": 50.0})
+    with pytest.raises(RigError, match="there is no gap"):
+        simulate(replace(rig_of_preset(preset("rmit")), magnet=None), duration=0.1, nonlinear=True)

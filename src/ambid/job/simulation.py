@@ -241,7 +241,7 @@ def _bench(
     if source.rotor is not None:
         if position is not None:
             raise AmbidError("--position is for one axis. Omit it")
-        return RotorBench.of(source, rate, closed)
+        return RotorBench.of(source, rate, closed, nonlinear=nonlinear)
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
 

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from ambid.rig.rig import Rig, RigChannel, RigMagnet
 
 
-_FINE = 0.25  # largest rate of the plant at rest times a Runge-Kutta step
+FINE = 0.25  # largest rate of the plant at rest times a Runge-Kutta step
 
 
 def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
@@ -161,7 +161,7 @@ def enough_steps(plant: NonlinearPlant, point: OperatingPoint, rate_hz: float) -
     resistance = p["R"] + abs(plant.stage.slope(0.0))  # the drop is steepest where the current passes zero
     rates = [resistance / p["L"], abs(p["k_i"]) / math.sqrt(p["L"] * p["m"]), math.sqrt(abs(p["k_x"]) / p["m"])]
     rates += [p["c"] / p["m"], plant.eddy_pole if math.isfinite(plant.eddy_pole) else 0.0]
-    return max(1, math.ceil(max(rates) / (_FINE * rate_hz)))
+    return max(1, math.ceil(max(rates) / (FINE * rate_hz)))
 
 
 TURNING = {"speed": "rad/s", "angle": "rad"}

@@ -1,15 +1,17 @@
 """Simulation of a rotor in its bearings: all axes in one loop, each with the rig's controller.
 
-The plant is stepped with its exact zero-order-hold matrices. Unbalance is exact: two states turn with the rotor.
+The linear plant is stepped with its exact zero-order-hold matrices, the one with nonlinear magnets by the classical
+Runge-Kutta method. Unbalance is exact: two states turn with the rotor.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -17,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
 from ambid.physics.drawn_rotor import drawn_numbers
-from ambid.physics.linear_model import DiscreteSpace, StateSpace, discretise
+from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.named_bench import Turning
 from ambid.physics.nonlinear import OperatingPoint
@@ -27,7 +29,11 @@ from ambid.record.record import Channel, Record, Step
 from ambid.rig.rig import Rig
 from ambid.simulation.bench import Simulation, acting, largest_amplitude
 from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back
-from ambid.simulation.rig_bench import as_columns, loop_of_rig
+from ambid.simulation.rig_bench import FINE, as_columns, loop_of_rig
+from ambid.simulation.rotor_magnets import Poles, poles_of
+
+if TYPE_CHECKING:
+    from ambid.simulation.rotor_kernels import Linear, Nonlinear
 
 _MOST_MODES = 12  # of a drawing that are looked at
 
@@ -41,9 +47,10 @@ class RotorBench:
     loop: Loop
     rate_hz: float
     shapes: Mapping[str, Array]  # what a force in the plane of each unbalance does: (n_coordinates / planes,)
+    poles: Poles | None = None  # nonlinear magnets
 
     @classmethod
-    def of(cls, rig: Rig, rate_hz: float | None, closed: bool | None) -> RotorBench:
+    def of(cls, rig: Rig, rate_hz: float | None, closed: bool | None, *, nonlinear: bool = False) -> RotorBench:
         """Return the bench of a rig with ``[bearings.X]``, as its records are taken unless `closed` says otherwise."""
         assert rig.rotor is not None
         numbers, rate = rig.modes.numbers, rig.record.rate_hz if rate_hz is None else rate_hz
@@ -67,7 +74,9 @@ class RotorBench:
             for u in rig.unbalance
         }
         plant = LinearPlant(model=of, parameters={p.name: values[p.name] for p in of.parameters if p.name in values})
-        return cls(rig=rig, plant=plant, loop=loop_of_rig(rig, closed) or Loop(), rate_hz=rate, shapes=shapes)
+        poles = poles_of(rig, of, plant.parameters) if nonlinear else None
+        loop = loop_of_rig(rig, closed) or Loop()
+        return cls(rig=rig, plant=plant, loop=loop, rate_hz=rate, shapes=shapes, poles=poles)
 
     @property
     def model(self) -> RotorModel:
@@ -118,9 +127,10 @@ class RotorBench:
         angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
         lost = self._run(u, np.random.default_rng(seed), angle, counts, measured, command, truth)
         if lost >= 0:
+            at = f"sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s)"
             raise ModelError(
-                f"the simulation diverges at sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s); an "
-                "unstable plant needs a loop that holds it. Give limits.position, or another loop"
+                f"the simulation closes a gap or diverges at {at}; an unstable plant needs a loop that holds it. Give "
+                "limits.position, or another loop"
             )
         names = (*(f"{axis}_position" for axis in of.axes), *(f"{of.axes[j]}_current" for j in of.coils))
         low, high = self.limits.current
@@ -132,7 +142,7 @@ class RotorBench:
         order = sorted(values, key=lambda name: of.axes.index(name.split("_")[0]))  # an axis after the other
         channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
         channels += [Channel(name="angle", unit="rad", values=angle[settle:])] if of.speed else []
-        made = {"plant": f"{of.name}, linear", "seed": str(seed)}
+        made = {"plant": f"{of.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
         settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
         record = Record(
             rate_hz=self.rate_hz,
@@ -154,9 +164,13 @@ class RotorBench:
         )
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
-        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits."""
+        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits.
+
+        It is that of the linear plant, which is near the nonlinear one in that part of the gap, and fast.
+        """
+        linear = replace(self, poles=None)
         found = largest_amplitude(
-            lambda u: self.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
+            lambda u: linear.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
             operating_point=OperatingPoint(), fraction=fraction,
         )  # fmt: skip
         return float(f"{found:.3g}")
@@ -174,11 +188,7 @@ class RotorBench:
         from ambid.simulation.rotor_kernels import run_rotor
 
         of, period, whole = self.model, 1.0 / self.rate_hz, math.floor(self.loop.delay)
-        d, c, kinds = (
-            self._discrete(self.loop.delay - whole),
-            self.loop,
-            [name.rsplit("_", 1)[-1] for name in of.inputs],
-        )
+        c, fraction, kinds = self.loop, self.loop.delay - whole, [name.rsplit("_", 1)[-1] for name in of.inputs]
         if len(set(kinds)) > 1:
             raise ModelError(
                 f"axes are driven by {', '.join(sorted(set(kinds)))}; one loop drives all alike. Correct it"
@@ -187,13 +197,15 @@ class RotorBench:
         magnets, _ = of.rows(self.plant.parameters)
         mass, _, _ = of.rotor_matrices(self.plant.parameters)
         pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
-        x = np.zeros(d.A.shape[0])
+        continuous = self._continuous()
+        equations = self._sampled(continuous, fraction) if self.poles is None else self._nonlinear(self.poles, fraction)
+        x = np.zeros(continuous.A.shape[0])
         x[len(of.states) :: 2] = 1.0
         states = [of.states.index(f"{of.axes[j]}_current") for j in of.coils]
         return int(
             run_rotor(
                 u, self._noise(rng, u.shape[0]), self._runout(angle),
-                (d.A, d.B, d.B_late, d.E), d.C, fed_back(of),
+                equations, np.ascontiguousarray(continuous.C), fed_back(of),
                 np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]), np.array(steps[:-1]),
                 (*getattr(self.limits, _kind(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
                 self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), x, counts,
@@ -201,19 +213,39 @@ class RotorBench:
             )
         )  # fmt: skip
 
-    def _discrete(self, fraction: float) -> DiscreteSpace:
-        """Return the sampled plant; after its states cos and sin of the angle, from which unbalance pushes."""
-        of, space = self.model, self.plant.model.matrices(self.plant.parameters)
+    def _continuous(self, theta: Mapping[str, float] | None = None) -> StateSpace:
+        """Return the plant; after its states cos and sin of the angle, from which unbalance pushes."""
+        of, space = self.model, self.plant.model.matrices(theta or self.plant.parameters)
         n, speed = len(of.states), of.speed
         A, C = np.zeros((n + 2, n + 2)), np.zeros((space.C.shape[0], n + 2))
         A[:n, :n], C[:, :n] = space.A, space.C
         A[n, n + 1], A[n + 1, n] = -speed, speed
         A[:n, n:] = sum((self._unbalance(u) for u in self.rig.unbalance), np.zeros((n, 2)))
         B, E = (np.vstack([x, np.zeros((2, x.shape[1]))]) for x in (space.B, space.E))
-        d, *_ = discretise(StateSpace(A=A, B=B, E=E, C=C), 1.0 / self.rate_hz, fraction=fraction)
-        return DiscreteSpace(
-            **{name: np.ascontiguousarray(getattr(d, name)) for name in ("A", "B", "B_late", "E", "C")}
-        )
+        return StateSpace(A=A, B=B, E=E, C=C)
+
+    def _sampled(self, space: StateSpace, fraction: float) -> Linear:
+        d, *_ = discretise(space, 1.0 / self.rate_hz, fraction=fraction)
+        a, b, late, e = (np.ascontiguousarray(x) for x in (d.A, d.B, d.B_late, d.E))
+        return a, b, late, e
+
+    def _nonlinear(self, poles: Poles, fraction: float) -> Nonlinear:
+        """Return what the compiled loop steps the plant with: all that is linear, and the poles."""
+        of, theta = self.model, self.plant.parameters
+        free = self._continuous({**theta, **{f"{axis}.{q}": 0.0 for axis in of.axes for q in ("k_i", "k_x")}})
+        flows = of.states.index(f"{of.axes[0]}_current")
+        acts = of.states.index(f"{of.axes[0]}_effective_current") if "a" in of.extras else flows
+        A = free.A.copy()
+        A[flows : flows + len(of.axes)] = 0.0
+        places = np.argwhere(A)
+        largest = float(np.abs(np.linalg.eigvals(self._continuous().A)).max())
+        steps = max(1, math.ceil(largest / (FINE * self.rate_hz)))
+        values, push = A[places[:, 0], places[:, 1]], np.ascontiguousarray(free.E[:, : len(of.axes)])
+        resistance = np.array([theta[f"{axis}.R"] for axis in of.axes])
+        return (
+            values, np.ascontiguousarray(places), push, poles.numbers, poles.axes, resistance, poles.leakage,
+            (flows, acts), (fraction, 1.0 / self.rate_hz, steps),
+        )  # fmt: skip
 
     def _unbalance(self, u: Turning) -> Array:
         """Return what cos and sin of the angle do to the states: U W² (cos, sin)(angle + phase) in the planes x, y."""

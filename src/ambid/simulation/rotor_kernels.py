@@ -17,6 +17,9 @@ from ambid.simulation.kernels import order, quantise
 Integers = NDArray[np.int64]
 
 Linear = tuple[Array, Array, Array, Array]  # A, B, B_late and E of a sample
+# Of `rate`: entries of A without magnets, their places (n, 2), what forces do to the states (n_states, n_axes), poles
+# and their axes, resistances, leakages; first states of the currents that flow and that act; fraction, period, steps
+Nonlinear = tuple[Array, Integers, Array, Array, Integers, Array, Array, tuple[int, int], tuple[float, float, int]]
 
 
 @compiled(error_model="numpy", inline="always")
@@ -27,6 +30,110 @@ def multiply(matrix: Array, vector: Array, into: Array) -> None:
         for column in range(matrix.shape[1]):
             s += matrix[row, column] * vector[column]
         into[row] += s
+
+
+@compiled(error_model="numpy")
+def rate(
+    x: Array, seen: Array, moving: Array, voltage: Array, force: Array, plant: Nonlinear, into: Array, room: Array
+) -> bool:
+    """Write the derivative of the states; tell whether all gaps are open.
+
+    `seen`, `moving` (n_axes,): what each axis sees of the rotor and of its speed; `voltage`, `force` (n_axes,): with
+    disturbances; `room` (n_axes, n_axes + 2) is to work in: inductances, what drives the currents, force.
+    """
+    values, places, pushes, poles, axes, resistance, leakage, (flows, acts), _ = plant
+    n = voltage.size
+    into[:] = 0.0
+    for k in range(values.size):
+        into[places[k, 0]] += values[k] * x[places[k, 1]]
+    room[:] = 0.0
+    for j in range(n):
+        room[j, j] = leakage[j]
+        room[j, n] = voltage[j] - resistance[j] * x[flows + j]
+        room[j, n + 1] = force[j]
+    for p in range(poles.shape[0]):
+        k, gap, current, sigma, d1, w1, d2, w2 = poles[p]
+        a, b = axes[p, 0], axes[p, 1]
+        gap -= d1 * seen[a]
+        acting = current + w1 * x[acts + a]
+        current += w1 * x[flows + a]
+        closing = d1 * moving[a]
+        if b >= 0:
+            gap -= d2 * seen[b]
+            acting += w2 * x[acts + b]
+            current += w2 * x[flows + b]
+            closing += d2 * moving[b]
+        if not gap > 0.0:
+            return False
+        r = math.sqrt(1.0 + sigma * current * current)
+        pull = k / (gap * gap) * acting * acting / (1.0 + math.sqrt(1.0 + sigma * acting * acting))
+        motional, own = k / (gap * gap) * current / r * closing, k / gap / (r * r * r)
+        room[a, n + 1] += d1 * pull
+        room[a, n] -= w1 * motional
+        room[a, a] += own * w1 * w1
+        if b >= 0:
+            room[b, n + 1] += d2 * pull
+            room[b, n] -= w2 * motional
+            room[b, b] += own * w2 * w2
+            room[a, b] += own * w1 * w2
+            room[b, a] += own * w1 * w2
+    multiply(pushes, room[:, n + 1], into)
+    for a in range(n):  # inductances are symmetric and positive: no pivots are sought
+        for b in range(a + 1, n):
+            if room[b, a] != 0.0:
+                share = room[b, a] / room[a, a]
+                for c in range(a, n + 1):
+                    room[b, c] -= share * room[a, c]
+    for a in range(n - 1, -1, -1):
+        for c in range(a + 1, n):
+            room[a, n] -= room[a, c] * room[c, n]
+        room[a, n] /= room[a, a]
+        into[flows + a] = room[a, n]
+    return True
+
+
+@compiled(error_model="numpy")
+def advance_poles(
+    x: Array,
+    late: Array,
+    now: Array,
+    disturbance: Array,
+    plant: Nonlinear,
+    magnets: Array,
+    pushes: Array,
+    stops: tuple[float, float],
+) -> tuple[bool, bool]:
+    """Carry the states over one sample in place, by classical Runge-Kutta steps; tell of contact and of open gaps."""
+    fraction, period, steps = plant[8]
+    n, n_coordinates = magnets.shape
+    at, total, slope = np.empty(x.size), np.empty(x.size), np.empty(x.size)
+    seen, moving, voltage, room = np.empty(n), np.empty(n), np.empty(n), np.empty((n, n + 2))
+    touched = False
+    for part in range(2):
+        length = period * (fraction if part == 0 else 1.0 - fraction)
+        if length == 0.0:
+            continue
+        h = length / steps
+        for j in range(n):
+            voltage[j] = (late[j] if part == 0 else now[j]) + disturbance[n + j]
+        for _ in range(steps):
+            total[:] = x
+            at[:] = x
+            for stage in range(4):
+                seen[:] = 0.0
+                moving[:] = 0.0
+                multiply(magnets, at, seen)
+                multiply(magnets, at[n_coordinates:], moving)
+                if not rate(at, seen, moving, voltage, disturbance, plant, slope, room):
+                    return touched, False
+                weight = h / 6.0 if stage in (0, 3) else h / 3.0
+                step = 0.5 * h if stage < 2 else h
+                for k in range(x.size):
+                    total[k] += weight * slope[k]
+                    at[k] = x[k] + step * slope[k]
+            x[:] = total
+            touched = touch(x, magnets, pushes, stops) or touched
+    return touched, True
 
 
 @compiled(error_model="numpy")
@@ -59,7 +166,7 @@ def run_rotor(
     excitation: Array,
     noise: Array,
     offsets: Array,
-    equations: Linear,
+    equations: Linear | Nonlinear,
     read: Array,
     roles: Integers,
     gains: Array,
@@ -83,7 +190,7 @@ def run_rotor(
     none; `gains` kp, ki T, kd, kc, tau, T; `limits` low, high and resolution of the commands; `line` (whole delay + 2,
     n_inputs), zero at first; `carried`: states that are currents. Filled: measured, command, truth = what each axis
     sees of the rotor, then the currents; counts = first contact, first limited sample (-1: none), limited samples.
-    Returns the first sample that is not finite, -1 for none.
+    Returns the first sample that is not finite or in which a gap closes, -1 for none.
     """
     n, n_inputs, n_outputs = command.shape[0], command.shape[1], measured.shape[1]
     n_axes = magnets.shape[0]
@@ -123,13 +230,21 @@ def run_rotor(
             if counts[1] < 0:
                 counts[1] = k
         disturbance[:] = noise[k, n_outputs:]
-        a, b, b_late, e = equations
-        after[:] = 0.0
-        multiply(a, x, after)
-        multiply(b, line[whole], after)
-        multiply(b_late, line[whole + 1], after)
-        multiply(e, disturbance, after)
-        x[:] = after
-        if touch(x, magnets, pushes, stops) and counts[0] < 0:
+        if len(equations) == 4:  # known while compiling: each plant compiles its own equations alone
+            a, b, b_late, e = equations
+            after[:] = 0.0
+            multiply(a, x, after)
+            multiply(b, line[whole], after)
+            multiply(b_late, line[whole + 1], after)
+            multiply(e, disturbance, after)
+            x[:] = after
+            touched = touch(x, magnets, pushes, stops)
+        else:
+            touched, open_gaps = advance_poles(
+                x, line[whole + 1], line[whole], disturbance, equations, magnets, pushes, stops
+            )
+            if not open_gaps:
+                return k
+        if touched and counts[0] < 0:
             counts[0] = k + 1
     return -1
