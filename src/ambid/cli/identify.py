@@ -26,7 +26,9 @@ def command(
     records: Annotated[
         list[Path],
         opt.argument(
-            "RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; with --nonlinear several, best at several positions."
+            "RECORD...",
+            "Record: .csv, .csv.gz, .h5 or .mat; with --nonlinear several, best at several positions; of a rotor "
+            "several, best at rest and at speed.",
         ),
     ],
     rig: opt.RigFile = None,
@@ -63,6 +65,14 @@ def command(
             "as the rig says",
         ),
     ] = None,
+    speed: Annotated[
+        list[float] | None,
+        option(
+            "--speed RPM",
+            "Speed of a rotor in rpm; once for each record, in their order.",
+            "as the record's angle or speed, or the rig, says",
+        ),
+    ] = None,
     second: Annotated[Path | None, option("--validate RECORD2", "Validate the estimate on this second record.")] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
@@ -91,10 +101,11 @@ def command(
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
     with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
+        opt.refuse_twice([*records, *kept])
         if nonlinear:
             if off_below is not None and not isfinite(off_below):
                 raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
-            opt.refuse_twice([*records, *kept])
+            refuse_given({"--speed": speed}, "{} is for rotors with a linear model. Omit {}")
         else:
             refuse_given(
                 {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
@@ -104,7 +115,7 @@ def command(
             estimate: Estimate | NonlinearBearingEstimate | RotorEstimate = (
                 job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
-                else job.identify(list(records), rig, tick=show, **how)
+                else job.identify(list(records), rig, speed_rpm=speed, tick=show, **how)
             )
             stop.torn()
             outputs.give(estimate, show)

@@ -15,7 +15,7 @@ import numpy as np
 from ambid.bearing.magnet_problem import BearingRecord, touching
 from ambid.errors import EstimationError, counted
 from ambid.estimation.progress import Tick
-from ambid.job.data import Reading, Source, known_rig, load_bench, origin
+from ambid.job.data import Reading, Source, known_rig, load_bench, origin, overlap
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.rig import Rig, RigMagnet
@@ -244,11 +244,7 @@ def _refuse_senseless(record: BearingRecord) -> None:
 
 def _overlap(a: TakenRecord, b: TakenRecord) -> bool:
     """Whether both come from one file and one stretch of its time."""
-    if a.remembered["sha256"] is None or a.remembered["sha256"] != b.remembered["sha256"]:
-        return False
-    ends = [t.start_s + t.record.u.size / t.record.rate_hz for t in (a, b)]
-    half = 0.5 / a.record.rate_hz
-    return max(a.start_s, b.start_s) + half < min(ends)
+    return overlap(*((t.remembered["sha256"], t.start_s, t.record.u.size, t.record.rate_hz) for t in (a, b)))
 
 
 def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:

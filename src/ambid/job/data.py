@@ -71,6 +71,17 @@ def origin(record: Record) -> dict[str, object]:
     }
 
 
+Stretch = tuple[object, float, int, float]
+"""Of a file's time: sha256 of the file, time of the first sample in s, samples, rate in Hz."""
+
+
+def overlap(a: Stretch, b: Stretch) -> bool:
+    """Whether two records come from one file and share a stretch of its time."""
+    (sha256, start, n, rate), (other, begin, m, other_rate) = a, b
+    ends = start + n / rate, begin + m / other_rate
+    return sha256 is not None and sha256 == other and max(start, begin) + 0.5 / rate < min(ends)
+
+
 class Reading(TypedDict, total=False):
     """How files are read, and which part of a record is used."""
 

@@ -34,6 +34,7 @@ def identify(
     rig: Rig | str | Path | None = None,
     *,
     validate: Source | None = None,
+    speed_rpm: float | Sequence[float] | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -54,6 +55,8 @@ def identify(
         What is known of the bench; default: columns voltage, current and position, everything free.
     validate : as `record`, optional
         A second record of the same bench to validate the estimate on.
+    speed_rpm : float or sequence of float, optional
+        Speed of a rotor in each record, rpm; default: as its channel of angle or speed, or the rig, says.
     from_s, to_s : float, optional
         Part of a record in which the rotor moves, in s; overrides the rig's.
     rate_hz : float, optional
@@ -94,7 +97,9 @@ def identify(
 
         if validate is not None:
             raise EstimationError("a second record validates one axis only; a rotor takes all records at once. Omit it")
-        return identify_rotor(sources, bench, tick=tick, **reading)
+        return identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
+    if speed_rpm is not None:
+        raise EstimationError("--speed is of a rotor's records; the rig has no [bearings.X]. Omit it")
     if len(sources) != 1:
         raise EstimationError(
             f"{len(sources)} records are given; the linear model takes one, since k_x, k_i and L differ from one "

@@ -16,20 +16,28 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.data import Clock, Reading, Source, load_bench, origin, rig_entry
+from ambid.job.data import Clock, Reading, Source, origin, rig_entry
+from ambid.job.rotor_records import read_records
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 
 _LEAST = 200  # samples
+_AT_REST = 0.25 * 2.0 * np.pi  # rad that a rotor at rest may creep in a record
 
 
 def identify_rotor(
-    records: Sequence[Source], rig: Rig, *, tick: Tick | None = None, **reading: Unpack[Reading]
+    records: Sequence[Source],
+    rig: Rig,
+    *,
+    speed_rpm: float | Sequence[float] | None = None,
+    tick: Tick | None = None,
+    **reading: Unpack[Reading],
 ) -> RotorEstimate:
     """Identify a rotor from one or several records.
 
-    `rig`: with bearings; `reading`: how files are read. EstimationError where nothing can be identified.
+    `rig`: with bearings; `speed_rpm`: of each record; `reading`: how files are read. EstimationError where nothing can
+    be identified.
     """
     from ambid.rotor.conclusion import conclude, experiments_hint
     from ambid.rotor.estimator import estimate_rotor
@@ -38,17 +46,16 @@ def identify_rotor(
 
     say, clock, model = tick or silent, Clock(), rig.rotor
     assert model is not None
-    benches = []
-    for source in records:
-        say("read")
-        benches.append(load_bench(source, rig, **reading))
+    taken = read_records(records, rig, speed_rpm, say, **reading)
+    benches = [r.bench for r in taken]
     for bench in benches:
         _check(bench, rig)
     clock.lap("read")
-    experiments, remembered, warnings = [], [], []
-    for bench in benches:
+    experiments, remembered, warnings = [], [], [said for r in taken for said in r.warnings]
+    for r in taken:
         say("periods")
-        speed, excitation = speed_of(bench, rig), find_excitation(bench, model)
+        bench, speed = r.bench, speed_of(r.bench, rig) if r.speed is None else r.speed
+        excitation = find_excitation(bench, model)
         if excitation is None:
             raise EstimationError(
                 f"{name_of(bench)} is not periodic or has less than two whole periods; the estimator of rotors needs "
@@ -90,8 +97,8 @@ def speed_of(bench: Record, rig: Rig) -> float:
     """Return the speed of a record in rad/s: of its angle or speed channel, else as the rig says."""
     if "angle" in bench:
         turned = np.unwrap(bench["angle"].values)
-        seconds = (bench.n_samples - 1) / bench.rate_hz
-        return float((turned[-1] - turned[0]) / seconds)
+        seconds, angle = (bench.n_samples - 1) / bench.rate_hz, float(turned[-1] - turned[0])
+        return angle / seconds if abs(angle) > _AT_REST else 0.0
     if "speed" in bench:
         return float(np.mean(bench["speed"].values))
     return 0.0 if rig.rotor is None else rig.rotor.speed
