@@ -19,12 +19,16 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.named_bench import Turning
 from ambid.physics.rotor_model import Bearing, RotorModel
+from ambid.record import Record, read_record
 from ambid.rig import Rig
 from ambid.rig.rig import RecordSettings, RigChannel, RigModes
 from tests.measured import RECORDS
 
 DATUM = 0.2
 """Of the planes, from the centre of gravity, m."""
+
+
+_UNITS = {"voltage": "V", "current": "A", "position": "m", "reference": "A"}
 
 
 def _simulator() -> ModuleType | None:
@@ -71,6 +75,31 @@ def rig_of(bench: Any) -> Rig:
                          position=bench.position_noise, current=bench.current_noise),
         record=RecordSettings(rate_hz=bench.rate),
     )  # fmt: skip
+
+
+def free_rig(bench: Any) -> Rig:
+    """Return the rig of a bench as an engineer knows it: the planes and the speed."""
+    model, _ = model_of(bench)
+    rigid, known = replace(model, n_modes=0), {"A.z", "A.z_sensor", "B.z", "B.z_sensor"}
+    angle = [RigChannel(role="angle", column="angle")] if bench.rpm else []
+    return Rig(
+        name=bench.name, model="rotor", rotor=rigid, channels=(*_channels(rigid), *angle),
+        parameters=tuple(
+            Parameter(name=p.name, unit=p.unit, role="fixed", value=p.default) if p.name in known
+            else Parameter(name=p.name, unit=p.unit, role="free")
+            for p in rigid.parameters
+        ),
+    )  # fmt: skip
+
+
+def record_of(bench: Any, seed: int) -> Record:
+    """Return a record of a bench; with the angle where it turns."""
+    found = truth.simulate(bench, seed)
+    columns = {f"{axis}_{q}": found[q][:, j] for j, axis in enumerate(truth.AXES) for q in _UNITS}
+    units = {f"{axis}_{q}": unit for axis in truth.AXES for q, unit in _UNITS.items()}
+    if bench.rpm:
+        columns["angle"], units["angle"] = found["angle"], "rad"
+    return read_record(columns, rate_hz=bench.rate, units=units)
 
 
 def _channels(model: RotorModel) -> Iterator[RigChannel]:
