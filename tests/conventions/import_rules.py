@@ -9,7 +9,8 @@ from collections.abc import Iterator
 TIERS: tuple[tuple[str, ...], ...] = (
     ("cli", "console", "fleet"),
     ("job",),
-    ("report", "control"),
+    ("report",),
+    ("control",),
     ("acquisition",),
     ("tracking",),
     ("validation",),

@@ -6,9 +6,9 @@ machine.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
@@ -21,6 +21,10 @@ from ambid.job.rotor_records import read_records
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
+
+if TYPE_CHECKING:
+    from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.spectra import PeriodSpectra
 
 _LEAST = 200  # samples
 _AT_REST = 0.25 * 2.0 * np.pi  # rad that a rotor at rest may creep in a record
@@ -84,8 +88,27 @@ def identify_rotor(
             more_checks=_record_checks(benches, rig), rig=rig_entry(rig),
             warnings=[*warnings, *([hint] if hint else [])],
         )  # fmt: skip
+        sensitivity = _sensitivity(estimate, rig, fastest(experiments).spectra)
     clock.lap("checks")
-    return replace(estimate, timing_s=clock.laps, used=tuple(benches))
+    return replace(estimate, sensitivity=sensitivity, timing_s=clock.laps, used=tuple(benches))
+
+
+def fastest(experiments: Sequence[Experiment]) -> Experiment:
+    """Return the experiment at the highest speed, which is that of the estimate's plant."""
+    return max(experiments, key=lambda e: abs(e.speed))
+
+
+def _sensitivity(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> Mapping[str, Any]:
+    """Return the peaks of the sensitivity by axis: the controller is that of the record, or of the rig's [loop]."""
+    from ambid.control.margins import sensitivity_by_axis
+    from ambid.control.measured import measured_sensitivity
+    from ambid.job.margins import closed_loop
+
+    try:
+        loop = closed_loop(estimate, rig, spectra)
+    except EstimationError:
+        return {}
+    return sensitivity_by_axis(loop, measured_sensitivity(spectra, loop.at(spectra.frequency_hz)))
 
 
 def name_of(bench: Record) -> str:

@@ -23,6 +23,12 @@ Complex = NDArray[np.complex128]
 ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"))
 """Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio: 9.5, 12 and 14 dB; beyond is zone D."""
 
+
+def zone_of(peak: float) -> str:
+    """Return the zone of ISO 14839-3 of a peak of the sensitivity, ``"A"`` to ``"D"``."""
+    return next((zone for most, zone in ZONES if peak < most), "D")
+
+
 _REACH = 20.0  # factor on the gains that is looked at, up and down
 _GAINS = 81  # of them, even in the logarithm
 _SLACK = 1e-9  # of a pole on the circle: an integrator that nothing holds
@@ -68,7 +74,7 @@ class LoopMargins:
     @property
     def zone(self) -> str:
         """Zone of ISO 14839-3, ``"A"`` to ``"D"``."""
-        return next((zone for most, zone in ZONES if self.peak[0] < most), "D")
+        return zone_of(self.peak[0])
 
     @property
     def phase_deg(self) -> float | None:

@@ -1,0 +1,1 @@
+"""The loop as it is: its controller, sensitivity, margins and compliance."""

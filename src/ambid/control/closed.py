@@ -1,0 +1,272 @@
+"""A closed loop in the frequency domain: an estimated plant and its controller; sensitivity, openings, compliance.
+
+With positions p and other outputs q of the plant y = H u, and the controller u = F r - K y, the sensitivity at the
+position signals with all else closed is
+
+    S = (I + P C)⁻¹,   P C = H_p (I + K_q H_q)⁻¹ K_p,
+
+in which F cancels: its diagonal is what ISO 14839-3 measures axis by axis. The loop of one axis, opened alone while the
+others stay closed, is L = 1/S_jj - 1. At the commands the same is said of (I + K H)⁻¹.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.controller import Controller
+from ambid.estimation.estimate import Delay
+from ambid.physics.linear_model import LinearModel, StateSpace
+from ambid.physics.rotor_model import RotorModel, position_role
+from ambid.rotor.response import Sampled
+
+_SPAN = 1e-4  # of the rate: the lowest frequency
+_FREQUENCIES = 2400
+_AROUND = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0])  # half widths of a resonance
+_FINE = 121  # frequencies around a peak
+DECIBEL = 20.0 / np.log(10.0)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Plant:
+    """A model with its numbers as an estimate gives them; delays in samples."""
+
+    model: LinearModel
+    theta: Mapping[str, float]
+    delays: Array  # (n_inputs,)
+    rate_hz: float
+    names: tuple[str, ...] = ()  # what was estimated, delays included, in the order of `covariance`
+    covariance: Array | None = None
+
+    @classmethod
+    def of(
+        cls, model: LinearModel, theta: Mapping[str, float], delay: Mapping[str, Delay], rate_hz: float,
+        names: tuple[str, ...] = (), covariance: Array | None = None,
+    ) -> Plant:  # fmt: skip
+        """Return the plant of an estimate's parts."""
+        delays = [delay[role].samples + delay[role].fraction if role in delay else 0.0 for role in model.inputs]
+        return cls(
+            model=model, theta=theta, delays=np.array(delays, dtype=np.float64), rate_hz=rate_hz, names=names,
+            covariance=covariance,
+        )  # fmt: skip
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        """Names of the axes; of a model of one axis, "x"."""
+        return self.model.axes if isinstance(self.model, RotorModel) else ("x",)
+
+    @property
+    def sensors(self) -> tuple[tuple[int, ...], ...]:
+        """The outputs that are positions of each axis; none of a model without a position."""
+        outputs = self.model.outputs
+        if not isinstance(self.model, RotorModel):
+            return ((outputs.index("position"),),) if "position" in outputs else ()
+        of = self.model
+        return tuple(
+            tuple(outputs.index(position_role(axis, k)) for i, k in of.sensors if i == j)
+            for j, axis in enumerate(of.axes)
+        )
+
+    @cached_property
+    def space(self) -> StateSpace:
+        """The matrices."""
+        return self.model.matrices(self.theta)
+
+    def sampled(self, frequency_hz: Array) -> Sampled:
+        """Return the sampled response at some frequencies."""
+        of = self.model
+        held = tuple(not isinstance(of, RotorModel) or of.drive(j) == "voltage" for j in range(len(of.inputs)))
+        return Sampled(
+            space=self.space, omega=2.0 * np.pi * frequency_hz, rate_hz=self.rate_hz, delays=self.delays, held=held
+        )
+
+    def grid(self) -> Array:
+        """Return frequencies up to half the rate, closer around the plant's resonances."""
+        poles = np.linalg.eigvals(self.space.A)
+        size = np.abs(poles)
+        narrow = (np.abs(poles.imag) > 0.9 * size) & (poles.imag > 0.0)
+        around = [
+            (size[k] + side * width * abs(poles[k].real)) / (2.0 * np.pi)
+            for k in np.flatnonzero(narrow) for side in (-1.0, 1.0) for width in _AROUND
+        ]  # fmt: skip
+        low, high = _SPAN * self.rate_hz, 0.499 * self.rate_hz
+        near = np.array([f for f in around if low < f < high], dtype=np.float64)
+        return np.union1d(np.geomspace(low, high, _FREQUENCIES), near)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Peak:
+    """The peak of the sensitivity of one axis."""
+
+    ratio: float
+    frequency_hz: float
+    sd_db: float
+
+    @property
+    def decibel(self) -> float:
+        """Its size in dB."""
+        return float(20.0 * np.log10(self.ratio))
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ClosedLoop:
+    """Plant and controller at some frequencies; without frequencies of its own, on the plant's grid."""
+
+    plant: Plant
+    controller: Controller
+    frequency_hz: Array
+
+    @classmethod
+    def of(cls, plant: Plant, controller: Controller) -> ClosedLoop:
+        """Return the loop on the plant's grid."""
+        return cls(plant=plant, controller=controller, frequency_hz=plant.grid())
+
+    def at(self, frequency_hz: Array) -> ClosedLoop:
+        """Return the loop at other frequencies."""
+        return replace(self, frequency_hz=frequency_hz)
+
+    @cached_property
+    def sampled(self) -> Sampled:
+        """The plant."""
+        return self.plant.sampled(self.frequency_hz)
+
+    @cached_property
+    def H(self) -> Complex:
+        """From inputs to outputs, (n, n_y, n_u)."""
+        return self.sampled.transfer()
+
+    @cached_property
+    def K(self) -> Complex:
+        """From outputs to inputs, without sign, (n, n_u, n_y)."""
+        return self.controller.response(self.frequency_hz)[0]
+
+    @cached_property
+    def _parts(self) -> tuple[list[int], list[int], Complex, Complex]:
+        """Positions p, other outputs q, (I + K_q H_q)⁻¹ K_p, and S over all sensors."""
+        p = [k for group in self.plant.sensors for k in group]
+        q = [k for k in range(self.H.shape[1]) if k not in p]
+        inner = np.eye(self.H.shape[2]) + self.K[:, :, q] @ self.H[:, q]
+        back = np.linalg.solve(inner, self.K[:, :, p])
+        S = np.linalg.inv(np.eye(len(p)) + self.H[:, p] @ back)
+        return p, q, back.astype(np.complex128), S.astype(np.complex128)
+
+    @cached_property
+    def weights(self) -> Complex:
+        """How the controller of each axis weighs its sensors, (n, n_axes, n_p): 1 for a single one."""
+        p = self._parts[0]
+        found = np.zeros((self.frequency_hz.size, len(self.plant.sensors), len(p)), dtype=complex)
+        for j, group in enumerate(self.plant.sensors):
+            at = [p.index(k) for k in group]
+            own = self.K[:, j, list(group)]
+            total = own.sum(axis=1, keepdims=True)
+            found[:, j, at] = np.where(total == 0.0, 1.0 / len(group), own / np.where(total == 0.0, 1.0, total))
+        return found
+
+    @cached_property
+    def together(self) -> Array:
+        """Which sensors an axis has, (n_p, n_axes)."""
+        p = self._parts[0]
+        return np.array([[1.0 * (k in group) for group in self.plant.sensors] for k in p])
+
+    @cached_property
+    def sensitivity(self) -> Complex:
+        """S of the axes at their position signals, (n, n_axes, n_axes); sensors of one axis are taken together."""
+        return np.asarray(self.weights @ self._parts[3] @ self.together)
+
+    @cached_property
+    def at_commands(self) -> Complex:
+        """The sensitivity at the inputs, diagonal of (I + K H)⁻¹, (n, n_u)."""
+        found = np.linalg.inv(np.eye(self.H.shape[2]) + self.K @ self.H)
+        return np.asarray(np.diagonal(found, axis1=1, axis2=2))
+
+    @property
+    def of_axes(self) -> Complex:
+        """The diagonal of `sensitivity`, (n, n_axes)."""
+        return np.asarray(np.diagonal(self.sensitivity, axis1=1, axis2=2))
+
+    def peaks(self) -> tuple[Peak, ...]:
+        """Return the peak of each axis, refined between the frequencies."""
+        found = []
+        for j, size in enumerate(np.abs(self.of_axes).T):
+            fine = self.at(_around(self.frequency_hz, int(np.argmax(size))))
+            k = int(np.argmax(np.abs(fine.of_axes[:, j])))
+            at = self.at(fine.frequency_hz[k : k + 1])
+            found.append(
+                Peak(ratio=float(np.abs(at.of_axes[0, j])), frequency_hz=float(at.frequency_hz[0]), sd_db=at._sd_db(j))
+            )
+        return tuple(found)
+
+    def largest_singular(self) -> tuple[float, float]:
+        """Return the peak of the largest singular value of the sensitivity as a ratio, and its frequency in Hz."""
+
+        def sizes(loop: ClosedLoop) -> Array:
+            return np.asarray(np.linalg.norm(loop.sensitivity, ord=2, axis=(1, 2)))
+
+        fine = self.at(_around(self.frequency_hz, int(np.argmax(sizes(self)))))
+        size = sizes(fine)
+        k = int(np.argmax(size))
+        return float(size[k]), float(fine.frequency_hz[k])
+
+    def compliance(self) -> Complex:
+        """Return the displacement at each magnet by a force there, the loop closed, (n, n_axes), m/N."""
+        of, space, n = self.plant.model, self.plant.space, len(self.plant.axes)
+        if isinstance(of, RotorModel):
+            magnets = of.rows(self.plant.theta)[0]
+            rows = np.hstack([magnets, np.zeros((n, space.A.shape[0] - magnets.shape[1]))])
+        else:
+            rows = space.C[[of.outputs.index("position")]]
+        C, forces = np.vstack([space.C, rows]), space.E[:, :n]
+        wide = replace(self.sampled, space=replace(space, C=C))
+        pushed = replace(
+            wide, space=replace(space, B=forces, C=C), delays=np.zeros(n), held=(False,) * n
+        ).transfer()  # fmt: skip
+        n_y, G = space.C.shape[0], wide.transfer()
+        answer = np.linalg.solve(np.eye(G.shape[2]) + self.K @ G[:, :n_y], self.K @ pushed[:, :n_y])
+        return np.asarray(np.diagonal(pushed[:, n_y:] - G[:, n_y:] @ answer, axis1=1, axis2=2))
+
+    def _sd_db(self, j: int) -> float:
+        """Return the standard deviation of 20 lg |S_jj| at the one frequency of this loop (delta method).
+
+        dS = -S [I, -H_p (I + K_q H_q)⁻¹ K_q] dH (I + K_q H_q)⁻¹ K_p S, and likewise by dK.
+        """
+        p, q, back, S = self._parts
+        H, K = self.H[0], self.K[0]
+        inner = np.linalg.inv(np.eye(H.shape[1]) + K[:, q] @ H[q])
+        right, left = S[0] @ self.together[:, j], self.weights[0, j] @ S[0]
+        driven = back[0] @ right  # what the inputs do, without sign
+        row = np.zeros(H.shape[0], dtype=complex)
+        row[p], row[q] = left, -left @ H[p] @ inner @ K[:, q]
+        scale = -DECIBEL / self.of_axes[0, j]
+        variance = 0.0
+        covariance = self.plant.covariance
+        if covariance is not None and self.plant.names:
+            g = np.real(scale * (row @ self._slopes(driven)))
+            variance += float(g @ covariance @ g)
+        seen = np.zeros(H.shape[0], dtype=complex)
+        seen[p], seen[q] = right, -H[q] @ driven
+        weights = scale * (left @ H[p] @ inner)
+        d = complex(self.controller.backward(self.frequency_hz)[0])
+        for law, weight in zip(self.controller.laws, weights, strict=True):
+            variance += law.variance(d, seen[list(law.outputs)], complex(weight))
+        return float(np.sqrt(max(variance, 0.0)))
+
+    def _slopes(self, driven: Complex) -> Complex:
+        """Return the derivatives of H driven by what was estimated, (n_y, n_names)."""
+        of, names = self.plant.model, self.plant.names
+        roles = [f"{role}.delay" for role in of.inputs]
+        known = [n for n in names if n not in roles]
+        steps = [of.derivative(self.plant.theta, name) for name in known]
+        found = self.sampled.slopes(driven[None, :], steps, len(roles))[0]
+        order: Sequence[int] = [
+            len(known) + roles.index(n) if n in roles else known.index(n) for n in names
+        ]  # fmt: skip
+        return np.asarray(found[:, order])
+
+
+def _around(frequency_hz: Array, k: int) -> Array:
+    """Return frequencies between the neighbours of one."""
+    return np.linspace(frequency_hz[max(k - 1, 0)], frequency_hz[min(k + 1, frequency_hz.size - 1)], _FINE)

@@ -1,0 +1,90 @@
+"""The sensitivity as a record itself shows it: from the responses to the references, without a model of the plant.
+
+With x = T r at the position signals and the controller's K_p and F, S = I - T F⁻¹ K_p. A line at which one reference
+alone has power gives its column of T at once; where several have, neighbouring lines are taken together.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import ClosedLoop
+from ambid.rotor.spectra import PeriodSpectra
+
+_SILENT = 1e-6  # of the largest line, below which a reference has no power
+_COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
+_LINES_PER_UNKNOWN = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MeasuredSensitivity:
+    """|S_jj| of one axis at the lines of its reference, and its standard deviation."""
+
+    frequency_hz: Array  # (n_lines,)
+    ratio: Array
+    sd: Array
+
+    @property
+    def peak(self) -> tuple[float, float]:
+        """Largest ratio, and its frequency in Hz."""
+        k = int(np.argmax(self.ratio))
+        return float(self.ratio[k]), float(self.frequency_hz[k])
+
+
+def measured_sensitivity(spectra: PeriodSpectra, loop: ClosedLoop) -> tuple[MeasuredSensitivity | None, ...]:
+    """Return the sensitivity of each axis as measured, None of an axis without a reference of its own.
+
+    `loop`: at the lines of the spectra; its controller is used, its plant is not.
+    """
+    sensors = loop.plant.sensors
+    if spectra.R is None or spectra.R.shape[1] != len(sensors):
+        return (None,) * len(sensors)
+    size = np.abs(spectra.R)
+    on = size > _SILENT * size.max()
+    K, F = loop.controller.response(spectra.frequency_hz)
+    p = [k for group in sensors for k in group]
+    C = np.linalg.pinv(F) @ K[:, :, p]
+    columns = {k: _column(spectra, on, k, p) for k in range(on.shape[1]) if np.any(on[:, k])}
+    return tuple(_of_axis(spectra, loop, columns, C, on, j) if j in columns else None for j in range(len(sensors)))
+
+
+def _of_axis(
+    spectra: PeriodSpectra, loop: ClosedLoop, columns: dict[int, Complex], C: Complex, on: Array, j: int
+) -> MeasuredSensitivity:
+    """Return the sensitivity of axis `j`; the scatter is that of its own term."""
+    at, f = np.flatnonzero(on[:, j]), spectra.frequency_hz
+    through = C[at] @ loop.together[:, j]  # (n_lines, n_references): what a disturbance of the axis' sensors orders
+    weights = loop.weights[at, j]  # (n_lines, n_p)
+    S = 1.0 - np.sum(weights * columns[j], axis=2) * through[:, j]  # (n_periods, n_lines)
+    for other, column in columns.items():
+        if other == j or np.all(np.abs(through[:, other]) <= _COUPLED * np.abs(through[:, j])):
+            continue
+        mean = column.mean(axis=0)
+        near = np.flatnonzero(on[:, other])
+        found = np.stack([np.interp(f[at], f[near], x) for x in mean.T], axis=1)
+        S = S - np.sum(weights * found, axis=1) * through[:, other]
+    mean = S.mean(axis=0)
+    scatter = np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
+    return MeasuredSensitivity(frequency_hz=f[at], ratio=np.abs(mean), sd=np.sqrt(scatter / 2.0))
+
+
+def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Complex:
+    """Return positions over a reference at its lines, by period, (n_periods, n_lines of it, n_p)."""
+    assert spectra.R is not None
+    R, at = spectra.R, np.flatnonzero(on[:, mine])
+    if not np.any(on[at].sum(axis=1) > 1):
+        return np.asarray(spectra.Y[:, at][:, :, p] / R[at, mine][:, None])
+    others = np.flatnonzero(np.any(on[at], axis=0))
+    window = min(2 * _LINES_PER_UNKNOWN * others.size, R.shape[0])
+    found = np.empty((spectra.n_periods, at.size, len(p)), dtype=complex)
+    for m, k in enumerate(at):
+        first = int(np.clip(k - window // 2, 0, R.shape[0] - window))
+        near = slice(first, first + window)
+        run = (spectra.frequency_hz[near] - spectra.frequency_hz[k])[:, None] / np.ptp(spectra.frequency_hz[near])
+        rows = np.hstack([R[near][:, others], run * R[near][:, others]])
+        answers = np.linalg.lstsq(rows, spectra.Y[:, near][:, :, p].transpose(1, 0, 2).reshape(window, -1), rcond=None)
+        found[:, m] = answers[0][int(np.flatnonzero(others == mine)[0])].reshape(spectra.n_periods, len(p))
+    return found

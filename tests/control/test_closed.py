@@ -1,0 +1,125 @@
+"""The controller from a record, and the sensitivity, against the independent simulator."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.controller import controller_of_loop, identify_controller
+from ambid.control.measured import measured_sensitivity
+from ambid.rotor.spectra import find_excitation, period_spectra
+from ambid.simulation.plant import fed_back
+from tests.rotor_benches import model_of, needs_simulator, rig_of, truth
+
+pytestmark = needs_simulator
+SHORT = {"period": 0.5, "periods": 3}
+
+
+def record_of(bench, seed=1):
+    found = truth.simulate(bench, seed)
+    names = {"voltage": "V", "current": "A", "position": "m", "reference": "A"}
+    table = {f"{axis}_{x}": found[x][:, j] for j, axis in enumerate(truth.AXES) for x in names}
+    units = {f"{axis}_{x}": unit for axis in truth.AXES for x, unit in names.items()}
+    return ambid.Record(
+        rate_hz=bench.rate,
+        channels=tuple(ambid.Channel(name=n, unit=units[n], values=x) for n, x in table.items()),
+    )
+
+
+def free_rig(bench):
+    """A rig that knows the planes alone, and no loop."""
+    rig = rig_of(bench)
+    freed = (p if p.name.endswith((".z", "z_sensor")) else replace(p, role="free", value=None) for p in rig.parameters)
+    return replace(rig, parameters=tuple(freed), loop=None)
+
+
+def plant_of(bench):
+    model, theta = model_of(bench)
+    return Plant(model=model, theta=theta, delays=np.full(4, float(bench.delay)), rate_hz=bench.rate)
+
+
+def spectra_of(bench, seed=1):
+    record, model = record_of(bench, seed), model_of(bench)[0]
+    return period_spectra(record, model, find_excitation(record, model))
+
+
+def identified(spectra, model):
+    own = [[k for k in pair if k >= 0] for pair in fed_back(model)]
+    return identify_controller(
+        spectra.frequency_hz, spectra.mean_u, spectra.mean_y, spectra.R, rate_hz=spectra.rate_hz, own=own
+    )
+
+
+def peaks_of(bench):
+    return [a["iso14839_3_peak_db"] for a in truth.truth(bench)["axes"].values()]
+
+
+@pytest.mark.parametrize("name", ["rigid", "rmit", "flexible"])
+def test_controller_of_a_record_is_exact_and_gives_the_peaks_of_the_truth(name):
+    bench = replace(truth.BENCHES[name], **SHORT)
+    spectra, plant = spectra_of(bench), plant_of(bench)
+    controller = identified(spectra, plant.model)
+    f = np.geomspace(1.0, 0.45 * bench.rate, 50)
+    K, F = controller.response(f)
+    exact = bench.kc * truth.controller_frf(bench, f)
+    for j in range(4):
+        np.testing.assert_allclose(K[:, j, j], exact, rtol=1e-5)
+        np.testing.assert_allclose(K[:, j, 4 + j], bench.kc, rtol=1e-5)
+        np.testing.assert_allclose(F[:, j, j], bench.kc, rtol=1e-5)
+    loop = ClosedLoop.of(plant, controller)
+    assert [p.decibel for p in loop.peaks()] == pytest.approx(peaks_of(bench), abs=2e-4)
+    np.testing.assert_allclose(loop.at(f).sensitivity, truth.sensitivity_frf(bench, f), rtol=1e-5, atol=1e-6)
+
+
+def test_sensitivity_measured_without_a_model_scatters_about_the_truth():
+    bench = replace(truth.BENCHES["rigid"], **SHORT)
+    spectra, plant = spectra_of(bench), plant_of(bench)
+    loop = ClosedLoop(plant=plant, controller=identified(spectra, plant.model), frequency_hz=spectra.frequency_hz)
+    for j, found in enumerate(measured_sensitivity(spectra, loop)):
+        exact = np.abs(truth.sensitivity_frf(bench, found.frequency_hz)[:, j, j])
+        assert np.median(np.abs(found.ratio - exact)) < 0.02
+        assert 0.7 < np.sqrt(np.mean((found.ratio - exact) ** 2)) / np.sqrt(np.mean(found.sd**2)) < 1.4
+
+
+def test_references_that_share_lines_are_told_apart_by_neighbours():
+    bench = replace(truth.BENCHES["rigid"], excitation="full", **SHORT)
+    spectra, plant = spectra_of(bench), plant_of(bench)
+    loop = ClosedLoop(plant=plant, controller=identified(spectra, plant.model), frequency_hz=spectra.frequency_hz)
+    for j, found in enumerate(measured_sensitivity(spectra, loop)):
+        exact = np.abs(truth.sensitivity_frf(bench, found.frequency_hz)[:, j, j])
+        assert np.median(np.abs(found.ratio - exact)) < 0.05
+
+
+def test_loop_of_a_rig_has_the_controller_of_the_truth():
+    bench = truth.BENCHES["rigid"]
+    controller = controller_of_loop(rig_of(bench).loop, model_of(bench)[0], bench.rate)
+    f = np.geomspace(1.0, 0.45 * bench.rate, 50)
+    K = controller.response(f)[0]
+    np.testing.assert_allclose(K[:, 1, 1], bench.kc * truth.controller_frf(bench, f), rtol=1e-9)
+    np.testing.assert_allclose(K[:, 1, 5], bench.kc)
+
+
+@pytest.fixture(scope="module")
+def rigid():
+    """A bench and what is identified of its record alone."""
+    bench = replace(truth.BENCHES["rigid"], **SHORT)
+    return bench, ambid.identify(record_of(bench), free_rig(bench))
+
+
+def test_identified_rotor_knows_its_sensitivity(rigid):
+    bench, estimate = rigid
+    for axis, exact in zip(truth.AXES, peaks_of(bench), strict=True):
+        found = estimate.sensitivity[axis]
+        assert found["peak_db"]["value"] == pytest.approx(exact, abs=0.1)
+        assert abs(found["peak_db"]["value"] - exact) < 4.0 * found["peak_db"]["sd"]
+        assert found["zone"] == "A"
+        assert found["measured_peak_db"] == pytest.approx(exact, abs=0.5)
+
+
+def test_estimate_of_a_rotor_comes_back_from_its_file(rigid, tmp_path):
+    rigid[1].save(tmp_path / "e.json")
+    again = ambid.load(tmp_path / "e.json")
+    assert again.sensitivity == rigid[1].sensitivity
+    np.testing.assert_array_equal(again.covariance, rigid[1].covariance)
