@@ -8,9 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from ambid import load
 from ambid.blackbox.fit_file import NO_INNOVATIONS, fit_from_json
 from ambid.physics.presets import preset
 from ambid.record import read_record
+from tests.blackbox import sweeps
 from tests.job.loops import loop_csv
 
 TRUTH = preset("unstable-bearing").parameters
@@ -238,3 +240,67 @@ def test_simulate_repeats_and_logs_the_excitation(tmp_path, monkeypatch, ambid):
     assert not (tmp_path / "b.csv").exists()
     assert ambid(*words).code == 0
     assert "excitation" not in read_record(tmp_path / "a.csv").names
+
+
+# --- modes ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def sweep_text():
+    """Four seconds of a sweep and three accelerometers, with modes at 60 and 140 Hz."""
+    rng, u = np.random.default_rng(1), sweeps.sweep(4.0)
+    y, _ = sweeps.structure(((60.0, 0.01), (140.0, 0.008)), u, rng, n_outputs=3, noise=0.01)
+    rows = np.column_stack([np.arange(u.size) / sweeps.RATE, u, y])
+    head = "time [s],current [A],a0 [m/s^2],a1 [m/s^2],a2 [m/s^2]"
+    return "\n".join([head, *(",".join(f"{x:.7g}" for x in row) for row in rows)]) + "\n"
+
+
+MODES = ("--output", "a0", "--output", "a1", "--output", "a2", "--modes")
+
+
+def test_modes_are_found_without_a_rig_and_stand_in_the_file(tmp_path, sweep_text, ambid, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sweep.csv").write_text(sweep_text, encoding="utf-8")
+    files = ("--json", "m.json", "--plot", "m.png")
+    found = ambid("frf", "sweep.csv", "--input", "current", *MODES, "auto", "--open-loop", *files)
+    assert found.code == 0
+    assert "modes_fit" in found.out
+    assert max(map(len, found.out.splitlines())) <= 80
+    modes = json.loads(Path("m.json").read_text())["modes"]
+    assert [m["frequency_hz"]["value"] for m in modes] == pytest.approx([60.0, 140.0], rel=1e-3)
+    assert [m["damping"]["value"] for m in modes] == pytest.approx([0.01, 0.008], rel=0.05)
+    for m in modes:
+        assert set(m["shape"]) == {"a0", "a1", "a2"}
+        for number in (m["frequency_hz"], m["damping"], *m["shape"].values()):
+            assert number.keys() >= {"value", "sd", "ci95", "identifiable"}
+    assert Path("m.png").read_bytes().startswith(PNG)
+    again = load("m.json")
+    assert [m.damping.value for m in again.modes] == [m["damping"]["value"] for m in modes]
+    assert "frequency" in again.summary()
+    assert len(again.to_dataframe()) == again.response.frequency_hz.size
+
+
+def test_outputs_alone_give_operational_modes(tmp_path, sweep_text, ambid, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("sweep.csv").write_text(sweep_text, encoding="utf-8")
+    found = ambid("frf", "sweep.csv", *MODES, "2", "--json", "m.json", "--plot", "m.png", "--band", "20:200")
+    assert found.code == 0
+    assert json.loads(Path("m.json").read_text())["schema"] == "ambid.modes/1"
+    assert "operational modes" in load("m.json").summary()
+    assert Path("m.png").read_bytes().startswith(PNG)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--input", "current", *MODES, "few"), "--modes is 'few'; it must be a number of modes, or auto"),
+        ((*MODES, "auto", "--state-space", "n=2"), "a model was requested, and no input was named"),
+        (("--input", "current", *MODES, "auto", "--band", "60:61"), "lines of the record between 60 and 61 Hz"),
+    ],
+)
+def test_modes_that_cannot_be_sought_are_refused_on_one_line(tmp_path, sweep_text, ambid, monkeypatch, words, said):
+    monkeypatch.chdir(tmp_path)
+    Path("sweep.csv").write_text(sweep_text, encoding="utf-8")
+    found = ambid("frf", "sweep.csv", *words)
+    assert (found.code, found.out, found.err.count("\n")) == (2, "", 1)
+    assert said in found.err
