@@ -140,9 +140,11 @@ def test_few_coordinates_with_their_residual_stand_for_the_whole_shaft() -> None
     np.testing.assert_allclose(campbell(TWO_SLEEVES, [20_000 * RPM], supports, lines=8).poles, wanted.poles, rtol=1e-7)
 
 
-def test_speeds_that_do_not_rise_are_refused() -> None:
+def test_what_cannot_be_drawn_is_refused() -> None:
     for speeds in ([], [10.0, 5.0], [-1.0, 2.0]):
         with pytest.raises(ModelError, match="have to rise"):
             campbell(RIGID, speeds)
+    with pytest.raises(ModelError, match="it shows at most 12"):
+        campbell(TWO_DISCS, [0.0], ALIKE, lines=14)
     with pytest.raises(ModelError, match="must be positive"):
         critical_speeds(RIGID, 0.0)

@@ -152,7 +152,8 @@ def campbell(
     Raises
     ------
     ModelError
-        If the speeds do not rise from 0 or more, or a support lies outside the shaft.
+        If the speeds do not rise from 0 or more, a support lies outside the shaft, or more lines are asked for than the
+        elements of a shaft can show.
 
     Examples
     --------
@@ -173,8 +174,13 @@ def campbell(
         raise ModelError("the speeds of a Campbell diagram have to rise from 0 or more. Correct them")
     if isinstance(rotor, Shaft):
         lines = lines or 8
-        planes = [s.z for s in supports]
-        rotor = rotor.free_rotor(min(lines // 2 + _MORE, rotor.elements), planes=planes, residual=True)
+        modes = min(lines // 2 + _MORE, rotor.elements)
+        if lines > 2 * modes:
+            raise ModelError(
+                f"{lines} lines are asked for of a shaft cut into {rotor.elements} elements; it shows at most "
+                f"{2 * modes}. Ask for fewer, or raise elements"
+            )
+        rotor = rotor.free_rotor(modes, planes=[s.z for s in supports], residual=True)
     whirl = _Whirl.of(rotor, supports)
     # at rest two alike planes have double eigenvalues with any shapes: a speed near 0 tells them apart
     first = whirl.at(max(float(speed[0]), 1e-5 * max(float(speed[-1]), 1.0)))
