@@ -1,9 +1,16 @@
 """What is shown of a rotor: tables by bearing, figures, page; and that it comes back from its file."""
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
+import numpy as np
+
 import ambid
+from ambid.job.rotor import replays_of
+from ambid.report.drawing import NARROW
+from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
+from ambid.report.rotor_page import rotor_page
 from tests.report.rotor_record import estimate
 
 
@@ -40,3 +47,62 @@ def test_an_estimate_of_a_rotor_comes_back_from_its_file(tmp_path: Path) -> None
     assert again.plant == e.plant
     assert again.dumps() == e.dumps()
     assert again.summary() == e.summary()
+
+
+@cache
+def evidence() -> RotorEvidence:
+    e = estimate()
+    return RotorEvidence(estimate=e, runs=replays_of(e, e.used))
+
+
+def test_measured_lines_stand_around_the_model_by_their_noise() -> None:
+    (run,) = evidence().runs
+    found = measured_pairs(run, [0, 2], [0, 2])
+    known = np.isfinite(found.sd[:, 0])  # by input
+    assert not np.any(known[:, 0] & known[:, 1])  # zippered: a line is one axis'
+    assert np.count_nonzero(known) > 100
+    for j in range(2):
+        at = known[:, j]
+        away = np.abs(found.G[at, :, j] - run.H[at][:, [0, 2], 2 * j]) / found.sd[at, :, j]
+        assert 0.7 < np.mean(away**2) < 1.3
+
+
+def test_a_band_of_the_response_is_what_its_derivatives_say() -> None:
+    e = estimate()
+    at = response_of(e, evidence().runs[0])
+    moved = dict(e.numbers) | {"m": e.numbers["m"] * (1 + 1e-6)}
+    of = response_of(replace(e, numbers=moved), evidence().runs[0])
+    alone = np.zeros_like(e.covariance)
+    k = e.covariance_names.index("m")
+    alone[k, k] = (e.numbers["m"] * 1e-6) ** 2
+    band = response_of(replace(e, covariance=alone), evidence().runs[0])
+    _, one, other = np.intersect1d(of.frequency_hz, at.frequency_hz, return_indices=True)  # the grid follows the poles
+    assert one.size > 400
+    change = np.abs(np.log(np.abs(of.G[one, 0, 0] / at.G[other, 0, 0])))
+    np.testing.assert_allclose(change, band.log_sd[other, 0, 0], rtol=1e-3, atol=1e-12)
+
+
+def test_poles_of_a_rotor_are_those_of_its_plant_with_a_spread() -> None:
+    e = estimate()
+    found = rotor_poles(e)
+    np.testing.assert_allclose(
+        sorted(p.value.real for p in found), sorted(e.continuous.poles.real), rtol=1e-9, atol=1e-6
+    )
+    assert all(p.covariance is not None and np.all(np.diag(p.covariance) >= 0) for p in found)
+    assert any(p.value.real > 0 for p in found)
+
+
+def test_figure_and_page_of_a_rotor_show_its_record() -> None:
+    e = estimate()
+    figure = rotor_overview(evidence(), NARROW)
+    heads = {a.get_title(loc="left") for a in figure.axes}
+    for pair in ("ax_voltage → ax_position", "by_voltage → ay_position", "bx_voltage → bx_current"):
+        assert pair in heads
+    (residual,) = (a for a in figure.axes if a.get_title(loc="left").startswith("ay_position: "))
+    measured = next(line for line in residual.lines if line.get_label() == "residual")
+    assert len(measured.get_xdata()) == evidence().runs[0].left.shape[0]
+    page = rotor_page(evidence())
+    assert [s.title for s in page.sections][:3] == ["Rotor", "Bearings", "Checks"]
+    assert {"Response in plane x", "Coils", "Residuals", "Poles", "Noise", "Rig"} <= {s.title for s in page.sections}
+    assert e.to_dataframe().loc["ax.k_i", "value"] == e["ax.k_i"].value
+    assert all(s.figure is not None for s in page.sections if s.title in ("Coils", "Residuals", "Poles"))

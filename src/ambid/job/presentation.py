@@ -452,18 +452,21 @@ def _modal() -> View:
 
 
 def _rotor() -> View:
-    from ambid.report.drawing import stacked
+    from ambid.job.rotor import replays_of
+    from ambid.report.rotor_figures import RotorEvidence, rotor_overview
+    from ambid.report.rotor_page import rotor_page
     from ambid.report.rotor_text import rotor_text
 
-    def title(e: Any) -> str:
-        return f"{e.record.get('file') or 'record'}, rotor on {len(e.plant.axes)} axes"
+    def evidence(e: Any, used: Any) -> RotorEvidence:
+        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used))
 
     return View(
         text=rotor_text,
-        figure=lambda e, _, width: stacked(title(e), [], width),
+        figure=lambda e, used, width: rotor_overview(evidence(e, used), width),
+        page=lambda e, used: rotor_page(evidence(e, used)),
         document=lambda e: str(e.dumps()),
-        table=lambda e: parameter_columns(e.parameters),
-        title=title,
+        table=lambda e: parameter_columns((*e.parameters, *e.mode_parameters)),
+        title=lambda e: f"{e.record.get('file') or 'record'}, rotor on {len(e.plant.axes)} axes",
     )
 
 

@@ -23,7 +23,9 @@ from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 
 if TYPE_CHECKING:
+    from ambid.physics.rotor_model import RotorModel
     from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.replay import RotorReplay
     from ambid.rotor.spectra import PeriodSpectra
 
 _LEAST = 200  # samples
@@ -58,7 +60,7 @@ def identify_rotor(
     experiments, remembered, warnings = [], [], [said for r in taken for said in r.warnings]
     for r in taken:
         say("periods")
-        bench, speed = r.bench, speed_of(r.bench, rig) if r.speed is None else r.speed
+        bench, speed = r.bench, speed_of(r.bench, model) if r.speed is None else r.speed
         excitation = find_excitation(bench, model)
         if excitation is None:
             raise EstimationError(
@@ -111,20 +113,36 @@ def _sensitivity(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> M
     return sensitivity_by_axis(loop, measured_sensitivity(spectra, loop.at(spectra.frequency_hz)))
 
 
+def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[RotorReplay, ...]:
+    """Return an estimate on those of its own or other records whose excitation is periodic, channels named by role."""
+    from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.replay import replays
+    from ambid.rotor.spectra import find_excitation, period_spectra
+
+    found, own = [], benches is estimate.used
+    for k, bench in enumerate(benches):
+        speed = float(str(estimate.records[k]["speed"])) if own else speed_of(bench, estimate.plant)
+        excitation = find_excitation(bench, estimate.plant)
+        if excitation is not None:
+            spectra = period_spectra(bench, estimate.plant, excitation, speed)
+            found.append(Experiment(spectra=spectra, speed=speed))
+    return replays(estimate, found)
+
+
 def name_of(bench: Record) -> str:
     """Return the name of a record's file."""
     return str(bench.provenance.get("file") or "record")
 
 
-def speed_of(bench: Record, rig: Rig) -> float:
-    """Return the speed of a record in rad/s: of its angle or speed channel, else as the rig says."""
+def speed_of(bench: Record, model: RotorModel) -> float:
+    """Return the speed of a record in rad/s: of its angle or speed channel, else that of the model."""
     if "angle" in bench:
         turned = np.unwrap(bench["angle"].values)
         seconds, angle = (bench.n_samples - 1) / bench.rate_hz, float(turned[-1] - turned[0])
         return angle / seconds if abs(angle) > _AT_REST else 0.0
     if "speed" in bench:
         return float(np.mean(bench["speed"].values))
-    return 0.0 if rig.rotor is None else rig.rotor.speed
+    return model.speed
 
 
 def _check(bench: Record, rig: Rig) -> None:

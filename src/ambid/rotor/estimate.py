@@ -118,6 +118,21 @@ class RotorEstimate(Parametric, Judged, Linear):
         """Speed of `continuous`, rad/s."""
         return self.plant.speed
 
+    @property
+    def mode_parameters(self) -> tuple[EstimatedParameter, ...]:
+        """Frequency and damping of each bending mode as parameters, ``mode1.frequency_hz``, ``mode1.damping`` …"""
+        named = [
+            (f"mode{r}.{what}", unit, number)
+            for r, m in enumerate(self.modes, 1)
+            for what, unit, number in (("frequency_hz", "Hz", m.frequency_hz), ("damping", "1", m.damping))
+        ]
+        return tuple(
+            EstimatedParameter(
+                name=name, unit=unit, value=x.value, sd=x.sd, ci95=x.ci95, role="free", identifiable=x.identifiable
+            )
+            for name, unit, x in named
+        )
+
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.
 
