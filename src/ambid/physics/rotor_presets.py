@@ -80,7 +80,7 @@ def _utrc() -> Preset:
 def _rmit() -> Preset:
     axes = ("xL", "yL", "xR", "yR")
     numbers = {"k_i": 61.0, "k_x": -150_000.0, "R": 2.0, "L": 30e-3}
-    rigid = {"m": 4.0, "Id": 0.0365, "Ip": 0.0040, "z_cg": 0.20}
+    rigid = {"m": 4.0, "Id": 0.0365, "z_cg": 0.20}
     source = "thesis sec. 1.4"
     return Preset(
         name="rmit",
@@ -88,9 +88,7 @@ def _rmit() -> Preset:
         model="rotor",
         parameters=MappingProxyType({**rigid, **{f"{axis}.{name}": x for axis in axes for name, x in numbers.items()}}),
         rotor=RotorBody(
-            model=RotorModel(
-                bearings=(_radial("L", axes[:2], 0.07, 0.04), _radial("R", axes[2:], 0.33, 0.36)), polar=True
-            ),
+            model=RotorModel(bearings=(_radial("L", axes[:2], 0.07, 0.04), _radial("R", axes[2:], 0.33, 0.36))),
             gap=0.40e-3,
         ),
         loop=Loop(kp=1.7e5, ki=1.5e6, kd=330.0, kc=40.0, derivative_cutoff_hz=1500.0, delay=1.0),
@@ -104,7 +102,7 @@ def _rmit() -> Preset:
                 "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
                 "limits.position": f"{source}: clearance of the actuators",
                 "position_sensor, amplifier": source,
-                "m, Id, Ip, planes, R": "chosen",
+                "m, Id, planes, R": "chosen",
                 "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
                 "gap": "chosen: the clearance and 0.05 mm of iron and cover",
             }
