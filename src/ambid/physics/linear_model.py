@@ -66,6 +66,7 @@ class Parameter:
 
 UNITS = {  # of inputs, outputs, states and disturbances
     "voltage": "V",
+    "command": "V",
     "current": "A",
     "position": "m",
     "velocity": "m/s",

@@ -6,6 +6,10 @@ z runs along the shaft, slopes alpha = dx/dz, beta = dy/dz (theory.md sec. 5). W
     eta'' + 2 zeta w eta' + w² eta + gyroscopic terms = Σ phi(z_b) f,   modal mass 1 kg, the same shapes in both planes,
     f = k_i i_eff - k_x x_b,   i_eff' = a (i - i_eff) where an eddy pole a is asked for (thesis eq. 1.4),
     V = R i + L i' + k_i x_b' (thesis eq. 4.4),   sensors read gain·x(z_s), behind a pole where one is asked for.
+
+Where only the command of a current amplifier is logged, i' = p (g u - i) (thesis eq. 1.5: p = (R + K H)/L and
+g = K/(R + K H), voltages induced by motion neglected against K). Command and position show p, and of k_i and g only the
+product; K, H, R and L cannot be told apart.
 """
 
 from __future__ import annotations
@@ -21,7 +25,7 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.linear_model import UNITS, ParameterSpec, StateSpace, unknown_parameter
 
-Drive = Literal["voltage", "current"]
+Drive = Literal["voltage", "current", "command"]
 
 _STEP = 1e-30
 """Of the complex step: the matrices are rational in the parameters, so that it is exact to rounding."""
@@ -64,7 +68,8 @@ class RotorModel:
     bearings: tuple[Bearing, ...]  # in their order along the shaft
     speed: float = 0.0  # speed of rotation W, rad/s
     polar: bool = False  # whether the polar moment of inertia is a parameter
-    drives: tuple[Drive, ...] = ()  # of each axis: its coil's voltage (current measured), or its measured current
+    # of each axis: its coil's voltage (current measured), its measured current, or the command of its current amplifier
+    drives: tuple[Drive, ...] = ()
     extras: tuple[str, ...] = ()  # optional parameters that are asked for: "a", "<axis>.gain", "<axis>.sensor_pole"
     n_modes: int = 0  # bending modes
     name: str = "rotor"
@@ -108,8 +113,13 @@ class RotorModel:
         return tuple(j for j in range(len(self.axes)) if self.drive(j) == "voltage")
 
     @cached_property
+    def amplified(self) -> tuple[int, ...]:
+        """Axes that are driven by the command of an amplifier."""
+        return tuple(j for j in range(len(self.axes)) if self.drive(j) == "command")
+
+    @cached_property
     def inputs(self) -> tuple[str, ...]:
-        """One an axis: its voltage, or its current."""
+        """One an axis: its voltage, its current, or the command of its amplifier."""
         return tuple(f"{axis}_{self.drive(j)}" for j, axis in enumerate(self.axes))
 
     @cached_property
@@ -141,6 +151,7 @@ class RotorModel:
         return (
             *self.coordinates, *(f"{q}_rate" for q in self.coordinates),
             *(f"{self.axes[j]}_current" for j in self.coils), *eddy, *lagged,
+            *(f"{self.axes[j]}_amplifier_current" for j in self.amplified),
         )  # fmt: skip
 
     @cached_property
@@ -179,6 +190,14 @@ class RotorModel:
                         name=f"{axis}.R", unit="ohm", meaning=f"coil resistance of axis {axis}", positive=True
                     ),
                     ParameterSpec(name=f"{axis}.L", unit="H", meaning=f"coil inductance of axis {axis}", positive=True),
+                ]
+            if j in self.amplified:
+                gain, pole = f"{axis}.amplifier_gain", f"{axis}.amplifier_pole"
+                found += [
+                    ParameterSpec(name=gain, unit="A/V", meaning=f"static gain of the amplifier of axis {axis}"),
+                    ParameterSpec(
+                        name=pole, unit="rad/s", meaning=f"pole of the amplifier of axis {axis}", positive=True
+                    ),
                 ]
             if f"{axis}.gain" in self.extras:
                 found.append(
@@ -327,7 +346,7 @@ class RotorModel:
         n, n_i, axes, coils = len(self.coordinates), len(self.coils), self.axes, list(self.coils)
         eddy, lagged = "a" in self.extras, [k for k, (j, _) in enumerate(self.sensors) if self._pole(j)]
         n_e = len(axes) if eddy else 0
-        size = 2 * n + n_i + n_e + len(lagged)
+        size = 2 * n + n_i + n_e + len(lagged) + len(self.amplified)
         position, rate = slice(0, n), slice(n, 2 * n)
         current = 2 * n + np.arange(n_i)
         effective = 2 * n + n_i + np.arange(n_e)
@@ -349,7 +368,11 @@ class RotorModel:
         A[current, rate] = -(k_i[coils] / inductance)[:, None] * magnets[coils]
         B[current, coils] = E[current, len(axes) + np.arange(n_i)] = 1.0 / inductance
         pull = force * k_i  # of one ampere in each axis
-        where = dict(zip(coils, current, strict=True))
+        ordered = size - len(self.amplified) + np.arange(len(self.amplified))
+        for j, state in zip(self.amplified, ordered, strict=True):
+            made, pole = theta[f"{axes[j]}.amplifier_gain"], theta[f"{axes[j]}.amplifier_pole"]
+            A[state, state], B[state, j] = -pole, pole * made
+        where = dict(zip([*coils, *self.amplified], [*current, *ordered], strict=True))
         for j in range(len(axes)):
             into, gain = (effective[j], theta["a"]) if eddy else (rate, pull[:, j])
             if j in where:

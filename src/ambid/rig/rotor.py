@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ambid.physics.linear_model import LinearModel
     from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, QuantityEntry, RigFile, TurningEntry
 
+_DRIVES: tuple[Drive, ...] = ("voltage", "current", "command")
 TURN = 2.0 * math.pi
 _SPEEDS = {"rad/s": 1.0, "Hz": TURN}
 """SI units in which a speed may be given, and what makes rad/s of them."""
@@ -26,7 +27,7 @@ def rotor_of(file: RigFile, where: str) -> RotorModel:
     """Return the rotor that a rig file describes by ``[bearings.X]``.
 
     `where`: the file, for messages. An axis with a voltage channel, or of a rig without channels, is driven by that
-    voltage; one with a current alone by its current.
+    voltage; else by its current, or by the command of its amplifier.
     """
     if file.model != "rotor":
         raise RigError(f'{where}: [bearings] are given, but the model is {file.model!r}. Set model = "rotor"')
@@ -35,13 +36,13 @@ def rotor_of(file: RigFile, where: str) -> RotorModel:
     axes = [axis for b in bearings for axis in b.axes]
     drives: list[Drive] = []
     for axis in axes:
-        driven = not file.channels or f"{axis}_voltage" in file.channels
-        if not driven and f"{axis}_current" not in file.channels:
+        found: list[Drive] = [x for x in _DRIVES if f"{axis}_{x}" in file.channels]
+        if file.channels and not found:
             raise RigError(
-                f"{where}: axis {axis!r} has neither [channels.{axis}_voltage] nor [channels.{axis}_current]; one of "
-                "them drives it. Add it with its column"
+                f"{where}: axis {axis!r} has none of [channels.{axis}_voltage], [channels.{axis}_current] and "
+                f"[channels.{axis}_command]; one of them drives it. Add it with its column"
             )
-        drives.append("voltage" if driven else "current")
+        drives.append(found[0] if found else "voltage")
     known = {f"{axis}.{what}" for axis in axes for what in ("gain", "sensor_pole")} | {"a"}
     return RotorModel(
         bearings=bearings, speed=speed, drives=tuple(drives),

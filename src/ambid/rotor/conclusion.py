@@ -232,6 +232,8 @@ def _hint(unseen: Sequence[str]) -> str:
     kinds = {name.split(".")[-1] for name in unseen}
     if {"m", "k_i"} <= kinds and "R" not in kinds:
         return "Without voltages only ratios to m show: log the coil voltages, or give m as fixed"
+    if {"k_i", "amplifier_gain"} <= kinds:
+        return "Commands show k_i and the gain of the amplifier as a product only: give one of them as fixed"
     if kinds & {"z_sensor", "z"}:
         return "Give one length between planes"
     if kinds == {"Ip"}:

@@ -61,7 +61,7 @@ def sampled(experiment: Experiment, model: RotorModel, at: Point) -> Sampled:
     spectra = experiment.spectra
     return Sampled(
         space=model.at_speed(experiment.speed).matrices(at.theta), omega=spectra.omega, rate_hz=spectra.rate_hz,
-        delays=at.delays, held=tuple(model.drive(j) == "voltage" for j in range(len(model.axes))),
+        delays=at.delays, held=tuple(model.drive(j) != "current" for j in range(len(model.axes))),
     )  # fmt: skip
 
 

@@ -58,10 +58,15 @@ def rigid_start(
     """Return start values of the rigid rotor from one band of lines; values that are fixed or given are kept."""
     known = {p.name: p.value for p in parameters if p.value is not None}
     planes = planes_known(model, known)
-    seen = _see(experiment.spectra, model, planes)
+    amplifiers = {
+        p.name: known.get(p.name, 1.0 if p.unit == "A/V" else np.pi * experiment.spectra.rate_hz)
+        for p in model.parameters
+        if ".amplifier_" in p.name
+    }
+    seen = _see(experiment.spectra, model, planes, amplifiers)
     electric = {n: v for n, v in known.items() if n.split(".")[-1] in ("R", "L", "k_i")}
     delays, coils = _coils(experiment.spectra, model, seen, electric)
-    theta = {**planes, **coils}
+    theta = {**planes, **coils, **amplifiers}
     if "a" in model.extras:
         theta["a"] = known.get("a", eddy or 2.0 * np.pi * 1000.0)
     for name in model.extras:
@@ -72,8 +77,10 @@ def rigid_start(
     return Point(theta={**theta, **known}, delays=delays)
 
 
-def _see(spectra: PeriodSpectra, model: RotorModel, planes: Mapping[str, float]) -> _Seen:
-    """Return what the sensors show of the rigid motion."""
+def _see(
+    spectra: PeriodSpectra, model: RotorModel, planes: Mapping[str, float], amplifiers: Mapping[str, float]
+) -> _Seen:
+    """Return what the sensors show of the rigid motion, and the currents; a command's as its amplifier makes it."""
     n, n_axes = spectra.frequency_hz.size, len(model.axes)
     Y, noise = spectra.mean_y, spectra.scatter[1] / spectra.n_periods
     at = np.zeros((n, n_axes), dtype=complex)
@@ -99,6 +106,10 @@ def _see(spectra: PeriodSpectra, model: RotorModel, planes: Mapping[str, float])
             current[:, j], noise_i[:, j] = Y[:, k], noise[:, k]
         else:
             current[:, j], noise_i[:, j] = spectra.mean_u[:, j], spectra.scatter[0][:, j] / spectra.n_periods
+            if j in model.amplified:
+                gain, pole = (amplifiers[f"{model.axes[j]}.amplifier_{q}"] for q in ("gain", "pole"))
+                made = gain * pole / (1j * spectra.omega + pole)
+                current[:, j], noise_i[:, j] = current[:, j] * made, noise_i[:, j] * np.abs(made) ** 2
     return _Seen(
         omega=spectra.omega, at_magnets=at, of_planes=of_planes, current=current, noise_x=noise_x, noise_i=noise_i
     )

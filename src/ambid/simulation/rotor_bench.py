@@ -94,6 +94,13 @@ class RotorBench:
         """Of every axis."""
         return self.rig.noise or Noise()
 
+    @property
+    def _currents(self) -> tuple[str, ...]:
+        """States that are currents of coils."""
+        of = self.model
+        coils = dict.fromkeys(of.coils, "") | dict.fromkeys(of.amplified, "_amplifier")
+        return tuple(f"{of.axes[j]}{kind}_current" for j, kind in sorted(coils.items()))
+
     @cached_property
     def largest_pole(self) -> float:
         """Largest modulus of the sampled loop's poles."""
@@ -122,7 +129,7 @@ class RotorBench:
             )
         n = u.shape[0]
         measured, command, truth = (np.empty((n, m)) for m in (len(of.outputs), u.shape[1], len(of.axes)))
-        truth = np.empty((n, len(of.axes) + len(of.coils)))
+        truth = np.empty((n, len(of.axes) + len(self._currents)))
         counts = np.array([-1, -1, 0], dtype=np.int64)
         angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
         lost = self._run(u, np.random.default_rng(seed), angle, counts, measured, command, truth)
@@ -132,7 +139,10 @@ class RotorBench:
                 f"the simulation closes a gap or diverges at {at}; an unstable plant needs a loop that holds it. Give "
                 "limits.position, or another loop"
             )
-        names = (*(f"{axis}_position" for axis in of.axes), *(f"{of.axes[j]}_current" for j in of.coils))
+        names = (
+            *(f"{axis}_position" for axis in of.axes),
+            *(name.replace("_amplifier", "") for name in self._currents),
+        )
         low, high = self.limits.current
         currents = truth[settle:, len(of.axes) :]
         values = dict(zip(of.inputs, command[settle:].T, strict=True))
@@ -201,7 +211,7 @@ class RotorBench:
         equations = self._sampled(continuous, fraction) if self.poles is None else self._nonlinear(self.poles, fraction)
         x = np.zeros(continuous.A.shape[0])
         x[len(of.states) :: 2] = 1.0
-        states = [of.states.index(f"{of.axes[j]}_current") for j in of.coils]
+        states = [of.states.index(name) for name in self._currents]
         return int(
             run_rotor(
                 u, self._noise(rng, u.shape[0]), self._runout(angle),
