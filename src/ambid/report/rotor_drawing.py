@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.modes import Mode
+from ambid.physics.drawn_rotor import free_rotor_of, whirl_sd
+from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import FreeRotor, Shaft
-from ambid.physics.whirl import Campbell
+from ambid.physics.whirl import Campbell, campbell
 from ambid.report.drawing import (
     BOUND,
     GREEN,
@@ -32,6 +34,7 @@ if TYPE_CHECKING:
 _STEEL, _DISC = "#d9dde2", "#b9c2cc"
 _WIDEST = 0.45  # of the length: what a disc given by its mass alone is drawn like, at most
 _FORWARD, _BACKWARD = PREDICTED, ORANGE
+_SPEEDS = 41  # of a Campbell diagram
 _PLANAR = 0.02  # of a circular orbit, under which a whirl has no direction
 
 
@@ -59,12 +62,47 @@ def campbell_panel(
     sd: Array | None = None,
     speeds: Sequence[float] = (),
 ) -> Panel:
-    """Draw whirl frequencies over speed: identified lines, with 95 % bands from `sd`; those of a drawing dashed.
+    """Draw whirl frequencies over speed: identified lines, with 95 % bands from `sd`; those of a drawing dashed, grey
+    where both are drawn.
 
     `sd`: standard deviations of the identified frequencies in rad/s, (n_speeds, n_lines); `speeds`: at which records
     were taken, rad/s. Where a line meets the speed itself (1x), a critical speed is marked.
     """
     return panel(_campbell, identified, drawn, sd, speeds, height=4.2)
+
+
+def campbell_block(
+    model: RotorModel,
+    theta: Mapping[str, float],
+    *,
+    names: Sequence[str] = (),
+    covariance: Array | None = None,
+    speeds: Sequence[float] = (),
+    shaft: Shaft | None = None,
+) -> Block | None:
+    """Draw the whirl of a rotor without its bearings over speed; None where neither parameters nor drawing turn.
+
+    `theta`: numbers of the model, which show a turning rotor where ``Ip`` is among them; `covariance`: of `names`;
+    `speeds`: of its records, rad/s. Drawn as far as the first critical speed of bending, or a quarter beyond records.
+    """
+    turning = "Ip" in theta
+    if not turning and shaft is None:
+        return None
+    rotor = free_rotor_of(model, theta) if turning else None
+    drawn = None if shaft is None else shaft.free_rotor(max(model.n_modes, 1))
+    lowest = min(r.omega[2] for r in (rotor, drawn) if r is not None and r.omega.size > 2) if model.n_modes else 0.0
+    most = max(1.25 * max(speeds, default=0.0), 1.25 * lowest) or 2000.0
+    at = np.linspace(0.0, most, _SPEEDS)
+    identified = None if rotor is None else campbell(rotor, at)
+    sd = None
+    if identified is not None and covariance is not None:
+        known = [k for k, name in enumerate(names) if name in {p.name for p in model.parameters}]
+        sd = whirl_sd(model, theta, [names[k] for k in known], covariance[np.ix_(known, known)], identified)
+    lines = None if shaft is None else campbell(shaft, at, lines=2 * model.n_modes + 1 if model.n_modes else 5)
+    turned = [x for x in speeds if x > 0]
+    return Block(
+        columns=[[campbell_panel(identified, drawn=lines, sd=sd, speeds=turned)]], title="whirl without bearings"
+    )
 
 
 def _ends(planes: Mapping[str, float], shaft: Shaft | None) -> tuple[float, float]:
@@ -183,13 +221,12 @@ def _campbell(
     """Frequencies in Hz over speed in 1/min."""
     given = [x for x in (identified, drawn) if x is not None]
     most = max(float(x.speed[-1]) for x in given)
-    criticals: list[str] = []
-    for which, dashed in ((drawn, True), (identified, False)):
-        if which is None:
-            continue
-        _lines(axes, which, None if dashed else sd, dashed=dashed)
-        if which is identified or identified is None:
-            criticals = _criticals(axes, which)
+    if identified is not None:
+        _lines(axes, identified, sd, {})
+    if drawn is not None:
+        apart = {"color": MEASURED, "label": "from the drawing", "linewidth": 1.0} if identified is not None else {}
+        _lines(axes, drawn, None, {"linestyle": "--", **apart})
+    criticals = _criticals(axes, given[0])
     at = np.array([0.0, most])
     axes.plot(at * 30 / np.pi, at / (2 * np.pi), color=MEASURED, linewidth=0.9, label="speed itself (1x)")
     for speed in speeds:
@@ -202,19 +239,17 @@ def _campbell(
     head(axes, f"critical {many} {', '.join(criticals)} 1/min" if criticals else "no critical speed up to here")
 
 
-def _lines(axes: Axes, which: Campbell, sd: Array | None, *, dashed: bool) -> None:
-    """The lines of one diagram, by their direction over the upper half of the speeds, with bands."""
+def _lines(axes: Axes, which: Campbell, sd: Array | None, style: Mapping[str, Any]) -> None:
+    """The lines of one diagram with bands, in the colour of their direction over the upper half of the speeds."""
     x, f = which.speed * 30 / np.pi, which.frequency / (2 * np.pi)
     for k in range(f.shape[1]):
         known = np.isfinite(f[:, k])
         if not known.any():
             continue
         way = float(np.mean(which.direction[known, k][-max(1, int(known.sum()) // 2) :]))
-        color = _FORWARD if way > _PLANAR else _BACKWARD if way < -_PLANAR else SKY
-        name = "forward" if way > _PLANAR else "backward" if way < -_PLANAR else "in a plane"
-        label = f"{name}, from the drawing" if dashed else name
-        style = {"linestyle": "--", "linewidth": 1.0, "alpha": 0.75} if dashed else {"linewidth": 1.6}
-        axes.plot(x, f[:, k], color=color, label=label, **style)
+        color, label = (_FORWARD, "forward") if way > _PLANAR else (_BACKWARD, "backward")
+        color, label = (SKY, "in a plane") if abs(way) <= _PLANAR else (color, label)
+        axes.plot(x, f[:, k], **{"color": color, "label": label, "linewidth": 1.6, **style})
         if sd is not None:
             half = NORMAL_95 * sd[:, k] / (2 * np.pi)
             axes.fill_between(x, f[:, k] - half, f[:, k] + half, color=color, alpha=0.25, linewidth=0)
