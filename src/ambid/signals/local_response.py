@@ -18,6 +18,7 @@ from ambid.errors import EstimationError
 from ambid.signals.response import FEEDBACK, FrequencyResponse, Hold, checked, labels, ratio, weak_inputs
 
 _DEGREE = 2  # of the polynomials
+_LOUD = 1e-6  # power of a line over the largest, from which it is excited
 _CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
 _WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1
 
@@ -161,10 +162,18 @@ def _plan(X: Complex, Z: Complex, free: int | None) -> _Plan:
             "as many lines as signals. Give more"
         )
     unknowns = (_DEGREE + 1) * (X.shape[1] + 1)
-    half = (unknowns + free) // 2
+    half = max(unknowns + free, (_DEGREE + 2) * _apart(X)) // 2
     if X.shape[0] < 2 * half + 1:
         raise EstimationError(f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record")
     return _Plan(half=half, unknowns=unknowns)
+
+
+def _apart(X: Complex) -> int:
+    """Return how many lines lie between those that excite the sparsest input: a zippered multisine leaves most out."""
+    power = np.abs(X) ** 2
+    loud = power > _LOUD * power.max(axis=0)
+    gaps = [np.diff(np.flatnonzero(column)) for column in loud.T]
+    return max((int(np.percentile(g, 90)) for g in gaps if g.size), default=1)
 
 
 def _in_band(frequency: Array, band: tuple[float, float] | None) -> np.ndarray:
