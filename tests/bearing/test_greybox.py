@@ -80,7 +80,7 @@ def test_fractional_delays_are_found(name, delay):
     assert fit.status == "converged"
     assert fit.problem.fractional
     assert fit.problem.delay == int(delay)
-    assert 0 <= fit.problem.lag_at(fit.vector) < 1
+    assert 0 <= fit.problem.lags_at(fit.vector)[0] < 1
     assert abs(fit.problem.delay_samples(fit.vector) - delay) < 4 * uncertainty(fit).delay_sd
     assert max(judged(fit, bench)[2].values()) < 3.5
 

@@ -66,7 +66,11 @@ def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
         mean[problem.slices["noise"]] = problem.noise_center
         inverse_sd[problem.slices["noise"]] = 1 / NOISE_PRIOR_SD
     active = inverse_sd > 0
-    return ((vector - mean) * inverse_sd)[active], np.diag(inverse_sd)[active]
+    r, J = ((vector - mean) * inverse_sd)[active], np.diag(inverse_sd)[active]
+    if problem.joint_priors is not None:
+        slopes, left = problem.joint_priors(vector[:n])
+        r, J = np.concatenate([r, -left]), np.vstack([J, np.pad(slopes, ((0, 0), (0, problem.size - n)))])
+    return r, J
 
 
 def criterion(problem: PredictorProblem, vector: Array, covariance: Array) -> float:

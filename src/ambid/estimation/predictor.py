@@ -11,8 +11,8 @@ F^T + dA P F^T + F P dA^T + dQ + K dR K^T (a Lyapunov equation, because the gain
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 from typing import Any, Literal
 
@@ -52,9 +52,11 @@ class PredictorProblem:
     prior_sd: Array
     scales: Scales
     delay: int = 0  # whole samples of delay on all inputs
-    lag: float = 0.0  # fraction of a sample of delay on top, 0 <= lag < 1, where it is not estimated
+    # fraction of a sample of delay on top, 0 <= lag < 1, where it is not estimated; one for all inputs, or (n_inputs,)
+    lag: float | Array = 0.0
     # whether the delay is estimated as a real number near `delay`: delay - 1 < total < delay + 2
     fractional: bool = False
+    late: tuple[int, ...] = (0,)  # inputs of which it is estimated, each on its own
     # samples left out at the start, so that fits with different delays see the same data; at least ``delay + 2``
     skip: int = 2
     # the predictor sees every stride-th output (all inputs act); more than 1 only with noise "gain" or "given"
@@ -65,6 +67,9 @@ class PredictorProblem:
     noise_center: Array = field(default_factory=lambda: np.zeros(0))
     # (n_states, n_outputs), predictor gain in scaled units, for noise "given"
     gain: Array = field(default_factory=lambda: np.zeros((0, 0)))
+    # slopes (n, n_estimated) and residuals (n,) of priors at the estimated physical parameters (n_estimated,), over
+    # their standard deviations, where they are not each of one parameter
+    joint_priors: Callable[[Array], tuple[Array, Array]] | None = None
 
     slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
 
@@ -76,7 +81,7 @@ class PredictorProblem:
         n, n_y, n_d = len(self.model.states), len(self.model.outputs), len(self.model.disturbances)
         sizes = {
             "physical": self.n_physical,
-            "fraction": int(self.fractional),
+            "fraction": len(self.late) if self.fractional else 0,
             "noise": {"levels": n_d + n_y - 1, "gain": n * n_y, "given": 0}[self.noise],
             "offset": n_d,
             "initial": n,
@@ -99,7 +104,7 @@ class PredictorProblem:
         """Lags beyond `delay`, in samples, at which the input acts over one sample."""
         if self.fractional:
             return (-1, 0, 1, 2)
-        return (0, 1) if self.lag else (0,)
+        return (0, 1) if np.any(self.lag) else (0,)
 
     @property
     def lags(self) -> tuple[int, ...]:
@@ -119,19 +124,23 @@ class PredictorProblem:
         values = vector[self.slices["physical"]] * self.magnitude
         return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
 
-    def lag_at(self, vector: Array) -> float:
-        """Return the delay in samples beyond `delay` at a vector.
+    def lags_at(self, vector: Array) -> Array:
+        """Return the delay of each input in samples beyond `delay` at a vector, (n_inputs,).
 
         `vector`: (size,).
         """
-        return float(vector[self.slices["fraction"]][0]) if self.fractional else self.lag
+        out = np.empty(self.u.shape[1])
+        out[:] = self.lag
+        if self.fractional:
+            out[list(self.late)] = vector[self.slices["fraction"]]
+        return out
 
     def delay_samples(self, vector: Array) -> float:
-        """Return the whole delay in samples at a vector.
+        """Return the whole delay of the first input in samples at a vector.
 
         `vector`: (size,).
         """
-        return self.delay + self.lag_at(vector)
+        return self.delay + float(self.lags_at(vector)[0])
 
 
 def noise_floor(y: Array) -> Array:
@@ -179,6 +188,9 @@ def all_scales(
     ]
 
 
+_KRONECKER = 6  # states up to which a Lyapunov equation is solved as a linear one: small systems are quicker so
+_DOUBLINGS = 60
+_ROUNDING = 1e-16
 _STEP = 1e-7  # of a Newton step, relative: convergence is quadratic, which leaves an error of about 1e-14
 
 
@@ -283,23 +295,41 @@ def solve_lyapunov(F: Array, Q: Array) -> Array:
     `F`: (n, n), stable, or (n_plants, n, n); `Q`: symmetric right-hand sides. Returns symmetric solutions.
     """
     n = F.shape[-1]
+    if n > _KRONECKER:
+        return _doubled(F, Q)
     kronecker = (F[..., :, None, :, None] * F[..., None, :, None, :]).reshape(*F.shape[:-2], n * n, n * n)
     right = Q.reshape(-1, n * n).T if F.ndim == 2 else Q.reshape(-1, n * n, 1)
     P = _turned(np.linalg.solve(np.eye(n * n) - kronecker, right)).reshape(Q.shape)
     return np.asarray(0.5 * (P + _turned(P)), dtype=np.float64)
 
 
-def gain_derivatives(A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array) -> Array:
+def _doubled(F: Array, Q: Array) -> Array:
+    """Sum F^k Q (F^k)^T by doubling the number of terms (Smith 1968): n^3 work a step, where n^2 equations cost n^6."""
+    P = Q
+    with np.errstate(over="ignore", invalid="ignore"):
+        for _ in range(_DOUBLINGS):
+            more = F @ P @ _turned(F)
+            P, F = P + more, F @ F
+            if not np.abs(more).max() > _ROUNDING * np.abs(P).max():
+                break
+    return np.asarray(0.5 * (P + _turned(P)), dtype=np.float64)
+
+
+def gain_derivatives(
+    A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array, dC: Array | None = None
+) -> Array:
     """Differentiate the predictor gain exactly along p directions.
 
-    `A`: (n_states, n_states); `C`: (n_outputs, n_states), independent of the parameters; `at`: solution at the point;
-    `dA`, `dQ`: (p, n_states, n_states); `dR`: (p, n_outputs, n_outputs). Returns (p, n_states, n_outputs), dK = (dA P
-    C^T + F dP C^T - K dR) S^-1.
+    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `at`: solution at the point; `dA`, `dQ`: (p, n_states,
+    n_states); `dR`: (p, n_outputs, n_outputs); `dC`: (p, n_outputs, n_states), none where no parameter moves C. Returns
+    (p, n_states, n_outputs), dK = (dF P C^T + F dP C^T + F P dC^T - K dR) S^-1 with dF = dA - K dC.
     """
-    F = A - at.K @ C
-    cross = dA @ at.P @ F.T
+    F, dF = A - at.K @ C, dA if dC is None else dA - at.K @ dC
+    cross = dF @ at.P @ F.T
     dP = solve_lyapunov(F, cross + np.swapaxes(cross, 1, 2) + dQ + at.K @ dR @ at.K.T)
-    right = dA @ at.P @ C.T + F @ dP @ C.T - at.K @ dR
+    right = dF @ at.P @ C.T + F @ dP @ C.T - at.K @ dR
+    if dC is not None:
+        right = right + F @ at.P @ np.swapaxes(dC, 1, 2)
     return np.swapaxes(np.linalg.solve(at.S, np.swapaxes(right, 1, 2)), 1, 2)
 
 
@@ -331,6 +361,7 @@ class Predictor:
     E: Array  # (n, n_disturbances), what constant disturbances do over one step
     dE: Array  # (n, n_disturbances, size), exact derivative of `E`
     C: Array  # (n_outputs, n)
+    dC: Array  # (n_outputs, n, size), size 0 where no number moves C
     x0: Array  # (n,)
     gain: Array  # (n, n_outputs)
     innovations: Innovations | None  # Riccati solution, where the noise is described by levels
@@ -355,9 +386,9 @@ def assemble(
     no stable predictor or no physical plant (mass or inductance not positive).
     """
     sl = problem.slices
-    theta, lag = problem.parameters(vector), problem.lag_at(vector)
+    theta, lag = problem.parameters(vector), problem.lags_at(vector)
     possible = np.all(np.isfinite(vector)) and all(theta.get(name, 1.0) > 0 for name in ("m", "L"))
-    if not possible or not -1.0 < lag < 2.0 or problem.delay + lag < 0.0:
+    if not possible or not np.all((lag > -1.0) & (lag < 2.0) & (problem.delay + lag >= 0.0)):
         return None
     try:
         plant, slopes = _discrete(problem, theta, lag, with_derivatives=with_derivatives)
@@ -373,7 +404,7 @@ def assemble_all(problems: Sequence[PredictorProblem], vectors: Sequence[Array])
     `problems`: of one model, noise described by levels, delays equal but for whole samples; `vectors`: (size,) each.
     """
     first, sl = problems[0], problems[0].slices
-    lag, pairs = first.lag, list(zip(problems, vectors, strict=True))
+    lag, pairs = first.lags_at(vectors[0]), list(zip(problems, vectors, strict=True))
     try:
         C = first.model.matrices(first.parameters(vectors[0])).C * first.scales.state / first.scales.output[:, None]
         plants = _discrete_all(pairs, C, lag if len(first.taps) > 1 else None)
@@ -396,7 +427,7 @@ def assemble_all(problems: Sequence[PredictorProblem], vectors: Sequence[Array])
 def _recursion(
     problem: PredictorProblem,
     vector: Array,
-    lag: float,
+    lag: Array,
     plant: DiscreteSpace,
     K: Array,
     inner: Innovations | None = None,
@@ -411,12 +442,15 @@ def _recursion(
         return None
     M = np.hstack([F, step.inputs, K, (step.E @ offset)[:, None]])
     dM = np.zeros((*M.shape, 0 if dK is None else problem.size))
-    dE = np.zeros((*step.E.shape, dM.shape[2]))
+    dE, dC = np.zeros((*step.E.shape, dM.shape[2])), None
     if dK is not None:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
             dM[:, :n, q], dM[:, n:first_y, q], dM[:, -1, q] = d.A, d.inputs, d.E @ offset
             dE[:, :, q] = d.E
+        dC = _slopes_of_C(slopes, plant.C)
+        if dC is not None:
+            dM[:, :n, : len(dC)] -= np.moveaxis(K @ dC, 0, 2)
         # dK holds physical parameters, delay and noise in the order of the vector
         dM[:, :n, : len(dK)] -= np.moveaxis(dK @ plant.C, 0, 2)
         dM[:, first_y:-1, : len(dK)] += np.moveaxis(dK, 0, 2)
@@ -428,14 +462,20 @@ def _recursion(
         E=step.E,
         dE=dE,
         C=np.ascontiguousarray(plant.C),
+        dC=np.zeros((*plant.C.shape, 0)) if dC is None else np.moveaxis(dC, 0, 2),
         x0=vector[sl["initial"]].copy(),
         gain=K,
         innovations=inner,
     )
 
 
+def _slopes_of_C(slopes: Sequence[DiscreteSpace], C: Array) -> Array | None:
+    """Derivatives of C, (n_slopes, n_outputs, n), none where all vanish."""
+    return stack([d.C for d in slopes], C.shape) if any(np.any(d.C) for d in slopes) else None
+
+
 def _discrete(
-    problem: PredictorProblem, theta: dict[str, float], lag: float, *, with_derivatives: bool
+    problem: PredictorProblem, theta: dict[str, float], lag: Array, *, with_derivatives: bool
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
     """Scaled discrete plant, and its derivatives by the physical parameters and the delay."""
     model, sc = problem.model, problem.scales
@@ -443,22 +483,22 @@ def _discrete(
     spaces = [model.matrices(theta), *(model.derivative(theta, name) for name in names)]
     # a derivative by a parameter becomes one by its scaled value
     factor = np.concatenate([[1.0], problem.magnitude[: len(names)]])[:, None, None]
-    A, B, E = (
-        factor * np.array(stacked) * size / sc.state[:, None]
-        for stacked, size in (
-            ([x.A for x in spaces], sc.state),
-            ([x.B for x in spaces], sc.input),
-            ([x.E for x in spaces], sc.disturbance),
+    A, B, E, C = (
+        factor * np.array(stacked) * size / over[:, None]
+        for stacked, size, over in (
+            ([x.A for x in spaces], sc.state, sc.state),
+            ([x.B for x in spaces], sc.input, sc.state),
+            ([x.E for x in spaces], sc.disturbance, sc.state),
+            ([x.C for x in spaces], sc.state, sc.output),
         )
     )
-    C = spaces[0].C * sc.state / sc.output[:, None]
-    scaled = [StateSpace(A=a, B=b, E=e, C=C) for a, b, e in zip(A, B, E, strict=True)]
+    scaled = [StateSpace(A=a, B=b, E=e, C=c) for a, b, e, c in zip(A, B, E, C, strict=True)]
     fraction = lag - np.floor(lag) if len(problem.taps) > 1 else None
     plant, slopes = _sampled(scaled[0], problem, fraction, scaled[1:])
     return plant, slopes[: problem.slices["fraction"].stop] if with_derivatives else ()
 
 
-def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fraction: float | None) -> DiscreteSpace:
+def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fraction: Array | None) -> DiscreteSpace:
     """Scaled discrete plants of several problems, stacked."""
     spaces = [p.model.matrices(p.parameters(v)) for p, v in pairs]
     state, into, push = (np.array([getattr(p.scales, k) for p, _ in pairs]) for k in ("state", "input", "disturbance"))
@@ -474,14 +514,40 @@ def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fra
 
 
 def _sampled(
-    space: StateSpace, problem: PredictorProblem, fraction: float | None, derivatives: Sequence[StateSpace] = ()
+    space: StateSpace, problem: PredictorProblem, fraction: Array | None, derivatives: Sequence[StateSpace] = ()
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
-    """Discretise a plant of a trial step, or raise LinAlgError where it passes all numbers within a sample."""
+    """Discretise a plant of a trial step, or raise LinAlgError where it passes all numbers within a sample.
+
+    `fraction`: (n_inputs,). The slopes by the delays come last.
+    """
+    period = 1.0 / problem.rate_hz
     with np.errstate(over="ignore", invalid="ignore"):
-        plant, slopes = discretise(space, 1.0 / problem.rate_hz, fraction=fraction, derivatives=derivatives)
+        if fraction is None:
+            plant, slopes = discretise(space, period, derivatives=derivatives)
+        else:
+            found = {f: discretise(space, period, fraction=f, derivatives=derivatives) for f in set(fraction.tolist())}
+            plant, slopes = found[fraction[0]]
+            if len(found) > 1:
+                each = [(p, *d) for p, d in (found[f] for f in fraction.tolist())]
+                plant, *more = (_by_input(same) for same in zip(*each, strict=True))
+                slopes = tuple(more)
+            slopes = (*slopes[:-1], *(_alone(slopes[-1], j) for j in problem.late))
     if not all(np.isfinite(x).all() for of in (plant, *slopes) for x in (of.A, of.B, of.B_late, of.E)):
         raise np.linalg.LinAlgError("the plant passes all numbers within a sample")
     return plant, slopes
+
+
+def _by_input(plants: Sequence[DiscreteSpace]) -> DiscreteSpace:
+    """The plant whose input j is that of the j-th."""
+    B, late = (np.stack([getattr(p, x)[..., j] for j, p in enumerate(plants)], -1) for x in ("B", "B_late"))
+    return replace(plants[0], B=B, B_late=late)
+
+
+def _alone(plant: DiscreteSpace, j: int) -> DiscreteSpace:
+    """The plant with input j alone."""
+    one = np.zeros(plant.B.shape[-1])
+    one[j] = 1.0
+    return replace(plant, B=plant.B * one, B_late=plant.B_late * one)
 
 
 def _gain(
@@ -514,25 +580,29 @@ def _gain(
             dQ[n_slopes + j] = 2 * variance[j] * np.outer(plant.E[:, j], plant.E[:, j])
         else:
             dR[n_slopes + j, j - n_d + 1, j - n_d + 1] = 2 * sensor[j - n_d + 1]
-    return at.K, gain_derivatives(plant.A, plant.C, at, dA, dQ, dR), at
+    moved, dC = _slopes_of_C(slopes, plant.C), None
+    if moved is not None:
+        dC = np.zeros((size, n_y, n))
+        dC[:n_slopes] = moved
+    return at.K, gain_derivatives(plant.A, plant.C, at, dA, dQ, dR, dC), at
 
 
 def _stepped(
-    problem: PredictorProblem, lag: float, plant: DiscreteSpace, slopes: Sequence[DiscreteSpace]
+    problem: PredictorProblem, lag: Array, plant: DiscreteSpace, slopes: Sequence[DiscreteSpace]
 ) -> tuple[Step, list[Step]]:
     """Put the inputs at their lags and take the plant over `stride` samples, with derivatives by the product rule."""
     if problem.lags == (0,):
         return Step(A=plant.A, inputs=plant.B, E=plant.E), [Step(A=d.A, inputs=d.B, E=d.E) for d in slopes]
     n, n_u = plant.B.shape
-    place = problem.taps.index(int(np.floor(lag)))
+    place, columns = np.floor(lag).astype(int) - problem.taps[0], np.arange(n_u)
 
     def spread(now: Array, late: Array, powers: Sequence[Array]) -> Array:
         out = np.zeros((n, len(problem.lags), n_u))
         for j, power in enumerate(powers):  # the input j samples into the step acts through powers[j]
             at = place + problem.stride - 1 - j
-            out[:, at] += power @ now
+            out[:, at, columns] += power @ now
             if len(problem.taps) > 1:
-                out[:, at + 1] += power @ late
+                out[:, at + 1, columns] += power @ late
         return out.reshape(n, -1)
 
     one = np.eye(n)

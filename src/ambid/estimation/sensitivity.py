@@ -306,6 +306,13 @@ def residual_blocks(
     forcing[:, :n] = turned.T @ forcing[:, :n]
     if turn is not None:
         forcing[:, :, :p] = forcing[:, :, :p] @ turn
+    through = None  # what numbers that move C do to the innovations at once
+    if predictor.dC.shape[2]:
+        through = np.zeros((n_y, n, width))
+        through[:, :, : predictor.dC.shape[2]] = -np.tensordot(weight, predictor.dC, axes=1)
+        through = turned.T @ through
+        if turn is not None:
+            through[:, :, :p] = through[:, :, :p] @ turn
     rows, s = work.buffers((n, length, width), (n, width))
     s[:], x = 0.0, basis @ predictor.x0
     s[:, problem.slices["initial"]] = basis
@@ -319,6 +326,8 @@ def residual_blocks(
         state_scan(M, part, x)
         np.matmul(part, forcing, out=block)
         sensitivity_scan(F, part, outputs[a : a + _BLOCK], s, block, p)
+        if through is not None:
+            block[:n_y] += part[:, :n] @ through
         yield block[:n_y, :, : p + 1].swapaxes(0, 1)
 
 
