@@ -336,7 +336,7 @@ def _noise(fit: Fit) -> NoiseModel:
     disturbance: dict[str, float] = {}
     sensor: dict[str, float] = {}
     if problem.noise == "levels":
-        disturbance, sensor = _levels(fit, predictor)
+        disturbance, sensor = noise_levels(fit, predictor)
     elif not np.any(predictor.gain):
         disturbance = dict.fromkeys(problem.model.disturbances, 0.0)
         sensor = dict(zip(problem.model.outputs, (np.sqrt(np.diag(fit.covariance)) * sc.output).tolist(), strict=True))
@@ -349,7 +349,7 @@ def _noise(fit: Fit) -> NoiseModel:
     )
 
 
-def _levels(fit: Fit, predictor: Predictor) -> tuple[dict[str, float], dict[str, float]]:
+def noise_levels(fit: Fit, predictor: Predictor) -> tuple[dict[str, float], dict[str, float]]:
     """Noise standard deviations in SI: the log levels give ratios, the innovation covariance their common size."""
     problem, sc, model = fit.problem, fit.problem.scales, fit.problem.model
     numbers = fit.vector[problem.slices["noise"]]

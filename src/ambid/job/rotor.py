@@ -1,13 +1,13 @@
 """The job of a rotor on many axes: records and a rig in, one estimate of the machine out.
 
-Read -> periods -> estimate -> judge. Records at several speeds, or with one bearing excited at a time, give one
-machine.
+Read -> periods, or none -> estimate -> judge. Records at several speeds, or with one bearing excited at a time, give
+one machine.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
@@ -24,9 +24,10 @@ from ambid.rotor.estimate import RotorEstimate
 
 if TYPE_CHECKING:
     from ambid.physics.rotor_model import RotorModel
-    from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.conclusion import Evidence
+    from ambid.rotor.estimator import Ending
     from ambid.rotor.replay import RotorReplay
-    from ambid.rotor.spectra import PeriodSpectra
+    from ambid.rotor.spectra import Excitation, PeriodSpectra
 
 _LEAST = 200  # samples
 _AT_REST = 0.25 * 2.0 * np.pi  # rad that a rotor at rest may creep in a record
@@ -42,13 +43,12 @@ def identify_rotor(
 ) -> RotorEstimate:
     """Identify a rotor from one or several records.
 
-    `rig`: with bearings; `speed_rpm`: of each record; `reading`: how files are read. EstimationError where nothing can
-    be identified.
+    Records of two or more whole periods go to the estimator on period spectra, another one to the predictor. `rig`:
+    with bearings; `speed_rpm`: of each record; `reading`: how files are read. EstimationError where nothing can be
+    identified.
     """
-    from ambid.rotor.conclusion import conclude, experiments_hint
-    from ambid.rotor.estimator import estimate_rotor
-    from ambid.rotor.likelihood import Experiment
-    from ambid.rotor.spectra import find_excitation, period_spectra
+    from ambid.rotor.conclusion import conclude
+    from ambid.rotor.spectra import find_excitation
 
     say, clock, model = tick or silent, Clock(), rig.rotor
     assert model is not None
@@ -56,17 +56,58 @@ def identify_rotor(
     benches = [r.bench for r in taken]
     for bench in benches:
         _check(bench, rig)
+    speeds = [speed_of(r.bench, model) if r.speed is None else r.speed for r in taken]
     clock.lap("read")
-    experiments, remembered, warnings = [], [], [said for r in taken for said in r.warnings]
-    for r in taken:
-        say("periods")
-        bench, speed = r.bench, speed_of(r.bench, model) if r.speed is None else r.speed
-        excitation = find_excitation(bench, model)
-        if excitation is None:
-            raise EstimationError(
-                f"{name_of(bench)} is not periodic or has less than two whole periods; the estimator of rotors needs "
-                "them. Excite with a multisine of whole periods"
-            )
+    say("periods")
+    excitations = [find_excitation(bench, model) for bench in benches]
+    clock.lap("periods")
+    with one_thread():
+        periodic = [x for x in excitations if x is not None]
+        if len(periodic) == len(benches):
+            found = _from_periods(benches, speeds, periodic, rig, say, clock)
+        else:
+            found = _from_innovations(benches, speeds, excitations, rig, say, clock)
+        estimate = conclude(
+            found.fit, found.evidence, rig.parameters, found.records,
+            delay_how=["given" if d is not None else "estimated" for d in _delays(rig)],
+            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=found.why)},
+            rig=rig_entry(rig), warnings=[*(said for r in taken for said in r.warnings), *found.warnings],
+        )  # fmt: skip
+        sensitivity = _sensitivity(estimate, rig, found.spectra)
+    clock.lap("checks")
+    return replace(estimate, sensitivity=sensitivity, timing_s=clock.laps, used=tuple(benches))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Found:
+    """What either estimator leaves to be concluded from; `why` it was chosen."""
+
+    fit: Ending
+    evidence: Evidence
+    records: Sequence[Mapping[str, object]]
+    spectra: PeriodSpectra  # of the record at the highest speed, which is that of the estimate's plant
+    why: str
+    warnings: Sequence[str] = ()
+
+
+def _from_periods(
+    benches: Sequence[Record],
+    speeds: Sequence[float],
+    excitations: Sequence[Excitation],
+    rig: Rig,
+    say: Tick,
+    clock: Clock,
+) -> _Found:
+    """Estimate from period spectra."""
+    from ambid.rotor.conclusion import experiments_hint, of_periods
+    from ambid.rotor.estimator import estimate_rotor
+    from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.spectra import period_spectra
+
+    model = rig.rotor
+    assert model is not None
+    experiments, remembered, warnings = [], [], list[str]()
+    for bench, speed, excitation in zip(benches, speeds, excitations, strict=True):
         spectra = period_spectra(bench, model, excitation, speed)
         experiments.append(Experiment(spectra=spectra, speed=speed))
         remembered.append(
@@ -76,28 +117,58 @@ def identify_rotor(
             lost = spectra.dropped / bench.rate_hz
             warnings.append(f"{name_of(bench)}: the first {lost:.4g} s were left out: a transient, or part of a period")
     clock.lap("periods")
-    given = [rig.channel(role).delay for role in model.inputs]
-    with one_thread():
-        fit = estimate_rotor(
-            experiments, model, rig.parameters, delays=[None if d == "auto" else float(d) for d in given],
-            n_modes=rig.modes.count, tick=say,
-        )  # fmt: skip
-        clock.lap("fit")
-        say("check")
-        hint = experiments_hint(experiments, model)
-        estimate = conclude(
-            fit, rig.parameters, remembered, delay_how=["estimated" if d == "auto" else "given" for d in given],
-            more_checks=_record_checks(benches, rig), rig=rig_entry(rig),
-            warnings=[*warnings, *([hint] if hint else [])],
-        )  # fmt: skip
-        sensitivity = _sensitivity(estimate, rig, fastest(experiments).spectra)
-    clock.lap("checks")
-    return replace(estimate, sensitivity=sensitivity, timing_s=clock.laps, used=tuple(benches))
+    fit = estimate_rotor(experiments, model, rig.parameters, delays=_delays(rig), n_modes=rig.modes.count, tick=say)
+    clock.lap("fit")
+    say("check")
+    hint = experiments_hint(experiments, model)
+    least = min(x.count for x in excitations)
+    return _Found(
+        fit=fit, evidence=of_periods(fit), records=remembered, warnings=[*warnings, *([hint] if hint else [])],
+        spectra=max(experiments, key=lambda e: abs(e.speed)).spectra,
+        why=f"the excitation is periodic ({least} whole periods): maximum likelihood on period spectra",
+    )  # fmt: skip
 
 
-def fastest(experiments: Sequence[Experiment]) -> Experiment:
-    """Return the experiment at the highest speed, which is that of the estimate's plant."""
-    return max(experiments, key=lambda e: abs(e.speed))
+def _from_innovations(
+    benches: Sequence[Record],
+    speeds: Sequence[float],
+    excitations: Sequence[Excitation | None],
+    rig: Rig,
+    say: Tick,
+    clock: Clock,
+) -> _Found:
+    """Estimate from the innovations of a predictor."""
+    from ambid.rotor.prediction import predict_rotor
+    from ambid.validation.rotor import of_predictor
+
+    model, odd = rig.rotor, name_of(next(b for b, x in zip(benches, excitations, strict=True) if x is None))
+    assert model is not None
+    why = f"{odd} is not periodic or has less than two whole periods"
+    if len(benches) > 1:
+        raise EstimationError(
+            f"{why}; several records together need them. Excite with a multisine of whole periods, or give one record"
+        )
+    if any(role.endswith("_current") for role in model.inputs):
+        raise EstimationError(
+            f"{why}; without voltages the estimator needs them, as measured currents carry noise of their own. Excite "
+            "with a multisine of whole periods, or log the voltages"
+        )
+    fit = predict_rotor(
+        benches[0], model, rig.parameters, speed=speeds[0], delays=_delays(rig), n_modes=rig.modes.count, tick=say
+    )
+    clock.lap("fit")
+    say("check")
+    return _Found(
+        fit=fit, evidence=of_predictor(fit), records=[{**origin(benches[0]), "speed": speeds[0]}],
+        spectra=fit.spectra, why=f"{why}: maximum likelihood on the innovations of a predictor",
+    )  # fmt: skip
+
+
+def _delays(rig: Rig) -> list[float | None]:
+    """Return the delay of each input in samples, None where it is to be estimated."""
+    assert rig.rotor is not None
+    given = [rig.channel(role).delay for role in rig.rotor.inputs]
+    return [None if d == "auto" else float(d) for d in given]
 
 
 def _sensitivity(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> Mapping[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.estimator import RotorFit
+from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
@@ -42,9 +42,9 @@ class Numbers:
         return self.names.index(name) if name in self.names else None
 
 
-def numbers_of(fit: RotorFit) -> Numbers:
+def numbers_of(fit: Ending) -> Numbers:
     """Return numbers and covariance by the names of the model."""
-    unknowns, point = fit.problem.unknowns, fit.point
+    unknowns, point = fit.unknowns, fit.point
     named, chain = unknowns.chain(fit.vector)
     roles = [f"{role}.delay" for role in unknowns.model.inputs]
     keep = [*range(len(named)), *(len(named) + k for k in unknowns.free_delays)]
@@ -61,8 +61,24 @@ def numbers_of(fit: RotorFit) -> Numbers:
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Evidence:
+    """What a method shows beside numbers: its noise, how much it explains, whether its residuals are noise."""
+
+    method: Literal["periods", "predictor"]
+    noise: Mapping[str, float]  # rms of each source, SI
+    fit: Mapping[str, OutputFit]
+    checks: Mapping[str, Check]
+
+
+def of_periods(fit: RotorFit) -> Evidence:
+    """Return the evidence of period spectra."""
+    return Evidence(method="periods", noise=_noise(fit), fit=_fits(fit), checks=_residual_checks(fit))
+
+
 def conclude(
-    fit: RotorFit,
+    fit: Ending,
+    evidence: Evidence,
     parameters: Sequence[Parameter],
     records: Sequence[Mapping[str, object]],
     *,
@@ -74,15 +90,15 @@ def conclude(
     """Return the estimate of a search; `delay_how`: by input, "given" or "estimated"."""
     numbers, model = numbers_of(fit), fit.model
     found = _parameters(model, parameters, numbers)
-    checks = {**_residual_checks(fit), "identifiable": _identifiable(found, numbers), **more_checks}
-    speed = max((e.speed for e in fit.problem.experiments), key=abs)
+    checks = {**evidence.checks, "identifiable": _identifiable(found, numbers), **more_checks}
+    speed = max(fit.speeds, key=abs)
     turned = model.at_speed(speed)
     space = turned.matrices(numbers.theta)
     modes, above = _modes(model, numbers, fit.band_hz)
     checks |= _mode_checks(modes, above)
     return RotorEstimate(
         status=fit.status,
-        method="periods",
+        method=evidence.method,
         record=records[0],
         records=tuple(records),
         parameters=found,
@@ -96,8 +112,8 @@ def conclude(
             states=turned.states, A=space.A, B=space.B, C=space.C,
             poles=np.linalg.eigvals(space.A).astype(np.complex128),
         ),
-        noise=_noise(fit),
-        fit=_fits(fit),
+        noise=evidence.noise,
+        fit=evidence.fit,
         checks=checks,
         warnings=tuple(warnings),
         information={"condition": numbers.condition, "weakest": numbers.weakest, "band_hz": fit.band_hz},

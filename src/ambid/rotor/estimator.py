@@ -39,31 +39,41 @@ _EDDY_STARTS = tuple(2.0 * np.pi * f for f in (300.0, 1000.0, 3000.0))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class RotorFit:
-    """Where the search ended."""
+class Ending:
+    """Where a search ended, whichever criterion it was made with."""
 
-    problem: Likelihood
+    unknowns: Unknowns
+    base: Point  # what did not move
     vector: Array
-    cost: float
     status: Status
-    last_step: float  # squared length of the last step, in standard deviations
     triangle: Array  # of [J | r], priors included
     band_hz: tuple[float, float]
+    speeds: tuple[float, ...]  # of the records, rad/s
 
     @property
     def model(self) -> RotorModel:
         """The model with its modes."""
-        return self.problem.unknowns.model
+        return self.unknowns.model
 
     @property
     def point(self) -> Point:
         """Numbers by name and delays."""
-        return self.problem.point(self.vector)
+        theta, delays = self.unknowns.unpack(self.vector, self.base.theta, self.base.delays)
+        return Point(theta=theta, delays=delays)
 
     @property
     def seen(self) -> Directions:
         """Singular directions of the information, priors included."""
         return directions(self.triangle[:, :-1])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class RotorFit(Ending):
+    """Where the search on period spectra ended."""
+
+    problem: Likelihood
+    cost: float
+    last_step: float  # squared length of the last step, in standard deviations
 
 
 def estimate_rotor(
@@ -81,17 +91,38 @@ def estimate_rotor(
     modes within the excited band, None: the likelihood decides.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
-    slowest = _slowest(ordered)
     work = _Work(
         model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
         tick=tick,
     )  # fmt: skip
-    first = [_together(slowest)]
-    edge, at = work.begin(first)
-    current, at = work.grow(first, edge, at)
-    if len(ordered) > len(slowest):
-        at = work.turn(ordered[len(slowest) :], current, at)
-    return work.finish(ordered, current, at)
+    return work.finish(ordered, *work.start(ordered))
+
+
+def begin_rotor(
+    experiments: Sequence[Experiment],
+    model: RotorModel,
+    parameters: Sequence[Parameter],
+    *,
+    delays: Sequence[float | None],
+    n_modes: int | None = None,
+    tick: Tick = silent,
+) -> tuple[RotorModel, Point]:
+    """Return the model and its numbers where `estimate_rotor` would begin to believe the noise: start values."""
+    ordered = sorted(experiments, key=lambda e: abs(e.speed))
+    work = _Work(
+        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
+        tick=tick,
+    )  # fmt: skip
+    return work.start(ordered)
+
+
+def unknowns_at(model: RotorModel, parameters: Sequence[Parameter], at: Point, free: Sequence[int]) -> Unknowns:
+    """Return the unknowns of a model; sizes of numbers are those of the point; `free`: inputs with unknown delay."""
+    span = model.span(at.theta)
+    lengths = {p.name for p in model.parameters if p.unit == "m"}
+    gyro = {p.name for p in model.mode_parameters if p.name.startswith("gyro.")}
+    scales = {n: span if n in lengths else 0.1 if n in gyro else max(abs(x), 1e-9) for n, x in at.theta.items()}
+    return Unknowns(model=model, known=tuple(parameters), scales=scales, free_delays=tuple(free))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -105,13 +136,9 @@ class _Work:
     def problem(
         self, experiments: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]
     ) -> Likelihood:
-        """Return the criterion at a model; sizes of numbers are those of the point."""
-        span = model.span(at.theta)
-        lengths = {p.name for p in model.parameters if p.unit == "m"}
-        gyro = {p.name for p in model.mode_parameters if p.name.startswith("gyro.")}
-        scales = {n: span if n in lengths else 0.1 if n in gyro else max(abs(x), 1e-9) for n, x in at.theta.items()}
+        """Return the criterion at a model."""
         free = tuple(k for k, d in enumerate(self.delays) if d is None)
-        unknowns = Unknowns(model=model, known=self.parameters, scales=scales, free_delays=free)
+        unknowns = unknowns_at(model, self.parameters, at, free)
         return Likelihood(unknowns=unknowns, base=at, experiments=experiments, weights=weights)
 
     def rough(
@@ -125,6 +152,16 @@ class _Work:
             at, found = minimise(problem, at, most=most, tolerance=1e-3)
             cost = found.cost / problem.n_real
         return at, cost
+
+    def start(self, ordered: Sequence[Experiment]) -> tuple[RotorModel, Point]:
+        """Return model and numbers from the slowest records, then from the others."""
+        slowest = _slowest(ordered)
+        first = [_together(slowest)]
+        edge, at = self.begin(first)
+        current, at = self.grow(first, edge, at)
+        if len(ordered) > len(slowest):
+            at = self.turn(ordered[len(slowest) :], current, at)
+        return current, at
 
     def begin(self, experiments: Sequence[Experiment]) -> tuple[float, Point]:
         """Return the band in Hz that a rigid rotor explains, and its numbers."""
@@ -230,8 +267,10 @@ class _Work:
         v, triangle, last = problem.corrected(problem.pack(at))
         f = [e.spectra.frequency_hz for e in experiments]
         return RotorFit(
-            problem=problem, vector=v, cost=cost, status="converged" if converged and last < 0.1 else "stalled",
+            unknowns=problem.unknowns, base=problem.base, problem=problem, vector=v, cost=cost,
+            status="converged" if converged and last < 0.1 else "stalled",
             last_step=last, triangle=triangle, band_hz=(min(float(x[0]) for x in f), max(float(x[-1]) for x in f)),
+            speeds=tuple(e.speed for e in experiments),
         )  # fmt: skip
 
     def _one_more(self, experiments: Sequence[Experiment], fit: RotorFit) -> RotorFit | None:

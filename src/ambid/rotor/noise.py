@@ -122,5 +122,5 @@ def rough_covariance(spectra: PeriodSpectra, H: Complex, relative: float) -> Com
     """
     e = residuals(spectra, H)
     level = np.sqrt(smoothed(np.abs(spectra.mean_y) ** 2, 2))
-    variance = smoothed(np.var(e, axis=0, ddof=1)) / spectra.n_periods + (relative * level) ** 2
+    variance = spectra.scatter_of(e) / spectra.n_periods + (relative * level) ** 2
     return np.asarray(variance[:, :, None] * np.eye(e.shape[2]))

@@ -21,6 +21,11 @@ from ambid.signals.periodic_response import excited_lines, find_period, transien
 
 _TRANSIENT = 5.0  # standard deviations by which a first period may differ from the others
 _LEAST_PERIODS = 2
+_FIRST_LINE = 5  # of a window's spectrum: below, what leaks from the edges is not small
+_MOST_LINES = 1200
+_LINES_PER_UNKNOWN = 3
+_FLOOR = 1e-3  # power of the reference, over its largest, from which a line is excited
+_CLEAR = 25.0  # power of a position, over its noise, from which it is seen
 _SYNCHRONOUS_LINES = 1.5  # lines beside a harmonic of the speed that are left out on either side
 
 
@@ -45,6 +50,8 @@ class PeriodSpectra:
     period: int  # samples
     dropped: int  # samples before the first period that is used
     left_out_hz: Array  # lines near harmonics of the speed
+    # variances of a spectrum where there is no second one to show them: of inputs and outputs, (n_lines, n)
+    known_scatter: tuple[Array, Array] | None = None
 
     @property
     def n_periods(self) -> int:
@@ -69,7 +76,13 @@ class PeriodSpectra:
     @cached_property
     def scatter(self) -> tuple[Array, Array]:
         """Variance of one period's spectra, smoothed over lines: of the inputs and of the outputs."""
+        if self.known_scatter is not None:
+            return self.known_scatter
         return smoothed(np.var(self.U, axis=0, ddof=1)), smoothed(np.var(self.Y, axis=0, ddof=1))
+
+    def scatter_of(self, e: Complex) -> Array:
+        """Return the variance of one period's residuals `e` (n_periods, n_lines, n_y), smoothed over lines."""
+        return self.scatter[1] if self.known_scatter is not None else smoothed(np.var(e, axis=0, ddof=1))
 
     def lines(self, keep: NDArray[np.bool_]) -> PeriodSpectra:
         """Return the spectra at some of the lines."""
@@ -77,6 +90,7 @@ class PeriodSpectra:
             frequency_hz=self.frequency_hz[keep], U=self.U[:, keep], Y=self.Y[:, keep],
             R=None if self.R is None else self.R[keep], rate_hz=self.rate_hz, period=self.period, dropped=self.dropped,
             left_out_hz=self.left_out_hz,
+            known_scatter=None if (known := self.known_scatter) is None else (known[0][keep], known[1][keep]),
         )  # fmt: skip
 
 
@@ -85,13 +99,14 @@ def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
     first, n = spectra[0], min(s.n_periods for s in spectra)
     if len(spectra) == 1:
         return first
-    references = [s.R for s in spectra]
+    references, known = [s.R for s in spectra], [s.known_scatter for s in spectra if s.known_scatter is not None]
     logged = [r for r in references if r is not None]
     return PeriodSpectra(
         frequency_hz=np.concatenate([s.frequency_hz for s in spectra]),
         U=np.concatenate([s.U[-n:] for s in spectra], axis=1), Y=np.concatenate([s.Y[-n:] for s in spectra], axis=1),
         R=np.concatenate(logged) if len(logged) == len(references) else None, rate_hz=first.rate_hz,
         period=first.period, dropped=first.dropped, left_out_hz=np.concatenate([s.left_out_hz for s in spectra]),
+        known_scatter=(np.concatenate([k[0] for k in known]), np.concatenate([k[1] for k in known])) if known else None,
     )  # fmt: skip
 
 
@@ -161,6 +176,61 @@ def period_spectra(record: Record, model: RotorModel, found: Excitation, speed: 
         frequency_hz=frequency[~near], U=U[:, keep], Y=Y[:, keep], R=R[keep] if logged else None, rate_hz=rate,
         period=n, dropped=found.first, left_out_hz=frequency[near],
     )  # fmt: skip
+
+
+def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> PeriodSpectra:
+    """Return the spectra of a whole record under a Hann window, at lines where it moves: rough, for start values.
+
+    `speed`: rad/s.
+    """
+    n, rate = record.n_samples, record.rate_hz
+    window: Array = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n)
+
+    def spectra(roles: Sequence[str]) -> Complex:
+        x = np.column_stack([record[role].values for role in roles])
+        return np.fft.rfft((x - x.mean(axis=0)) * window[:, None], axis=0)[: (n + 1) // 2] / n
+
+    U, Y = spectra(model.inputs), spectra(model.outputs)
+    noise = _scatter(U, Y)
+    frequency: Array = np.arange(U.shape[0], dtype=np.float64) * (rate / n)
+    half = max(2, U.shape[0] // 2000)
+    n_x = len(model.sensors)
+    seen = np.max(smoothed(np.abs(Y[:, :n_x]) ** 2, half) / noise[:, :n_x], axis=1) > _CLEAR
+    logged = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
+    if logged:
+        excited = smoothed(np.abs(spectra(logged)) ** 2, half).sum(axis=1)
+        seen &= excited > _FLOOR * np.max(excited[_FIRST_LINE:])
+    seen[:_FIRST_LINE] = False
+    seen &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
+    lines = np.flatnonzero(seen)
+    if lines.size < 20:
+        raise EstimationError(
+            f"the record shows motion above its noise at {lines.size} lines; a rotor needs 20. Excite more, and more "
+            "frequencies, or record longer"
+        )
+    keep = lines[np.unique(np.linspace(0, lines.size - 1, _MOST_LINES).round().astype(int))]
+    return PeriodSpectra(
+        frequency_hz=frequency[keep], U=U[None, keep], Y=Y[None, keep], R=None, rate_hz=rate, period=n, dropped=0,
+        left_out_hz=np.zeros(0), known_scatter=(np.zeros((keep.size, U.shape[1])), noise[keep]),
+    )  # fmt: skip
+
+
+def _scatter(U: Complex, Y: Complex) -> Array:
+    """Return the variance of what the inputs do not explain of the outputs, (n_lines, n_y).
+
+    By the local polynomial method, of first order (Pintelon and Schoukens 2012, sec. 7.2), in bands of equal width.
+    """
+    n, n_u = U.shape
+    width = min(_LINES_PER_UNKNOWN * 2 * (n_u + 1), n)
+    starts = np.unique(np.linspace(0, n - width, max(2, 2 * n // width)).round().astype(int))
+    at = starts[:, None] + np.arange(width)
+    own = np.concatenate([U[at], np.ones((*at.shape, 1))], axis=2)
+    regressors = np.concatenate([own, own * np.linspace(-1.0, 1.0, width)[:, None]], axis=2)
+    Q = np.linalg.qr(regressors)[0]
+    left = Y[at] - Q @ (np.conj(np.swapaxes(Q, 1, 2)) @ Y[at])
+    variance = np.sum(np.abs(left) ** 2, axis=1) / (width - regressors.shape[2])
+    middle = starts + 0.5 * (width - 1)
+    return np.stack([np.interp(np.arange(n), middle, v) for v in variance.T], axis=1)
 
 
 def beside_harmonics(frequency_hz: Array, speed_hz: float, spacing_hz: float) -> NDArray[np.bool_]:

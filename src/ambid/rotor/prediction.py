@@ -1,0 +1,244 @@
+"""The innovations-form predictor of a rotor: maximum likelihood from any record, periodic or not.
+
+The plant of `RotorModel` is sampled exactly, its noise is a level of every disturbance and sensor, and the predictor's
+gain follows from them by the Riccati equation (Ljung 1999, sec. 4.3 and 7.4; `ambid.estimation.predictor`). Unstable
+plants and feedback need no care: the innovations do not depend on inputs to come.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import EstimationError
+from ambid.estimation.likelihood import Fit, score_statistic, search
+from ambid.estimation.linear import triangle_of
+from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
+from ambid.estimation.progress import Tick, silent
+from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, discretise
+from ambid.physics.rotor_model import RotorModel
+from ambid.record import Record
+from ambid.rotor.estimator import Ending, begin_rotor, unknowns_at
+from ambid.rotor.likelihood import Experiment, Point
+from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
+from ambid.rotor.unknowns import Unknowns
+
+_FIRST = 12_000  # samples that a first search is made on
+_REACH = 20  # samples within which a state shows in the outputs
+_LEVEL = -2.0  # log level of disturbances at the start
+_NEAR = 0.1  # samples by which a delay may miss a whole number at the start and still be tried there
+_LATE = 12.0  # what one free delay must promise to be freed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PredictorFit(Ending):
+    """Where the search on innovations ended."""
+
+    spectra: PeriodSpectra  # windowed, of the start
+    fit: Fit  # of the core's problem, in which noise, offsets and the first state are numbers too
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Searched:
+    """A rotor as a linear model of the numbers that are searched."""
+
+    unknowns: Unknowns
+    base: Point
+    name: str = "rotor"
+    summary: str = "rotor by the numbers that are searched"
+    parameters: tuple[ParameterSpec, ...] = field(default=())
+
+    @property
+    def rotor(self) -> RotorModel:
+        """The rotor at the speed of the record."""
+        return self.unknowns.model
+
+    @property
+    def inputs(self) -> tuple[str, ...]:
+        """Of the rotor."""
+        return self.rotor.inputs
+
+    @property
+    def outputs(self) -> tuple[str, ...]:
+        """Of the rotor."""
+        return self.rotor.outputs
+
+    @property
+    def states(self) -> tuple[str, ...]:
+        """Of the rotor."""
+        return self.rotor.states
+
+    @property
+    def disturbances(self) -> tuple[str, ...]:
+        """Of the rotor."""
+        return self.rotor.disturbances
+
+    @property
+    def units(self) -> Mapping[str, str]:
+        """Of the rotor's signals."""
+        return self.rotor.units
+
+    def vector(self, theta: Mapping[str, float]) -> Array:
+        """Return the vector of unknowns; delays rest at those of the base."""
+        free = self.base.delays[list(self.unknowns.free_delays)]
+        return np.array([*theta.values(), *free])
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return the rotor's matrices."""
+        return self.rotor.matrices(self.unknowns.unpack(self.vector(theta), self.base.theta, self.base.delays)[0])
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return the rotor's derivative by the chain rule."""
+        v = self.vector(theta)
+        named, chain = self.unknowns.chain(v)
+        at, _ = self.unknowns.unpack(v, self.base.theta, self.base.delays)
+        column = chain[: len(named), self.unknowns.names.index(parameter)]
+        parts = [(x, self.rotor.derivative(at, name)) for name, x in zip(named, column.tolist(), strict=True) if x]
+        A, B, E, C = (sum(x * getattr(d, which) for x, d in parts) for which in "ABEC")
+        return StateSpace(A=A, B=B, E=E, C=C)
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return one for what may be zero: it is over its size already."""
+        return {name: 1.0 for name in self.unknowns.linear if name in theta}
+
+
+def predict_rotor(
+    record: Record,
+    model: RotorModel,
+    parameters: Sequence[Parameter],
+    *,
+    speed: float,
+    delays: Sequence[float | None],
+    n_modes: int | None = None,
+    tick: Tick = silent,
+) -> PredictorFit:
+    """Estimate a rotor from one record by its innovations, with start values from windowed spectra.
+
+    `record`: channels by role; `speed`: rad/s; `parameters`, `delays`, `n_modes`: as for `estimate_rotor`.
+    """
+    tick("start", 0.0)
+    spectra = windowed_spectra(record, model, speed)
+    experiment = Experiment(spectra=spectra, speed=speed)
+    model, at = begin_rotor([experiment], model, parameters, delays=delays, n_modes=n_modes, tick=tick)
+    model = model.at_speed(speed)
+    tried = at.delays
+    whole = np.round(tried)
+    settled = bool(np.all(np.abs(tried - whole)[[d is None for d in delays]] < _NEAR))
+    free = tuple(k for k, d in enumerate(delays) if d is None)
+    if settled:
+        at = replace(at, delays=np.array([w if d is None else d for w, d in zip(whole, delays, strict=True)]))
+    problem, vector = predictor_problem(record, model, parameters, at, () if settled else free)
+    fit = _search(problem, vector, tick)
+    if settled and free:
+        loose, there = _freed(fit, free)
+        if score_statistic(fit, loose, there) > _LATE * len(free):
+            fit = search(loose, there, tick=lambda: tick("fit", 0.9))
+    return _ended(fit, spectra, speed)
+
+
+def predictor_problem(
+    record: Record,
+    model: RotorModel,
+    parameters: Sequence[Parameter],
+    at: Point,
+    free: Sequence[int] = (),
+) -> tuple[PredictorProblem, Array]:
+    """Return the core's problem at a point, and its vector there; `free`: inputs whose delay is searched."""
+    unknowns = unknowns_at(model, parameters, at, free)
+    searched = Searched(unknowns=unknowns, base=at)
+    u, y = (np.column_stack([record[r].values for r in roles]) for roles in (model.inputs, model.outputs))
+    u, y = u - u.mean(axis=0), y - y.mean(axis=0)
+    whole = np.floor(at.delays + 1e-9).astype(int)
+    least, most = int(whole.min()), int(whole.max())
+    for j, k in enumerate(whole - least):
+        if k:  # one delay for all inputs is left
+            u[k:, j], u[:k, j] = u[:-k, j].copy(), u[0, j]
+    n = len(unknowns.names) - len(free)
+    names = unknowns.names[:n]
+    n_d, n_y = len(model.disturbances), len(model.outputs)
+    problem = PredictorProblem(
+        model=searched, rate_hz=record.rate_hz, u=u, y=y, estimated=names, known={}, magnitude=np.ones(n),
+        prior_mean=np.zeros(n), prior_sd=np.full(n, np.inf),
+        scales=_scales(model, at.theta, u, noise_floor(y), record.rate_hz),
+        delay=least, lag=np.maximum(at.delays - whole, 0.0), fractional=bool(free), late=tuple(free), skip=most + 2,
+        noise_center=np.concatenate([np.full(n_d, _LEVEL), np.zeros(n_y - 1)]), joint_priors=_joint_priors(searched),
+    )  # fmt: skip
+    vector = np.zeros(problem.size)
+    vector[:n] = unknowns.pack(at.theta, at.delays)[:n]
+    vector[problem.slices["fraction"]] = (at.delays - whole)[list(free)]
+    vector[problem.slices["noise"]] = problem.noise_center
+    return problem, vector
+
+
+def _joint_priors(searched: Searched) -> Callable[[Array], tuple[Array, Array]]:
+    """Priors of the unknowns, by the numbers without the delays, which have none."""
+
+    def rows(values: Array) -> tuple[Array, Array]:
+        unknowns = searched.unknowns
+        v = np.concatenate([values, searched.base.delays[list(unknowns.free_delays)]])
+        slopes, left = unknowns.priors(v)
+        return slopes[:, : values.size], left
+
+    return rows
+
+
+def _scales(model: RotorModel, theta: Mapping[str, float], u: Array, floor: Array, rate_hz: float) -> Scales:
+    """Return scales: of a state or disturbance what moves an output by its noise within some samples."""
+    space, _ = discretise(model.matrices(theta), 1.0 / rate_hz)
+    rows, reach = space.C / floor[:, None], np.zeros(space.A.shape[0])
+    for k in range(_REACH):
+        reach = np.maximum(reach, np.max(np.abs(rows), axis=0))
+        if k == 1:
+            push = np.max(np.abs(np.vstack([space.C / floor[:, None], rows]) @ space.E), axis=0)
+        rows = rows @ space.A
+    return Scales(state=1.0 / reach, input=np.std(u, axis=0), output=floor, disturbance=1.0 / push)
+
+
+def _search(problem: PredictorProblem, vector: Array, tick: Tick) -> Fit:
+    """Search on the first part of a long record, then on all of it."""
+    if problem.y.shape[0] > 2 * _FIRST:
+        part = replace(problem, u=problem.u[:_FIRST], y=problem.y[:_FIRST])
+        first = search(part, vector, tick=lambda: tick("fit", 0.2))
+        vector = first.vector if first.status != "failed" else vector
+    fit = search(problem, vector, tick=lambda: tick("fit", 0.6))
+    if fit.status == "failed":
+        raise EstimationError(
+            "the search found no stable predictor for this record. Check columns, signs, planes and fixed values"
+        )
+    return fit
+
+
+def _freed(fit: Fit, free: tuple[int, ...]) -> tuple[PredictorProblem, Array]:
+    """Return the fit's problem with delays as further numbers, and its vector there."""
+    old = fit.problem
+    searched = old.model
+    assert isinstance(searched, Searched)
+    more = replace(searched, unknowns=replace(searched.unknowns, free_delays=free))
+    loose = replace(old, model=more, fractional=True, late=free, joint_priors=_joint_priors(more))
+    return loose, np.insert(fit.vector, old.n_physical, np.zeros(len(free)))
+
+
+def _ended(fit: Fit, spectra: PeriodSpectra, speed: float) -> PredictorFit:
+    """Return the end of a search by the unknowns: numbers of noise, offsets and first state are taken out by QR."""
+    problem, searched = fit.problem, fit.problem.model
+    assert isinstance(searched, Searched)
+    n = problem.slices["fraction"].stop
+    rows = np.vstack([np.column_stack([fit.J, np.zeros(len(fit.J))]), np.column_stack([fit.J_prior, -fit.r_prior])])
+    order = [*range(n, problem.size), *range(n), problem.size]
+    triangle = triangle_of([rows[:, order]])[problem.size - n :, problem.size - n :]
+    base = searched.base
+    moved = base.delays.copy()
+    if problem.fractional:
+        moved[list(problem.late)] = (
+            np.floor(base.delays + 1e-9)[list(problem.late)] + fit.vector[problem.slices["fraction"]]
+        )
+    values = fit.vector[: problem.n_physical]
+    vector = np.concatenate([values, moved[list(searched.unknowns.free_delays)]])
+    return PredictorFit(
+        unknowns=searched.unknowns, base=base, vector=vector, status=fit.status, triangle=triangle,
+        band_hz=(float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1])),
+        speeds=(speed,), spectra=spectra, fit=fit,
+    )  # fmt: skip

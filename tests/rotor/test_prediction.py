@@ -1,0 +1,81 @@
+"""The innovations-form predictor of a rotor: records without periods, and the same ones as period spectra see them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.job.data import load_bench
+from ambid.physics.rotor_model import RotorModel
+from ambid.record import Record
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.likelihood import Point
+from ambid.rotor.prediction import predictor_problem
+from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
+
+pytestmark = needs_simulator
+_FAR = 3.5  # standard deviations
+
+
+@pytest.fixture(scope="module")
+def once() -> tuple[Any, Record]:
+    """One period alone, from its transient on: nothing in it comes back."""
+    bench = replace(truth.BENCHES["rigid"], period=1.2, periods=1, settle=0, excitation="full")
+    return bench, record_of(bench, 3)
+
+
+@pytest.fixture(scope="module")
+def found(once: tuple[Any, Record]) -> RotorEstimate:
+    bench, record = once
+    estimate = ambid.identify(record, free_rig(bench))
+    assert isinstance(estimate, RotorEstimate)
+    return estimate
+
+
+def test_a_record_without_periods_goes_to_the_predictor_by_itself(found: RotorEstimate) -> None:
+    assert found.method == "predictor"
+    assert "not periodic" in found.checks["method"].detail
+    assert found.status == "converged"
+    assert not [name for name, check in found.checks.items() if not check.passed]
+
+
+def test_the_predictor_finds_the_machine_within_its_intervals(once: tuple[Any, Record], found: RotorEstimate) -> None:
+    bench, _ = once
+    _, theta = model_of(bench)
+    for p in found.parameters:
+        assert abs(p.value - theta[p.name]) <= _FAR * p.sd, p
+    assert found["m"].sd < 0.003 * found["m"].value
+    assert [d.samples + d.fraction for d in found.delay.values()] == [float(bench.delay)] * 4
+    assert found.noise["ax_position"] == pytest.approx(bench.position_noise, rel=0.05)
+    assert found.noise["ax_current"] == pytest.approx(bench.current_noise, rel=0.05)
+
+
+def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
+    """Every number of the vector, the delays of two inputs and the level of every noise among them."""
+    from ambid.estimation.sensitivity import Workspace, innovations, linearise
+
+    bench, record = once
+    rig = free_rig(bench)
+    assert isinstance(rig.rotor, RotorModel)
+    model, theta = model_of(bench)
+    model, theta = model.with_modes(1), theta | {"mode1.omega": 600.0, "mode1.zeta": 0.01}
+    theta |= {"mode1.A.z": 0.2, "mode1.B.z": -0.3, "mode1.A.z_sensor": 0.25, "mode1.B.z_sensor": -0.2}
+    short = load_bench(record, rig)[0.0:0.01]
+    at = Point(theta=theta, delays=np.array([1.0, 1.3, 2.2, 1.7]))
+    problem, vector = predictor_problem(short, model, rig.parameters, at, free=(1, 2))
+    work, weight = Workspace(problem), np.eye(8)
+    slopes = linearise(problem, vector, weight, work)
+    assert slopes is not None
+    step = 1e-5 * np.random.default_rng(1).standard_normal(problem.size)
+    there, back = (innovations(problem, vector + s * step) for s in (1.0, -1.0))
+    assert there is not None
+    assert back is not None
+    along = (there - back) / 2.0
+    assert np.linalg.norm(slopes.J @ step) == pytest.approx(np.linalg.norm(along), rel=1e-5)
+    e = innovations(problem, vector)
+    assert e is not None
+    assert slopes.r @ (slopes.J @ step) == pytest.approx(float(np.sum(e * along)), rel=1e-4)
