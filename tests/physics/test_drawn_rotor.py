@@ -58,6 +58,6 @@ def test_the_spread_of_whirl_is_that_of_drawn_parameters() -> None:
     at_rest = campbell(free_rotor_of(model, theta), [0.0])  # double poles
     found = whirl_sd(model, theta, ["mode1.omega"], np.ones((1, 1)), at_rest)
     np.testing.assert_allclose(found[0, 1:3], math.sqrt(1 - 0.01**2), rtol=1e-6)
-    both = whirl_sd(model, theta, ["Ip", "mode1.omega"], np.diag([1e-8, 4.0]), whirl)
+    both = whirl_sd(model, theta, ["Ip", "mode3.omega", "mode1.omega", "ax.k_i"], np.diag([1e-8, 9.0, 4.0, 1.0]), whirl)
     alone = [whirl_sd(model, theta, [n], np.array([[v]]), whirl) for n, v in (("Ip", 1e-8), ("mode1.omega", 4.0))]
     np.testing.assert_allclose(both, np.hypot(*alone), rtol=1e-12)

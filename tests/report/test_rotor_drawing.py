@@ -7,10 +7,8 @@ import pytest
 
 from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics import campbell
-from ambid.physics.drawn_rotor import drawn_numbers
 from ambid.report.drawing import Block, single
-from ambid.report.rotor_drawing import campbell_block, campbell_panel, shapes_block
-from tests.physics import test_drawn_rotor as drawn_rotor
+from ambid.report.rotor_drawing import campbell_panel, shapes_block
 from tests.physics.test_shaft import RPM, TWO_SLEEVES
 
 PLANES = {"A.z": 0.10, "A.z_sensor": 0.13, "B.z": 0.65, "B.z_sensor": 0.62}
@@ -60,21 +58,3 @@ def test_the_campbell_diagram_marks_the_critical_speeds_of_the_identified_lines(
     assert marked == pytest.approx(forward)
     assert axes.get_title(loc="left") == f"critical speed {forward[0]:.0f} 1/min"
     assert len(axes.collections) == found.frequency.shape[1]  # a band for every line
-
-
-def test_the_whirl_of_an_estimate_stands_beside_that_of_the_drawing() -> None:
-    model = drawn_rotor.MODEL
-    theta = drawn_numbers(model, TWO_SLEEVES, PLANES) | PLANES
-    names, covariance = ["mode1.omega", "A.z", "Ip"], np.diag([4.0, 1e-8, 1e-8])
-    block = campbell_block(model, theta, names=names, covariance=covariance, speeds=[0.0, 1500.0], shaft=TWO_SLEEVES)
-    assert block is not None
-    (axes,) = single(block).axes
-    assert axes.get_xlim()[1] == pytest.approx(1.25 * 1500.0 / RPM)
-    found = [x for x in axes.lines if x.get_label() in ("forward", "backward")]
-    expected = [x for x in axes.lines if x.get_label() == "from the drawing"]
-    assert len(found) == 7  # tilting, and three modes twice
-    for one, other in zip(found, expected, strict=True):  # alike up to what modes beyond the third do at speed
-        np.testing.assert_allclose(one.get_ydata(), other.get_ydata(), rtol=0.02, atol=0.1)
-    without = {name: x for name, x in theta.items() if name != "Ip"}
-    assert campbell_block(model, without) is None
-    assert campbell_block(model, without, shaft=TWO_SLEEVES) is not None

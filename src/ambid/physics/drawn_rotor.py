@@ -87,17 +87,22 @@ def whirl_sd(
 
 
 def _moved(rotor: FreeRotor, G: Array, name: str) -> tuple[Array, Array, Array]:
-    """Derivatives by a parameter of stiffness, damping and gyroscopic matrix, all scaled with the masses."""
+    """Derivatives by a parameter of stiffness, damping and gyroscopic matrix, all scaled with the masses.
+
+    Zero where the rotor does not have it, as of a mode left out or of a bearing.
+    """
     dK, dC, dG = np.zeros_like(G), np.zeros_like(G), np.zeros_like(G)
     place, _, what = name.partition(".")
     if what in ("omega", "zeta"):
         r = int(place.removeprefix("mode")) + 1
-        dC[r, r] = 2 * (rotor.zeta[r] if what == "omega" else rotor.omega[r])
-        dK[r, r] = 2 * rotor.omega[r] if what == "omega" else 0.0
+        if r < rotor.mass.size:
+            dC[r, r] = 2 * (rotor.zeta[r] if what == "omega" else rotor.omega[r])
+            dK[r, r] = 2 * rotor.omega[r] if what == "omega" else 0.0
     elif name == "Id":
         dG[1], dG[:, 1] = -G[1] / (2 * rotor.mass[1]), -G[:, 1] / (2 * rotor.mass[1])
         dG[1, 1] *= 2
     elif name == "Ip" or place == "gyro":
         r, s = (1, 1) if name == "Ip" else (int(what[0]) + 1, int(what[1:]) + 1)
-        dG[r, s] = dG[s, r] = 1.0 / np.sqrt(rotor.mass[r] * rotor.mass[s])
+        if max(r, s) < rotor.mass.size:
+            dG[r, s] = dG[s, r] = 1.0 / np.sqrt(rotor.mass[r] * rotor.mass[s])
     return dK, dC, dG

@@ -10,10 +10,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.modes import Mode
-from ambid.physics.drawn_rotor import free_rotor_of, whirl_sd
-from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import FreeRotor, Shaft
-from ambid.physics.whirl import Campbell, campbell
+from ambid.physics.whirl import Campbell
 from ambid.report.drawing import (
     BOUND,
     GREEN,
@@ -34,7 +32,6 @@ if TYPE_CHECKING:
 _STEEL, _DISC = "#d9dde2", "#b9c2cc"
 _WIDEST = 0.45  # of the length: what a disc given by its mass alone is drawn like, at most
 _FORWARD, _BACKWARD = PREDICTED, ORANGE
-_SPEEDS = 41  # of a Campbell diagram
 _PLANAR = 0.02  # of a circular orbit, under which a whirl has no direction
 
 
@@ -69,40 +66,6 @@ def campbell_panel(
     were taken, rad/s. Where a line meets the speed itself (1x), a critical speed is marked.
     """
     return panel(_campbell, identified, drawn, sd, speeds, height=4.2)
-
-
-def campbell_block(
-    model: RotorModel,
-    theta: Mapping[str, float],
-    *,
-    names: Sequence[str] = (),
-    covariance: Array | None = None,
-    speeds: Sequence[float] = (),
-    shaft: Shaft | None = None,
-) -> Block | None:
-    """Draw the whirl of a rotor without its bearings over speed; None where neither parameters nor drawing turn.
-
-    `theta`: numbers of the model, which show a turning rotor where ``Ip`` is among them; `covariance`: of `names`;
-    `speeds`: of its records, rad/s. Drawn as far as the first critical speed of bending, or a quarter beyond records.
-    """
-    turning = "Ip" in theta
-    if not turning and shaft is None:
-        return None
-    rotor = free_rotor_of(model, theta) if turning else None
-    drawn = None if shaft is None else shaft.free_rotor(max(model.n_modes, 1))
-    lowest = min(r.omega[2] for r in (rotor, drawn) if r is not None and r.omega.size > 2) if model.n_modes else 0.0
-    most = max(1.25 * max(speeds, default=0.0), 1.25 * lowest) or 2000.0
-    at = np.linspace(0.0, most, _SPEEDS)
-    identified = None if rotor is None else campbell(rotor, at)
-    sd = None
-    if identified is not None and covariance is not None:
-        known = [k for k, name in enumerate(names) if name in {p.name for p in model.parameters}]
-        sd = whirl_sd(model, theta, [names[k] for k in known], covariance[np.ix_(known, known)], identified)
-    lines = None if shaft is None else campbell(shaft, at, lines=2 * model.n_modes + 1 if model.n_modes else 5)
-    turned = [x for x in speeds if x > 0]
-    return Block(
-        columns=[[campbell_panel(identified, drawn=lines, sd=sd, speeds=turned)]], title="whirl without bearings"
-    )
 
 
 def _ends(planes: Mapping[str, float], shaft: Shaft | None) -> tuple[float, float]:
