@@ -23,14 +23,15 @@ from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 
 if TYPE_CHECKING:
-    from ambid.physics.rotor_model import RotorModel
+    from ambid.arrays import Complex
+    from ambid.control.closed import ClosedLoop
     from ambid.rotor.conclusion import Evidence
     from ambid.rotor.estimator import Ending
     from ambid.rotor.replay import RotorReplay
     from ambid.rotor.spectra import Excitation, PeriodSpectra
+    from ambid.rotor.synchronous import Separated
 
 _LEAST = 200  # samples
-_AT_REST = 0.25 * 2.0 * np.pi  # rad that a rotor at rest may creep in a record
 
 
 def identify_rotor(
@@ -48,7 +49,7 @@ def identify_rotor(
     identified.
     """
     from ambid.rotor.conclusion import conclude
-    from ambid.rotor.spectra import find_excitation
+    from ambid.rotor.synchronous import separate
 
     say, clock, model = tick or silent, Clock(), rig.rotor
     assert model is not None
@@ -56,26 +57,31 @@ def identify_rotor(
     benches = [r.bench for r in taken]
     for bench in benches:
         _check(bench, rig)
-    speeds = [speed_of(r.bench, model) if r.speed is None else r.speed for r in taken]
     clock.lap("read")
     say("periods")
-    excitations = [find_excitation(bench, model) for bench in benches]
+    turning = [separate(r.bench, model, r.speed) for r in taken]
+    warnings = [said for r in taken for said in r.warnings]
+    for r, x in zip(taken, turning, strict=True):
+        warnings += x.warnings(r.name, model.speed if r.speed is None else r.speed)
+    clean, speeds, excitations = ([getattr(x, q) for x in turning] for q in ("record", "speed", "excitation"))
     clock.lap("periods")
     with one_thread():
         periodic = [x for x in excitations if x is not None]
         if len(periodic) == len(benches):
-            found = _from_periods(benches, speeds, periodic, rig, say, clock)
+            found = _from_periods(clean, speeds, periodic, rig, say, clock)
         else:
-            found = _from_innovations(benches, speeds, excitations, rig, say, clock)
+            found = _from_innovations(clean, speeds, excitations, rig, say, clock)
         estimate = conclude(
             found.fit, found.evidence, rig.parameters, found.records,
             delay_how=["given" if d is not None else "estimated" for d in _delays(rig)],
             more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=found.why)},
-            rig=rig_entry(rig), warnings=[*(said for r in taken for said in r.warnings), *found.warnings],
+            rig=rig_entry(rig), warnings=[*warnings, *found.warnings],
         )  # fmt: skip
-        sensitivity = _sensitivity(estimate, rig, found.spectra)
+        loop = _loop(estimate, rig, found.spectra)
+        sensitivity = {} if loop is None else _sensitivity(loop, found.spectra)
+        synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
     clock.lap("checks")
-    return replace(estimate, sensitivity=sensitivity, timing_s=clock.laps, used=tuple(benches))
+    return replace(estimate, sensitivity=sensitivity, synchronous=synchronous, timing_s=clock.laps, used=tuple(benches))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,6 +93,7 @@ class _Found:
     records: Sequence[Mapping[str, object]]
     spectra: PeriodSpectra  # of the record at the highest speed, which is that of the estimate's plant
     why: str
+    seen: Sequence[PeriodSpectra | None]  # of each record
     warnings: Sequence[str] = ()
 
 
@@ -124,7 +131,7 @@ def _from_periods(
     least = min(x.count for x in excitations)
     return _Found(
         fit=fit, evidence=of_periods(fit), records=remembered, warnings=[*warnings, *([hint] if hint else [])],
-        spectra=max(experiments, key=lambda e: abs(e.speed)).spectra,
+        spectra=max(experiments, key=lambda e: abs(e.speed)).spectra, seen=[e.spectra for e in experiments],
         why=f"the excitation is periodic ({least} whole periods): maximum likelihood on period spectra",
     )  # fmt: skip
 
@@ -160,7 +167,7 @@ def _from_innovations(
     say("check")
     return _Found(
         fit=fit, evidence=of_predictor(fit), records=[{**origin(benches[0]), "speed": speeds[0]}],
-        spectra=fit.spectra, why=f"{why}: maximum likelihood on the innovations of a predictor",
+        spectra=fit.spectra, seen=[None], why=f"{why}: maximum likelihood on the innovations of a predictor",
     )  # fmt: skip
 
 
@@ -171,49 +178,68 @@ def _delays(rig: Rig) -> list[float | None]:
     return [None if d == "auto" else float(d) for d in given]
 
 
-def _sensitivity(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> Mapping[str, Any]:
-    """Return the peaks of the sensitivity by axis: the controller is that of the record, or of the rig's [loop]."""
-    from ambid.control.margins import sensitivity_by_axis
-    from ambid.control.measured import measured_sensitivity
+def _loop(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> ClosedLoop | None:
+    """Return the closed loop: its controller is that of the record, or of the rig's [loop]; None: neither is known."""
     from ambid.job.margins import closed_loop
 
     try:
-        loop = closed_loop(estimate, rig, spectra)
+        return closed_loop(estimate, rig, spectra)
     except EstimationError:
-        return {}
+        return None
+
+
+def _sensitivity(loop: ClosedLoop, spectra: PeriodSpectra) -> Mapping[str, Any]:
+    """Return the peaks of the sensitivity by axis."""
+    from ambid.control.margins import sensitivity_by_axis
+    from ambid.control.measured import measured_sensitivity
+
     return sensitivity_by_axis(loop, measured_sensitivity(spectra, loop.at(spectra.frequency_hz)))
+
+
+def _synchronous(
+    estimate: RotorEstimate,
+    turning: Sequence[Separated],
+    spectra: Sequence[PeriodSpectra | None],
+    loop: ClosedLoop | None,
+    rig: Rig,
+) -> Mapping[str, Any]:
+    """Return what the synchronous responses say of unbalance and run-out; empty where the rotor stood still."""
+    from ambid.rotor.balance import Machine, Turned, balance_rotor
+
+    def controller(speed: float) -> Complex | None:
+        return None if loop is None else loop.controller.response(np.array([abs(speed) / (2.0 * np.pi)]))[0][0]
+
+    turned = [
+        Turned(record=k, response=x.response, spectra=s, controller=controller(x.speed))
+        for k, (x, s) in enumerate(zip(turning, spectra, strict=True))
+        if x.response is not None
+    ]
+    if not turned:
+        return {}
+    clearance = None if rig.limits is None else min(abs(x) for x in rig.limits.position)
+    runout = {f"{r.name}.z_sensor": r.value * np.exp(1j * r.phase) for r in rig.runout}
+    return balance_rotor(Machine.of(estimate), turned, runout=runout, clearance=clearance)
 
 
 def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[RotorReplay, ...]:
     """Return an estimate on those of its own or other records whose excitation is periodic, channels named by role."""
     from ambid.rotor.likelihood import Experiment
     from ambid.rotor.replay import replays
-    from ambid.rotor.spectra import find_excitation, period_spectra
+    from ambid.rotor.spectra import period_spectra
+    from ambid.rotor.synchronous import separate
 
     found, own = [], benches is estimate.used
     for k, bench in enumerate(benches):
-        speed = float(str(estimate.records[k]["speed"])) if own else speed_of(bench, estimate.plant)
-        excitation = find_excitation(bench, estimate.plant)
-        if excitation is not None:
-            spectra = period_spectra(bench, estimate.plant, excitation, speed)
-            found.append(Experiment(spectra=spectra, speed=speed))
+        of = separate(bench, estimate.plant, float(str(estimate.records[k]["speed"])) if own else None)
+        if of.excitation is not None:
+            spectra = period_spectra(of.record, estimate.plant, of.excitation, of.speed)
+            found.append(Experiment(spectra=spectra, speed=of.speed))
     return replays(estimate, found)
 
 
 def name_of(bench: Record) -> str:
     """Return the name of a record's file."""
     return str(bench.provenance.get("file") or "record")
-
-
-def speed_of(bench: Record, model: RotorModel) -> float:
-    """Return the speed of a record in rad/s: of its angle or speed channel, else that of the model."""
-    if "angle" in bench:
-        turned = np.unwrap(bench["angle"].values)
-        seconds, angle = (bench.n_samples - 1) / bench.rate_hz, float(turned[-1] - turned[0])
-        return angle / seconds if abs(angle) > _AT_REST else 0.0
-    if "speed" in bench:
-        return float(np.mean(bench["speed"].values))
-    return model.speed
 
 
 def _check(bench: Record, rig: Rig) -> None:

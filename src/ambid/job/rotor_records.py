@@ -15,7 +15,7 @@ from ambid.job.data import Reading, Source, load_bench, overlap
 from ambid.record import Record
 from ambid.rig import Rig
 
-_TURNING = ("angle", "speed")
+_TURNING = ("angle", "speed", "tacho")
 _SAME_RATE = 1e-6
 
 

@@ -130,8 +130,8 @@ class RotorModel:
 
     @cached_property
     def optional_roles(self) -> Mapping[str, str]:
-        """Roles that a rig may name beside: the reference of each axis, in any unit."""
-        return {f"{axis}_reference": "?" for axis in self.axes}
+        """Roles that a rig may name beside, in any unit: the reference of each axis, pulses once a revolution."""
+        return {**{f"{axis}_reference": "?" for axis in self.axes}, "tacho": "?"}
 
     @cached_property
     def coordinates(self) -> tuple[str, ...]:

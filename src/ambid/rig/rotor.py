@@ -46,7 +46,7 @@ def rotor_of(file: RigFile, where: str) -> RotorModel:
     known = {f"{axis}.{what}" for axis in axes for what in ("gain", "sensor_pole")} | {"a"}
     return RotorModel(
         bearings=bearings, speed=speed, drives=tuple(drives),
-        polar=bool(speed) or "angle" in file.channels or "speed" in file.channels or "Ip" in file.parameters,
+        polar=bool(speed) or not {"angle", "speed", "tacho"}.isdisjoint(file.channels) or "Ip" in file.parameters,
         extras=tuple(sorted(name for name in file.parameters if name in known)),
     )  # fmt: skip
 

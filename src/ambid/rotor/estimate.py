@@ -74,7 +74,23 @@ class RotorEstimate(Parametric, Judged, Linear):
     sensitivity : Mapping[str, Any]
         Peak of the sensitivity by axis, where a loop is known or a reference is logged.
     synchronous : Mapping[str, Any]
-        Unbalance, run-out and synchronous response, of records at speed.
+        What the synchronous response of records at speed shows; empty without one. The angle runs from x to y, phases
+        are in rad against its zero, a number is ``{"value", "sd", "phase", "phase_sd", "identifiable"}``.
+
+        - ``records``: of each its number in `records`, ``speed`` in rad/s, ``drift`` (its range over its mean),
+          ``source`` of the angle, harmonics (``orders``); ``response`` by role with ``amplitude``, ``phase`` and ``sd``
+          of each harmonic, the part of the excitation taken out (``excitation_apart``); ``orbits`` by bearing at its
+          first sensors: ``major`` and ``minor`` radius of the synchronous orbit in m, whether it turns ``forward``,
+          the largest radius of the rest (``non_synchronous``), and the ``clearance``.
+        - ``used``: numbers of the records that the following comes from, with ``misfit``, the mean square of what it
+          leaves over the noise, and its degrees of ``freedom``; ``hint``: what stands against it.
+        - ``unbalance``: ``planes`` (the outer bearing planes, kg m, at ``z``), their sum ``static`` with ``grade_mm_s``
+          (e W of ISO 21940-11), ``modes`` (what each bending mode sees beyond the planes, kg^(1/2) m), and
+          ``one_plane``: where along the shaft it stands if ``fits`` one plane.
+        - ``runout``: of the sensors by their plane, m; x reads value cos(angle + phase), y the sine.
+        - ``influence``: by record and plane, motion at each position sensor of 1 kg m, m.
+        - ``balancing``: ``correction`` by plane in kg m, and ``vibration`` at each sensor in m without run-out:
+          ``before``, expected ``after``, and ``at_most`` with 95 %.
     validation : Mapping[str, object] or None
     warnings : tuple of str
     timing_s : Mapping[str, float]

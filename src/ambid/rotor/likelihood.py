@@ -58,10 +58,14 @@ class Weight:
 
 def sampled(experiment: Experiment, model: RotorModel, at: Point) -> Sampled:
     """Return the model at the lines and the speed of an experiment."""
-    spectra = experiment.spectra
+    return at_lines(model, at, experiment.spectra.omega, experiment.speed, experiment.spectra.rate_hz)
+
+
+def at_lines(model: RotorModel, at: Point, omega: Array, speed: float, rate_hz: float) -> Sampled:
+    """Return the model at a speed and angular frequencies in rad/s."""
     return Sampled(
-        space=model.at_speed(experiment.speed).matrices(at.theta), omega=spectra.omega, rate_hz=spectra.rate_hz,
-        delays=at.delays, held=tuple(model.drive(j) != "current" for j in range(len(model.axes))),
+        space=model.at_speed(speed).matrices(at.theta), omega=omega, rate_hz=rate_hz, delays=at.delays,
+        held=tuple(model.drive(j) != "current" for j in range(len(model.axes))),
     )  # fmt: skip
 
 

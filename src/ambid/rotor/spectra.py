@@ -124,10 +124,11 @@ def find_excitation(record: Record, model: RotorModel) -> Excitation | None:
     Leading periods with a transient are left out.
     """
     roles = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
-    signals = (record[role].values for role in (roles or model.inputs))
-    x = np.column_stack([s for s in signals if np.ptp(s) > 0.0] or [np.zeros(record.n_samples)])
+    signals = [record[role].values for role in (roles or model.inputs) if np.ptp(record[role].values) > 0.0]
+    if not signals:
+        return None
     try:
-        period = find_period(x)
+        period = find_period(np.column_stack(signals))
     except EstimationError:
         return None
     n = record.n_samples

@@ -1,0 +1,453 @@
+"""Unbalance, run-out and balancing of a rotor from synchronous responses and its identified model.
+
+At the speed W the outputs obey y = H(jW) v + X u + r whatever controller holds the rotor: H the plant from its inputs,
+X its response to unbalances u = U exp(j phase), whose force is U W² (cos, sin)(angle + phase) in the planes x and y, so
+that they turn with the rotor from x to y, and r the run-out of the sensors. Both u and r are found by generalised least
+squares over all records; weights count the noise between lines and the covariance of the plant, which is common to all.
+Currents see the rotor through the voltage that its motion induces, and no run-out; two speeds tell the two apart by W².
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.estimation.linear import directions
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.likelihood import Point, at_lines
+from ambid.rotor.replay import point_of
+from ambid.rotor.spectra import PeriodSpectra
+from ambid.rotor.synchronous import SynchronousResponse
+
+_ROUNDS = 3  # the plant's share of the covariance follows the unbalance
+_SEEN = 0.25  # standard deviation over size, up to which an unbalance or a run-out is identified
+_LINES = 16  # excited lines on either side that show the response to the excitation at a harmonic
+_ONE_PLANE = 3.0  # standard deviations within which an unbalance is that of one plane
+_FAR = 4.5  # standard deviations from which the response is not explained
+_CIRCLE_95 = 2.4477468306808166  # radius that holds 95 % of a round normal distribution, in standard deviations
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Machine:
+    """An identified rotor: its numbers, and the covariance of those that `names` lists."""
+
+    model: RotorModel
+    at: Point
+    names: tuple[str, ...]
+    covariance: Array
+
+    @classmethod
+    def of(cls, estimate: RotorEstimate) -> Machine:
+        """Return the machine of an estimate."""
+        return cls(
+            model=estimate.plant, at=point_of(estimate), names=estimate.covariance_names, covariance=estimate.covariance
+        )
+
+    def moved(self, by: Array) -> Machine:
+        """Return the machine with estimated numbers moved."""
+        theta, delays = dict(self.theta), self.at.delays.copy()
+        for name, step in zip(self.names, by.tolist(), strict=True):
+            if name.endswith(".delay"):
+                delays[self.model.inputs.index(name.removesuffix(".delay"))] += step
+            else:
+                theta[name] += step
+        return replace(self, at=Point(theta=theta, delays=delays))
+
+    @property
+    def theta(self) -> Mapping[str, float]:
+        """Numbers by the names of the model, SI."""
+        return self.at.theta
+
+    def transfer(self, omega: Array, speed: float, rate_hz: float) -> Complex:
+        """Return its sampled response at a speed, (n_lines, n_y, n_u); all in rad/s."""
+        return at_lines(self.model, self.at, omega, speed, rate_hz).transfer()
+
+    def forced(self, speed: float, shapes: Array) -> Complex:
+        """Return the response (n_y, n) of the outputs to unbalances of 1 kg m; `shapes`: (n_coordinates a plane, n)."""
+        of = self.model.at_speed(speed)
+        space, (mass, _, _) = of.matrices(self.theta), of.rotor_matrices(self.theta)
+        F = np.zeros((space.A.shape[0], shapes.shape[1]), dtype=complex)
+        n = mass.size
+        for plane, factor in ((0, 1.0), (1, -1j)):
+            at = [k for k, q in enumerate(of.coordinates) if q.endswith("xy"[plane]) and plane in of.planes]
+            if at:
+                F[[n + k for k in at]] = factor * speed**2 * shapes / mass[at, None]
+        return np.asarray(space.C @ np.linalg.solve(1j * speed * np.eye(space.A.shape[0]) - space.A, F))
+
+    def shape(self, place: str) -> Array:
+        """Return what an unbalance in a bearing's or sensor's plane does to the coordinates of a plane."""
+        modes = [self.theta[f"mode{r}.{place}"] for r in range(1, self.model.n_modes + 1)]
+        return np.array([1.0, self.theta[place] - self.theta["z_cg"], *modes])
+
+    def unknown_shapes(self, places: Sequence[str]) -> Array:
+        """Return the shapes of what is estimated: unbalance in planes, then what each bending mode sees beyond them."""
+        modes = np.eye(2 + self.model.n_modes)[:, 2:]
+        return np.column_stack([*(self.shape(p) for p in places), modes])
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Unbalance:
+    """Unbalance by plane, modal unbalance and run-out, as one vector of complex numbers with its covariance."""
+
+    names: tuple[str, ...]  # of planes, "mode1" …, sensor planes
+    value: Complex  # (n,); kg m, kg^(1/2) m, m
+    half: Array  # (2 n, k), covariance of (real parts, imaginary parts) is half halfᵀ
+    size: Array  # (n,), of a value that would explain the response alone
+    misfit: float  # mean square of whitened residuals over their degrees of freedom
+    freedom: int
+
+    def part(self, names: Sequence[str]) -> tuple[Complex, Array]:
+        """Return some of the numbers with their share of `half`."""
+        at = [self.names.index(x) for x in names]
+        return self.value[at], self.half[[*at, *(len(self.names) + k for k in at)]]
+
+    def entry(self, name: str) -> dict[str, Any]:
+        """Return one number for a result: value, phase and standard deviations."""
+        k = self.names.index(name)
+        value, half = self.part([name])
+        return {**polar(complex(value[0]), half), "identifiable": bool(_spread(half) <= _SEEN * self.size[k])}
+
+
+def polar(value: complex, half: Array) -> dict[str, Any]:
+    """Return size and phase of a complex number with standard deviations; `half`: (2, k)."""
+    size = abs(value)
+    along = np.array([value.real, value.imag]) / size if size else np.array([1.0, 0.0])
+    sd, across = (float(np.linalg.norm(d @ half)) for d in (along, np.array([-along[1], along[0]])))
+    return {
+        "value": float(size), "sd": sd, "phase": float(np.angle(value)),
+        "phase_sd": min(across / size, np.pi) if size else np.pi,
+    }  # fmt: skip
+
+
+def estimate_unbalance(
+    machine: Machine,
+    responses: Sequence[SynchronousResponse],
+    *,
+    runout: Mapping[str, complex] | None = None,
+) -> Unbalance:
+    """Estimate unbalance in the outer bearing planes, modal unbalance, and run-out of the sensors.
+
+    `runout`: of sensor planes where it is known, m; the others' is estimated.
+    """
+    model, given = machine.model, dict(runout or {})
+    planes = places_of(model)
+    free = [place for place in read_by(model) if place not in given]
+    names = (*planes, *(f"mode{r}" for r in range(1, model.n_modes + 1)), *free)
+    parts = [_Part.of(machine, r, planes, free, given) for r in responses]
+    u = np.zeros(len(names), dtype=complex)
+    noise = [p.noise_half for p in parts]
+    for _ in range(_ROUNDS):
+        common = np.concatenate([p.plant_half(machine, u) for p in parts])
+        A, b = (np.concatenate(x) for x in zip(*((_real_rows(p.X), _real(p.left)) for p in parts), strict=True))
+        factor = np.linalg.cholesky(_block(noise) + common @ common.T)
+        A, b = (np.linalg.solve(factor, x) for x in (A, b))
+        found = directions(A)
+        x = found.solve(b)
+        u = x[: len(names)] + 1j * x[len(names) :]
+    freedom = max(b.size - x.size, 0)
+    misfit = float(np.sum((b - A @ x) ** 2)) / freedom if freedom else 0.0
+    return Unbalance(names=names, value=u, half=found.root(1e-9), size=_sizes(A, b, u), misfit=misfit, freedom=freedom)
+
+
+def places_of(model: RotorModel) -> list[str]:
+    """Return the outermost radial bearing planes."""
+    radial = [f"{b.name}.z" for b in model.bearings if not b.axial]
+    return list(dict.fromkeys([radial[0], radial[-1]])) if radial else []
+
+
+def _sizes(A: Array, b: Array, u: Complex) -> Array:
+    """Return of each number the larger of its size and of the size at which it alone would explain the response."""
+    n = u.size
+    alone = [np.linalg.lstsq(A[:, [k, n + k]], b, rcond=None)[0] for k in range(n)]
+    return np.maximum(np.abs(u), [float(np.hypot(*x)) for x in alone])
+
+
+def read_by(model: RotorModel) -> dict[str, Complex]:
+    """Return by sensor plane what its run-out exp(j phase) does to the outputs: cos(angle + phase) in x, sin in y."""
+    found: dict[str, Complex] = {}
+    for row, (j, k) in enumerate(model.sensors):
+        bearing, plane = model.placed[j]
+        if plane < 2:
+            read = found.setdefault(bearing.sensor_parameter(k), np.zeros(len(model.outputs), dtype=complex))
+            read[row] = 1.0 if plane == 0 else -1j
+    return found
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Part:
+    """What one record says: left = X u + noise."""
+
+    response: SynchronousResponse
+    V: Complex  # (n_u,)
+    X: Complex  # (n_y, n)
+    left: Complex  # (n_y,)
+    noise_half: Array  # (2 n_y, 2 n_y)
+    planes: tuple[str, ...]
+
+    @classmethod
+    def of(
+        cls,
+        machine: Machine,
+        response: SynchronousResponse,
+        planes: Sequence[str],
+        free: Sequence[str],
+        known: Mapping[str, complex],
+    ) -> _Part:
+        model, W, rate = machine.model, response.speed, response.rate_hz
+        V, Y = (np.array([response.of(role) for role in roles]) for roles in (model.inputs, model.outputs))
+        f, bins = response.noise()
+        columns = [[response.roles.index(r) for r in roles] for roles in (model.inputs, model.outputs)]
+        H = machine.transfer(np.array([W, *(2.0 * np.pi * f)]), W, rate)
+        U_f, Y_f = (bins[:, at] for at in columns)
+        e = Y_f - np.einsum("kyu,ku->ky", H[1:], U_f)
+        e = np.conj(e) if W < 0 else e
+        C = response.inflation[0] * e.T @ np.conj(e) / len(f)
+        real = 0.5 * np.block([[C.real, -C.imag], [C.imag, C.real]])
+        read = read_by(model)
+        X = np.column_stack([machine.forced(W, machine.unknown_shapes(planes)), *(read[place] for place in free)])
+        offset = sum((x * read[place] for place, x in known.items()), np.zeros(len(model.outputs), dtype=complex))
+        return cls(
+            response=response, V=V, X=X, left=Y - H[0] @ V - offset,
+            noise_half=np.asarray(np.linalg.cholesky(real + 1e-12 * np.diag(np.diag(real)))), planes=tuple(planes),
+        )  # fmt: skip
+
+    def plant_half(self, machine: Machine, u: Complex) -> Array:
+        """Return what one standard deviation along each direction of the plant's covariance does, (2 n_y, n)."""
+        values, vectors = np.linalg.eigh(machine.covariance)
+        steps = (vectors * np.sqrt(np.maximum(values, 0.0))).T
+        W, n = self.response.speed, len(self.planes) + machine.model.n_modes
+
+        def expected(step: Array) -> Complex:
+            of = machine.moved(step)
+            H = of.transfer(np.array([W]), W, self.response.rate_hz)[0]
+            return np.asarray(H @ self.V + of.forced(W, of.unknown_shapes(self.planes)) @ u[:n])
+
+        slopes = [0.5 * (expected(s) - expected(-s)) for s in steps]
+        return np.column_stack([_real(x) for x in slopes]) if slopes else np.zeros((2 * self.left.size, 0))
+
+
+def _real(x: Complex) -> Array:
+    return np.concatenate([x.real, x.imag])
+
+
+def _real_rows(X: Complex) -> Array:
+    return np.block([[X.real, -X.imag], [X.imag, X.real]])
+
+
+def _block(halves: Sequence[Array]) -> Array:
+    size = sum(h.shape[0] for h in halves)
+    found, at = np.zeros((size, size)), 0
+    for h in halves:
+        found[at : at + h.shape[0], at : at + h.shape[0]] = h @ h.T
+        at += h.shape[0]
+    return found
+
+
+def _spread(half: Array) -> float:
+    """Return the rms of both parts of a complex number with covariance half halfᵀ, half (2, k)."""
+    return float(np.sqrt(0.5 * np.sum(half**2)))
+
+
+# --- what is told of it ---------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Turned:
+    """A record in which the rotor turned: its number and response, its spectra where its excitation is periodic.
+
+    `controller`: K of u = F r - K y at the speed, (n_u, n_y), where it is known.
+    """
+
+    record: int
+    response: SynchronousResponse
+    spectra: PeriodSpectra | None = None
+    controller: Complex | None = None
+
+    def own(self, order: int = 1) -> tuple[Complex, Array, bool]:
+        """Return amplitudes of inputs and outputs at a harmonic without the response to the excitation, and their sd.
+
+        Where an excited line falls on the harmonic, its part follows from the references there and the response to
+        them at neighbouring lines, a parabola over the frequency; without references it stays, and the last is false.
+        """
+        r, s = self.response, self.spectra
+        k, n = r.orders.index(order), sum(not role.endswith("_reference") for role in r.roles)
+        a, sd = r.amplitude[k, :n], r.sd(order)[:n]
+        if not r.together[k]:
+            return a, sd, True
+        f = order * abs(r.speed) / (2.0 * np.pi)
+        if s is None or s.R is None or s.frequency_hz.size < 2 * _LINES:
+            return a, sd, False
+        near = np.argsort(np.abs(s.frequency_hz - f))[: 2 * _LINES]
+        axes = [role.rsplit("_", 1)[0] for role in r.roles[: s.R.shape[1]]]
+        at = [j for j, axis in enumerate(axes) if np.any(s.R[near, j]) and f"{axis}_reference" in r.roles]
+        drive = np.array([r.of(f"{axes[j]}_reference", order) for j in at])
+        drive = np.conj(drive) if r.speed < 0.0 else drive
+        away = (s.frequency_hz[near, None] - f) * s.period / s.rate_hz / _LINES
+        A = np.hstack([s.R[near][:, at] * away**p for p in range(3)])
+        solve = np.linalg.pinv(A, rcond=1e-9)
+        Z = np.hstack([s.mean_u, s.mean_y])[near]
+        left = np.sqrt(np.sum(np.abs(Z - A @ (solve @ Z)) ** 2, axis=0) / (near.size - A.shape[1]))
+        row = drive @ solve[: len(at)]
+        part = row @ Z
+        part = np.conj(part) if r.speed < 0.0 else part
+        return a - part, np.hypot(sd, float(np.linalg.norm(row)) * left / np.sqrt(2.0)), True
+
+    def loop(self, machine: Machine) -> Complex | None:
+        """Return what the feedback makes of a disturbance of the outputs: (I + H K)⁻¹, (n_y, n_y)."""
+        if self.controller is None:
+            return None
+        W = self.response.speed
+        H = machine.transfer(np.array([W]), W, self.response.rate_hz)[0]
+        K = np.conj(self.controller) if W < 0.0 else self.controller
+        return np.asarray(np.linalg.inv(np.eye(H.shape[0]) + H @ K))
+
+
+def balance_rotor(
+    machine: Machine,
+    turned: Sequence[Turned],
+    *,
+    runout: Mapping[str, complex] | None = None,
+    clearance: float | None = None,
+) -> dict[str, Any]:
+    """Return unbalance, run-out, influence and a proposal for balancing as `RotorEstimate.synchronous` keeps them.
+
+    `clearance`: radius in m within which the rotor may move.
+    """
+    marked = [t for t in turned if t.response.rotation.marked]
+    used = marked or [max(turned, key=lambda t: abs(t.response.speed))]
+    u = estimate_unbalance(machine, [t.response for t in used], runout=runout)
+    planes = places_of(machine.model)
+    found: dict[str, Any] = {
+        "records": [_record(machine.model, t, clearance) for t in turned],
+        "used": [t.record for t in used],
+        "unbalance": _unbalance(machine, u, planes, max(abs(t.response.speed) for t in used)),
+        "runout": {place: u.entry(place) for place in read_by(machine.model) if place in u.names},
+        "misfit": u.misfit, "freedom": u.freedom,
+    }  # fmt: skip
+    unseen = [p for p in planes if not found["unbalance"]["planes"][p]["identifiable"]]
+    found["hint"] = _hint(unseen, u, marked=bool(marked), records=len(used))
+    if not unseen:
+        found |= _proposal(machine, used, u, planes)
+    return found
+
+
+def _record(model: RotorModel, t: Turned, clearance: float | None) -> dict[str, Any]:
+    """Return the response of one record by role and harmonic, and the orbit in each bearing."""
+    r = t.response
+    parts = [t.own(order) for order in r.orders]
+    response = {
+        role: {
+            "amplitude": [float(abs(a[k])) for a, _, _ in parts], "phase": [float(np.angle(a[k])) for a, _, _ in parts],
+            "sd": [float(sd[k]) for _, sd, _ in parts],
+        }
+        for k, role in enumerate(r.roles[: parts[0][0].size])
+    }  # fmt: skip
+    orbits = {}
+    for b in model.bearings:
+        if len(b.axes) == 2 and not b.axial:
+            k = [r.roles.index(f"{axis}_position") for axis in b.axes]
+            x, y = (complex(parts[0][0][j]) for j in k)
+            forward, backward = abs(x + 1j * y) / 2.0, abs(x - 1j * y) / 2.0
+            orbits[b.name] = {
+                "major": forward + backward, "minor": abs(forward - backward), "forward": bool(forward >= backward),
+                "non_synchronous": float(np.max(np.hypot(*r.left[:, k].T))), "clearance": clearance,
+            }  # fmt: skip
+    return {
+        "record": t.record, "speed": r.speed, "drift": r.rotation.drift, "source": r.rotation.source,
+        "orders": list(r.orders), "excitation_apart": all(apart for _, _, apart in parts), "response": response,
+        "orbits": orbits,
+    }  # fmt: skip
+
+
+def _unbalance(machine: Machine, u: Unbalance, planes: Sequence[str], speed: float) -> dict[str, Any]:
+    """Return unbalance by plane, static, modal, and where it would stand in one plane."""
+    value, half = u.part(planes)
+    n, z = len(planes), np.array([machine.theta[p] for p in planes])
+    add = np.hstack([np.eye(1), np.eye(1)]) if n == 2 else np.eye(1)
+    static = {**polar(complex(value.sum()), _through(add.astype(complex), half))}
+    static["grade_mm_s"] = 1e3 * static["value"] * speed / machine.theta["m"]
+    found: dict[str, Any] = {
+        "planes": {p: {"z": float(machine.theta[p]), **u.entry(p)} for p in planes},
+        "static": static,
+        "modes": {name: u.entry(name) for name in u.names if name.startswith("mode")},
+    }
+    if n == 2:
+        # z = Σ z U/Σ U is real where one plane holds all; its slope by the U of a plane is (z_p - z)/Σ U
+        at = complex(z @ value / value.sum())
+        spread = _through(((z - at) / value.sum())[None, :], half)
+        sd = [float(np.linalg.norm(row)) for row in spread]
+        found["one_plane"] = {"z": at.real, "sd": sd[0], "fits": bool(abs(at.imag) < _ONE_PLANE * sd[1])}
+    return found
+
+
+def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance, planes: Sequence[str]) -> dict[str, Any]:
+    """Return influence coefficients, and the masses that leave least vibration, with what they leave."""
+    model, sensors = machine.model, read_by(machine.model)
+    rows = [k for k in range(len(model.sensors)) if any(x[k] for x in sensors.values())]
+    free = [place for place in sensors if place in u.names]
+    n = len(u.names) - len(free)
+    moved, influence, roles = [], [], []
+    for t in used:
+        loop = t.loop(machine)
+        if loop is None:  # a rigid rotor is balanced whatever holds it, by as much as is known
+            opposite = {p: polar(-complex(u.value[j]), u.part([p])[1]) for j, p in enumerate(planes)}
+            return {} if machine.model.n_modes else {"balancing": {"correction": opposite, "vibration": []}}
+        X = loop @ machine.forced(t.response.speed, machine.unknown_shapes(planes))
+        shaken = [(loop - np.eye(loop.shape[0])) @ sensors[p] for p in free]  # by a run-out that the loop follows
+        moved.append(np.column_stack([X, *shaken])[rows])
+        influence += [
+            {
+                "record": t.record, "plane": p,
+                "sensors": {
+                    model.outputs[k]: {"value": float(abs(X[k, j])), "phase": float(np.angle(X[k, j]))} for k in rows
+                },
+            }
+            for j, p in enumerate(planes)
+        ]  # fmt: skip
+        roles += [(t.record, model.outputs[k]) for k in rows]
+    M = np.concatenate(moved)
+    A = M[:, : len(planes)]
+    take = np.linalg.pinv(A) @ M[:, :n]  # what the masses have to undo, in their planes
+    correction, half = -take @ u.value[:n], _through(take, u.part(u.names[:n])[1])
+    left = M @ u.value + A @ correction
+    sd = [float(np.linalg.norm(_through(row[None, :], u.half), 2)) for row in M]  # masses that stay as they are
+    return {
+        "influence": influence,
+        "balancing": {
+            "correction": {p: polar(complex(correction[j]), half[[j, len(planes) + j]]) for j, p in enumerate(planes)},
+            "vibration": [
+                {
+                    "record": record, "sensor": role,
+                    "before": float(abs(M[k] @ u.value)), "after": float(abs(left[k])),
+                    "at_most": float(abs(left[k]) + _CIRCLE_95 * sd[k]),
+                }
+                for k, (record, role) in enumerate(roles)
+            ],
+        },
+    }  # fmt: skip
+
+
+def _through(L: Complex, half: Array) -> Array:
+    """Return half of the covariance of L u, from that of u, both as real over imaginary parts."""
+    return np.asarray(_real_rows(L) @ half)
+
+
+def _hint(unseen: Sequence[str], u: Unbalance, *, marked: bool, records: int) -> str:
+    """Say what stands against the numbers; empty where nothing does."""
+    if unseen:
+        more = "a second record at another speed" if records == 1 else "a record at a speed further off"
+        return (
+            f"unbalance in {', '.join(unseen)} and run-out of the sensors cannot be told apart: take {more}, log the "
+            "voltages, or give the run-out in the rig"
+        )
+    if u.freedom and (u.misfit - 1.0) * np.sqrt(u.freedom / 2.0) > _FAR:
+        return (
+            f"unbalance and run-out leave {u.misfit:.3g} times the noise of the synchronous response: speed, planes or "
+            "modes may be wrong, or another force turns with the rotor"
+        )
+    return "" if marked else "phases count from the first sample: log the angle or pulses to know where the mass is"
