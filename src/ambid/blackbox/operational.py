@@ -33,6 +33,7 @@ _BANDS, _SHARE = 8, 0.25  # at most so many bands, each so wide beside its frequ
 _PEAK = 4.0  # power at a mode's frequency over that beside it
 _ROWS = 160  # of the Toeplitz matrix, about: lags times outputs
 _LAGS = (12, 60)
+_MEMORY = 40.0  # periods of the middle of the band that lags reach: a time constant at 0.4 % damping
 _ORDERS = 20
 _STRETCHES = 12  # of the jackknife
 _STEADY = 1.5  # fourth moment of an envelope over its squared second: 2 for noise, 1 for a harmonic
@@ -151,7 +152,9 @@ def _of_band(Y: Complex, omega: Array, inside: tuple[float, float]) -> tuple[lis
 def _shifted(Y: Complex, omega: Array) -> _Band:
     """Covariances of a band as a complex signal at the band's own rate."""
     n, n_y = Y.shape
-    lags = 2 * min(max(_ROWS // n_y, _LAGS[0]), _LAGS[1])
+    step = (omega[-1] - omega[0]) / (n - 1)
+    memory = int(_MEMORY * n * step / omega[n // 2])
+    lags = 2 * max(min(memory, _ROWS // n_y, _LAGS[1]), _LAGS[0])
     z = np.fft.ifft(Y, axis=0) * np.sqrt(n)
     edges = np.linspace(0, n, _STRETCHES + 1).astype(int)
     R = np.zeros((_STRETCHES, lags, n_y, n_y), dtype=np.complex128)
@@ -161,7 +164,6 @@ def _shifted(Y: Complex, omega: Array) -> _Band:
             late = z[a + k : min(b + k, n)]
             R[s, k] = late.T @ z[a : a + late.shape[0]].conj()
             counts[s, k] = late.shape[0]
-    step = (omega[-1] - omega[0]) / (n - 1)
     return _Band(centre=float(omega[0]), period=2 * np.pi / (n * step), R=R, counts=counts)
 
 
