@@ -9,7 +9,7 @@ z runs along the shaft, slopes alpha = dx/dz, beta = dy/dz (theory.md sec. 5). W
 
 Where only the command of a current amplifier is logged, i' = p (g u - i) (thesis eq. 1.5: p = (R + K H)/L and
 g = K/(R + K H), voltages induced by motion neglected against K). Command and position show p, and of k_i and g only the
-product; K, H, R and L cannot be told apart.
+product; K, H, R and L do not show one by one.
 """
 
 from __future__ import annotations

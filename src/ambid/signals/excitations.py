@@ -535,7 +535,7 @@ def excitation_of_axes(
     if name not in AXES_EXCITATIONS:
         if name in ("steps", "chirp", "schroeder") and len(moved) > 1:
             raise AmbidError(
-                f"excitation {name!r} is the same on every axis, which tells them not apart. Give {AXES_EXCITATIONS[0]}"
+                f"excitation {name!r} is the same on every axis, so none shows by itself. Give {AXES_EXCITATIONS[0]}"
             )
         for j in moved:
             x = excitation(name, period, rate_hz, amplitude=amplitude, band=band, seed=np.random.default_rng([seed, j]))
