@@ -17,6 +17,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
+from ambid.rotor.scores import agreement_checks, scores
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
@@ -73,7 +74,12 @@ class Evidence:
 
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
-    return Evidence(method="periods", noise=_noise(fit), fit=_fits(fit), checks=_residual_checks(fit))
+    return Evidence(
+        method="periods",
+        noise=_noise(fit),
+        fit=_fits(fit),
+        checks={**_residual_checks(fit), **agreement_checks(scores(fit.problem, fit.vector), fit.model)},
+    )
 
 
 def conclude(
@@ -223,7 +229,7 @@ def _residual_checks(fit: RotorFit) -> dict[str, Check]:
             passed=white, values={"z": worst["z"]},
             detail=detail + ", in every band" if white else f"the model misses part of {worst['where']} "
             f"(z = {worst['z']:.3g}"
-            "). A mode, a delay or a sensor's pole may be missing, a plane be wrong",
+            "). A mode, a delay or a sensor's pole may be missing, or the magnets be nonlinear: excite less",
         ),
         "residuals_uncorrelated": Check(
             passed=whole, values={"mean_square": ratio, "z": float(z_all)},

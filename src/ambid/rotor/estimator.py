@@ -23,6 +23,7 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
 from ambid.rotor.modes import scan
+from ambid.rotor.scores import sensor_gain
 from ambid.rotor.spectra import joined
 from ambid.rotor.start import rigid_start
 from ambid.rotor.unknowns import Unknowns
@@ -202,7 +203,7 @@ class _Work:
                 weight = rough_weight(band[0], model, at, _RELATIVE)
                 low = float(band[0].spectra.frequency_hz.min())
                 found = scan(band[0], model, at, weight, (low, _ABOVE * edge))
-                if found is None:
+                if found is None or self._sensors(band, model, at, [weight]) > found.gain:
                     break
                 more = model.with_modes(model.n_modes + 1)
                 trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
@@ -248,15 +249,19 @@ class _Work:
         if whole is not None:
             delays = tuple(float(x) for x in whole)
             held = replace(self, delays=delays)
-            fit = held.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)))
+            fit = held.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)), fit)
         return fit
 
-    def likely(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> RotorFit:
-        """Search with the noise model, which follows it twice, and correct for feedback."""
+    def likely(
+        self, experiments: Sequence[Experiment], model: RotorModel, at: Point, before: RotorFit | None = None
+    ) -> RotorFit:
+        """Search with the noise model, which follows it, and correct for feedback; `before`: at a point nearby."""
         self.tick("fit", 0.0)
-        converged, cost = False, np.inf
+        converged, cost = False, np.inf if before is None else before.cost
+        known: Sequence[Weight | None] = [None] * len(experiments) if before is None else before.problem.weights
         for k in range(3):
-            weights = [noise_weight(e, model, at) for e in experiments]
+            weights = [noise_weight(e, model, at, w) for e, w in zip(experiments, known, strict=True)]
+            known = weights
             problem = self.problem(experiments, model, at, weights)
             self.tick("fit", 0.3 * (k + 1))
             at, found = minimise(problem, at, most=40, tolerance=1e-7)
@@ -281,17 +286,22 @@ class _Work:
         low, high = float(e.spectra.frequency_hz.min()), float(e.spectra.frequency_hz.max())
         found = scan(e, fit.model, fit.point, w, (low, 2.0 * high))
         price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
-        if found is None or found.gain < price:
+        if found is None or found.gain < max(price, sensor_gain(fit.problem, fit.vector)):
             return None
         more = fit.model.with_modes(fit.model.n_modes + 1)
         theta = _with_mode(fit.point.theta, more, found.named(more.n_modes))
         try:
-            trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)))
+            trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)), fit)
         except np.linalg.LinAlgError:  # ran off
             return None
         # Weights follow the model: both are judged by those of the larger one.
         before = replace(fit.problem, weights=trial.problem.weights)
         return trial if before.cost(fit.vector) - trial.cost > price else None
+
+    def _sensors(self, band: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]) -> float:
+        """Return what a sensor at fault would explain, which no bending mode is to stand in for."""
+        problem = self.problem(band[:1], model, at, weights)
+        return sensor_gain(problem, problem.pack(at))
 
     def _whole(self, fit: RotorFit) -> Array | None:
         """Return the delays where all that are searched agree with whole samples."""

@@ -23,6 +23,7 @@ from ambid.rotor.unknowns import Unknowns
 
 _ROOT_2 = np.sqrt(2.0)
 _CORRECTIONS = 6
+_FAR = 50.0  # logarithms beyond which a number is no machine's
 _SETTLED = 1e-3  # squared length of a corrected step, in standard deviations, below which it is over
 
 
@@ -56,9 +57,11 @@ class Weight:
     noise: Noise | None = None
 
 
-def sampled(experiment: Experiment, model: RotorModel, at: Point) -> Sampled:
-    """Return the model at the lines and the speed of an experiment."""
-    return at_lines(model, at, experiment.spectra.omega, experiment.speed, experiment.spectra.rate_hz)
+def sampled(experiment: Experiment, model: RotorModel, at: Point, *, between: bool = False) -> Sampled:
+    """Return the model at the speed of an experiment, at its lines or between them."""
+    spectra = experiment.spectra
+    omega = 2.0 * np.pi * spectra.between.frequency_hz if between else spectra.omega
+    return at_lines(model, at, omega, experiment.speed, spectra.rate_hz)
 
 
 def at_lines(model: RotorModel, at: Point, omega: Array, speed: float, rate_hz: float) -> Sampled:
@@ -76,13 +79,13 @@ def rough_weight(experiment: Experiment, model: RotorModel, at: Point, relative:
     return Weight(whiten=(np.eye(variance.shape[1]) / np.sqrt(variance)[:, :, None]).astype(np.complex128))
 
 
-def noise_weight(experiment: Experiment, model: RotorModel, at: Point) -> Weight:
-    """Return weights by the noise model, with the feedback."""
+def noise_weight(experiment: Experiment, model: RotorModel, at: Point, before: Weight | None = None) -> Weight:
+    """Return weights by the noise model, with the feedback; `before`: those at a point nearby."""
     of, spectra = sampled(experiment, model, at), experiment.spectra
-    H = of.transfer()
-    noise = fit_noise(spectra, of, H)
+    beside, H = sampled(experiment, model, at, between=True), of.transfer()
+    noise = fit_noise(spectra.between, beside, of, None if before is None else before.noise)
     factor = np.linalg.cholesky(noise.covariance / spectra.n_periods)
-    back = feedback(spectra, H, measured=not all(of.held))
+    back = feedback(spectra, H, beside.transfer(), measured=not all(of.held))
     return Weight(whiten=np.linalg.inv(factor).astype(np.complex128), back=back, noise=noise)
 
 
@@ -114,7 +117,7 @@ class Likelihood:
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squares of whitened residuals and priors."""
-        if not np.all(np.isfinite(theta)) or np.any(np.abs(theta[: len(self.unknowns.logs)]) > 200.0):
+        if not np.all(np.isfinite(theta)) or np.any(np.abs(theta[: len(self.unknowns.logs)]) > _FAR):
             return np.inf
         with np.errstate(all="ignore"):
             try:

@@ -1,14 +1,14 @@
-"""Noise of a rotor's spectra: levels of sensors, forces and voltages from the scatter between periods, and feedback.
+"""Noise of a rotor's spectra: levels of sensors, forces and voltages from between the excited lines, and feedback.
 
-The residual of one period is e_p = Y_p - H U_p. Its covariance over the lines is that of white sources seen through the
-model,
+Between the lines of a periodic excitation e = Y - H U is noise alone. Its covariance is that of white sources seen
+through the model,
 
     C(k) = Σ_j s_j g_j(k) g_j(k)ᴴ,   g_j: a sensor's unit vector, or the response to a held force or voltage,
 
-whose levels s_j maximise the likelihood of the scatter of e_p about its mean (Fisher scoring; Pintelon and Schoukens
-2012, ch. 10 and 12). Feedback carries that noise back into the inputs: with U = R - K Y the inputs hold -(I + K H)⁻¹ K
-e; K follows from the scatter of U and Y, which a controller binds line by line. Inputs that are measured themselves,
-such as currents without voltages, hold noise of their own: there Q follows from the scatter of U and e.
+whose levels s_j maximise the likelihood (Fisher scoring; Pintelon and Schoukens 2012, ch. 10 and 12). Feedback carries
+that noise back into the inputs: with U = R - K Y they hold -(I + K H)⁻¹ K e; K follows from U and Y between the lines,
+which a controller binds. Inputs that are measured themselves, such as currents without voltages, hold noise of their
+own: there Q follows from U and e.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.estimation.linear import least_squares
 from ambid.rotor.response import Sampled
-from ambid.rotor.spectra import PeriodSpectra, smoothed
+from ambid.rotor.spectra import Between, PeriodSpectra, smoothed
 
 _STEPS = 40
-_SETTLED = 1e-4
+_SETTLED = 1e-3
 _LEAST = 1e-14  # level of a source, over the mean power that it would explain alone
 _LINES_PER_UNKNOWN = 3
 
@@ -33,7 +33,7 @@ class Noise:
     """Noise of one period's residuals."""
 
     levels: Array  # (n_sources,): variance of one period's spectrum, sensors first, then disturbances
-    covariance: Complex  # (n_lines, n_y, n_y), of one period
+    covariance: Complex  # (n_lines, n_y, n_y) at the excited lines, of one period
 
     def sd(self, period: int) -> Array:
         """Return the rms of each source in samples of SI units."""
@@ -45,69 +45,74 @@ def residuals(spectra: PeriodSpectra, H: Complex) -> Complex:
     return np.asarray(spectra.Y - np.einsum("kyu,pku->pky", H, spectra.U))
 
 
-def fit_noise(spectra: PeriodSpectra, sampled: Sampled, H: Complex) -> Noise:
-    """Return the noise at a model: levels by maximum likelihood, covariance at each line."""
-    e = residuals(spectra, H)
-    apart = e - e.mean(axis=0)
-    freedom = spectra.n_periods - 1
-    scatter = np.einsum("pki,pkj->kij", apart, apart.conj()) / freedom
-    n_y = e.shape[2]
-    unit = np.broadcast_to(np.eye(n_y, dtype=complex), (e.shape[1], n_y, n_y))
-    g = np.concatenate([unit, sampled.disturbed()], axis=2)  # (n_lines, n_y, n_sources)
+def fit_noise(between: Between, beside: Sampled, sampled: Sampled, before: Noise | None = None) -> Noise:
+    """Return the noise at a model: levels by maximum likelihood between the lines, covariance at each line.
+
+    `beside`, `sampled`: the model between the lines and at them; `before`: at a model nearby.
+    """
+    e = between.Y - (beside.transfer() @ between.U[:, :, None])[:, :, 0]
+    g = _sources(beside)  # (n_between, n_y, n_sources)
     power = np.real(np.einsum("kij,kij->kj", g.conj(), g))
-    size = np.sqrt(np.maximum(power, 1e-300))
-    typical = np.real(np.einsum("kis,kij,kjs->ks", (g / size[:, None, :]).conj(), scatter, g / size[:, None, :]))
-    start = np.median(typical / np.maximum(power, 1e-300), axis=0) / 2.0
-    levels = np.maximum(start, 1e-300)
-    least = _LEAST * levels
+    pulled = np.abs(np.einsum("kis,ki->ks", g.conj(), e)) ** 2 / np.maximum(power, 1e-300) ** 2
+    alone = np.maximum(np.median(pulled, axis=0) / 2.0, 1e-300)
+    least = _LEAST * alone
+    levels = alone if before is None else before.levels
     for _ in range(_STEPS):
-        inverse = np.linalg.inv(_covariance(g, levels))
-        back = inverse @ g
-        pulled = np.real(np.einsum("kis,kij,kjs->s", back.conj(), scatter, back))
-        present = np.real(np.einsum("kis,kis->s", g.conj(), back))
-        gradient = freedom * levels * (pulled - present)
+        back = np.linalg.solve(_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
+        back, whitened = back[:, :, :-1], back[:, :, -1]
+        seen = np.sum(np.abs(np.einsum("kis,ki->ks", g.conj(), whitened)) ** 2, axis=0)
         products = np.conj(np.swapaxes(g, 1, 2)) @ back
-        information = freedom * np.sum(np.abs(products) ** 2, axis=0) * np.outer(levels, levels)
-        step = least_squares(information + 1e-9 * np.diag(np.diag(information)), gradient)
+        present = np.real(np.einsum("kss->s", products))
+        information = np.sum(np.abs(products) ** 2, axis=0) * np.outer(levels, levels)
+        step = least_squares(information + 1e-9 * np.diag(np.diag(information)), levels * (seen - present))
         step = np.clip(step, -2.0, 2.0)
         levels = np.maximum(levels * np.exp(step), least)
         if float(np.max(np.abs(step) * (levels > 2.0 * least))) < _SETTLED:
             break
-    return Noise(levels=levels, covariance=_covariance(g, levels))
+    return Noise(levels=levels, covariance=_covariance(_sources(sampled), levels))
+
+
+def _sources(sampled: Sampled) -> Complex:
+    """Return what each source does to the outputs, (n_lines, n_y, n_sources): sensors, then disturbances."""
+    g = sampled.disturbed()
+    unit = np.broadcast_to(np.eye(g.shape[1], dtype=complex), (g.shape[0], g.shape[1], g.shape[1]))
+    return np.concatenate([unit, g], axis=2)
 
 
 def _covariance(g: Complex, levels: Array) -> Complex:
     return np.asarray((g * levels) @ np.conj(np.swapaxes(g, 1, 2)))
 
 
-def feedback(spectra: PeriodSpectra, H: Complex, *, measured: bool) -> Complex | None:
+def feedback(spectra: PeriodSpectra, H: Complex, beside: Complex, *, measured: bool) -> Complex | None:
     """Return Q(k), what goes with the residuals in the inputs, (n_lines, n_u, n_y); None: too few lines.
 
     K (or Q) is constant with a slope over as many neighbouring lines as its rows have unknowns, three equations for
-    each. `measured`: some inputs are no commands of a controller.
+    each. `H`, `beside`: the model at the lines and between them; `measured`: some inputs are no commands of a
+    controller.
     """
-    n_u, n_y = spectra.U.shape[2], spectra.Y.shape[2]
-    d_u, d_y = (x - x.mean(axis=0) for x in (spectra.U, residuals(spectra, H) if measured else spectra.Y))
-    window = int(np.ceil(_LINES_PER_UNKNOWN * 2 * n_y / (spectra.n_periods - 1)))
-    n = spectra.frequency_hz.size
-    if window > n:
+    of = spectra.between
+    at, n_u, n_y = of.frequency_hz, of.U.shape[1], of.Y.shape[1]
+    y = of.Y - (beside @ of.U[:, :, None])[:, :, 0] if measured else of.Y
+    window = _LINES_PER_UNKNOWN * 2 * n_y
+    if window > at.size:
         return None
-    size = np.sqrt(np.mean(np.abs(d_y) ** 2, axis=(0, 1)))
+    size = np.sqrt(np.mean(np.abs(y) ** 2, axis=0))
     if not np.all(size > 0.0):
         return None
-    centres = np.unique(np.r_[np.arange(window // 2, n - window // 2, max(1, window // 4)), n - 1 - window // 2])
+    centres = np.unique(
+        np.r_[np.arange(window // 2, at.size - window // 2, max(1, window // 4)), at.size - window // 2 - 1]
+    )
     K = np.empty((centres.size, n_u, n_y), dtype=complex)
     for j, c in enumerate(centres):
         near = slice(c - window // 2, c - window // 2 + window)
-        run = (spectra.frequency_hz[near] - spectra.frequency_hz[c]) / np.ptp(spectra.frequency_hz[near])
-        y = (d_y[:, near] / size).reshape(-1, n_y)
-        slope = y * np.tile(run, spectra.n_periods)[:, None]
-        found = np.linalg.lstsq(np.hstack([y, slope]), -d_u[:, near].reshape(-1, n_u), rcond=1e-10)[0]
+        run = (at[near] - at[c]) / np.ptp(at[near])
+        x = y[near] / size
+        found = np.linalg.lstsq(np.hstack([x, x * run[:, None]]), -of.U[near], rcond=1e-10)[0]
         K[j] = (found[:n_y] / size[:, None]).T
-    at = spectra.frequency_hz
-    every = np.stack([np.interp(at, at[centres], x) for x in K.reshape(centres.size, -1).T], axis=1)
-    found = every.reshape(n, n_u, n_y).astype(np.complex128)
-    return -found if measured else closed(found, H)
+    lines = spectra.frequency_hz
+    every = np.stack([np.interp(lines, at[centres], x) for x in K.reshape(centres.size, -1).T], axis=1)
+    smooth: Complex = np.asarray(every.reshape(lines.size, n_u, n_y), dtype=np.complex128)
+    return np.asarray(-smooth) if measured else closed(smooth, H)
 
 
 def closed(K: Complex, H: Complex) -> Complex:

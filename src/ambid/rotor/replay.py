@@ -52,7 +52,8 @@ class RotorReplay:
     def covariance(self) -> Complex:
         """Covariance of `left` by noise alone, (n_lines, n_y, n_y)."""
         spectra = self.experiment.spectra
-        return np.asarray(fit_noise(spectra, self.sampled, self.H).covariance / spectra.n_periods)
+        beside = sampled(self.experiment, self.model, point_of(self.estimate), between=True)
+        return np.asarray(fit_noise(spectra.between, beside, self.sampled).covariance / spectra.n_periods)
 
     @cached_property
     def whitened(self) -> tuple[Complex, Array]:

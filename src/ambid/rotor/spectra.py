@@ -26,6 +26,7 @@ _MOST_LINES = 1200
 _LINES_PER_UNKNOWN = 3
 _FLOOR = 1e-3  # power of the reference, over its largest, from which a line is excited
 _CLEAR = 25.0  # power of a position, over its noise, from which it is seen
+_MOST_BETWEEN = 1600  # lines between the excited ones that are kept
 _SYNCHRONOUS_LINES = 1.5  # lines beside a harmonic of the speed that are left out on either side
 
 
@@ -36,6 +37,30 @@ class Excitation:
     period: int
     first: int
     count: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Between:
+    """Spectra of the whole record between the excited lines, where noise stands alone; scaled as those of one period.
+
+    Over all periods at once less leaks from line to line than in single periods.
+    """
+
+    frequency_hz: Array  # (n_between,)
+    U: Complex
+    Y: Complex
+
+    @classmethod
+    def of(cls, parts: Sequence[Between]) -> Between:
+        """Return those of several records one after the other."""
+        return cls(
+            frequency_hz=np.concatenate([x.frequency_hz for x in parts]), U=np.concatenate([x.U for x in parts]),
+            Y=np.concatenate([x.Y for x in parts]),
+        )  # fmt: skip
+
+    def part(self, keep: NDArray[np.bool_]) -> Between:
+        """Return some of them."""
+        return Between(frequency_hz=self.frequency_hz[keep], U=self.U[keep], Y=self.Y[keep])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -50,6 +75,7 @@ class PeriodSpectra:
     period: int  # samples
     dropped: int  # samples before the first period that is used
     left_out_hz: Array  # lines near harmonics of the speed
+    between: Between  # empty of windowed spectra
     # variances of a spectrum where there is no second one to show them: of inputs and outputs, (n_lines, n)
     known_scatter: tuple[Array, Array] | None = None
 
@@ -89,9 +115,14 @@ class PeriodSpectra:
         return PeriodSpectra(
             frequency_hz=self.frequency_hz[keep], U=self.U[:, keep], Y=self.Y[:, keep],
             R=None if self.R is None else self.R[keep], rate_hz=self.rate_hz, period=self.period, dropped=self.dropped,
-            left_out_hz=self.left_out_hz,
+            left_out_hz=self.left_out_hz, between=self._beside(keep),
             known_scatter=None if (known := self.known_scatter) is None else (known[0][keep], known[1][keep]),
         )  # fmt: skip
+
+    def _beside(self, keep: NDArray[np.bool_]) -> Between:
+        f, spacing = self.between.frequency_hz, self.rate_hz / self.period
+        low, high = self.frequency_hz[keep][[0, -1]]
+        return self.between.part((f >= low - spacing) & (f <= high + spacing))
 
 
 def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
@@ -107,6 +138,7 @@ def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
         R=np.concatenate(logged) if len(logged) == len(references) else None, rate_hz=first.rate_hz,
         period=first.period, dropped=first.dropped, left_out_hz=np.concatenate([s.left_out_hz for s in spectra]),
         known_scatter=(np.concatenate([k[0] for k in known]), np.concatenate([k[1] for k in known])) if known else None,
+        between=Between.of([s.between for s in spectra]),
     )  # fmt: skip
 
 
@@ -176,6 +208,7 @@ def period_spectra(record: Record, model: RotorModel, found: Excitation, speed: 
     return PeriodSpectra(
         frequency_hz=frequency[~near], U=U[:, keep], Y=Y[:, keep], R=R[keep] if logged else None, rate_hz=rate,
         period=n, dropped=found.first, left_out_hz=frequency[near],
+        between=_between(record, model, found, keep, speed / (2.0 * np.pi)),
     )  # fmt: skip
 
 
@@ -213,6 +246,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     return PeriodSpectra(
         frequency_hz=frequency[keep], U=U[None, keep], Y=Y[None, keep], R=None, rate_hz=rate, period=n, dropped=0,
         left_out_hz=np.zeros(0), known_scatter=(np.zeros((keep.size, U.shape[1])), noise[keep]),
+        between=Between(frequency_hz=np.zeros(0), U=U[:0], Y=Y[:0]),
     )  # fmt: skip
 
 
@@ -232,6 +266,23 @@ def _scatter(U: Complex, Y: Complex) -> Array:
     variance = np.sum(np.abs(left) ** 2, axis=1) / (width - regressors.shape[2])
     middle = starts + 0.5 * (width - 1)
     return np.stack([np.interp(np.arange(n), middle, v) for v in variance.T], axis=1)
+
+
+def _between(record: Record, model: RotorModel, found: Excitation, lines: NDArray[np.intp], speed_hz: float) -> Between:
+    """Return the spectra between the excited lines, thinned where they are many."""
+    count, n = found.count, found.period
+    bins = (lines[:, None] * count + np.arange(1, count)).ravel()
+    frequency = np.asarray(bins * (record.rate_hz / (n * count)), dtype=np.float64)
+    clean = ~beside_harmonics(frequency, speed_hz, record.rate_hz / n)
+    every = max(1, bins.size // _MOST_BETWEEN)
+    bins, frequency = bins[clean][::every], frequency[clean][::every]
+
+    def spectra(roles: Sequence[str]) -> Complex:
+        signals = (record[role].values[found.first : found.first + count * n] for role in roles)
+        stacked: Complex = np.stack([np.fft.rfft(x)[bins] for x in signals], axis=1)
+        return stacked / (n * float(np.sqrt(count)))
+
+    return Between(frequency_hz=frequency, U=spectra(model.inputs), Y=spectra(model.outputs))
 
 
 def beside_harmonics(frequency_hz: Array, speed_hz: float, spacing_hz: float) -> NDArray[np.bool_]:
