@@ -153,4 +153,6 @@ def _words(s: Score, unit: str) -> str:
             f"the positions lag behind the currents by {1e6 * s.size:.3g} us ({sure}). Add to [parameters] an eddy "
             "pole, a, or the poles of the sensors"
         )
-    return f"{s.name} holds {100 * s.size:+.3g} % of the other plane ({sure}): cross-talk or a turned sensor. Check its mounting"
+    return (
+        f"{s.name} holds {100 * s.size:+.3g} % of the other plane ({sure}): cross-talk, or turned. Check its mounting"
+    )
