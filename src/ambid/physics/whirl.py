@@ -23,7 +23,7 @@ from ambid.physics.shaft import FreeRotor, Shaft
 SPEEDS = 121  # of the grid on which critical speeds are sought
 _SURE = 0.95  # likeness of two shapes, from which they are one mode
 _GONE = 0.2  # likeness below which a mode no longer oscillates
-_HALVINGS = 7  # of the step between two speeds, where modes are not told apart
+_STEPS = (1e-4, 1 / 60)  # of the highest speed: at the least step modes that repel each other count as crossing
 _BESIDE = 4  # modes followed beyond the lines shown, so that none is taken for one of them
 _MORE = 8  # bending modes of a shaft beyond those asked for
 
@@ -188,7 +188,7 @@ def campbell(
         first = first.lowest(lines + _BESIDE)
     path = [first]
     for w in speed[1:]:
-        path.append(_followed(whirl, path[-1], float(w)))
+        path.append(_followed(whirl, path[-1], float(w), float(speed[-1])))
     kept = [p.lowest(lines) for p in path]
     return Campbell(
         speed=speed, poles=np.array([p.poles for p in kept]), direction=np.array([p.direction for p in kept])
@@ -279,19 +279,21 @@ class _Whirl:
         return _At(speed=speed, poles=values[up], shapes=shapes, direction=direction)
 
 
-def _followed(whirl: _Whirl, before: _At, speed: float, halvings: int = _HALVINGS) -> _At:
+def _followed(whirl: _Whirl, before: _At, speed: float, top: float) -> _At:
     """Return the modes of `before` at another speed, in their order; nan where one no longer oscillates."""
     from scipy.optimize import linear_sum_assignment
 
+    step = (speed - before.speed) / top
+    if step > _STEPS[1]:
+        return _followed(whirl, _followed(whirl, before, (before.speed + speed) / 2.0, top), speed, top)
     after = whirl.at(speed)
     likeness = np.abs(np.nan_to_num(before.shapes).conj().T @ after.shapes) ** 2
     # of modes with the same shape, as of one coordinate on two supports, the nearer frequency
     apart = np.abs(np.nan_to_num(before.poles)[:, None] - after.poles) / (1.0 + np.abs(after.poles))
     rows, columns = linear_sum_assignment(likeness - 1e-3 * np.minimum(apart, 1.0), maximize=True)
     alive = np.isfinite(before.poles[rows])
-    if halvings and np.any(likeness[rows, columns][alive] < _SURE):
-        middle = _followed(whirl, before, (before.speed + speed) / 2.0, halvings - 1)
-        return _followed(whirl, middle, speed, halvings - 1)
+    if step > _STEPS[0] and np.any(likeness[rows, columns][alive] < _SURE):
+        return _followed(whirl, _followed(whirl, before, (before.speed + speed) / 2.0, top), speed, top)
     sure = alive & (likeness[rows, columns] > _GONE)
     n = before.poles.size
     poles, direction = np.full(n, np.nan, dtype=complex), np.full(n, np.nan)
