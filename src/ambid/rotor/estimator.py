@@ -29,6 +29,7 @@ from ambid.rotor.start import rigid_start
 from ambid.rotor.unknowns import Unknowns
 
 _RELATIVE = 0.03  # error of the model beside noise while it is incomplete
+_REFINED = 0.01  # the same, of a model that is complete but for small modes
 _FITS = 1.6  # mean square of residuals up to which a band is explained
 _WIDER = 1.5  # by which the band grows
 _ABOVE = 1.5  # how far above the band a mode may be that shows in it
@@ -108,13 +109,13 @@ def begin_rotor(
     n_modes: int | None = None,
     tick: Tick = silent,
 ) -> tuple[RotorModel, Point]:
-    """Return the model and its numbers where `estimate_rotor` would begin to believe the noise: start values."""
+    """Return start values from spectra whose noise is known beforehand: the model with its modes, and its numbers."""
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
     work = _Work(
         model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
         tick=tick,
     )  # fmt: skip
-    return work.start(ordered)
+    return work.refine(ordered, *work.start(ordered))
 
 
 def unknowns_at(model: RotorModel, parameters: Sequence[Parameter], at: Point, free: Sequence[int]) -> Unknowns:
@@ -143,12 +144,17 @@ class _Work:
         return Likelihood(unknowns=unknowns, base=at, experiments=experiments, weights=weights)
 
     def rough(
-        self, experiments: Sequence[Experiment], model: RotorModel, at: Point, most: int = 25
+        self,
+        experiments: Sequence[Experiment],
+        model: RotorModel,
+        at: Point,
+        most: int = 25,
+        relative: float = _RELATIVE,
     ) -> tuple[Point, float]:
         """Search with a relative error; return the point, and the mean square of the residuals."""
         cost = np.inf
         for _ in range(2):  # the weights follow the scatter at the model
-            weights = [rough_weight(e, model, at, _RELATIVE) for e in experiments]
+            weights = [rough_weight(e, model, at, relative) for e in experiments]
             problem = self.problem(experiments, model, at, weights)
             at, found = minimise(problem, at, most=most, tolerance=1e-3)
             cost = found.cost / problem.n_real
@@ -216,6 +222,32 @@ class _Work:
             above = [r for r in range(1, model.n_modes + 1) if at.theta[f"mode{r}.omega"] > 2.0 * np.pi * edge]
             edge = min(edge * _WIDER, last)
             model, at = _without(model, at, above)  # what was seen from below is found again from within
+
+    def refine(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> tuple[RotorModel, Point]:
+        """Add the modes that a smaller relative error shows, as long as the likelihood wants them."""
+        slowest = [_together(_slowest(experiments))]
+        spectra = slowest[0].spectra
+        band, n_real = (
+            (float(spectra.frequency_hz.min()), _ABOVE * float(spectra.frequency_hz.max())),
+            2 * spectra.Y.size,
+        )
+        at, cost = self.rough(experiments, model, at, relative=_REFINED)
+        while model.n_modes < self._most:
+            weight = rough_weight(slowest[0], model, at, _REFINED)
+            found = scan(slowest[0], model, at, weight, band)
+            price = np.log(n_real) * (3 + len(model.places))
+            if found is None or found.gain < price:
+                break
+            more = model.with_modes(model.n_modes + 1)
+            trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
+            try:
+                trial, lower = self.rough(experiments, more, trial, relative=_REFINED)
+            except np.linalg.LinAlgError:  # ran off
+                break
+            if not (cost - lower) * n_real > price:
+                break
+            model, at, cost = more, trial, lower
+        return _in_order(model, at)
 
     def turn(self, fast: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
         """Find polar inertia and gyroscopic terms of records at higher speeds by scans of the criterion."""

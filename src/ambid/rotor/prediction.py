@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import Fit, score_statistic, search
-from ambid.estimation.linear import triangle_of
+from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
 from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, discretise
@@ -28,9 +29,10 @@ from ambid.rotor.unknowns import Unknowns
 
 _FIRST = 12_000  # samples that a first search is made on
 _REACH = 20  # samples within which a state shows in the outputs
+_REST = 4  # samples beside the longest delay that are left out at the start: fits with other delays see the same data
+_WHOLE = 0.01  # samples by which a delay that is estimated may miss a whole number however exact it is
+_ROUNDING = 1e-9
 _LEVEL = -2.0  # log level of disturbances at the start
-_NEAR = 0.1  # samples by which a delay may miss a whole number at the start and still be tried there
-_LATE = 12.0  # what one free delay must promise to be freed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -124,18 +126,21 @@ def predict_rotor(
     experiment = Experiment(spectra=spectra, speed=speed)
     model, at = begin_rotor([experiment], model, parameters, delays=delays, n_modes=n_modes, tick=tick)
     model = model.at_speed(speed)
-    tried = at.delays
-    whole = np.round(tried)
-    settled = bool(np.all(np.abs(tried - whole)[[d is None for d in delays]] < _NEAR))
     free = tuple(k for k, d in enumerate(delays) if d is None)
-    if settled:
-        at = replace(at, delays=np.array([w if d is None else d for w, d in zip(whole, delays, strict=True)]))
-    problem, vector = predictor_problem(record, model, parameters, at, () if settled else free)
+    near = np.array([np.round(x) if d is None else d for x, d in zip(at.delays, delays, strict=True)])
+    skip = int(near.max()) + _REST
+    problem, vector = predictor_problem(record, model, parameters, replace(at, delays=near), skip=skip)
     fit = _search(problem, vector, tick)
-    if settled and free:
-        loose, there = _freed(fit, free)
-        if score_statistic(fit, loose, there) > _LATE * len(free):
-            fit = search(loose, there, tick=lambda: tick("fit", 0.9))
+
+    def again(delays: Array, free: Sequence[int], last: Fit) -> tuple[PredictorProblem, Array]:
+        point = replace(_point_of(last), delays=delays)
+        problem, vector = predictor_problem(record, model, parameters, point, free, skip=skip)
+        for group in ("noise", "offset", "initial"):
+            vector[problem.slices[group]] = last.vector[last.problem.slices[group]]
+        return replace(problem, scales=last.problem.scales), vector
+
+    if free:
+        fit = _with_delays(fit, free, again, lambda: tick("fit", 0.9))
     return _ended(fit, spectra, speed)
 
 
@@ -145,17 +150,19 @@ def predictor_problem(
     parameters: Sequence[Parameter],
     at: Point,
     free: Sequence[int] = (),
+    skip: int = 0,
 ) -> tuple[PredictorProblem, Array]:
-    """Return the core's problem at a point, and its vector there; `free`: inputs whose delay is searched."""
+    """Return the core's problem at a point, and its vector there.
+
+    `free`: inputs whose delay is searched; `skip`: samples that are left out at the start, at least.
+    """
     unknowns = unknowns_at(model, parameters, at, free)
     searched = Searched(unknowns=unknowns, base=at)
     u, y = (np.column_stack([record[r].values for r in roles]) for roles in (model.inputs, model.outputs))
     u, y = u - u.mean(axis=0), y - y.mean(axis=0)
-    whole = np.floor(at.delays + 1e-9).astype(int)
-    least, most = int(whole.min()), int(whole.max())
-    for j, k in enumerate(whole - least):
-        if k:  # one delay for all inputs is left
-            u[k:, j], u[:k, j] = u[:-k, j].copy(), u[0, j]
+    whole = np.floor(at.delays + _ROUNDING).astype(int)
+    least = int(whole.min())
+    u = _late(u, whole - least)  # one delay for all inputs is left
     n = len(unknowns.names) - len(free)
     names = unknowns.names[:n]
     n_d, n_y = len(model.disturbances), len(model.outputs)
@@ -163,7 +170,8 @@ def predictor_problem(
         model=searched, rate_hz=record.rate_hz, u=u, y=y, estimated=names, known={}, magnitude=np.ones(n),
         prior_mean=np.zeros(n), prior_sd=np.full(n, np.inf),
         scales=_scales(model, at.theta, u, noise_floor(y), record.rate_hz),
-        delay=least, lag=np.maximum(at.delays - whole, 0.0), fractional=bool(free), late=tuple(free), skip=most + 2,
+        delay=least, lag=np.maximum(at.delays - whole, 0.0), fractional=bool(free), late=tuple(free),
+        skip=max(skip, int(whole.max()) + 2),
         noise_center=np.concatenate([np.full(n_d, _LEVEL), np.zeros(n_y - 1)]), joint_priors=_joint_priors(searched),
     )  # fmt: skip
     vector = np.zeros(problem.size)
@@ -211,6 +219,42 @@ def _search(problem: PredictorProblem, vector: Array, tick: Tick) -> Fit:
     return fit
 
 
+_Again = Callable[[Array, Sequence[int], Fit], tuple[PredictorProblem, Array]]
+
+
+def _with_delays(fit: Fit, free: tuple[int, ...], again: _Again, tick: Callable[[], None]) -> Fit:
+    """Estimate delays as real numbers where the score test says that they are not those whole samples.
+
+    Those that come to rest at whole samples, where the criterion has an edge, are held there, and the others searched
+    once more.
+    """
+    loose, vector = again(_point_of(fit).delays, free, fit)
+    price = len(free) * float(np.log(fit.problem.n_used))
+    if score_statistic(fit, loose, vector) < price:
+        return fit
+    found = search(loose, vector, tick=tick)
+    if found.status == "failed" or not fit.criterion - found.criterion > price:
+        return fit
+    delays = _point_of(found).delays
+    whole = np.round(delays)
+    sd = np.sqrt(np.diag(directions(found.J).inverse()))[loose.slices["fraction"]]
+    held = [k for k, s in zip(free, sd.tolist(), strict=True) if abs(delays[k] - whole[k]) < max(3.0 * s, _WHOLE)]
+    if not held:
+        return found
+    delays[held] = whole[held]
+    settled = search(*again(delays, [k for k in free if k not in held], found), tick=tick)
+    return settled if settled.criterion - found.criterion < price else found
+
+
+def _late(u: Array, by: NDArray[np.intp]) -> Array:
+    """Return inputs, each later by whole samples; before the first they stand still."""
+    out = u.copy()
+    for j, k in enumerate(by.tolist()):
+        if k:
+            out[k:, j], out[:k, j] = u[:-k, j], u[0, j]
+    return out
+
+
 def _freed(fit: Fit, free: tuple[int, ...]) -> tuple[PredictorProblem, Array]:
     """Return the fit's problem with delays as further numbers, and its vector there."""
     old = fit.problem
@@ -221,6 +265,20 @@ def _freed(fit: Fit, free: tuple[int, ...]) -> tuple[PredictorProblem, Array]:
     return loose, np.insert(fit.vector, old.n_physical, np.zeros(len(free)))
 
 
+def _point_of(fit: Fit) -> Point:
+    """Return the rotor's numbers and delays of a fit."""
+    problem, searched = fit.problem, fit.problem.model
+    assert isinstance(searched, Searched)
+    vector = np.concatenate(
+        [fit.vector[: problem.n_physical], searched.base.delays[list(searched.unknowns.free_delays)]]
+    )
+    theta, delays = searched.unknowns.unpack(vector, searched.base.theta, searched.base.delays)
+    if problem.fractional:
+        late = list(problem.late)
+        delays[late] = np.floor(delays[late] + _ROUNDING) + fit.vector[problem.slices["fraction"]]
+    return Point(theta=theta, delays=delays)
+
+
 def _ended(fit: Fit, spectra: PeriodSpectra, speed: float) -> PredictorFit:
     """Return the end of a search by the unknowns: numbers of noise, offsets and first state are taken out by QR."""
     problem, searched = fit.problem, fit.problem.model
@@ -229,16 +287,9 @@ def _ended(fit: Fit, spectra: PeriodSpectra, speed: float) -> PredictorFit:
     rows = np.vstack([np.column_stack([fit.J, np.zeros(len(fit.J))]), np.column_stack([fit.J_prior, -fit.r_prior])])
     order = [*range(n, problem.size), *range(n), problem.size]
     triangle = triangle_of([rows[:, order]])[problem.size - n :, problem.size - n :]
-    base = searched.base
-    moved = base.delays.copy()
-    if problem.fractional:
-        moved[list(problem.late)] = (
-            np.floor(base.delays + 1e-9)[list(problem.late)] + fit.vector[problem.slices["fraction"]]
-        )
-    values = fit.vector[: problem.n_physical]
-    vector = np.concatenate([values, moved[list(searched.unknowns.free_delays)]])
+    vector = searched.unknowns.pack((at := _point_of(fit)).theta, at.delays)
     return PredictorFit(
-        unknowns=searched.unknowns, base=base, vector=vector, status=fit.status, triangle=triangle,
+        unknowns=searched.unknowns, base=searched.base, vector=vector, status=fit.status, triangle=triangle,
         band_hz=(float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1])),
         speeds=(speed,), spectra=spectra, fit=fit,
     )  # fmt: skip

@@ -234,6 +234,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     if logged:
         excited = smoothed(np.abs(spectra(logged)) ** 2, half).sum(axis=1)
         seen &= excited > _FLOOR * np.max(excited[_FIRST_LINE:])
+    seen = smoothed(seen[:, None].astype(np.float64), half)[:, 0] > 1.0 - 1e-9  # no edge within reach
     seen[:_FIRST_LINE] = False
     seen &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
     lines = np.flatnonzero(seen)
