@@ -54,6 +54,69 @@ def test_a_rotor_rig_is_written_as_it_was_read() -> None:
     )  # fmt: skip
 
 
+TURNING = """
+[unbalance.disc]
+value = 12.0
+unit = "g mm"
+phase = 0.7
+z = { value = 200.0, unit = "mm" }
+[modes.shapes]
+"A.z" = [1.0, 2.0]
+"A.z_sensor" = [1.5, 2.5]
+"B.z" = [-1.0, 2.0]
+"B.z_sensor" = [-1.5, 2.5]
+"B.z_sensor2" = [-1.6, 2.6]
+"unbalance.disc" = [0.1, -0.2]
+[modes.gyroscopic]
+"01" = 0.01
+"12" = 0.2
+[magnet]
+cone = 0.4
+[magnet.parameters]
+s = { value = 0.4, unit = "mm", role = "fixed" }
+"""
+MODES = "[modes]\nfrequency_hz = [150.0, 500.0]\ndamping = [0.01, 0.02]"
+BENDING = TEXT.replace("[modes]", MODES).replace('axes = ["ax"', 'runout = { value = 1, unit = "um" }\naxes = ["ax"')
+
+
+def test_what_a_simulation_needs_is_read_and_written_back() -> None:
+    rig = rig_from_text(BENDING + TURNING, "bench.toml")
+    numbers = rig.modes.numbers
+    assert numbers["mode2.omega"] == pytest.approx(2 * 3.141592653589793 * 500.0)
+    assert (numbers["mode2.zeta"], numbers["mode1.B.z_sensor2"], numbers["gyro.12"]) == (0.02, -1.6, 0.2)
+    assert numbers["mode2.unbalance.disc"] == -0.2
+    (disc,), (runout,) = rig.unbalance, rig.runout
+    assert (disc.value, disc.z, disc.phase) == (pytest.approx(12e-6), pytest.approx(0.2), 0.7)
+    assert (runout.name, runout.value) == ("A", pytest.approx(1e-6))
+    again = rig_from_text(rig_text(rig, Path()), "bench.toml")
+    assert dict(again.modes.numbers) == pytest.approx(dict(numbers))
+    assert (again.unbalance, again.runout, again.magnet) == (rig.unbalance, rig.runout, rig.magnet)
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "says"),
+    [
+        ('"B.z" = [-1.0, 2.0]', '"B.zz" = [-1.0, 2.0]', "'B.zz' is no plane of this rotor"),
+        ('"B.z" = [-1.0, 2.0]', "", "'B.z' is missing"),
+        ('"B.z" = [-1.0, 2.0]', '"B.z" = [-1.0]', "has 1 numbers, modes.frequency_hz 2"),
+        ('"12" = 0.2', '"13" = 0.2', "'13' is no pair of modes"),
+        ("damping = [0.01, 0.02]", "", "without modes.damping"),
+        ('unit = "g mm"', 'unit = "g"', r"measured in \[kg m\]"),
+        ("cone = 0.4", "cone = 1.6", "cone below pi/2"),
+        ("cone = 0.4", 'kind = "single"', "a rotor has pairs"),
+        (
+            's = { value = 0.4, unit = "mm", role',
+            'k = { value = 0.4, unit = "N m^2/A^2", role',
+            "a magnet has s, sigma",
+        ),
+    ],
+)
+def test_a_slip_in_what_a_simulation_needs_is_named(old: str, new: str, says: str) -> None:
+    assert old in BENDING + TURNING
+    with pytest.raises(RigError, match=says):
+        rig_from_text((BENDING + TURNING).replace(old, new), "bench.toml")
+
+
 def test_an_axis_without_a_voltage_is_driven_by_its_current() -> None:
     channels = "".join(f"[channels.{a}_{q}]\n" for a in ("ax", "ay", "bx", "by", "az") for q in ("current", "position"))
     channels += "[channels.bx_position2]\n[channels.by_position2]\n"

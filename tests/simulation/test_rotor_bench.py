@@ -15,7 +15,7 @@ from ambid.physics.loop import Limits, Noise
 from ambid.physics.named_bench import Preset
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import preset, preset_names
-from ambid.rig import preset_text, rig_from_text, rig_of_preset
+from ambid.rig import RigChannel, preset_text, rig_from_text, rig_of_preset
 from ambid.signals import multisine
 from ambid.simulation import LinearPlant
 from ambid.simulation import simulate as simulate_plant
@@ -161,6 +161,14 @@ def test_nonlinear_magnets_levitate_and_are_linear_for_small_motion(name: str) -
         assert np.abs(bent[role] - linear[role]).max() <= 2e-4 * np.abs(linear[role]).max()
     done, _ = simulate_used(name, duration=0.2, periods=2, nonlinear=True)
     assert done.within_limits
+
+
+def test_a_rig_that_names_them_gets_speed_and_pulses() -> None:
+    rig = rig_of_preset(preset("central-mass"))
+    more = (RigChannel(role="speed", column="speed"), RigChannel(role="tacho", column="pulses"))
+    record = simulate(replace(rig, channels=(*rig.channels, *more)), duration=0.2, amplitude=1.0)
+    assert record["speed"] == pytest.approx(np.full(4000, 100.0 * np.pi))
+    assert np.count_nonzero(np.diff(record["pulses"]) > 0) in (9, 10)  # 50 revolutions in a second
 
 
 def test_magnets_that_cannot_be_are_refused() -> None:

@@ -66,7 +66,7 @@ def _rig_of_rotor(bench: Preset, body: RotorBody) -> Rig:
     values = {**{p.name: p.default for p in of.parameters}, **bench.parameters}
     known = {*of.places, *(p.name for p in of.parameters if p.name.endswith(".sensor_pole"))}
     turning = ("angle",) if of.speed else ()
-    roles = (*of.inputs, *of.outputs, *turning, *of.optional_roles)
+    roles = (*of.inputs, *of.outputs, *turning, *(f"{axis}_reference" for axis in of.axes))
     numbers = {"s": body.gap, **({"sigma": body.sigma} if body.sigma else {})}
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
     return Rig(

@@ -78,8 +78,14 @@ def modes_of(file: RigFile, plant: LinearModel, where: str) -> RigModes:
         return RigModes()
     count = None if given.count == "auto" else int(given.count)
     n, numbers = len(given.frequency_hz), dict[str, float]()
-    if given.gyroscopic and not given.shapes:
-        raise RigError(f"{where}: modes.gyroscopic is given without modes.shapes. Give the shapes, or remove it")
+    lone = "gyroscopic" if given.gyroscopic else "damping" if given.damping is not None else None
+    if lone and not given.shapes:
+        raise RigError(
+            f"{where}: modes.{lone} is given without modes.shapes; a simulation takes all of a mode from here, or from "
+            "[shaft]. Give the shapes, or remove it"
+        )
+    if given.shapes and given.damping is None:
+        raise RigError(f"{where}: modes.shapes are given without modes.damping. Give the ratio of each mode, or one")
     damping = given.damping if isinstance(given.damping, list) else [given.damping or 0.0] * n
     if given.shapes:
         places = {*plant.places, *(f"unbalance.{name}" for name in file.unbalance)}

@@ -57,10 +57,10 @@ class RotorBench:
         if rate is None:
             raise RigError(f"rig {rig.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz")
         values = {p.name: p.value for p in rig.parameters if p.value is not None}
-        if rig.shaft is None:
-            n = sum(name.endswith(".omega") for name in numbers)
-        else:
-            n, numbers = _drawn(rig, rig.rotor, rig.shaft, values, rate)
+        n = sum(name.endswith(".omega") for name in numbers)
+        if rig.shaft is not None:  # of a rig that gives its modes, the drawing gives the rigid motion alone
+            n, drawn = _drawn(rig, rig.rotor, rig.shaft, values, rate, n)
+            numbers = {**drawn, **numbers}
         of, values = rig.rotor.with_modes(n), {**numbers, **values}
         missing = [p.name for p in of.parameters if p.name not in values and p.default is None]
         if missing:
@@ -151,7 +151,9 @@ class RotorBench:
         units = {**of.units, **dict.fromkeys((f"{axis}_reference" for axis in of.axes), of.units[of.inputs[0]])}
         order = sorted(values, key=lambda name: of.axes.index(name.split("_")[0]))  # an axis after the other
         channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
-        channels += [Channel(name="angle", unit="rad", values=angle[settle:])] if of.speed else []
+        channels += [
+            Channel(name=name, unit=unit, values=x[settle:]) for name, (unit, x) in self._turning(angle).items()
+        ]
         made = {"plant": f"{of.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
         settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
         record = Record(
@@ -165,13 +167,29 @@ class RotorBench:
             record=as_columns(record, self.rig) if columns else record,
             states=truth[settle:],
             state_names=names,
-            truth=MappingProxyType({**self.plant.parameters, "delay": self.loop.delay}),
+            truth=MappingProxyType(
+                {
+                    **self.plant.parameters,
+                    **{f"unbalance.{u.name}": u.value for u in self.rig.unbalance},
+                    "delay": self.loop.delay,
+                }
+            ),
             first_contact=first[0],
             first_saturated=first[1],
             n_saturated=int(counts[2]),
             n_over_current=int(np.count_nonzero(((currents < low) | (currents > high)).any(axis=1))),
             largest_pole=self.largest_pole,
         )
+
+    def _turning(self, angle: Array) -> dict[str, tuple[str, Array]]:
+        """Return what is logged of a rotor that turns: its angle; speed and tacho pulses where the rig names them."""
+        of, named = self.model, {c.role for c in self.rig.channels}
+        found = {"angle": ("rad", angle)} if of.speed or "angle" in named else {}
+        if "speed" in named:
+            found["speed"] = ("rad/s", np.full(angle.size, of.speed))
+        if "tacho" in named:  # high in the first tenth of every revolution
+            found["tacho"] = ("V", np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0))
+        return found
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
         """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits.
@@ -287,20 +305,23 @@ class RotorBench:
 
 
 def _drawn(
-    rig: Rig, rotor: RotorModel, shaft: Shaft, known: Mapping[str, float], rate_hz: float
+    rig: Rig, rotor: RotorModel, shaft: Shaft, known: Mapping[str, float], rate_hz: float, given: int
 ) -> tuple[int, Mapping[str, float]]:
     """Return how many bending modes a simulation keeps, and what follows from the drawing.
 
-    As many as ``modes.count`` says; else those below a quarter of the rate.
+    As many modes as ``modes.count`` says; else those below a quarter of the rate. `given`: modes whose numbers the rig
+    gives; then none come from the drawing.
     """
     missing = [place for place in rotor.places if place not in known]
     if missing:
         raise RigError(f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a shape needs it. Give it")
+    planes = {place: known[place] for place in rotor.places}
+    if given:
+        return given, drawn_numbers(rotor.with_modes(0), shaft, planes)
     n = rig.modes.count
     if n is None:
         omega = shaft.free_rotor(_MOST_MODES).omega[2:]
         n = int(np.count_nonzero(omega < 0.5 * np.pi * rate_hz))
-    planes = {place: known[place] for place in rotor.places}
     found = drawn_numbers(rotor.with_modes(n), shaft, planes)
     if rig.unbalance:
         at = [u.z for u in rig.unbalance]
