@@ -20,7 +20,7 @@ from ambid.arrays import Array, Complex
 from ambid.errors import ModelError
 from ambid.physics.shaft import FreeRotor, Shaft
 
-SPEEDS = 121  # of the grid on which critical speeds are sought
+SPEEDS = 61  # of the grid on which critical speeds are sought
 _SURE = 0.95  # likeness of two shapes, from which they are one mode
 _GONE = 0.2  # likeness below which a mode no longer oscillates
 _STEPS = (1e-4, 1 / 60)  # of the highest speed: at the least step modes that repel each other count as crossing
