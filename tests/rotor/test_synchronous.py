@@ -211,7 +211,7 @@ def test_influence_and_feedback_predict_the_synchronous_response():
     # what it makes of the true unbalance and run-out, at both ends of the loop
     model, loop = machine.model, turned.loop(machine)
     planes, run_out = planes_of(bench), sum(read_by(model).values()) * bench.runout * np.exp(1.1j)
-    of_unbalance = machine.forced(turned.response.speed, machine.unknown_shapes(["A.z", "B.z"])) @ planes
+    of_unbalance = machine.forced(turned.response.speed, machine.shapes) @ planes
     expected = loop @ (of_unbalance + run_out)
     assert np.abs((measured[4:] - expected) / sd[4:]).max() < 5.0
     influence = [[x["value"] * np.exp(1j * x["phase"]) for x in e["sensors"].values()] for e in said["influence"]]
@@ -241,3 +241,35 @@ def test_the_proposal_takes_the_unbalance_away():
     assert orbit["forward"]
     assert orbit["major"] == pytest.approx(orbit["minor"], rel=0.05)
     assert orbit["clearance"] == 2e-4
+
+
+@functools.cache
+def bending(rpm):
+    """Return model, numbers and response of a rotor with bending modes, out of balance in its middle."""
+    bench = dataclasses.replace(truth.BENCHES["utrc"], rpm=rpm, period=0.25, periods=3, settle=2)
+    model, theta = model_of(bench)
+    return bench, model, theta, separate(record_of(bench, truth.simulate(bench, 1)), model).response
+
+
+def test_a_bending_rotor_needs_two_speeds_or_the_plane_of_its_unbalance():
+    bench, model, theta, fast = bending(15000.0)
+    true = bench.unbalance * np.exp(1j * bench.phase_unbalance)
+    machine = true_machine(model, theta, bench)
+    alone = estimate_unbalance(machine, [fast])
+    assert not any(alone.entry(name)["identifiable"] for name in ("A.z", "B.z", "mode1", "mode3"))
+    said = balance_rotor(machine, [Turned(record=0, response=fast)])
+    assert "more speeds" in said["hint"]
+    assert "balancing" not in said
+    both = estimate_unbalance(machine, [fast, bending(9600.0)[3]])
+    modal = truth.modal_of(bench)
+    z = [machine.z(p) - theta["z_cg"] for p in ("A.z", "B.z")]
+    planes = true * np.linalg.solve([[1.0, 1.0], z], modal.unbalance[:2])
+    beyond = modal.unbalance[2:] * true - np.array([machine.shape(p)[2:] for p in ("A.z", "B.z")]).T @ planes
+    assert deviations(both, np.array([*planes, *beyond])).max() < 3.5
+    assert np.abs(both.value[:2] / planes - 1.0).max() < 0.02  # of 0.75 s
+    # with the plane and the shape of the modes there, one speed is enough
+    disc = dataclasses.replace(machine, beside={"disc": (DATUM + modal.unbalance[1], *modal.unbalance[2:])})
+    known = estimate_unbalance(disc, [fast])
+    assert known.names == ("disc", "A.z_sensor", "B.z_sensor")
+    assert deviations(known, np.array([true])).max() < 3.5
+    assert abs(known.value[0] / true - 1.0) < 0.01

@@ -217,8 +217,35 @@ def _synchronous(
     if not turned:
         return {}
     clearance = None if rig.limits is None else min(abs(x) for x in rig.limits.position)
-    runout = {f"{r.name}.z_sensor": r.value * np.exp(1j * r.phase) for r in rig.runout}
-    return balance_rotor(Machine.of(estimate), turned, runout=runout, clearance=clearance)
+    read = {b.name: [b.sensor_parameter(k) for k in range(len(b.z_sensors))] for b in estimate.plant.bearings}
+    runout = {place: r.value * np.exp(1j * r.phase) for r in rig.runout for place in read[r.name]}
+    machine = Machine.of(estimate, _balance_planes(estimate, rig))
+    return balance_rotor(machine, turned, runout=runout, clearance=clearance)
+
+
+def _balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, ...]]:
+    """Return the planes of unbalance that a rig gives: z, and the shape of each mode there.
+
+    Shapes are the rig's, else those of its drawing, each turned to the side of the identified mode.
+    """
+    modes, known = range(1, estimate.n_modes + 1), rig.modes.numbers
+    places = estimate.plant.places
+    z = {p: estimate.numbers[p] for p in places}
+    drawn = rig.shaft.free_rotor(estimate.n_modes, planes=list(z.values())) if rig.shaft and estimate.n_modes else None
+    found = {}
+    for u in rig.unbalance:
+        shapes = []
+        for r in modes:
+            own = np.array([estimate.numbers[f"mode{r}.{p}"] for p in places])
+            if drawn is not None:
+                given = drawn.deflection(np.array([*z.values(), u.z]))[:, r + 1]
+            elif f"mode{r}.unbalance.{u.name}" in known:
+                given = np.array([known[f"mode{r}.{p}"] for p in (*places, f"unbalance.{u.name}")])
+            else:
+                return {}
+            shapes.append(float(given[-1] * np.sign(own @ given[:-1])))
+        found[u.name] = (u.z, *shapes)
+    return found
 
 
 def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[RotorReplay, ...]:

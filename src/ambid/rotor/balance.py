@@ -10,7 +10,8 @@ Currents see the rotor through the voltage that its motion induces, and no run-o
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ from ambid.rotor.replay import point_of
 from ambid.rotor.spectra import PeriodSpectra
 from ambid.rotor.synchronous import SynchronousResponse
 
+_NO_PLANES: Mapping[str, tuple[float, ...]] = MappingProxyType({})
+_BEYOND = 3.0  # prior of what a mode sees beyond the planes, over mass, motion and shape
 _ROUNDS = 3  # the plant's share of the covariance follows the unbalance
 _SEEN = 0.25  # standard deviation over size, up to which an unbalance or a run-out is identified
 _LINES = 16  # excited lines on either side that show the response to the excitation at a harmonic
@@ -40,13 +43,32 @@ class Machine:
     at: Point
     names: tuple[str, ...]
     covariance: Array
+    beside: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: _NO_PLANES)  # planes: z, shape of each mode
 
     @classmethod
-    def of(cls, estimate: RotorEstimate) -> Machine:
-        """Return the machine of an estimate."""
+    def of(cls, estimate: RotorEstimate, beside: Mapping[str, tuple[float, ...]] = _NO_PLANES) -> Machine:
+        """Return the machine of an estimate; `beside`: planes in which unbalance may stand."""
         return cls(
-            model=estimate.plant, at=point_of(estimate), names=estimate.covariance_names, covariance=estimate.covariance
-        )
+            model=estimate.plant, at=point_of(estimate), names=estimate.covariance_names,
+            covariance=estimate.covariance, beside=beside,
+        )  # fmt: skip
+
+    @property
+    def planes(self) -> list[str]:
+        """Planes of unbalance: those that are given where they are enough, else the outermost radial bearings'."""
+        if self.beside and (self.model.n_modes or len(self.beside) > 1):
+            return list(self.beside)
+        radial = [f"{b.name}.z" for b in self.model.bearings if not b.axial]
+        return list(dict.fromkeys([radial[0], radial[-1]])) if radial else []
+
+    @property
+    def beyond(self) -> int:
+        """Number of bending modes that may see more than the unbalance in the planes: in given planes is all of it."""
+        return 0 if self.planes == list(self.beside) else self.model.n_modes
+
+    def z(self, place: str) -> float:
+        """Return where a plane stands along the shaft, m."""
+        return self.beside[place][0] if place in self.beside else self.theta[place]
 
     def moved(self, by: Array) -> Machine:
         """Return the machine with estimated numbers moved."""
@@ -80,14 +102,16 @@ class Machine:
         return np.asarray(space.C @ np.linalg.solve(1j * speed * np.eye(space.A.shape[0]) - space.A, F))
 
     def shape(self, place: str) -> Array:
-        """Return what an unbalance in a bearing's or sensor's plane does to the coordinates of a plane."""
-        modes = [self.theta[f"mode{r}.{place}"] for r in range(1, self.model.n_modes + 1)]
-        return np.array([1.0, self.theta[place] - self.theta["z_cg"], *modes])
+        """Return what an unbalance in a plane does to the coordinates of a plane of motion."""
+        named = [f"mode{r}.{place}" for r in range(1, self.model.n_modes + 1)]
+        modes = self.beside[place][1:] if place in self.beside else [self.theta[name] for name in named]
+        return np.array([1.0, self.z(place) - self.theta["z_cg"], *modes])
 
-    def unknown_shapes(self, places: Sequence[str]) -> Array:
-        """Return the shapes of what is estimated: unbalance in planes, then what each bending mode sees beyond them."""
-        modes = np.eye(2 + self.model.n_modes)[:, 2:]
-        return np.column_stack([*(self.shape(p) for p in places), modes])
+    @property
+    def shapes(self) -> Array:
+        """Shapes of what is estimated: unbalance in the planes, then what each bending mode sees beyond them."""
+        modes = np.eye(2 + self.model.n_modes)[:, 2 : 2 + self.beyond]
+        return np.column_stack([*(self.shape(p) for p in self.planes), modes])
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -97,7 +121,7 @@ class Unbalance:
     names: tuple[str, ...]  # of planes, "mode1" …, sensor planes
     value: Complex  # (n,); kg m, kg^(1/2) m, m
     half: Array  # (2 n, k), covariance of (real parts, imaginary parts) is half halfᵀ
-    size: Array  # (n,), of a value that would explain the response alone
+    most: Array  # (n,), standard deviation up to which a number is identified
     misfit: float  # mean square of whitened residuals over their degrees of freedom
     freedom: int
 
@@ -110,7 +134,7 @@ class Unbalance:
         """Return one number for a result: value, phase and standard deviations."""
         k = self.names.index(name)
         value, half = self.part([name])
-        return {**polar(complex(value[0]), half), "identifiable": bool(_spread(half) <= _SEEN * self.size[k])}
+        return {**polar(complex(value[0]), half), "identifiable": bool(_spread(half) <= self.most[k])}
 
 
 def polar(value: complex, half: Array) -> dict[str, Any]:
@@ -130,34 +154,45 @@ def estimate_unbalance(
     *,
     runout: Mapping[str, complex] | None = None,
 ) -> Unbalance:
-    """Estimate unbalance in the outer bearing planes, modal unbalance, and run-out of the sensors.
+    """Estimate unbalance in planes, what bending modes see beyond it, and run-out of the sensors.
 
-    `runout`: of sensor planes where it is known, m; the others' is estimated.
+    `runout`: of sensor planes where it is known, m; the others' is estimated. What modes see beyond the planes has a
+    wide prior, by the mass times the largest motion.
     """
-    model, given = machine.model, dict(runout or {})
-    planes = places_of(model)
-    free = [place for place in read_by(model) if place not in given]
-    names = (*planes, *(f"mode{r}" for r in range(1, model.n_modes + 1)), *free)
-    parts = [_Part.of(machine, r, planes, free, given) for r in responses]
-    u = np.zeros(len(names), dtype=complex)
-    noise = [p.noise_half for p in parts]
+    given = dict(runout or {})
+    free = [place for place in read_by(machine.model) if place not in given]
+    names = (*machine.planes, *(f"mode{r}" for r in range(1, machine.beyond + 1)), *free)
+    parts = [_Part.of(machine, r, free, given) for r in responses]
+    A, b = (np.concatenate(x) for x in zip(*((_real_rows(p.X), _real(p.left)) for p in parts), strict=True))
+    noise = _block([p.noise_half for p in parts])
+    prior, n = _prior(machine, responses, names), len(names)
+    u = np.zeros(n, dtype=complex)
     for _ in range(_ROUNDS):
         common = np.concatenate([p.plant_half(machine, u) for p in parts])
-        A, b = (np.concatenate(x) for x in zip(*((_real_rows(p.X), _real(p.left)) for p in parts), strict=True))
-        factor = np.linalg.cholesky(_block(noise) + common @ common.T)
-        A, b = (np.linalg.solve(factor, x) for x in (A, b))
-        found = directions(A)
-        x = found.solve(b)
-        u = x[: len(names)] + 1j * x[len(names) :]
-    freedom = max(b.size - x.size, 0)
-    misfit = float(np.sum((b - A @ x) ** 2)) / freedom if freedom else 0.0
-    return Unbalance(names=names, value=u, half=found.root(1e-9), size=_sizes(A, b, u), misfit=misfit, freedom=freedom)
+        factor = np.linalg.cholesky(noise + common @ common.T)
+        rows, right = (np.linalg.solve(factor, x) for x in (A, b))
+        found = directions(np.vstack([rows, prior]))
+        x = found.solve(np.concatenate([right, np.zeros(prior.shape[0])]))
+        u = x[:n] + 1j * x[n:]
+    freedom = max(b.size - x.size + prior.shape[0], 0)
+    misfit = float(np.sum((right - rows @ x) ** 2)) / freedom if freedom else 0.0
+    most = _SEEN * _sizes(rows, right, u)
+    for row in prior:  # what a prior says alone is not identified
+        k = int(np.argmax(row)) % n
+        most[k] = min(most[k], 0.5 / row.max())
+    return Unbalance(names=names, value=u, half=found.root(1e-9), most=most, misfit=misfit, freedom=freedom)
 
 
-def places_of(model: RotorModel) -> list[str]:
-    """Return the outermost radial bearing planes."""
-    radial = [f"{b.name}.z" for b in model.bearings if not b.axial]
-    return list(dict.fromkeys([radial[0], radial[-1]])) if radial else []
+def _prior(machine: Machine, responses: Sequence[SynchronousResponse], names: Sequence[str]) -> Array:
+    """Return rows over standard deviations for what modes see beyond the planes, (2 n_modes, 2 n)."""
+    n, beyond = len(names), machine.beyond
+    moved = max(abs(r.of(role)) for r in responses for role in machine.model.outputs[: len(machine.model.sensors)])
+    rows = np.zeros((2 * beyond, 2 * n))
+    for k in range(beyond):
+        size = max(abs(machine.shape(p)[2 + k]) for p in machine.planes) * machine.theta["m"] * moved
+        at = len(machine.planes) + k
+        rows[2 * k, at] = rows[2 * k + 1, n + at] = 1.0 / (_BEYOND * size)
+    return rows
 
 
 def _sizes(A: Array, b: Array, u: Complex) -> Array:
@@ -187,14 +222,12 @@ class _Part:
     X: Complex  # (n_y, n)
     left: Complex  # (n_y,)
     noise_half: Array  # (2 n_y, 2 n_y)
-    planes: tuple[str, ...]
 
     @classmethod
     def of(
         cls,
         machine: Machine,
         response: SynchronousResponse,
-        planes: Sequence[str],
         free: Sequence[str],
         known: Mapping[str, complex],
     ) -> _Part:
@@ -209,23 +242,23 @@ class _Part:
         C = response.inflation[0] * e.T @ np.conj(e) / len(f)
         real = 0.5 * np.block([[C.real, -C.imag], [C.imag, C.real]])
         read = read_by(model)
-        X = np.column_stack([machine.forced(W, machine.unknown_shapes(planes)), *(read[place] for place in free)])
+        X = np.column_stack([machine.forced(W, machine.shapes), *(read[place] for place in free)])
         offset = sum((x * read[place] for place, x in known.items()), np.zeros(len(model.outputs), dtype=complex))
         return cls(
             response=response, V=V, X=X, left=Y - H[0] @ V - offset,
-            noise_half=np.asarray(np.linalg.cholesky(real + 1e-12 * np.diag(np.diag(real)))), planes=tuple(planes),
+            noise_half=np.asarray(np.linalg.cholesky(real + 1e-12 * np.diag(np.diag(real)))),
         )  # fmt: skip
 
     def plant_half(self, machine: Machine, u: Complex) -> Array:
         """Return what one standard deviation along each direction of the plant's covariance does, (2 n_y, n)."""
         values, vectors = np.linalg.eigh(machine.covariance)
         steps = (vectors * np.sqrt(np.maximum(values, 0.0))).T
-        W, n = self.response.speed, len(self.planes) + machine.model.n_modes
+        W = self.response.speed
 
         def expected(step: Array) -> Complex:
             of = machine.moved(step)
             H = of.transfer(np.array([W]), W, self.response.rate_hz)[0]
-            return np.asarray(H @ self.V + of.forced(W, of.unknown_shapes(self.planes)) @ u[:n])
+            return np.asarray(H @ self.V + of.forced(W, of.shapes) @ u[: machine.shapes.shape[1]])
 
         slopes = [0.5 * (expected(s) - expected(-s)) for s in steps]
         return np.column_stack([_real(x) for x in slopes]) if slopes else np.zeros((2 * self.left.size, 0))
@@ -321,18 +354,18 @@ def balance_rotor(
     marked = [t for t in turned if t.response.rotation.marked]
     used = marked or [max(turned, key=lambda t: abs(t.response.speed))]
     u = estimate_unbalance(machine, [t.response for t in used], runout=runout)
-    planes = places_of(machine.model)
+    planes = machine.planes
     found: dict[str, Any] = {
         "records": [_record(machine.model, t, clearance) for t in turned],
         "used": [t.record for t in used],
-        "unbalance": _unbalance(machine, u, planes, max(abs(t.response.speed) for t in used)),
+        "unbalance": _unbalance(machine, u, max(abs(t.response.speed) for t in used)),
         "runout": {place: u.entry(place) for place in read_by(machine.model) if place in u.names},
         "misfit": u.misfit, "freedom": u.freedom,
     }  # fmt: skip
     unseen = [p for p in planes if not found["unbalance"]["planes"][p]["identifiable"]]
-    found["hint"] = _hint(unseen, u, marked=bool(marked), records=len(used))
+    found["hint"] = _hint(unseen, u, machine, marked=bool(marked), records=len(used))
     if not unseen:
-        found |= _proposal(machine, used, u, planes)
+        found |= _proposal(machine, used, u)
     return found
 
 
@@ -364,15 +397,15 @@ def _record(model: RotorModel, t: Turned, clearance: float | None) -> dict[str, 
     }  # fmt: skip
 
 
-def _unbalance(machine: Machine, u: Unbalance, planes: Sequence[str], speed: float) -> dict[str, Any]:
+def _unbalance(machine: Machine, u: Unbalance, speed: float) -> dict[str, Any]:
     """Return unbalance by plane, static, modal, and where it would stand in one plane."""
+    planes = machine.planes
     value, half = u.part(planes)
-    n, z = len(planes), np.array([machine.theta[p] for p in planes])
-    add = np.hstack([np.eye(1), np.eye(1)]) if n == 2 else np.eye(1)
-    static = {**polar(complex(value.sum()), _through(add.astype(complex), half))}
+    n, z = len(planes), np.array([machine.z(p) for p in planes])
+    static = polar(complex(value.sum()), _through(np.ones((1, n), dtype=complex), half))
     static["grade_mm_s"] = 1e3 * static["value"] * speed / machine.theta["m"]
     found: dict[str, Any] = {
-        "planes": {p: {"z": float(machine.theta[p]), **u.entry(p)} for p in planes},
+        "planes": {p: {"z": float(z[k]), **u.entry(p)} for k, p in enumerate(planes)},
         "static": static,
         "modes": {name: u.entry(name) for name in u.names if name.startswith("mode")},
     }
@@ -385,9 +418,9 @@ def _unbalance(machine: Machine, u: Unbalance, planes: Sequence[str], speed: flo
     return found
 
 
-def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance, planes: Sequence[str]) -> dict[str, Any]:
+def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance) -> dict[str, Any]:
     """Return influence coefficients, and the masses that leave least vibration, with what they leave."""
-    model, sensors = machine.model, read_by(machine.model)
+    model, planes, sensors = machine.model, machine.planes, read_by(machine.model)
     rows = [k for k in range(len(model.sensors)) if any(x[k] for x in sensors.values())]
     free = [place for place in sensors if place in u.names]
     n = len(u.names) - len(free)
@@ -397,7 +430,7 @@ def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance, planes: Se
         if loop is None:  # a rigid rotor is balanced whatever holds it, by as much as is known
             opposite = {p: polar(-complex(u.value[j]), u.part([p])[1]) for j, p in enumerate(planes)}
             return {} if machine.model.n_modes else {"balancing": {"correction": opposite, "vibration": []}}
-        X = loop @ machine.forced(t.response.speed, machine.unknown_shapes(planes))
+        X = loop @ machine.forced(t.response.speed, machine.shapes)
         shaken = [(loop - np.eye(loop.shape[0])) @ sensors[p] for p in free]  # by a run-out that the loop follows
         moved.append(np.column_stack([X, *shaken])[rows])
         influence += [
@@ -437,8 +470,13 @@ def _through(L: Complex, half: Array) -> Array:
     return np.asarray(_real_rows(L) @ half)
 
 
-def _hint(unseen: Sequence[str], u: Unbalance, *, marked: bool, records: int) -> str:
+def _hint(unseen: Sequence[str], u: Unbalance, machine: Machine, *, marked: bool, records: int) -> str:
     """Say what stands against the numbers; empty where nothing does."""
+    if unseen and machine.beyond:
+        return (
+            f"unbalance in {', '.join(unseen)}, what bending modes see and run-out cannot be told apart: take records "
+            "at more speeds, or give the planes in which it stands ([unbalance.X], with [shaft])"
+        )
     if unseen:
         more = "a second record at another speed" if records == 1 else "a record at a speed further off"
         return (
