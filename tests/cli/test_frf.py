@@ -294,6 +294,7 @@ def test_outputs_alone_give_operational_modes(tmp_path, sweep_text, ambid, monke
     ("words", "said"),
     [
         (("--input", "current", *MODES, "few"), "--modes is 'few'; it must be a number of modes, or auto"),
+        (("--input", "current", "--output", "a0", "--estimate", "e.json"), "--estimate is for --modes"),
         ((*MODES, "auto", "--state-space", "n=2"), "a model was requested, and no input was named"),
         (("--input", "current", *MODES, "auto", "--band", "60:61"), "lines of the record between 60 and 61 Hz"),
     ],

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.linalg import block_diag
 
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import plain_json, read_as
-from ambid.estimation.modes import EstimatedNumber, Mode, mac
+from ambid.estimation.modes import EstimatedNumber, Modal, Mode, mac, plant_modes
 
 
 def mode(frequency, **shape):
@@ -46,3 +47,20 @@ def test_mode_is_written_and_read():
     written = plain_json(found)
     assert set(written["frequency_hz"]) == {"value", "sd", "ci95", "identifiable"}
     assert read_as(Mode, written) == found
+
+
+def test_modes_of_a_plant_are_those_that_oscillate_in_the_band():
+    blocks = [np.array([[0.0, 1.0], [-((2 * np.pi * f) ** 2), -2 * z * 2 * np.pi * f]]) for f, z in PLANT]
+    A, C = block_diag(*blocks, [[-3.0]]), np.array([[1.0, 0, 1.0, 0, 1.0, 0, 1.0], [2.0, 0, -1.0, 0, 0, 0, 0]])
+    found = plant_modes(A, C, ("a", "b"), (5.0, 100.0), 0.15)
+    assert [m.frequency_hz.value for m in found] == pytest.approx([10.0, 40.0])
+    assert [m.damping.value for m in found] == pytest.approx([0.01, 0.02])
+    assert found[0].complex_shape == {"a": pytest.approx(0.5), "b": pytest.approx(1.0)}
+    modal = Modal(
+        status="converged", method="", modes=(mode(10.1, a=0.5, b=1.0),), checks={}, inputs=(), outputs=("a", "b", "i"),
+        units={"a": "m", "b": "m", "i": "A"}, band_hz=(5.0, 100.0),
+    )  # fmt: skip
+    assert modal.beside(found).mac[0] == pytest.approx([1.0, 0.1], abs=1e-9)
+
+
+PLANT = ((10.0, 0.01), (40.0, 0.02), (60.0, 0.4))  # Hz and damping; the last is none of vibration

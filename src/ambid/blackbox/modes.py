@@ -11,7 +11,7 @@ formed. The noise V is what the fit leaves about each line, model errors include
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -35,6 +35,7 @@ _PASSES = 2
 _SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's frequency that must be the mode's ...
 _CLEAR = 10.0  # ... the less where it stands so many times out of what is left
 _MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
+_DOUBLE = 0.3  # second singular value of a mode's residues over the first, from which it is two
 _LOST = 0.5  # energy left from which a mode's numbers are not shown
 
 
@@ -187,6 +188,7 @@ class _Candidate:
     misfit: float = 0.0  # energy left there
     correlation: float = 0.0  # of what is left, from line to line
     shape: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
+    second: float = 0.0  # of the residues over all inputs: second singular value over the first
     shape_variance: Array = field(default_factory=lambda: np.zeros(0))
     likelihood: Array = field(default_factory=lambda: np.zeros((2, 2)))
     jackknife: Array = field(default_factory=lambda: np.zeros((2, 2)))
@@ -277,6 +279,8 @@ def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Pr
     e = fitted.e[:, wide]
     c.correlation = float(abs(np.sum(e[:, 1:] * e[:, :-1].conj())) / max(np.sum(np.abs(e) ** 2), 1e-300))
     c.shape = principal(residues[None, :, 1:])[0]
+    strength = np.linalg.svd(residues[:, 1:], compute_uv=False)
+    c.second = float(strength[1] / strength[0]) if strength.size > 1 else 0.0
     covariance = np.sum(np.abs(fitted.root) ** 2, axis=2)[:, at * m + 1 : (at + 1) * m]
     c.shape_variance = np.mean(covariance, axis=1)
 
@@ -339,7 +343,7 @@ def find_modes(
         status="converged" if found else "failed",
         method="maximum likelihood on the record's spectrum, transients included",
         modes=modes,
-        checks={**checks, "modes_fit": _fit_check(found)},
+        checks={**checks, "modes_fit": _fit_check(found), **_rank_check(found, data.inputs)},
         inputs=data.inputs,
         outputs=data.outputs,
         units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
@@ -375,3 +379,13 @@ def _fit_check(found: list[_Candidate]) -> Check:
         detail=f"what linear modes leave of the energy at {names} is not noise: a nonlinear or drifting resonance, or "
         "two modes in one place. Excite less, or record more outputs",
     )
+
+
+def _rank_check(found: list[_Candidate], inputs: Sequence[str]) -> dict[str, Check]:
+    """Whether each mode moves in one shape whichever input excites it: two modes in one place do not."""
+    if len(inputs) < 2:
+        return {}
+    double = ", ".join(f"{c.frequency_hz:.4g} Hz" for c in found if c.second > _DOUBLE)
+    said = f"two modes in one place at {double}: frequency and damping are means, the shape is the stronger one's"
+    remedy = ". Excite one plane at a time"
+    return {"modes_single": Check(passed=not double, detail=said + remedy if double else "each mode has one shape")}

@@ -52,6 +52,10 @@ def command(
             "Without --input: operational modes.",
         ),
     ] = None,
+    estimate: Annotated[
+        Path | None,
+        option("--estimate E.json", "With --modes: compare them with the modes of a physical estimate (MAC)."),
+    ] = None,
     domain: Annotated[
         Literal["s", "z"] | None,
         option(
@@ -79,14 +83,14 @@ def command(
     """
     from ambid.job import frf
 
-    with Outputs(record, rig, json=json, plot=plot, report=report) as outputs:
+    with Outputs(record, rig, estimate, json=json, plot=plot, report=report) as outputs:
         between, n, late, count = opt.band_of(band), _order(state_space), _delay(delay), _modes(modes)
         with progress("measure") as tick:
             found = frf(
                 record, input=inputs, output=output, reference=reference, open_loop=open_loop,
                 method=method, hold=hold, band=between, orders=orders, state_space=n, feedthrough=feedthrough,
-                modes=count, domain=domain, delay=late, rig=rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps,
-                tick=tick,
+                modes=count, estimate=estimate, domain=domain, delay=late, rig=rig, from_s=from_s,
+                to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
             )  # fmt: skip
             outputs.give(found, tick)
     outputs.show(found, strict=strict)

@@ -7,7 +7,7 @@ parameters. Likeness of shapes is the modal assurance criterion (Allemang and Br
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Literal
 
@@ -132,17 +132,34 @@ def student(freedom: int) -> float:
     return float(stdtrit(freedom, 0.975))
 
 
-def mac(ones: Sequence[Mode], others: Sequence[Mode]) -> Array:
+def plant_modes(
+    A: Array, C: Array, outputs: Sequence[str], band_hz: tuple[float, float], most_damped: float
+) -> tuple[Mode, ...]:
+    """Return the oscillating modes of x' = A x, y = C x in a band, without standard deviations: those of an estimate.
+
+    `A`, `C`: (n, n) and (n_outputs, n); `most_damped`: ratio from which a mode is none of vibration.
+    """
+    poles, vectors = np.linalg.eig(A)
+    none, still = np.zeros((2, 2)), np.zeros(len(outputs))
+    found, (low, high) = list[Mode](), (2 * np.pi * f for f in band_hz)
+    for k in np.argsort(poles.imag):
+        p = complex(poles[k])
+        if low <= p.imag <= high and abs(p.real) <= most_damped * abs(p):
+            found.append(mode_of(p, [(none, NORMAL_95)], outputs, C @ vectors[:, k], still))
+    return tuple(found)
+
+
+def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | None = None) -> Array:
     """Return the modal assurance criterion of each mode with each of others, on the outputs that both have.
 
-    Returns (n_ones, n_others), 0 to 1. EstimationError where fewer than two outputs have the same name: with one, all
-    shapes are alike.
+    `outputs`: those that count; default all. Returns (n_ones, n_others), 0 to 1. EstimationError where fewer than two
+    outputs have the same name: with one, all shapes are alike.
     """
     found = np.zeros((len(ones), len(others)))
     for i, a in enumerate(ones):
         for j, b in enumerate(others):
             own, other = a.complex_shape, b.complex_shape
-            both = [name for name in own if name in other]
+            both = [name for name in own if name in other and (outputs is None or name in outputs)]
             if len(both) < 2:
                 raise EstimationError(
                     f"two lists of modes share {len(both)} outputs ({', '.join(own)}; {', '.join(other)}); a "
@@ -170,3 +187,10 @@ class Modal(Judged):
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     # by mode, in the same order: ``energy_share``, ``misfit``, ``residual_correlation``, ``gain``
     details: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+    against: tuple[Mode, ...] = ()  # modes of an estimate that was given beside the record
+    mac: Array | None = None  # (n_modes, n_against), modal assurance criterion
+
+    def beside(self, others: Sequence[Mode]) -> Modal:
+        """Return it with modes of an estimate beside its own, compared on outputs of the first one's unit."""
+        alike = [o for o in self.outputs if self.units.get(o) == self.units.get(self.outputs[0])]
+        return replace(self, against=tuple(others), mac=mac(self.modes, others, alike))

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -16,15 +16,17 @@ from ambid.bearing.frequency import FrequencyEstimate
 from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.mode_starts import MOST_DAMPED
 from ambid.blackbox.model import Offsets
 from ambid.blackbox.modes import find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import Modal
+from ambid.estimation.modes import Modal, plant_modes
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Channels, Clock, Names, Source
+from ambid.job.results import load, rig_of
 from ambid.physics.linear_model import model
 from ambid.record import GapPolicy
 from ambid.rig import Rig
@@ -49,6 +51,7 @@ def frf(
     state_space: int | Literal["auto"] | None = None,
     feedthrough: bool = False,
     modes: int | Literal["auto"] | None = None,
+    estimate: Any = None,
     domain: Literal["s", "z"] | None = None,
     delay: Delay | None = None,
     from_s: float | None = None,
@@ -86,6 +89,8 @@ def frf(
         Find so many modes, or all that the record shows: poles common to all outputs, by maximum likelihood on the
         record's own spectrum. Without an input: operational modes, by stochastic subspace. Without `band`, those where
         the input (without one, the outputs) has power.
+    estimate : result, str or Path, optional
+        With `modes`: a physical estimate whose modes stand beside those found, with the modal assurance criterion.
     domain : {"s", "z"}, optional
         Of that model; default z for transfer functions of a held input, else s.
     delay : float or "auto", s, optional
@@ -118,7 +123,8 @@ def frf(
     if orders is not None and wanted is None:
         raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)
-    _check_modes(modes)
+    _check_modes(modes, estimate)
+    known = None if estimate is None else _plant_of(estimate)
     alone = bench is None and not channels.inputs
     if alone and modes is None:
         raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
@@ -128,28 +134,28 @@ def frf(
     clock.lap("read")
     modal: Modal | None = None
     if modes is not None and not data.inputs:
-        modal = operational_modes(data, modes, band=band, tick=say)
+        modal = _beside(operational_modes(data, modes, band=band, tick=say), known)
         clock.lap("modes")
         return replace(modal, timing_s=clock.laps)
     if modes is not None:
-        modal = find_modes(data, modes, band=band, tick=say)
+        modal = _beside(find_modes(data, modes, band=band, tick=say), known)
         clock.lap("modes")
         band = modal.band_hz
     say("measure")
     response = _measure(data, method, hold, band, leave_out=modes is not None)
     clock.lap("measure")
     found: BlackBoxFit | None = None
-    estimate: FrequencyEstimate | None = None
+    physical: FrequencyEstimate | None = None
     if wanted is not None or state_space is not None:
         say("fit")
         found = _fit_model(response, data, wanted, state_space, feedthrough, domain, 0.0 if delay is None else delay)
         clock.lap("fit")
     if bench is not None:
         say("identify")
-        estimate = _identify(response, bench, delay)
+        physical = _identify(response, bench, delay)
         clock.lap("identify")
     return Measured(
-        response=response, references=data.references, open_loop=data.open_loop, fit=found, estimate=estimate,
+        response=response, references=data.references, open_loop=data.open_loop, fit=found, estimate=physical,
         modal=modal, record=data.record, timing_s=clock.laps,
     )  # fmt: skip
 
@@ -178,7 +184,29 @@ def _check(
         raise EstimationError(f"the delay is {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
 
 
-def _check_modes(modes: object) -> None:
+def _plant_of(estimate: Any) -> Any:
+    """Return an estimate that has a plant."""
+    found = load(estimate) if isinstance(estimate, str | Path) else estimate
+    if not (hasattr(found, "continuous") and hasattr(found, "fit")):
+        raise EstimationError("the estimate has no plant whose modes could be compared. Give one of 'ambid identify'")
+    return found
+
+
+def _beside(modal: Modal, estimate: Any) -> Modal:
+    """Put the modes of an estimate's plant beside those found, its outputs named as in the record."""
+    if estimate is None:
+        return modal
+    names = list(estimate.fit)
+    if not set(names) & set(modal.outputs):
+        rig = rig_of(estimate, "the estimate")
+        names = [rig.channel(role).column for role in names]
+    plant = estimate.continuous
+    return modal.beside(plant_modes(plant.A, plant.C, names, modal.band_hz, MOST_DAMPED))
+
+
+def _check_modes(modes: object, estimate: object) -> None:
+    if estimate is not None and modes is None:
+        raise EstimationError("--estimate is for --modes; none were requested. Give --modes auto too")
     if modes is not None and modes != "auto" and (isinstance(modes, bool) or not isinstance(modes, int) or modes < 1):
         raise EstimationError(f"{modes!r} modes were requested; it must be at least 1, or 'auto'. Correct --modes")
 

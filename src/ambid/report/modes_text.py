@@ -46,6 +46,7 @@ def modal_body(modal: Modal, *, width: int = WIDTH, paint: Paint = plain) -> str
         [
             [paint(first, "strong"), *mode_lines(modal.modes)],
             shape_lines(modal.modes, modal.outputs, width),
+            [] if modal.mac is None else mac_lines(modal.mac, modal.modes, modal.against),
             check_lines(modal.checks, width=width, paint=paint, above=True),
         ]
     )
@@ -102,6 +103,8 @@ def mode_table(modes: Sequence[Mode]) -> dict[str, list[object]]:
 
 def mac_lines(assurance: Array, rows: Sequence[Mode], across: Sequence[Mode]) -> list[str]:
     """Write the modal assurance criterion of modes with others, by frequency; * from 0.8 on: alike."""
+    if not (rows and across):
+        return ["the estimate has no mode in this band"] if rows else []
     head = ("MAC", *(f"{m.frequency_hz.value:.4g} Hz" for m in across))
     body = [
         (f"{m.frequency_hz.value:.4g} Hz", *(f"{x:.2f}{'*' if x >= _ALIKE else ' '}" for x in values))
