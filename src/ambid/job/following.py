@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+import time
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any, Literal, TypedDict
@@ -11,8 +12,9 @@ from typing import Any, Literal, TypedDict
 from ambid.blackbox.data import Orders
 from ambid.errors import EstimationError, nearest
 from ambid.job.data import Names
-from ambid.recursive.lines import Event, TrackHeader, TrackLine
+from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
 from ambid.report.track_figures import TrackHistory
+from ambid.tracking.lines_file import Tally
 
 Flag = Literal["track", "hold", "accept", "revert"]
 Memory = float | Literal["auto", "all"]
@@ -47,6 +49,18 @@ class Following:
             return None if self.on_line is None else self.on_line(line)
 
         return take
+
+
+def tell(header: TrackHeader, lines: Iterable[TrackLine], how: Following) -> Track:
+    """Return the track of lines that come one by one, each told as `how` says."""
+    kept = list[TrackLine]()
+    tally, take, begun = Tally(header), how.collect(kept), time.perf_counter()
+    if how.on_header is not None:
+        how.on_header(header)
+    for line in lines:
+        tally.add(line)
+        take(line)
+    return Track(header=header, lines=tuple(kept), totals=tally.summary(computing_s=time.perf_counter() - begun))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

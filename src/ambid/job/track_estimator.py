@@ -6,7 +6,6 @@ coefficients from named inputs to an output, the joint filters physical paramete
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +20,7 @@ from ambid.blackbox.words import orders_of
 from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, names_of
-from ambid.job.following import EstimatorWords, Following, Memory
+from ambid.job.following import EstimatorWords, Following, Memory, tell
 from ambid.job.track_start import rows_of, start_of
 from ambid.physics.linear_model import model
 from ambid.record import Source, cut, read_record
@@ -38,7 +37,6 @@ from ambid.recursive import (
 )
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig
-from ambid.tracking.lines_file import Tally
 
 REGRESSIONS = ("rls", "lms", "nlms", "iv")
 POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")
@@ -238,20 +236,14 @@ def _joint(
 
 def _follow(run: _Run, method: str, how: Following) -> Track:
     """Feed the estimator with one reporting interval after the other."""
-    every, lines = max(1, round(how.every_s * run.rate_hz)), list[TrackLine]()
+    every = max(1, round(how.every_s * run.rate_hz))
     header = TrackHeader(
         rate_hz=run.rate_hz, limit=how.limit, method=method, model=run.model, units=run.units,
         every_s=every / run.rate_hz, start=run.start, record=run.origin, warnings=run.warnings,
     )  # fmt: skip
-    tally, take, begun = Tally(header), how.collect(lines), time.perf_counter()
-    if how.on_header is not None:
-        how.on_header(header)
-    for first in range(0, run.outputs.shape[0], every):
-        line = _line(run, slice(first, first + every))
-        tally.add(line)
-        take(line)
-    summary = replace(tally.summary(computing_s=time.perf_counter() - begun), samples=run.estimator.n_used)
-    return Track(header=header, lines=tuple(lines), totals=summary)
+    parts = (slice(first, first + every) for first in range(0, run.outputs.shape[0], every))
+    track = tell(header, (_line(run, part) for part in parts), how)
+    return replace(track, totals=replace(track.totals, samples=run.estimator.n_used))
 
 
 def _line(run: _Run, part: slice) -> TrackLine:

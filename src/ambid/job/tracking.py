@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.blackbox.data import Orders
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, refuse_given
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -33,6 +33,7 @@ from ambid.job.track_start import BenchRows, Start, check_settling, credible_lim
 from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig, load_rig
+from ambid.rotor.estimate import RotorEstimate
 from ambid.tracking.blocks import Block, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
@@ -56,7 +57,7 @@ def track(
     orders: Orders | str | None = None,
     open_loop: bool = False,
     step: float | None = None,
-    start: Estimate | str | Path | None = None,
+    start: Estimate | RotorEstimate | str | Path | None = None,
     start_s: float | None = None,
     every_s: float = 0.01,
     limit: float = 1.5,
@@ -74,6 +75,9 @@ def track(
 ) -> Track:
     """Track the physical parameters of a bench through a record, or the coefficients of another `method`.
 
+    Of a rotor on many axes (a rig with ``[bearings.X]``) force factors, stiffnesses, resistances and modes are tracked
+    from one period of the excitation to the next; `every_s` is then rounded to whole periods.
+
     Parameters
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays
@@ -90,7 +94,7 @@ def track(
         Declare the record open loop.
     step : float, optional
         Step size of ``lms`` and ``nlms``, for signals of size one.
-    start : Estimate, str or Path, optional
+    start : Estimate, RotorEstimate, str or Path, optional
         Where tracking begins; default: an identification of the first part of the record.
     start_s : float, optional
         Length of that part, s.
@@ -141,6 +145,20 @@ def track(
         raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
     given = load_rig(rig) if isinstance(rig, (str, Path)) else rig
     part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units)
+    if given is not None and given.rotor is not None:
+        from ambid.job.track_rotor import track_rotor
+
+        refuse_given(
+            {
+                "--method": method != "rpem" and method,
+                "--pace": how.pace != "fastest" and how.pace,
+                "--flag": how.flags,
+            },
+            "{} is for one axis; a rotor is tracked from one period to the next. Omit it",
+        )
+        return replace(track_rotor(record, given, start, start_s, part, how, say), used=Followed(record=record))
+    if isinstance(start, RotorEstimate):
+        raise EstimationError("the start is the estimate of a rotor; the rig has no [bearings.X]. Give the rotor's rig")
     if method != "rpem" or any(settings.values()):
         from ambid.job.track_estimator import track_estimator
 

@@ -102,6 +102,17 @@ class Sampled:
         h = self.scalar(True, 0.0)
         return np.asarray((h[:, None, :] * (self.space.C @ V)) @ (inverse @ self.space.E))
 
+    def transients(self) -> Complex:
+        """Return what a difference of states, and of held inputs, between the ends of a period adds: (n_lines, n_y, n).
+
+        z C (z - A_d)⁻¹ and C (z - A_d)⁻¹ B (Pintelon and Schoukens 2012, sec. 6.3.2).
+        """
+        s, V, inverse = self.eigen
+        z = np.exp(1j * self.omega / self.rate_hz)[:, None]
+        decay = 1.0 / (z - np.exp(s / self.rate_hz))
+        left = decay[:, None, :] * (self.space.C @ V)
+        return np.concatenate([z[:, :, None] * (left @ inverse), left @ (inverse @ self.space.B)], axis=2)
+
     def states(self, U: Complex) -> Complex:
         """Return the states at spectra of the inputs `U` (n_lines, n_u): (n_lines, n_states)."""
         return np.asarray(self._modal(U) @ self.eigen[1].T)

@@ -31,6 +31,7 @@ class Unknowns:
     scales: Mapping[str, float]
     free_delays: tuple[int, ...] = ()  # inputs whose delay is searched
     held_modes: bool = False  # whether frequencies and dampings of modes rest
+    chosen: tuple[str, ...] | None = None  # with `held_modes`: numbers that are searched, shapes of modes among them
 
     @cached_property
     def logs(self) -> tuple[str, ...]:
@@ -150,6 +151,8 @@ class Unknowns:
     @cached_property
     def _free(self) -> tuple[str, ...]:
         """Numbers but shapes and dampings of modes."""
+        if self.chosen is not None:
+            return self.chosen
         roles = {p.name: p.role for p in self.known}
         of_modes = [f"mode{r}.omega" for r in self._modes]
         of_modes += [p.name for p in self.model.mode_parameters if p.name.startswith("gyro.")]
