@@ -174,10 +174,11 @@ def campbell(
         raise ModelError("the speeds of a Campbell diagram have to rise from 0 or more. Correct them")
     if isinstance(rotor, Shaft):
         lines = lines or 8
-        modes = min(lines // 2 + _MORE, rotor.elements)
+        elements = max(rotor.elements, len(rotor.steps))
+        modes = min(lines // 2 + _MORE, elements)
         if lines > 2 * modes:
             raise ModelError(
-                f"{lines} lines are asked for of a shaft cut into {rotor.elements} elements; it shows at most "
+                f"{lines} lines are asked for of a shaft cut into {elements} elements; it shows at most "
                 f"{2 * modes}. Ask for fewer, or raise elements"
             )
         rotor = rotor.free_rotor(modes, planes=[s.z for s in supports], residual=True)
