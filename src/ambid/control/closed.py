@@ -79,7 +79,7 @@ class Plant:
     def sampled(self, frequency_hz: Array) -> Sampled:
         """Return the sampled response at some frequencies."""
         of = self.model
-        held = tuple(not isinstance(of, RotorModel) or of.drive(j) == "voltage" for j in range(len(of.inputs)))
+        held = of.held if isinstance(of, RotorModel) else (True,) * len(of.inputs)
         return Sampled(
             space=self.space, omega=2.0 * np.pi * frequency_hz, rate_hz=self.rate_hz, delays=self.delays, held=held
         )

@@ -452,13 +452,13 @@ def _modal() -> View:
 
 
 def _rotor() -> View:
-    from ambid.job.rotor import replays_of
+    from ambid.job.rotor import drawing_of, replays_of
     from ambid.report.rotor_figures import RotorEvidence, rotor_overview
     from ambid.report.rotor_page import rotor_page
     from ambid.report.rotor_text import rotor_text
 
     def evidence(e: Any, used: Any) -> RotorEvidence:
-        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used))
+        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=drawing_of(e))
 
     return View(
         text=rotor_text,

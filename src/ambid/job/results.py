@@ -22,6 +22,7 @@ from ambid.physics.linear_model import model
 from ambid.record import GapPolicy, read_record
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, read_bench, rig_from_text
+from ambid.rotor.estimate import RotorEstimate
 from ambid.tracking.lines_file import SCHEMA as TRACK
 from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
@@ -31,7 +32,7 @@ from ambid.validation.second_record import validation
 from ambid.validation.second_result import Validation
 
 AnyFit = BlackBoxFit | NonlinearFit
-AnyEstimate = Estimate | NonlinearBearingEstimate
+AnyEstimate = Estimate | NonlinearBearingEstimate | RotorEstimate
 _BEGIN = 200  # letters in which a track says that it is one
 
 

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from ambid.errors import EstimationError
+from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -25,6 +25,8 @@ from ambid.rotor.estimate import RotorEstimate
 if TYPE_CHECKING:
     from ambid.arrays import Complex
     from ambid.control.closed import ClosedLoop
+    from ambid.physics.rotor_model import RotorModel
+    from ambid.physics.shaft import Shaft
     from ambid.rotor.conclusion import Evidence
     from ambid.rotor.estimator import Ending
     from ambid.rotor.replay import RotorReplay
@@ -262,6 +264,16 @@ def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[Roto
             spectra = period_spectra(of.record, estimate.plant, of.excitation, of.speed)
             found.append(Experiment(spectra=spectra, speed=of.speed))
     return replays(estimate, found)
+
+
+def drawing_of(estimate: RotorEstimate) -> Shaft | None:
+    """Return the drawing in the rig that an estimate remembers, None without one."""
+    from ambid.job.results import rig_of
+
+    try:
+        return rig_of(estimate, "the estimate").shaft
+    except AmbidError:
+        return None
 
 
 def name_of(bench: Record) -> str:

@@ -107,6 +107,11 @@ class RotorModel:
         """Return what drives axis `j`."""
         return self.drives[j] if self.drives else "voltage"
 
+    @property
+    def held(self) -> tuple[bool, ...]:
+        """Whether each input is held over a sample: all but measured currents."""
+        return tuple(self.drive(j) != "current" for j in range(len(self.axes)))
+
     @cached_property
     def coils(self) -> tuple[int, ...]:
         """Axes that are driven by a voltage."""

@@ -37,6 +37,7 @@ Pair = tuple[int, int]  # output, input
 MOST_PAIRS = 6  # Bode diagrams beside each other; of more pairs the first are drawn, and the title says so
 _CHI2_95 = 5.991464547107979  # of two degrees of freedom
 _NEAR = 0.06  # of the span of all poles, from which two of them lie too close
+_TOLD = 0.15  # correlation from which a large matrix gives it in figures
 _MARKS = 18  # frequencies of each decade at which a measured response stands beside a model
 
 
@@ -142,7 +143,9 @@ def magnitude_axis(
     axes.set_ylim(0.5 * size.min(), 2 * size.max())
 
 
-def marks(axes: Axes, frf: FrequencyResponse, pair: Pair, guide: ModelResponse | None = None) -> None:
+def marks(
+    axes: Axes, frf: FrequencyResponse, pair: Pair, guide: ModelResponse | None = None, *, per_decade: int = _MARKS
+) -> None:
     """Draw some lines of a measured response with 95 % intervals, where it is known: magnitudes, or, with a `guide`
     whose turn they take, phases.
     """
@@ -153,7 +156,9 @@ def marks(axes: Axes, frf: FrequencyResponse, pair: Pair, guide: ModelResponse |
     f = frf.frequency_hz[known]
     at = known[
         np.unique(
-            np.searchsorted(f, np.geomspace(f[0], f[-1], 2 + int(_MARKS * np.log10(f[-1] / f[0])))).clip(max=f.size - 1)
+            np.searchsorted(f, np.geomspace(f[0], f[-1], 2 + int(per_decade * np.log10(f[-1] / f[0])))).clip(
+                max=f.size - 1
+            )
         )
     ]
     x, G, radius = frf.frequency_hz[at], frf.G[at, *pair], radius[at]
@@ -323,10 +328,13 @@ def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[
     def matrix(axes: Axes) -> None:
         axes.imshow(rho, cmap="PuOr_r", vmin=-1.0, vmax=1.0, aspect="auto")
         small = len(names) > 8
+        size_of_text = 7.0 if axes.figure.figure.get_figwidth() > NARROW else min(7.0, 85.0 / len(names))
         for k, row in enumerate(rho):
             for m, x in enumerate(row):
                 color = "white" if abs(x) > 0.75 else "#1a1a1a"
-                axes.text(m, k, f"{x:.1f}" if small else f"{x:.2f}", ha="center", va="center", color=color, fontsize=7)
+                if not small or abs(x) > _TOLD:
+                    said = f"{x:.1f}" if small else f"{x:.2f}"
+                    axes.text(m, k, said, ha="center", va="center", color=color, fontsize=size_of_text)
         axes.set_xticks(range(len(names)), names, rotation=45 if small else 0)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)

@@ -104,7 +104,10 @@ def _side(
     axes.axhline(0, color=MEASURED, linewidth=0.6, linestyle="-.", zorder=2)
     axes.set_xlim(*(1e3 * x for x in ends))
     axes.set_ylim(-1e3 * half * 1.3, 1e3 * half * 1.95)
-    axes.set_ylabel("radius [mm]")
+    if shaft is None:
+        axes.set_yticks([])
+    else:
+        axes.set_ylabel("radius [mm]")
     axes.grid(visible=False)
     said = "" if shaft is None or drawn is None else f", {drawn.mass[0]:.3g} kg, {1e3 * shaft.length:.0f} mm long"
     head(axes, f"rotor from the side{said}")

@@ -11,7 +11,10 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.model import complex_covariance
+from ambid.physics.drawn_rotor import free_rotor_of, whirl_sd
 from ambid.physics.rotor_model import RotorModel, position_role
+from ambid.physics.shaft import Shaft
+from ambid.physics.whirl import campbell
 from ambid.report.drawing import (
     MEASURED,
     PREDICTED,
@@ -34,7 +37,7 @@ from ambid.report.response_panels import (
     poles_panel,
     roots,
 )
-from ambid.report.rotor_drawing import shapes_block
+from ambid.report.rotor_drawing import campbell_panel, shapes_block
 from ambid.report.text import pole_table
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.replay import RotorReplay, at_speed, point_of, slopes
@@ -49,6 +52,8 @@ _AROUND = 1.6  # how far the model is drawn beyond the excited band
 _WIDEST = 1e9  # rad/s, from which the spread of a pole is not drawn
 _RAYLEIGH_95 = float(np.sqrt(-np.log(0.05)))  # 95 % of |e| over its standard deviation √E|e|²
 _SHARE = 0.5  # of the largest input at a line, from which a line without a reference counts as one of this axis
+_BEYOND, _SPEEDS = 1.3, 41  # how far over the fastest record and the lowest mode whirl is drawn, and at how many speeds
+_MARKS = 40  # lines of each decade that are drawn with their intervals: modes are narrow
 _PLANE_NAMES = ("x", "y", "z")
 
 
@@ -58,6 +63,7 @@ class RotorEvidence:
 
     estimate: RotorEstimate
     runs: tuple[RotorReplay, ...] = ()  # its records with periodic excitation; without any the model alone is drawn
+    shaft: Shaft | None = None  # its drawing
 
     @property
     def title(self) -> str:
@@ -75,12 +81,19 @@ class RotorEvidence:
         for p in plant.planes:
             at = [j for j, (_, plane) in enumerate(plant.placed) if plane == p]
             found[f"response_{_PLANE_NAMES[p]}"] = _matrix(e, r, first, _positions(plant, p), at)
+        if (plant if first is None else first.model).turning:
+            at = [j for j, (_, plane) in enumerate(plant.placed) if plane == 0]
+            found["response_across"] = _matrix(e, r, first, _positions(plant, 1), at)
         if plant.coils:
             found["coils"] = _coils(e, r, first)
         for k, run in enumerate(self.runs):
             found["residuals" if k == 0 else f"residuals_{k + 1}"] = _residuals(run)
-        if e.modes:
-            found["shapes"] = shapes_block({place: e.numbers[place] for place in plant.places}, e.modes)
+        if e.modes or self.shaft is not None:
+            planes = {place: e.numbers[place] for place in plant.places}
+            found["shapes"] = shapes_block(planes, e.modes, shaft=self.shaft)
+        whirl = _whirl(e, self.shaft)
+        if whirl is not None:
+            found["campbell"] = Block(columns=[[whirl]])
         found["poles"] = _poles(e)
         found["correlations"] = _correlations(e)
         return found
@@ -105,10 +118,7 @@ def response_of(estimate: RotorEstimate, run: RotorReplay | None = None, *, n_fr
     space, at = model.matrices(estimate.numbers), point_of(estimate)
     poles = np.linalg.eigvals(space.A).astype(np.complex128)
     f = frequency_grid(poles, lines[0] / _AROUND, min(_AROUND * lines[-1], 0.499 * rate), n_frequencies)
-    of = Sampled(
-        space=space, omega=2 * np.pi * f, rate_hz=rate, delays=at.delays,
-        held=tuple(model.drive(j) == "voltage" for j in range(len(model.axes))),
-    )  # fmt: skip
+    of = Sampled(space=space, omega=2 * np.pi * f, rate_hz=rate, delays=at.delays, held=model.held)
     n_u = len(model.inputs)
     unit = np.eye(n_u, dtype=complex)
     moved = [slopes(estimate, of, model, np.tile(unit[j], (f.size, 1))) for j in range(n_u)]
@@ -140,7 +150,11 @@ def measured_pairs(run: RotorReplay, outputs: Sequence[int], inputs: Sequence[in
 
 def _positions(plant: RotorModel, plane: int) -> list[int]:
     """Return the positions of a plane among the outputs."""
-    return [k for k, (j, _) in enumerate(plant.sensors) if plant.placed[j][1] == plane]
+    return [k for k in range(len(plant.sensors)) if _plane_of(plant, k) == plane]
+
+
+def _plane_of(plant: RotorModel, position: int) -> int:
+    return plant.placed[plant.sensors[position][0]][1]
 
 
 def _matrix(
@@ -151,8 +165,9 @@ def _matrix(
     for j in inputs:
         pairs = [panel(_pair, e.plant, r, run, (k, j), part, height=h) for k in outputs for part, h in _PARTS]
         columns.append(pairs)
-    plane = _PLANE_NAMES[e.plant.placed[inputs[0]][1]]
-    return Block(columns=columns, title=f"response of the rotor in plane {plane}")
+    source, plane = (_PLANE_NAMES[p] for p in (e.plant.placed[inputs[0]][1], _plane_of(e.plant, outputs[0])))
+    across = f"response in plane {plane} to magnets in plane {source}: gyroscopic coupling"
+    return Block(columns=columns, title=across if source != plane else f"response of the rotor in plane {plane}")
 
 
 _PARTS = ("magnitude", 2.0), ("phase", 1.4)
@@ -179,15 +194,37 @@ def _pair(
     if part == "magnitude":
         magnitude_axis(axes, one, (0, 0), label="identified rotor")
         if seen is not None:
-            marks(axes, seen, (0, 0))
+            marks(axes, seen, (0, 0), per_decade=_MARKS)
         axes.set_ylabel(f"[{response_unit(plant.units, output, source)}]")
         head(axes, f"{source} → {output}")
         return
     phase_axis(axes, one, (0, 0))
     if seen is not None:
-        marks(axes, seen, (0, 0), guide=one)
+        marks(axes, seen, (0, 0), guide=one, per_decade=_MARKS)
     axes.set_ylabel("phase [°]")
     axes.set_xlabel("frequency [Hz]")
+
+
+# --- along the shaft and over speed ----------------------------------------------------------------------------------
+
+
+def _whirl(e: RotorEstimate, shaft: Shaft | None) -> Panel | None:
+    """The whirl of the free rotor over speed, where its polar inertia or its drawing is known."""
+    fastest = max(abs(float(str(r["speed"]))) for r in e.records)
+    n = len(e.modes)
+    lowest = 2.0 * np.pi * e.modes[0].frequency_hz.value if n else 0.0
+    most = _BEYOND * max(fastest, lowest)
+    if most == 0.0 or (shaft is None and not (n and e.plant.turning)):
+        return None
+    speeds = np.linspace(0.0, most, _SPEEDS)
+    drawn = None if shaft is None else campbell(shaft, speeds, lines=2 * max(n, 1))
+    found = sd = None
+    if n and e.plant.turning:
+        free = e.plant.with_modes(n)  # those above the band are a guess
+        found = campbell(free_rotor_of(free, e.numbers), speeds)
+        sd = whirl_sd(free, e.numbers, e.covariance_names, e.covariance, found)
+    at = sorted({abs(float(str(r["speed"]))) for r in e.records} - {0.0})
+    return campbell_panel(found, drawn=drawn, sd=sd, speeds=at)
 
 
 # --- residuals ------------------------------------------------------------------------------------------------------
@@ -250,6 +287,7 @@ def _poles(e: RotorEstimate) -> Block:
 
 
 def _correlations(e: RotorEstimate) -> Block:
-    """Correlations of the parameters, in the order of the rig, without the numbers of the modes' shapes."""
+    """Correlations of the parameters, in the order of the rig, and of the modes' frequencies and dampings."""
     shown = [p.name for p in e.parameters if p.sd > 0.0]
-    return correlations_panel(shown, e.covariance_of(tuple(shown)), e.values)
+    shown += [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
+    return correlations_panel(shown, e.covariance_of(tuple(shown)), e.numbers)

@@ -28,6 +28,7 @@ _CAPTIONS: Mapping[str, tuple[str, str]] = {
     "response_x": ("Response in plane x", _LINES),
     "response_y": ("Response in plane y", _LINES),
     "response_z": ("Response along the shaft", _LINES),
+    "response_across": ("Response across the planes", "Gyroscopic coupling at the speed of the record. " + _LINES),
     "coils": ("Coils", "Current of each coil from its own voltage. " + _LINES),
     "residuals": (
         "Residuals",
@@ -37,6 +38,11 @@ _CAPTIONS: Mapping[str, tuple[str, str]] = {
     "shapes": (
         "Bending modes along the shaft",
         "Shapes at rest, of modal mass 1 kg, identified at the planes of bearings and sensors.",
+    ),
+    "campbell": (
+        "Campbell diagram",
+        "Whirl of the rotor without its bearings over speed: from the identified modes and gyroscopic terms with 95 % "
+        "bands, and from the drawing where the rig holds one. Unbalance excites a forward line where it meets 1x.",
     ),
     "poles": ("Poles", "Of the identified rotor in its magnets, in open loop, with their 95 % regions."),
     "correlations": (

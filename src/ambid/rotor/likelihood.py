@@ -67,8 +67,7 @@ def sampled(experiment: Experiment, model: RotorModel, at: Point, *, between: bo
 def at_lines(model: RotorModel, at: Point, omega: Array, speed: float, rate_hz: float) -> Sampled:
     """Return the model at a speed and angular frequencies in rad/s."""
     return Sampled(
-        space=model.at_speed(speed).matrices(at.theta), omega=omega, rate_hz=rate_hz, delays=at.delays,
-        held=tuple(model.drive(j) != "current" for j in range(len(model.axes))),
+        space=model.at_speed(speed).matrices(at.theta), omega=omega, rate_hz=rate_hz, delays=at.delays, held=model.held,
     )  # fmt: skip
 
 
