@@ -5,13 +5,15 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 import ambid
+from ambid.errors import EstimationError
 from ambid.job.rotor import replays_of
-from ambid.report.drawing import NARROW
+from ambid.report.drawing import NARROW, single
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
 from ambid.report.rotor_page import rotor_page
-from tests.report.rotor_record import estimate
+from tests.report.rotor_record import estimate, record
 
 
 def test_a_rotor_has_one_table_for_itself_and_one_for_each_bearing() -> None:
@@ -106,3 +108,36 @@ def test_figure_and_page_of_a_rotor_show_its_record() -> None:
     assert {"Response in plane x", "Coils", "Residuals", "Poles", "Noise", "Rig"} <= {s.title for s in page.sections}
     assert e.to_dataframe().loc["ax.k_i", "value"] == e["ax.k_i"].value
     assert all(s.figure is not None for s in page.sections if s.title in ("Coils", "Residuals", "Poles"))
+
+
+def test_an_estimate_holds_on_another_record_of_its_rotor_and_not_on_one_of_another() -> None:
+    e = estimate()
+    found = e.validate(record(2))
+    assert found.passed, found.summary()
+    assert 0.5 < found.fit["ax_position"]["over_noise"] < 1.3
+    assert "over its noise" in found.summary()
+    assert any(a.get_title(loc="left").startswith("ax_position: ") for a in found.plot().axes)
+    heavy = replace(e, numbers={**e.numbers, "m": 1.05 * e.numbers["m"]})
+    assert not heavy.validate(record(2)).passed
+    with pytest.raises(EstimationError, match="not periodic"):
+        e.validate(record(2)[0.0:0.4])
+    with pytest.raises(EstimationError, match="holds no predictor"):
+        e.predict(record(2))
+
+
+def test_a_whirl_diagram_is_drawn_where_what_turns_is_known() -> None:
+    from tests.report.test_rotor_drawing import PLANES, identified
+
+    e = estimate()
+    assert "campbell" not in RotorEvidence(estimate=e).drawings()
+    plant = replace(e.plant, polar=True, speed=300.0, n_modes=1)
+    numbers = {"Ip": 0.01, "gyro.01": 0.0, "gyro.11": 0.1, "mode1.omega": 918.0, "mode1.zeta": 0.004}
+    numbers |= {f"mode1.{name}": x.value for name, x in identified(1.0).shape.items()}
+    turning = replace(
+        e, plant=plant, numbers={**e.numbers, **numbers, **PLANES}, modes=(identified(1.0),),
+        records=({**e.records[0], "speed": 300.0},),
+    )  # fmt: skip
+    blocks = RotorEvidence(estimate=turning).drawings()
+    assert {"campbell", "shapes", "response_across"} <= set(blocks)
+    heads = [a.get_title(loc="left") for a in single(blocks["campbell"]).axes]
+    assert heads[0] == f"critical speed {918.0 / np.sqrt(1 - 0.1) * 30 / np.pi:.0f} 1/min"  # W²(1 - g) = w²

@@ -19,6 +19,7 @@ from ambid.job.data import Reading, signals_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.linear_model import StateSpace, discretise, model
+from ambid.rotor.estimate import RotorEstimate
 
 validated = validate
 
@@ -27,6 +28,11 @@ def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int, **reading: Un
     """Predict the outputs of a record some samples ahead, (n_samples,) by output in SI; NaN where nothing precedes."""
     if isinstance(ahead, bool) or not isinstance(ahead, Integral) or ahead < 1:
         raise EstimationError(f"ahead is {ahead!r}; it is a whole number of samples, 1 or more. Correct it")
+    if isinstance(result, RotorEstimate):
+        raise EstimationError(
+            "a rotor on many axes is not predicted sample by sample: its estimate holds no predictor. Validate it "
+            "on the record instead"
+        )
     ahead, data = int(ahead), data_of(result, record, where="the result", **reading)
     n = int((data.record.y.shape if isinstance(result, NonlinearBearingEstimate) else (data.n_samples,))[0])
     if ahead >= n:

@@ -230,10 +230,13 @@ def _fit() -> View:
 def _validation() -> View:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.estimation.estimate import Estimate
+    from ambid.job.rotor import replays_of
     from ambid.physics.linear_model import model
     from ambid.report.estimate_text import validation_text
     from ambid.report.figures import Evidence, bearing_evidence, validation_figure
     from ambid.report.fit_figures import traces_of
+    from ambid.report.rotor_figures import residuals_block
+    from ambid.rotor.estimate import RotorEstimate
     from ambid.validation.second_record import replay
 
     def beside(known: Any, data: Any) -> Sequence[Traces]:
@@ -247,6 +250,8 @@ def _validation() -> View:
         return (traces_of(known, data, second=True),)
 
     def drawn(v: Any, used: Any, width: float) -> Figure:
+        if used is not None and isinstance(used[0], RotorEstimate):
+            return validation_figure(v, (), width, more=[residuals_block(run) for run in replays_of(*used)])
         return validation_figure(v, () if used is None else beside(*used), width)
 
     return View(
@@ -452,13 +457,18 @@ def _modal() -> View:
 
 
 def _rotor() -> View:
-    from ambid.job.rotor import drawing_of, replays_of
+    from ambid.job.results import rig_of
+    from ambid.job.rotor import replays_of
     from ambid.report.rotor_figures import RotorEvidence, rotor_overview
     from ambid.report.rotor_page import rotor_page
     from ambid.report.rotor_text import rotor_text
 
     def evidence(e: Any, used: Any) -> RotorEvidence:
-        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=drawing_of(e))
+        try:
+            shaft = rig_of(e, "the estimate").shaft
+        except AmbidError:  # its text alone may say no more where it lies now
+            shaft = None
+        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=shaft)
 
     return View(
         text=rotor_text,

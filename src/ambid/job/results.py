@@ -139,6 +139,8 @@ def data_of(
 ) -> Any:
     """Read a further record as a result wants it: a Record, IOData of a fit, a TakenRecord of a nonlinear bearing.
 
+    A rotor has a tuple of records.
+
     `rig`: through which it is read; default: as the result remembers it; `where`: name of the result, for messages.
     """
     if isinstance(known, BlackBoxFit | NonlinearFit):
@@ -152,6 +154,8 @@ def data_of(
         check_same_bench(known.units, known.dt, data)
         return data
     bench = rig_of(known, where) if rig is None else rig
+    if isinstance(known, RotorEstimate):
+        return (load_bench(record, bench, **reading),)
     if isinstance(known, Estimate):
         return load_bench(record, bench, **reading)
     from ambid.job.bearing_records import bearing_rig, take_record
@@ -174,10 +178,10 @@ def validate(
 
     Parameters
     ----------
-    estimate : Estimate, NonlinearBearingEstimate, BlackBoxFit, NonlinearFit, str or Path
+    estimate : Estimate, NonlinearBearingEstimate, RotorEstimate, BlackBoxFit, NonlinearFit, str or Path
         A result, or its file.
     record : file, Record, DataFrame, Dataset or dict of arrays
-        Of a rotor that moves.
+        Of a rotor that moves; for a rotor on many axes with periodic excitation.
     rig : Rig, str or Path, optional
         Through which the record is read; default: the rig that the estimate was made with.
     from_s, to_s, rate_hz, gaps, units : optional
@@ -204,6 +208,11 @@ def validate(
             "samples": data.n_samples,
         }
         model_name, source = known.structure, data.record
+    elif isinstance(known, RotorEstimate):
+        from ambid.job.rotor import validated
+
+        found, model_name = validated(known, data), known.model
+        source = data[0].provenance
     elif isinstance(known, Estimate):
         found, model_name = dict(validation(known, signals_of(data, model(known.model)))), known.model
         source = data.provenance

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -25,8 +25,6 @@ from ambid.rotor.estimate import RotorEstimate
 if TYPE_CHECKING:
     from ambid.arrays import Complex
     from ambid.control.closed import ClosedLoop
-    from ambid.physics.rotor_model import RotorModel
-    from ambid.physics.shaft import Shaft
     from ambid.rotor.conclusion import Evidence
     from ambid.rotor.estimator import Ending
     from ambid.rotor.replay import RotorReplay
@@ -266,14 +264,18 @@ def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[Roto
     return replays(estimate, found)
 
 
-def drawing_of(estimate: RotorEstimate) -> Shaft | None:
-    """Return the drawing in the rig that an estimate remembers, None without one."""
-    from ambid.job.results import rig_of
+def validated(estimate: RotorEstimate, benches: Sequence[Record]) -> dict[str, Any]:
+    """Return ``fit``, ``checks`` and ``samples`` of an estimate on further records; EstimationError without periods."""
+    from ambid.rotor.replay import validation
 
-    try:
-        return rig_of(estimate, "the estimate").shaft
-    except AmbidError:
-        return None
+    runs = replays_of(estimate, benches)
+    if not runs:
+        raise EstimationError(
+            f"{name_of(benches[0])} is not periodic or has less than two whole periods; validating a rotor needs "
+            "them. Excite with a multisine of whole periods"
+        )
+    fit, checks = validation(runs)
+    return {"fit": fit, "checks": checks, "samples": sum(b.n_samples for b in benches)}
 
 
 def name_of(bench: Record) -> str:

@@ -183,6 +183,12 @@ def validation_rows(validation: Mapping[str, Any]) -> list[tuple[str, ...]]:
             free = "unstable in open loop" if f["simulation"] is None else fraction(f["simulation"])
             rows.append((role, *(fraction(f["k_step"][k]) for k in horizons), free))
         return rows
+    if "over_noise" in first:
+        rows = [("fit", "explained", "left over", "over its noise")]
+        for role, f in fits.items():
+            left = sized(float(f["innovation_rms"]), "A" if role.endswith("_current") else "m")
+            rows.append((role, fraction(f["one_step"]), f"{left} rms", f"{float(f['over_noise']):.3g}"))
+        return rows
     rows = [("fit", "one step", "innovations", "relative to identification")]
     for role, f in fits.items():
         rms = f"{sized(float(f['innovation_rms']), _UNITS[role])} rms"

@@ -178,13 +178,15 @@ def figures(evidence: Evidence | BearingEvidence, width: float = WIDE) -> dict[s
     return {name: single(block, width) for name, block in evidence.drawings().items()}
 
 
-def validation_figure(found: Validation, beside: Sequence[Traces] = (), width: float = WIDE) -> Figure:
+def validation_figure(
+    found: Validation, beside: Sequence[Traces] = (), width: float = WIDE, *, more: Sequence[Block] = ()
+) -> Figure:
     """Draw how a result does on a further record: its predictions one and more steps ahead, and their residuals.
 
-    `beside`: the record with its predictions; without it the sizes of the errors alone are drawn.
+    `beside`: the record with its predictions; without it the sizes of the errors alone are drawn, and `more`.
     """
     failed = [name for name, c in found.checks.items() if not c.passed]
-    blocks = [_sizes_ahead(found)]
+    blocks = [_sizes_ahead(found), *more]
     if beside and beside[0].sd.ndim > 1:
         blocks.append(records_panel(beside))
     elif beside:

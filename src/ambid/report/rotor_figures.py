@@ -87,7 +87,7 @@ class RotorEvidence:
         if plant.coils:
             found["coils"] = _coils(e, r, first)
         for k, run in enumerate(self.runs):
-            found["residuals" if k == 0 else f"residuals_{k + 1}"] = _residuals(run)
+            found["residuals" if k == 0 else f"residuals_{k + 1}"] = residuals_block(run)
         if e.modes or self.shaft is not None:
             planes = {place: e.numbers[place] for place in plant.places}
             found["shapes"] = shapes_block(planes, e.modes, shaft=self.shaft)
@@ -230,7 +230,7 @@ def _whirl(e: RotorEstimate, shaft: Shaft | None) -> Panel | None:
 # --- residuals ------------------------------------------------------------------------------------------------------
 
 
-def _residuals(run: RotorReplay) -> Block:
+def residuals_block(run: RotorReplay) -> Block:
     """What the model leaves of each output, a column for each axis, beside what noise would."""
     plant, rows = run.model, []
     for j, axis in enumerate(plant.axes):
@@ -288,6 +288,7 @@ def _poles(e: RotorEstimate) -> Block:
 
 def _correlations(e: RotorEstimate) -> Block:
     """Correlations of the parameters, in the order of the rig, and of the modes' frequencies and dampings."""
-    shown = [p.name for p in e.parameters if p.sd > 0.0]
-    shown += [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
+    modes = [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
+    known = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
+    shown = [name for name in (*(p.name for p in e.parameters), *modes) if known.get(name, 0.0) > 0.0]
     return correlations_panel(shown, e.covariance_of(tuple(shown)), e.numbers)

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.linear import directions
 from ambid.estimation.modes import EstimatedNumber, Mode
@@ -201,25 +201,38 @@ def _fits(fit: RotorFit) -> dict[str, OutputFit]:
 
 
 def _residual_checks(fit: RotorFit) -> dict[str, Check]:
-    """Judge the mean residuals against the noise between periods: of all lines, and band by band for each output.
+    """Judge the mean residuals against the noise between periods."""
+    left = zip(fit.problem.experiments, fit.problem.residuals(fit.vector), strict=True)
+    return line_checks(fit.model.outputs, [(e, r, np.zeros(r.shape)) for e, r in left], n_free=fit.vector.size)
 
-    2|r|² of a whitened residual has two degrees of freedom; the noise's own levels come from P - 1 periods.
+
+def line_checks(
+    outputs: Sequence[str], parts: Sequence[tuple[Experiment, Complex, Array]], *, n_free: int = 0
+) -> dict[str, Check]:
+    """Judge what a model leaves at the lines of records: of all lines, and band by band for each output.
+
+    `parts`: of each record its whitened mean residuals, and the squares that errors of the model's numbers are expected
+    to add to them, (n_lines, n_y); `n_free`: numbers that were fitted to these lines. 2|r|² of a whitened residual has
+    two degrees of freedom; the noise's own levels come from P - 1 periods.
     """
     worst: dict[str, Any] = {"z": 0.0, "where": ""}
     total, count, spread = 0.0, 0, 0.0
-    for e, r in zip(fit.problem.experiments, fit.problem.residuals(fit.vector), strict=True):
-        power, periods = 2.0 * np.abs(r) ** 2, e.spectra.n_periods
+    for e, r, added in parts:
+        power, periods = 2.0 * (np.abs(r) ** 2 - added), e.spectra.n_periods
+        more = 4.0 * float(added.sum()) * (2.0 + float(added.sum()))  # errors of numbers move many lines together
         total, count = total + float(power.sum()), count + 2 * power.size
-        spread += 2.0 * 2 * power.size * (1.0 + 1.0 / (periods - 1))
-        parts = np.array_split(np.arange(power.shape[0]), min(_BANDS, max(1, power.shape[0] // 10)))
-        for part in parts:
+        spread += 2.0 * 2 * power.size * (1.0 + 1.0 / (periods - 1)) + more
+        bands = np.array_split(np.arange(power.shape[0]), min(_BANDS, max(1, power.shape[0] // 10)))
+        for part in bands:
             freedom = 2.0 * part.size
-            z = (power[part].sum(axis=0) - freedom) / np.sqrt(2.0 * freedom * (1.0 + 1.0 / (periods - 1)))
+            more_here = 4.0 * added[part].sum(axis=0) * (2.0 + added[part].sum(axis=0))
+            own = 2.0 * freedom * (1.0 + 1.0 / (periods - 1))
+            z = (power[part].sum(axis=0) - freedom) / np.sqrt(own + more_here)
             k = int(np.argmax(z))
             if z[k] > worst["z"]:
                 f = e.spectra.frequency_hz[part]
-                worst = {"z": float(z[k]), "where": f"{fit.model.outputs[k]}, {f[0]:.4g} to {f[-1]:.4g} Hz"}
-    freedom = max(count - fit.vector.size, 1)
+                worst = {"z": float(z[k]), "where": f"{outputs[k]}, {f[0]:.4g} to {f[-1]:.4g} Hz"}
+    freedom = max(count - n_free, 1)
     ratio, z_all = total / freedom, (total - freedom) / np.sqrt(spread)
     whole = bool(ratio < 1.0 + _LIMIT_SHARE or z_all < _FAR)
     white = bool(worst["z"] < _FAR + 1.0)

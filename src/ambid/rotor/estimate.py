@@ -29,14 +29,14 @@ from ambid.estimation.estimate import (
     read_whole,
 )
 from ambid.estimation.modes import Mode
-from ambid.estimation.result import Linear
+from ambid.estimation.result import Linear, Predicting
 from ambid.physics.rotor_model import RotorModel
 
 _EMPTY: Mapping[str, Any] = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
-class RotorEstimate(Parametric, Judged, Linear):
+class RotorEstimate(Parametric, Judged, Predicting, Linear):
     """Physical parameters of a rotor in magnetic bearings, with its bending modes.
 
     Attributes

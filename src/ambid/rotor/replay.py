@@ -8,12 +8,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check
 from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.conclusion import line_checks
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Experiment, Point, sampled
 from ambid.rotor.noise import fit_noise
@@ -62,6 +65,24 @@ class RotorReplay:
         moved = whiten @ slopes(self.estimate, self.sampled, self.model, self.experiment.spectra.mean_u)
         added = np.einsum("kyn,nm,kym->ky", moved, self.estimate.covariance, moved.conj(), optimize=True)
         return np.asarray((whiten @ self.left[:, :, None])[:, :, 0]), np.asarray(added.real)
+
+
+def validation(runs: Sequence[RotorReplay]) -> tuple[dict[str, dict[str, Any]], dict[str, Check]]:
+    """Return how much of the excited lines an estimate explains by output, and the tests of what it leaves.
+
+    The tests allow for the estimate's own error: C_e + J P Jᴴ, with P its covariance.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for k, role in enumerate(runs[0].model.outputs):
+        left = sum(float(np.sum(np.abs(run.left[:, k]) ** 2)) for run in runs)
+        whole = sum(float(np.sum(np.abs(run.experiment.spectra.mean_y[:, k]) ** 2)) for run in runs)
+        noise = sum(float(np.sum(np.real(run.covariance[:, k, k]))) for run in runs)
+        found[role] = {
+            "one_step": 1.0 - float(np.sqrt(left / max(whole, 1e-300))), "simulation": None,
+            "innovation_rms": float(np.sqrt(2.0 * left / len(runs))), "over_noise": float(np.sqrt(left / noise)),
+        }  # fmt: skip
+    parts = [(run.experiment, *run.whitened) for run in runs]
+    return found, line_checks(runs[0].model.outputs, parts)
 
 
 def at_speed(estimate: RotorEstimate, speed: float) -> RotorModel:
