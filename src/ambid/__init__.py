@@ -1,8 +1,8 @@
 """Physical parameters of active magnetic bearings, with honest uncertainty.
 
-``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare`, `simulate`, `track`, `validate`, `info` and
-`acquire` are the functions that the commands of these names call, and `load` reads what they wrote. Rooms and names are
-imported when they are first used, so that ``import ambid`` costs next to nothing.
+``ambid.identify(record, rig)`` is the main job; `fit`, `frf`, `compare`, `margins`, `simulate`, `track`, `validate`,
+`info` and `acquire` are the functions that the commands of these names call, and `load` reads what they wrote. Rooms
+and names are imported when they are first used, so that ``import ambid`` costs next to nothing.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ambid.job import identify_nonlinear as identify_nonlinear
     from ambid.job import info as info
     from ambid.job import load as load
+    from ambid.job import margins as margins
     from ambid.job import simulate as simulate
     from ambid.job import track as track
     from ambid.job import validate as validate
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
     from ambid.simulation import simulate_rig as simulate_rig
 
 _ROOMS = (
-    "bearing", "blackbox", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive", "report",
-    "rig", "signals", "simulation", "tracking", "units", "validation",
+    "bearing", "blackbox", "control", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive",
+    "report", "rig", "signals", "simulation", "tracking", "units", "validation",
 )  # fmt: skip
 
 _exported, __dir__, __all__ = exports(__name__)

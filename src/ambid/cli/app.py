@@ -20,6 +20,7 @@ from ambid.cli import (
     identify,
     info,
     init,
+    margins,
     recover,
     simulate,
     track,
@@ -42,6 +43,7 @@ app.command("compare", short_help="compare several black-box structures")(compar
 app.command("acquire", short_help="take a record from a controller, real or emulated")(acquire.command)
 app.command("commission", short_help="go from a controller to tracked parameters, step by step")(commission.command)
 app.command("track", short_help="track parameters through a record, as on-line")(track.command)
+app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
 app.command("recover", short_help="recover a recording that was cut off")(recover.command)
 app.command("init", short_help="draft a rig file from a record")(init.command)
 app.command("simulate", short_help="simulate a record from the physics")(simulate.command)

@@ -1,1 +1,12 @@
 """The loop as it is: its controller, sensitivity, margins and compliance."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.control.margins import Margins as Margins
+
+__getattr__, __dir__, __all__ = exports(__name__)

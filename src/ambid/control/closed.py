@@ -154,6 +154,11 @@ class ClosedLoop:
         S = np.linalg.inv(np.eye(len(p)) + self.H[:, p] @ back)
         return p, q, back.astype(np.complex128), S.astype(np.complex128)
 
+    @property
+    def positions(self) -> list[int]:
+        """The outputs that are positions, in the order of `weights`."""
+        return self._parts[0]
+
     @cached_property
     def weights(self) -> Complex:
         """How the controller of each axis weighs its sensors, (n, n_axes, n_p): 1 for a single one."""

@@ -80,6 +80,11 @@ class Controller:
         """Largest residual of the laws over their inputs."""
         return max(law.misfit for law in self.laws)
 
+    @property
+    def orders(self) -> tuple[int, ...]:
+        """Degree of each law."""
+        return tuple(law.coefficients.shape[1] - 1 for law in self.laws)
+
     def backward(self, frequency_hz: Array) -> Complex:
         """Return d = 1 - 1/z at some frequencies."""
         return np.asarray(1.0 - np.exp(-2j * np.pi * frequency_hz / self.rate_hz))
@@ -97,7 +102,10 @@ class Controller:
 
 
 def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controller:
-    """Return the controller of a rig's [loop], the same on every axis; its law is that of `ambid.physics.loop.Loop`."""
+    """Return the controller of a rig's [loop], the same on every axis; its law is that of `ambid.physics.loop.Loop`.
+
+    The reference of an axis is what is added to the controller's output.
+    """
     T, tau = 1.0 / rate_hz, loop.filter_s
     lag = np.polynomial.Polynomial([T, tau])  # of the derivative, over which d stands
     integrates, one = bool(loop.ki), np.polynomial.Polynomial([0.0, 1.0])
@@ -105,14 +113,15 @@ def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controlle
     B = loop.kp * A + loop.kd * one * (one if integrates else 1.0)
     B = B + loop.ki * T * (1.0 - one) * lag if integrates else B
     laws = []
-    for position, current in fed_back(of):
+    for j, (position, current) in enumerate(fed_back(of)):
         own = [k for k in (position, current) if k >= 0]
-        rows = [A, *([B] if position >= 0 else []), *([loop.kc * A] if current >= 0 else [])]
-        table = np.zeros((len(rows), 3))
+        rows = [A, *([B] if position >= 0 else []), *([loop.kc * A] if current >= 0 else []), A]
+        table = np.zeros((len(rows), 2 + integrates))
         for row, polynomial in zip(table, rows, strict=True):
             row[: polynomial.coef.size] = polynomial.coef
-        laws.append(Law(outputs=tuple(own), references=(), scale=1.0, coefficients=table))
-    return Controller(laws=tuple(laws), rate_hz=rate_hz, n_outputs=len(of.outputs), n_references=0, source="rig")
+        laws.append(Law(outputs=tuple(own), references=(j,), scale=1.0, coefficients=table))
+    n_u, n_y = len(of.inputs), len(of.outputs)
+    return Controller(laws=tuple(laws), rate_hz=rate_hz, n_outputs=n_y, n_references=n_u, source="rig")
 
 
 def identify_controller(

@@ -13,6 +13,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop
 from ambid.rotor.spectra import PeriodSpectra
+from ambid.signals.response import FrequencyResponse
 
 _SILENT = 1e-6  # of the largest line, below which a reference has no power
 _COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
@@ -34,16 +35,19 @@ class MeasuredSensitivity:
         return float(self.ratio[k]), float(self.frequency_hz[k])
 
 
-def measured_sensitivity(spectra: PeriodSpectra, loop: ClosedLoop) -> tuple[MeasuredSensitivity | None, ...]:
+def measured_sensitivity(
+    spectra: PeriodSpectra, loop: ClosedLoop, *, silent: float = _SILENT
+) -> tuple[MeasuredSensitivity | None, ...]:
     """Return the sensitivity of each axis as measured, None of an axis without a reference of its own.
 
-    `loop`: at the lines of the spectra; its controller is used, its plant is not.
+    `loop`: at the lines of the spectra; its controller is used, its plant is not; `silent`: part of the largest line
+    below which a reference has no power.
     """
     sensors = loop.plant.sensors
     if spectra.R is None or spectra.R.shape[1] != len(sensors):
         return (None,) * len(sensors)
     size = np.abs(spectra.R)
-    on = size > _SILENT * size.max()
+    on = size > silent * size.max()
     K, F = loop.controller.response(spectra.frequency_hz)
     p = [k for group in sensors for k in group]
     C = np.linalg.pinv(F) @ K[:, :, p]
@@ -88,3 +92,21 @@ def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Compl
         answers = np.linalg.lstsq(rows, spectra.Y[:, near][:, :, p].transpose(1, 0, 2).reshape(window, -1), rcond=None)
         found[:, m] = answers[0][int(np.flatnonzero(others == mine)[0])].reshape(spectra.n_periods, len(p))
     return found
+
+
+def measured_locally(response: FrequencyResponse, loop: ClosedLoop) -> tuple[MeasuredSensitivity | None, ...]:
+    """Return the sensitivity by a measured response from references to positions, of a record that is not periodic.
+
+    `response`: (n, n_p, n_references); `loop`: at its frequencies.
+    """
+    p = [k for group in loop.plant.sensors for k in group]
+    K, F = loop.controller.response(response.frequency_hz)
+    C = np.linalg.pinv(F) @ K[:, :, p]
+    found = []
+    for j in range(len(loop.plant.sensors)):
+        through, weights = C @ loop.together[:, j], loop.weights[:, j]
+        ratio = np.abs(1.0 - np.einsum("kp,kpr,kr->k", weights, response.G, through))
+        size = np.abs(weights)[:, :, None] * response.sd * np.abs(through)[:, None, :]
+        sd = np.sqrt(np.sum(size**2, axis=(1, 2)) / 2.0)
+        found.append(MeasuredSensitivity(frequency_hz=response.frequency_hz, ratio=ratio, sd=sd))
+    return tuple(found)

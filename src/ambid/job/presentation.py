@@ -480,6 +480,24 @@ def _rotor() -> View:
     )
 
 
+def _margins() -> View:
+    from ambid.control.margins import SCHEMA
+    from ambid.report.margins_figures import margins_figure
+    from ambid.report.margins_text import margins_text
+
+    def title(m: Any) -> str:
+        return f"{m.record.get('file') or 'record'}, margins of the loop of model {m.model}"
+
+    def table(m: Any) -> Table:
+        rows = [{**fields_json(s), **fields_json(m.margins[axis])} for axis, s in m.sensitivity.items()]
+        return "axis", {"axis": list(m.sensitivity), **_numbers_of(rows)}
+
+    return View(
+        text=margins_text, figure=lambda m, _, width: margins_figure(m, title(m), width),
+        document=_fields_of(SCHEMA), table=table, title=title,
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
     "RotorEstimate": _rotor,
     "Estimate": _estimate,
@@ -489,6 +507,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Validation": _validation,
     "Measured": _measured,
     "Modal": _modal,
+    "Margins": _margins,
     "Track": _track,
     "Inspection": _inspection,
     "Acquired": _acquired,

@@ -118,6 +118,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     FIT_SCHEMA: _fit,
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
+    "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
@@ -269,7 +270,7 @@ def info(
     return inspect(found, inputs=bench.plant.inputs)
 
 
-def rig_of(estimate: AnyEstimate, where: str) -> Rig:
+def rig_of(estimate: AnyEstimate | RotorEstimate, where: str) -> Rig:
     """Return the rig that an estimate remembers; `where` is its name, for messages."""
     text, folder = estimate.rig.get("text"), estimate.rig.get("folder")
     if not isinstance(text, str) or not isinstance(folder, str):

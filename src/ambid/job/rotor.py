@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check
+from ambid.estimation.estimate import Check, plain_json
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, origin, rig_entry
@@ -77,8 +77,8 @@ def identify_rotor(
             more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=found.why)},
             rig=rig_entry(rig), warnings=[*warnings, *found.warnings],
         )  # fmt: skip
-        loop = _loop(estimate, rig, found.spectra)
-        sensitivity = {} if loop is None else _sensitivity(loop, found.spectra)
+        fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
+        loop, sensitivity = _loop(estimate, rig, clean[fastest], found.seen[fastest])
         synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
     clock.lap("checks")
     return replace(estimate, sensitivity=sensitivity, synchronous=synchronous, timing_s=clock.laps, used=tuple(benches))
@@ -178,22 +178,19 @@ def _delays(rig: Rig) -> list[float | None]:
     return [None if d == "auto" else float(d) for d in given]
 
 
-def _loop(estimate: RotorEstimate, rig: Rig, spectra: PeriodSpectra) -> ClosedLoop | None:
-    """Return the closed loop: its controller is that of the record, or of the rig's [loop]; None: neither is known."""
-    from ambid.job.margins import closed_loop
-
-    try:
-        return closed_loop(estimate, rig, spectra)
-    except EstimationError:
-        return None
-
-
-def _sensitivity(loop: ClosedLoop, spectra: PeriodSpectra) -> Mapping[str, Any]:
-    """Return the peaks of the sensitivity by axis."""
+def _loop(
+    estimate: RotorEstimate, rig: Rig, bench: Record, spectra: PeriodSpectra | None
+) -> tuple[ClosedLoop | None, Mapping[str, Any]]:
+    """Return the closed loop of a record, and the peaks of its sensitivity; None where its controller is not known."""
     from ambid.control.margins import sensitivity_by_axis
-    from ambid.control.measured import measured_sensitivity
+    from ambid.job.closed_loop import loop_of, measure, spectra_of
 
-    return sensitivity_by_axis(loop, measured_sensitivity(spectra, loop.at(spectra.frequency_hz)))
+    seen = spectra_of(bench, estimate.plant, estimate.speed) if spectra is None else spectra
+    try:
+        loop = loop_of(estimate, rig, bench.rate_hz, seen, estimate.speed)
+    except EstimationError:
+        return None, {}
+    return loop, plain_json(sensitivity_by_axis(loop, measure(loop, bench, seen)))
 
 
 def _synchronous(

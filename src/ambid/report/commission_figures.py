@@ -12,6 +12,7 @@ import numpy as np
 from ambid.acquisition.polarity import Pulse
 from ambid.arrays import Array
 from ambid.report.drawing import BAND, BOUND, MEASURED, ORANGE, PREDICTED, Block, curve, head, log_axis, panel
+from ambid.report.margins_figures import zone_lines
 from ambid.report.numbers import prefixed, sized
 from ambid.signals.spectra import power_spectrum
 from ambid.simulation.margins import ZONES, LoopMargins
@@ -195,13 +196,7 @@ def _sensitivity(axes: Axes, loops: Mapping[str, LoopMargins]) -> None:
     """Draw the sensitivity of loops over frequency."""
     for loop, (colour, style) in zip(loops.values(), ((PREDICTED, "-"), (ORANGE, "--")), strict=False):
         axes.plot(loop.frequency_hz, 20.0 * np.log10(loop.sensitivity), color=colour, linestyle=style)
-    for most, zone in ZONES:
-        level = 20.0 * math.log10(most)
-        axes.axhline(level, color=BOUND, linestyle=":", linewidth=0.9)
-        axes.annotate(
-            f"zone {zone}", (1.0, level), xycoords=("axes fraction", "data"), xytext=(-4, -2),
-            textcoords="offset points", ha="right", va="top", fontsize=8, color=BOUND,
-        )  # fmt: skip
+    zone_lines(axes)
     peak, hz = next(iter(loops.values())).peak
     first = next(iter(loops.values())).frequency_hz
     log_axis(axes.xaxis, float(first[0]), float(first[-1]))

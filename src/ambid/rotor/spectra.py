@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
 from ambid.signals.periodic_response import excited_lines, find_period, transient_ratio
@@ -150,12 +151,17 @@ def smoothed(power: Array, half: int = 12) -> Array:
     return np.asarray((sums[first + width] - sums[first]) / width)
 
 
-def find_excitation(record: Record, model: RotorModel) -> Excitation | None:
+def references_of(model: LinearModel) -> list[str]:
+    """Return the roles of the references of a model, one for each axis."""
+    return [f"{axis}_reference" for axis in model.axes] if isinstance(model, RotorModel) else ["reference"]
+
+
+def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
     """Return the periodic excitation of a record, None where it is not periodic or has less than two whole periods.
 
     Leading periods with a transient are left out.
     """
-    roles = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
+    roles = [role for role in references_of(model) if role in record]
     signals = [record[role].values for role in (roles or model.inputs) if np.ptp(record[role].values) > 0.0]
     if not signals:
         return None
@@ -177,7 +183,7 @@ def find_excitation(record: Record, model: RotorModel) -> Excitation | None:
     return Excitation(period=period, first=first, count=count)
 
 
-def period_spectra(record: Record, model: RotorModel, found: Excitation, speed: float = 0.0) -> PeriodSpectra:
+def period_spectra(record: Record, model: LinearModel, found: Excitation, speed: float = 0.0) -> PeriodSpectra:
     """Return the spectra of a record's periods at its excited lines, those beside harmonics of the speed left out.
 
     `speed`: rad/s.
@@ -189,7 +195,7 @@ def period_spectra(record: Record, model: RotorModel, found: Excitation, speed: 
         return np.fft.rfft(x.reshape(found.count, n, -1), axis=1) / n
 
     U, Y = spectra(model.inputs), spectra(model.outputs)
-    named = [f"{axis}_reference" for axis in model.axes]
+    named = references_of(model)
     logged = [role for role in named if role in record]
     R = np.zeros((U.shape[1], len(named)), dtype=complex)
     if logged:
@@ -230,7 +236,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     half = max(2, U.shape[0] // 2000)
     n_x = len(model.sensors)
     seen = np.max(smoothed(np.abs(Y[:, :n_x]) ** 2, half) / noise[:, :n_x], axis=1) > _CLEAR
-    logged = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
+    logged = [role for role in references_of(model) if role in record]
     if logged:
         excited = smoothed(np.abs(spectra(logged)) ** 2, half).sum(axis=1)
         seen &= excited > _FLOOR * np.max(excited[_FIRST_LINE:])
@@ -269,7 +275,9 @@ def _scatter(U: Complex, Y: Complex) -> Array:
     return np.stack([np.interp(np.arange(n), middle, v) for v in variance.T], axis=1)
 
 
-def _between(record: Record, model: RotorModel, found: Excitation, lines: NDArray[np.intp], speed_hz: float) -> Between:
+def _between(
+    record: Record, model: LinearModel, found: Excitation, lines: NDArray[np.intp], speed_hz: float
+) -> Between:
     """Return the spectra between the excited lines, thinned where they are many."""
     count, n = found.count, found.period
     bins = (lines[:, None] * count + np.arange(1, count)).ravel()

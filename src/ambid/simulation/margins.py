@@ -32,33 +32,17 @@ def zone_of(peak: float) -> str:
 _REACH = 20.0  # factor on the gains that is looked at, up and down
 _GAINS = 81  # of them, even in the logarithm
 _SLACK = 1e-9  # of a pole on the circle: an integrator that nothing holds
+_REAL = 0.3  # imaginary over real part up to which L is on its way to the real axis
 _SPAN = 1e-4  # of the rate: the lowest frequency
 _FREQUENCIES = 400
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class LoopMargins:
-    """What is predicted of a closed loop."""
+class OpenLoop:
+    """A stable closed loop opened at one signal, and its margins there."""
 
-    poles: Complex  # (n_poles,), in the z plane, by falling modulus
-    rate_hz: float
-    # factors on all gains between which the loop is stable: around 1 where it is; else those nearest to it. None: there
-    # are none within a factor of 20
-    gain: Interval | None
-    # of an unstable loop: the gains that hold it with the other sign, "kp, ki and kd" or "kc"
-    reversed: str | None
     frequency_hz: Array  # (n_frequencies,), up to half the rate
-    open_loop: Complex  # (n_frequencies,), L, from the controller's output back to it, for negative feedback
-
-    @property
-    def largest_pole(self) -> float:
-        """Largest modulus of the poles; the loop is unstable above 1."""
-        return float(np.abs(self.poles[0]))
-
-    @property
-    def stable(self) -> bool:
-        """Whether no pole lies outside the unit circle."""
-        return self.largest_pole <= 1.0 + _SLACK
+    open_loop: Complex  # (n_frequencies,), L, from the signal back to itself, for negative feedback
 
     @property
     def sensitivity(self) -> Array:
@@ -79,10 +63,58 @@ class LoopMargins:
     @property
     def phase_deg(self) -> float | None:
         """Smallest phase margin in degrees; None where the modulus of L never passes 1."""
+        _, angle = self._crossovers()
+        return float(np.degrees(np.min(np.abs(angle)))) if angle.size else None
+
+    @property
+    def delay_s(self) -> float | None:
+        """Further delay in s that makes the loop unstable; None where the modulus of L never passes 1."""
+        frequency, angle = self._crossovers()
+        return float(np.min((angle % (2.0 * np.pi)) / (2.0 * np.pi * frequency))) if angle.size else None
+
+    @property
+    def gain_between(self) -> tuple[float | None, float | None]:
+        """Factors on the gain nearest to 1, down and up, at which L passes -1; None: there is none."""
+        first, last = (x.conj() if abs(x.imag) < _REAL * abs(x.real) else x for x in self.open_loop[[0, -1]])
+        L = np.concatenate([[first], self.open_loop, [last]])  # real at rest, but behind an integrator, and at the end
+        k = np.flatnonzero(np.diff(np.sign(L.imag)))
+        share = L.imag[k] / (L.imag[k] - L.imag[k + 1])
+        real = L.real[k] + share * (L.real[k + 1] - L.real[k])
+        factors = -1.0 / real[real < 0.0]
+        down, up = factors[factors < 1.0], factors[factors > 1.0]
+        return (float(down.max()) if down.size else None, float(up.min()) if up.size else None)
+
+    def _crossovers(self) -> tuple[Array, Array]:
+        """Where the modulus of L is 1: frequencies, and angles of L from -1, in rad between -pi and pi."""
         size, angle = np.log(np.abs(self.open_loop)), np.unwrap(np.angle(self.open_loop))
         k = np.flatnonzero(np.diff(np.sign(size)))
-        at = angle[k] + (angle[k + 1] - angle[k]) * size[k] / (size[k] - size[k + 1])  # where it is 1
-        return float(np.degrees(np.min(np.abs((at % (2.0 * np.pi)) - np.pi)))) if k.size else None
+        share = size[k] / (size[k] - size[k + 1])
+        at = angle[k] + (angle[k + 1] - angle[k]) * share
+        frequency = self.frequency_hz[k] * (self.frequency_hz[k + 1] / self.frequency_hz[k]) ** share
+        return frequency, (at % (2.0 * np.pi)) - np.pi
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopMargins(OpenLoop):
+    """What is predicted of a closed loop, opened at the controller's output."""
+
+    poles: Complex  # (n_poles,), in the z plane, by falling modulus
+    rate_hz: float
+    # factors on all gains between which the loop is stable: around 1 where it is; else those nearest to it. None: there
+    # are none within a factor of 20
+    gain: Interval | None
+    # of an unstable loop: the gains that hold it with the other sign, "kp, ki and kd" or "kc"
+    reversed: str | None
+
+    @property
+    def largest_pole(self) -> float:
+        """Largest modulus of the poles; the loop is unstable above 1."""
+        return float(np.abs(self.poles[0]))
+
+    @property
+    def stable(self) -> bool:
+        """Whether no pole lies outside the unit circle."""
+        return self.largest_pole <= 1.0 + _SLACK
 
     def words(self) -> str:
         """Say how stable the loop is, on one line."""

@@ -1,0 +1,148 @@
+"""The loop of a record as it is: plant of an estimate, controller of the record or of the rig, measured sensitivity."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.controller import Controller, controller_of_loop, identify_controller
+from ambid.control.measured import MeasuredSensitivity, measured_locally, measured_sensitivity
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.physics.linear_model import LinearModel, model
+from ambid.record import Record
+from ambid.rig import Rig
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.spectra import Between, PeriodSpectra, find_excitation, period_spectra, references_of
+from ambid.simulation.plant import fed_back
+
+_NO_FEEDBACK = 1e-4  # share of an input below which nothing is fed back
+_IMPLIED = 0.03  # part of its largest line below which an excitation that follows from [loop] is rounding
+_POWER = 1e-4  # of the largest line, from which a reference that is not periodic excites
+_MOST_LINES = 3000
+
+Numbers = Estimate | RotorEstimate
+
+
+def loop_of(
+    estimate: Numbers, rig: Rig, rate_hz: float, spectra: PeriodSpectra | None, speed: float = 0.0
+) -> ClosedLoop:
+    """Return the closed loop of an estimate, of a rotor at a speed in rad/s.
+
+    `spectra`: of the record whose controller is looked for. EstimationError where nothing says what that is.
+    """
+    plant = plant_of(estimate, rate_hz, speed)
+    return ClosedLoop.of(plant, controller_of(plant, rig, spectra))
+
+
+def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:
+    """Return the plant of an estimate, of a rotor at a speed in rad/s."""
+    if isinstance(estimate, RotorEstimate):
+        of: LinearModel = estimate.plant.at_speed(speed)
+        theta: Mapping[str, float] = estimate.numbers
+        missing = [p.name for p in of.parameters if p.name not in theta]
+        if missing:
+            raise EstimationError(
+                f"the estimate does not know {', '.join(missing)}, and the rotor turns in this record. Identify it "
+                "with a record at speed too"
+            )
+    else:
+        of, theta = model(estimate.model), estimate.values
+    if "position" not in {role.split("_")[-1].rstrip("0123456789") for role in of.outputs}:
+        raise EstimationError(
+            f"model {of.name!r} has no position: there is no position loop, and no margin of it. Use model 'one-axis'"
+        )
+    return Plant.of(of, theta, estimate.delay, rate_hz, estimate.covariance_names, estimate.covariance)
+
+
+def controller_of(plant: Plant, rig: Rig, spectra: PeriodSpectra | None) -> Controller:
+    """Return the controller: of the record, else of the rig; EstimationError where neither says what it is."""
+    if spectra is not None and spectra.R is not None:
+        own = [[k for k in pair if k >= 0] for pair in fed_back(plant.model)]
+        found = identify_controller(
+            spectra.frequency_hz, spectra.mean_u, spectra.mean_y, spectra.R, rate_hz=spectra.rate_hz, own=own
+        )
+        back = np.einsum("kuy,ky->ku", found.response(spectra.frequency_hz)[0], spectra.mean_y)
+        if np.max(np.abs(back)) >= _NO_FEEDBACK * np.max(np.abs(spectra.mean_u)):
+            return found
+    elif rig.loop is not None and rig.loop.closed and not rig.open_loop:
+        return controller_of_loop(rig.loop, plant.model, plant.rate_hz)
+    elif rig.open_loop:
+        raise EstimationError(
+            "the rig declares its records open_loop: no loop is closed, and none has margins. Record the levitated "
+            "rotor"
+        )
+    else:
+        raise EstimationError(
+            "neither a reference in the record nor [loop] in the rig says what the controller is. Log the excitation "
+            "as reference, or give [loop]"
+        )
+    raise EstimationError(
+        "the inputs of the record follow its references alone: no loop is closed, and none has margins. Record the "
+        "levitated rotor"
+    )
+
+
+def spectra_of(bench: Record, of: LinearModel, speed: float = 0.0) -> PeriodSpectra | None:
+    """Return the spectra of a record at its excited lines; None where nothing says which these are.
+
+    Of a record that is not periodic all of it counts as one period: the law of the controller holds for any stretch.
+    """
+    found = find_excitation(bench, of)
+    if found is not None:
+        try:
+            return period_spectra(bench, of, found, speed)
+        except EstimationError:
+            pass
+    roles = [role for role in references_of(of) if role in bench]
+    if not any(np.ptp(bench[role].values) > 0.0 for role in roles):
+        return None
+
+    def spectrum(names: tuple[str, ...]) -> Complex:
+        x = np.column_stack([bench[n].values if n in bench else np.zeros(bench.n_samples) for n in names])
+        return np.asarray(np.fft.rfft(x - x.mean(axis=0), axis=0) / bench.n_samples)
+
+    R, U, Y = (spectrum(tuple(names)) for names in (references_of(of), of.inputs, of.outputs))
+    power = np.sum(np.abs(R) ** 2, axis=1)
+    lines = np.flatnonzero(power > _POWER * np.max(power))
+    lines = lines[(lines > 0) & (lines < (bench.n_samples + 1) // 2)]
+    lines = lines[:: max(1, -(-lines.size // _MOST_LINES))]
+    frequency: Array = np.asarray(lines * (bench.rate_hz / bench.n_samples), dtype=np.float64)
+    return PeriodSpectra(
+        frequency_hz=frequency, U=U[None, lines], Y=Y[None, lines], R=R[lines],
+        rate_hz=bench.rate_hz, period=bench.n_samples, dropped=0, left_out_hz=np.empty(0),
+        between=Between(frequency_hz=np.empty(0), U=U[:0], Y=Y[:0]),
+    )  # fmt: skip
+
+
+def measure(
+    loop: ClosedLoop, bench: Record | None, spectra: PeriodSpectra | None
+) -> tuple[MeasuredSensitivity | None, ...]:
+    """Return the sensitivity as the record shows it, by axis.
+
+    Without a reference, the excitation is what the inputs hold beside the controller's own answer.
+    """
+    none = (None,) * len(loop.plant.axes)
+    if spectra is None:
+        return none
+    at = loop.at(spectra.frequency_hz)
+    if spectra.R is None:
+        implied = spectra.mean_u + np.einsum("kuy,ky->ku", at.K, spectra.mean_y)
+        return measured_sensitivity(replace(spectra, R=implied), at, silent=_IMPLIED)
+    if spectra.n_periods > 1:
+        return measured_sensitivity(spectra, at)
+    if bench is None:
+        return none
+    from ambid.signals.frf import frequency_response
+
+    r, x = (
+        np.column_stack([bench[role].values for role in roles])
+        for roles in (references_of(loop.plant.model), [loop.plant.model.outputs[k] for k in at.positions])
+    )
+    found = frequency_response(r, x, bench.rate_hz, method="local", open_loop=True)
+    found = found.between(float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1]))
+    return measured_locally(found, loop.at(found.frequency_hz))

@@ -1,0 +1,166 @@
+"""The job of a loop's margins: a record and an estimate of its plant in, what the loop can bear out.
+
+Read -> identify, or take an estimate -> controller -> closed loop -> judge.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambid.control.closed import Plant
+from ambid.control.margins import (
+    Margins,
+    checks_of,
+    compliance_by_axis,
+    curves_of,
+    margins_by_axis,
+    sensitivity_by_axis,
+)
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
+from ambid.job.closed_loop import Numbers, loop_of, measure, spectra_of
+from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry
+from ambid.physics.linear_model import model
+from ambid.record import GapPolicy, Record
+from ambid.rig import Rig
+from ambid.rotor.estimate import RotorEstimate
+from ambid.simulation.margins import zone_of
+from ambid.simulation.plant import closed_loop_poles
+
+
+def margins(
+    record: Source,
+    rig: Rig | str | Path | None = None,
+    *,
+    estimate: Numbers | str | Path | None = None,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    rate_hz: float | None = None,
+    gaps: GapPolicy | None = None,
+    units: Mapping[str, str] | None = None,
+    tick: Tick | None = None,
+) -> Margins:
+    """Say how much margin the loop of a record has: sensitivity by ISO 14839-3, gain, phase, delay, compliance.
+
+    The plant is that of an estimate. The controller is identified from the record where an excitation is logged as
+    reference, else it is the rig's ``[loop]``.
+
+    Parameters
+    ----------
+    record : file, Record, DataFrame, Dataset or dict of arrays
+        Of the levitated rotor.
+    rig : Rig, str or Path, optional
+        What is known of the bench; default: that of the estimate, else as `ambid.identify`.
+    estimate : Estimate, RotorEstimate, str or Path, optional
+        The plant; default: identified from the record first.
+    from_s, to_s, rate_hz, gaps, units : optional
+        As `ambid.identify`.
+    tick : callable, optional
+        Called with the name of the present stage; may raise to interrupt.
+
+    Returns
+    -------
+    Margins
+
+    Raises
+    ------
+    AmbidError
+        If record, rig or estimate break a rule.
+    EstimationError
+        If no loop is closed, or nothing says what its controller is.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> from ambid.rig.preset_rig import rig_of_preset
+    >>> rig = rig_of_preset(ambid.preset("rmit-axis"))
+    >>> found = ambid.margins(ambid.simulate("rmit-axis", duration=0.5, seed=1), rig)
+    >>> found.sensitivity["x"].zone, found.verdict.word
+    ('A', 'usable')
+    """
+    say, clock = tick or silent, Clock()
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
+    if estimate is None:
+        from ambid.job.identification import identify
+
+        bench = known_rig(rig)
+        known: Any = identify(record, bench, tick=say, **reading)
+        used = known.used[0] if isinstance(known.used, tuple) else known.used
+    else:
+        known, bench = _given(estimate, rig)
+        say("read")
+        used = load_bench(record, bench, **reading)
+    clock.lap("identify")
+    say("margins")
+    with one_thread():
+        found = _margins(known, bench, used)
+    clock.lap("margins")
+    return replace(found, timing_s=clock.laps, rig=rig_entry(bench))
+
+
+def _given(estimate: Numbers | str | Path, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
+    """Return an estimate that is given, and the rig: its own unless another is given."""
+    from ambid.job.results import load, rig_of
+
+    name = Path(estimate).name if isinstance(estimate, str | Path) else "the estimate"
+    known = load(estimate) if isinstance(estimate, str | Path) else estimate
+    if not isinstance(known, Estimate | RotorEstimate):
+        raise EstimationError(
+            f"{name} is no linear estimate of a bearing or a rotor, and margins are of a linear loop. Give what 'ambid "
+            "identify --json' wrote, without --nonlinear"
+        )
+    bench = known_rig(rig) if rig is not None else rig_of(known, name)
+    if (bench.rotor is None) != isinstance(known, Estimate) or bench.model != known.model:
+        raise EstimationError(
+            f"{name} is of model {known.model!r}, the rig of model {bench.model!r}. Give the estimate's own rig"
+        )
+    return known, bench
+
+
+def _margins(estimate: Numbers, rig: Rig, bench: Record) -> Margins:
+    clean, speed = bench, 0.0
+    if isinstance(estimate, RotorEstimate):
+        from ambid.rotor.synchronous import separate
+
+        apart = separate(bench, estimate.plant.at_speed(0.0 if rig.rotor is None else rig.rotor.speed))
+        clean, speed = apart.record, apart.speed
+    spectra = spectra_of(clean, model(estimate.model) if isinstance(estimate, Estimate) else estimate.plant, speed)
+    loop = loop_of(estimate, rig, bench.rate_hz, spectra, speed)
+    if loop.controller.source == "rig":
+        _refuse_unstable(loop.plant, rig)
+    measured = measure(loop, clean, spectra)
+    found, of = sensitivity_by_axis(loop, measured), loop.controller
+    compliance, size = compliance_by_axis(loop)
+    ratio, hz = loop.largest_singular()
+    band = None if spectra is None else (float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1]))
+    checks = checks_of(loop, found, measured, band)
+    if not estimate.passed:
+        reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
+        checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    return Margins(
+        status=estimate.status, model=estimate.model, record=origin(bench), speed=speed,
+        controller={"source": of.source, "order": list(of.orders), "misfit": of.misfit},
+        sensitivity=found,
+        largest_singular={"peak_db": float(20.0 * np.log10(ratio)), "frequency_hz": hz, "zone": zone_of(ratio)},
+        margins=margins_by_axis(loop), compliance=compliance, checks=checks,
+        curves=curves_of(loop, size, measured),
+    )  # fmt: skip
+
+
+def _refuse_unstable(plant: Plant, rig: Rig) -> None:
+    """Refuse a [loop] that would not hold the estimated plant: it is not the one of the record."""
+    assert rig.loop is not None
+    loop = replace(rig.loop, delay=float(np.max(plant.delays)))
+    pole = float(np.abs(closed_loop_poles(plant.theta, loop, plant.rate_hz, of=plant.model)[0]))
+    if pole > 1.0 + 1e-6:
+        raise EstimationError(
+            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the record is of a "
+            "levitated rotor: it is another controller. Correct [loop], or log the excitation as reference"
+        )

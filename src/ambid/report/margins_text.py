@@ -1,0 +1,95 @@
+"""The margins of a loop as tables for the terminal: sensitivity, openings, compliance, an axis a row."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ambid.control.margins import AxisSensitivity, Margins, Opening
+from ambid.report.numbers import sized
+from ambid.report.text import (
+    WIDTH,
+    Paint,
+    check_lines,
+    columns,
+    joined,
+    other_warnings,
+    plain,
+    pure,
+    timing_lines,
+    title_line,
+    warning_lines,
+)
+
+TURN = 30.0 / np.pi  # 1/min in a rad/s
+_NONE = "–"
+
+
+def margins_text(found: Margins, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write the margins of a loop, below their verdict."""
+    record = found.record
+    samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
+    head = title_line(record.get("file"), "loop of a record", samples, rate, found.status, paint)
+    return joined(
+        [
+            [head, _whence(found)],
+            _sensitivity(found, paint),
+            _openings(found, paint),
+            _compliance(found, paint),
+            check_lines(found.checks, width=width, paint=paint, above=True),
+            warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
+            timing_lines(found.timing_s, width=width, paint=paint),
+        ]
+    )
+
+
+def _whence(found: Margins) -> str:
+    of = "the rig's [loop]"
+    if found.controller["source"] == "record":
+        orders = found.controller["order"]
+        assert isinstance(orders, list | tuple)
+        of = f"identified from the record, order {max(int(str(n)) for n in orders)}"
+    turning = f", at {found.speed * TURN:.6g} 1/min" if found.speed else ""
+    return f"model {found.model}{turning}; controller: {of}"
+
+
+def _sensitivity(found: Margins, paint: Paint) -> list[str]:
+    rows: list[tuple[str, ...]] = [("axis", "peak", "at", "zone", "measured")]
+    for axis, s in found.sensitivity.items():
+        peak = f"{pure(s.peak_db.value, s.peak_db.sd)} dB"
+        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.zone, _measured(s)))
+    lines = [paint("sensitivity at the position signals (ISO 14839-3)", "strong"), *columns(rows)]
+    if len(found.sensitivity) > 1:
+        of = {name: float(str(found.largest_singular[name])) for name in ("peak_db", "frequency_hz")}
+        at = f"{of['peak_db']:.2f} dB at {sized(of['frequency_hz'], 'Hz')}"
+        lines.append(f"all axes together, largest singular value: {at}")
+    return lines
+
+
+def _measured(s: AxisSensitivity) -> str:
+    if s.measured_peak_db is None or s.measured_frequency_hz is None:
+        return _NONE
+    return f"{s.measured_peak_db:.2f} dB at {sized(s.measured_frequency_hz, 'Hz')}"
+
+
+def _openings(found: Margins, paint: Paint) -> list[str]:
+    rows: list[tuple[str, ...]] = [("axis", "opened at", "gain", "phase", "delay", "peak")]
+    for axis, of in found.margins.items():
+        rows += [(axis, "position", *_opening(of.position)), ("", "input", *_opening(of.command))]
+    return [paint("margins, one loop opened, the others closed", "strong"), *columns(rows)]
+
+
+def _opening(of: Opening) -> tuple[str, ...]:
+    gain = f"{_number(of.gain_down)} … {_number(of.gain_up)}"
+    phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
+    delay = _NONE if of.delay_s is None else sized(of.delay_s, "s")
+    return (gain, phase, delay, f"{of.peak_db:.2f} dB")
+
+
+def _number(x: float | None) -> str:
+    return "any" if x is None else f"{x:.2g}"
+
+
+def _compliance(found: Margins, paint: Paint) -> list[str]:
+    rows: list[tuple[str, ...]] = [("axis", "least dynamic stiffness", "at")]
+    rows += [(axis, sized(1.0 / c.largest, "N/m"), sized(c.frequency_hz, "Hz")) for axis, c in found.compliance.items()]
+    return [paint("compliance at the magnets", "strong"), *columns(rows)]

@@ -1,0 +1,100 @@
+"""The margins of a loop: one axis against the prediction of its simulation, rotors against the truth; refusals."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.errors import EstimationError
+from ambid.rig.preset_rig import rig_of_preset
+from ambid.simulation.margins import loop_margins
+from tests.control.test_closed import SHORT, free_rig, peaks_of, record_of
+from tests.rotor_benches import needs_simulator, rig_of, truth
+
+
+@pytest.fixture(scope="module")
+def axis():
+    """One levitated axis: its rig, a record, and the margins of its loop."""
+    rig = rig_of_preset(ambid.preset("rmit-axis"))
+    record = ambid.simulate("rmit-axis", duration=1.0, seed=1)
+    return rig, record, ambid.margins(record, rig)
+
+
+def test_margins_at_the_input_are_those_that_the_simulation_predicts(axis):
+    rig, _, found = axis
+    of = loop_margins({p.name: p.value for p in rig.parameters}, rig.loop, rig.record.rate_hz)
+    at = found.margins["x"].command
+    assert at.gain_down == pytest.approx(of.gain[0], rel=0.01)
+    assert at.gain_up == pytest.approx(of.gain[1], rel=0.01)
+    assert at.phase_deg == pytest.approx(of.phase_deg, abs=0.3)
+    assert at.peak_db == pytest.approx(20.0 * np.log10(of.peak[0]), abs=0.02)
+
+
+def test_sensitivity_at_the_position_signal_is_not_hidden_by_the_current_loop(axis):
+    """All that the controller orders passes its output, the current's answer too: seen there the loop looks better."""
+    found = axis[2]
+    assert found.sensitivity["x"].peak_db.value > found.margins["x"].command.peak_db + 3.0
+    assert found.sensitivity["x"].peak_db.value == pytest.approx(found.margins["x"].position.peak_db, abs=0.01)
+    assert found.verdict.word == "usable"
+    assert found.sensitivity["x"].zone == "A"
+
+
+def test_at_the_delay_margin_the_loop_is_about_to_swing(axis):
+    from ambid.simulation import closed_loop_poles
+
+    rig, _, found = axis
+    more = found.margins["x"].command.delay_s * rig.record.rate_hz
+    parameters = {p.name: p.value for p in rig.parameters}
+    largest = [
+        np.abs(closed_loop_poles(parameters, replace(rig.loop, delay=rig.loop.delay + x * more), rig.record.rate_hz)[0])
+        for x in (0.97, 1.03)
+    ]
+    assert largest[0] < 1.0 < largest[1]
+
+
+def test_margins_come_back_from_their_file(axis, tmp_path):
+    found = axis[2]
+    found.save(tmp_path / "m.json")
+    document = json.loads((tmp_path / "m.json").read_text())
+    assert document["schema"] == "ambid.margins/1"
+    assert set(document["sensitivity"]["x"]) >= {"peak_db", "frequency_hz", "zone", "measured_peak_db"}
+    again = ambid.load(tmp_path / "m.json")
+    assert again.sensitivity == found.sensitivity
+    np.testing.assert_allclose(again.curves.sensitivity["x"], found.curves.sensitivity["x"])
+    assert again.summary() == found.summary()
+
+
+def test_an_open_loop_has_no_margins():
+    record = ambid.simulate("thesis", duration=0.3, seed=1)
+    with pytest.raises(EstimationError, match="open_loop"):
+        ambid.margins(record, rig_of_preset(ambid.preset("thesis")))
+
+
+def test_without_reference_and_loop_nothing_says_what_the_controller_is(axis):
+    rig, record, _ = axis
+    with pytest.raises(EstimationError, match="neither a reference"):
+        ambid.margins(record, replace(rig, loop=None))
+
+
+def test_a_loop_that_does_not_hold_the_plant_is_another_one(axis):
+    rig, record, _ = axis
+    with pytest.raises(EstimationError, match="does not hold the estimated plant"):
+        ambid.margins(record, replace(rig, loop=replace(rig.loop, kp=0.1 * rig.loop.kp)))
+
+
+@needs_simulator
+def test_margins_of_a_rotor_with_the_estimate_of_another_record():
+    bench = replace(truth.BENCHES["rigid"], **SHORT)
+    estimate = ambid.identify(record_of(bench, 1), free_rig(bench))
+    found = ambid.margins(record_of(bench, 2), free_rig(bench), estimate=estimate)
+    peaks = [s.peak_db.value for s in found.sensitivity.values()]
+    assert peaks == pytest.approx(peaks_of(bench), abs=0.1)
+    assert found.verdict.word == "usable"
+    assert found.checks["agreement"].values["z"] < 5.0
+    stiff = replace(estimate, numbers={**estimate.numbers, "ax.k_i": 1.5 * estimate.numbers["ax.k_i"]})
+    wrong = ambid.margins(record_of(bench, 2), free_rig(bench), estimate=stiff)
+    assert not wrong.checks["agreement"].passed
+    ruled = ambid.margins(record_of(bench, 2), replace(free_rig(bench), loop=rig_of(bench).loop), estimate=estimate)
+    assert ruled.controller["source"] == "record"
