@@ -184,7 +184,8 @@ def campbell(
         rotor = rotor.free_rotor(modes, planes=[s.z for s in supports], residual=True)
     whirl = _Whirl.of(rotor, supports)
     # at rest two alike planes have double eigenvalues with any shapes: a speed near 0 tells them apart
-    first = whirl.at(max(float(speed[0]), 1e-5 * max(float(speed[-1]), 1.0)))
+    slow = 1e-5 * max(float(speed[-1]), float(rotor.omega[2]) if rotor.omega.size > 2 else 1.0)
+    first = whirl.at(max(float(speed[0]), slow))
     if lines is not None:
         first = first.lowest(lines + _BESIDE)
     path = [first]
