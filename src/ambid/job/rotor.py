@@ -124,7 +124,7 @@ def _from_periods(
             lost = spectra.dropped / bench.rate_hz
             warnings.append(f"{name_of(bench)}: the first {lost:.4g} s were left out: a transient, or part of a period")
     clock.lap("periods")
-    fit = estimate_rotor(experiments, model, rig.parameters, delays=_delays(rig), n_modes=rig.modes.count, tick=say)
+    fit = estimate_rotor(experiments, model, rig.parameters, delays=_delays(rig), modes=rig.modes, tick=say)
     clock.lap("fit")
     say("check")
     hint = experiments_hint(experiments, model)
@@ -161,7 +161,7 @@ def _from_innovations(
             "with a multisine of whole periods, or log the voltages"
         )
     fit = predict_rotor(
-        benches[0], model, rig.parameters, speed=speeds[0], delays=_delays(rig), n_modes=rig.modes.count, tick=say
+        benches[0], model, rig.parameters, speed=speeds[0], delays=_delays(rig), modes=rig.modes, tick=say
     )
     clock.lap("fit")
     say("check")

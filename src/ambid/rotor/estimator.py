@@ -21,8 +21,9 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.search import Status
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
+from ambid.rig.rig import RigModes
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
-from ambid.rotor.modes import scan
+from ambid.rotor.modes import Candidate, scan
 from ambid.rotor.scores import sensor_gain
 from ambid.rotor.spectra import joined
 from ambid.rotor.start import rigid_start
@@ -33,6 +34,8 @@ _REFINED = 0.01  # the same, of a model that is complete but for small modes
 _FITS = 1.6  # mean square of residuals up to which a band is explained
 _WIDER = 1.5  # by which the band grows
 _ABOVE = 1.5  # how far above the band a mode may be that shows in it
+_FAR_ABOVE = 2.0
+_BESIDE = 1.05  # how far a mode may stand from where the rig says, or from the highest line
 _LEAST_LINES = 24
 _MOST_MODES = 9
 _WHOLE = 2e-3  # samples by which a delay may miss a whole number however exact it is
@@ -84,17 +87,17 @@ def estimate_rotor(
     parameters: Sequence[Parameter],
     *,
     delays: Sequence[float | None],
-    n_modes: int | None = None,
+    modes: RigModes = RigModes(),  # noqa: B008 - a frozen value
     tick: Tick = silent,
 ) -> RotorFit:
     """Estimate a rotor from records with periodic excitation, the slowest first: their lines together give the start.
 
-    `parameters`: what the rig knows; `delays`: of each input in samples, None where it is searched; `n_modes`: bending
-    modes within the excited band, None: the likelihood decides.
+    `parameters`: what the rig knows; `delays`: of each input in samples, None where it is searched; `modes`: how many
+    within the excited band, and where they may be; left open, the likelihood decides.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
     work = _Work(
-        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
+        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), modes=modes,
         tick=tick,
     )  # fmt: skip
     return work.finish(ordered, *work.start(ordered))
@@ -106,13 +109,13 @@ def begin_rotor(
     parameters: Sequence[Parameter],
     *,
     delays: Sequence[float | None],
-    n_modes: int | None = None,
+    modes: RigModes = RigModes(),  # noqa: B008 - a frozen value
     tick: Tick = silent,
 ) -> tuple[RotorModel, Point]:
     """Return start values from spectra whose noise is known beforehand: the model with its modes, and its numbers."""
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
     work = _Work(
-        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), wanted=n_modes,
+        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), modes=modes,
         tick=tick,
     )  # fmt: skip
     return work.refine(ordered, *work.start(ordered))
@@ -132,7 +135,7 @@ class _Work:
     model: RotorModel
     parameters: tuple[Parameter, ...]
     delays: tuple[float | None, ...]
-    wanted: int | None
+    modes: RigModes
     tick: Tick
 
     def problem(
@@ -205,10 +208,9 @@ class _Work:
             band = [e.between(0.0, edge * (1.0 + 1e-9)) for e in experiments]
             self.tick("modes", min(1.0, edge / last))
             at, cost = self.rough(band, model, at)
-            while cost > _FITS and model.n_modes < self._most:
+            while cost > _FITS:
                 weight = rough_weight(band[0], model, at, _RELATIVE)
-                low = float(band[0].spectra.frequency_hz.min())
-                found = scan(band[0], model, at, weight, (low, _ABOVE * edge))
+                found = self.missing(band[0], model, at, weight, _ABOVE, last)
                 if found is None or self._sensors(band, model, at, [weight]) > found.gain:
                     break
                 more = model.with_modes(model.n_modes + 1)
@@ -226,15 +228,11 @@ class _Work:
     def refine(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> tuple[RotorModel, Point]:
         """Add the modes that a smaller relative error shows, as long as the likelihood wants them."""
         slowest = [_together(_slowest(experiments))]
-        spectra = slowest[0].spectra
-        band, n_real = (
-            (float(spectra.frequency_hz.min()), _ABOVE * float(spectra.frequency_hz.max())),
-            2 * spectra.Y.size,
-        )
+        n_real, last = 2 * slowest[0].spectra.Y.size, float(slowest[0].spectra.frequency_hz.max())
         at, cost = self.rough(experiments, model, at, relative=_REFINED)
-        while model.n_modes < self._most:
+        while True:
             weight = rough_weight(slowest[0], model, at, _REFINED)
-            found = scan(slowest[0], model, at, weight, band)
+            found = self.missing(slowest[0], model, at, weight, _ABOVE, last)
             price = np.log(n_real) * (3 + len(model.places))
             if found is None or found.gain < price:
                 break
@@ -272,7 +270,7 @@ class _Work:
             model = model.at_speed(max((e.speed for e in experiments), key=abs))
             at, _ = self.rough(experiments, model, at)
         fit = self.likely(experiments, model, at)
-        while fit.model.n_modes < self._most:
+        while True:
             more = self._one_more(experiments, fit)
             if more is None:
                 break
@@ -315,8 +313,7 @@ class _Work:
         slowest = _slowest(experiments)
         e = _together(slowest)
         w = Weight(whiten=np.concatenate([w.whiten for w in fit.problem.weights[: len(slowest)]]))
-        low, high = float(e.spectra.frequency_hz.min()), float(e.spectra.frequency_hz.max())
-        found = scan(e, fit.model, fit.point, w, (low, 2.0 * high))
+        found = self.missing(e, fit.model, fit.point, w, _FAR_ABOVE, float(e.spectra.frequency_hz.max()))
         price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
         if found is None or found.gain < max(price, sensor_gain(fit.problem, fit.vector)):
             return None
@@ -345,9 +342,26 @@ class _Work:
         near = np.abs(delays - np.round(delays))[list(free)]
         return np.round(delays) if np.all(near <= np.maximum(3.0 * sd, _WHOLE)) and np.all(sd < 0.1) else None
 
-    @property
-    def _most(self) -> int:
-        return _MOST_MODES if self.wanted is None else self.wanted
+    def missing(
+        self, e: Experiment, model: RotorModel, at: Point, weight: Weight, above: float, last: float
+    ) -> Candidate | None:
+        """Return the mode that the residuals ask for, up to `above` times the highest line; first where the rig hints.
+
+        Where as many modes as the rig says are within the excited band, up to `last` Hz, only those above are sought:
+        they stand for the rest of the shaft.
+        """
+        known = [at.theta[f"mode{r}.omega"] / (2.0 * np.pi) for r in range(1, model.n_modes + 1)]
+        low, high = float(e.spectra.frequency_hz.min()), above * float(e.spectra.frequency_hz.max())
+        if self.modes.count is not None and sum(f <= last for f in known) >= self.modes.count:
+            low = max(low, _BESIDE * last)
+        if low >= high or model.n_modes >= _MOST_MODES:
+            return None
+        for f in self.modes.frequency_hz:
+            if low <= f <= high and not any(f / _BESIDE < x < f * _BESIDE for x in known):
+                found = scan(e, model, at, weight, (f / _BESIDE, f * _BESIDE))
+                if found is not None:
+                    return found
+        return scan(e, model, at, weight, (low, high))
 
 
 def _slowest(ordered: Sequence[Experiment]) -> list[Experiment]:

@@ -22,6 +22,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, discretise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
+from ambid.rig.rig import RigModes
 from ambid.rotor.estimator import Ending, begin_rotor, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
@@ -114,17 +115,17 @@ def predict_rotor(
     *,
     speed: float,
     delays: Sequence[float | None],
-    n_modes: int | None = None,
+    modes: RigModes = RigModes(),  # noqa: B008 - a frozen value
     tick: Tick = silent,
 ) -> PredictorFit:
     """Estimate a rotor from one record by its innovations, with start values from windowed spectra.
 
-    `record`: channels by role; `speed`: rad/s; `parameters`, `delays`, `n_modes`: as for `estimate_rotor`.
+    `record`: channels by role; `speed`: rad/s; `parameters`, `delays`, `modes`: as for `estimate_rotor`.
     """
     tick("start", 0.0)
     spectra = windowed_spectra(record, model, speed)
     experiment = Experiment(spectra=spectra, speed=speed)
-    model, at = begin_rotor([experiment], model, parameters, delays=delays, n_modes=n_modes, tick=tick)
+    model, at = begin_rotor([experiment], model, parameters, delays=delays, modes=modes, tick=tick)
     model = model.at_speed(speed)
     free = tuple(k for k, d in enumerate(delays) if d is None)
     near = np.array([np.round(x) if d is None else d for x, d in zip(at.delays, delays, strict=True)])
