@@ -7,6 +7,7 @@ import pytest
 import ambid
 from ambid.errors import RigError
 from ambid.rig import rig_from_text
+from ambid.rotor.spectra import experiments_of
 
 AXES = ("ax", "ay")
 RIG = """
@@ -68,6 +69,22 @@ def test_commands_and_positions_show_poles_and_the_product_of_gain_and_force_fac
     assert not found["ax.amplifier_gain"].identifiable
     assert found["ax.amplifier_pole"].identifiable
     assert "as a product only: give one of them as fixed" in str(found.checks["identifiable"].detail)
+
+
+def test_experiments_of_an_orthogonal_excitation_are_taken_as_records_of_one_rotor() -> None:
+    rig = rig_from_text(RIG, "amplifiers.toml")
+    record = ambid.simulate(rig, duration=2.0, periods=4, seed=2, excitation="orthogonal")
+    assert rig.rotor is not None
+    parts = experiments_of(record, rig.rotor)
+    assert [(round(p.start_s, 3), p.n_samples) for p in parts] == [(0.0, 10_000), (1.0, 10_000)]
+    found = ambid.identify(record, replace(rig, modes=replace(rig.modes, count=0)))
+    assert len(found.records) == 2
+    assert found.verdict.word == "usable"
+    for name, truth in {"ax.k_i": 61.0, "bx.k_i": 58.0, "bx.amplifier_pole": 4000.0}.items():
+        assert abs(found[name].value - truth) < 3.5 * found[name].sd < 0.1 * truth, name
+    short = ambid.simulate(rig, duration=1.0, periods=2, seed=2, excitation="orthogonal")
+    assert experiments_of(short, rig.rotor) == (short,)  # two periods leave none after a transient
+    assert len(experiments_of(ambid.simulate(rig, duration=1.0, excitation="gaussian"), rig.rotor)) == 1
 
 
 def test_an_axis_that_nothing_drives_is_refused() -> None:

@@ -43,14 +43,18 @@ def read_records(
     """Read the records of one rotor.
 
     `speed_rpm`: of each record, or of a single one; None: each says its own, and one without the channel of angle or
-    speed that another has was taken at rest.
+    speed that another has was taken at rest. A record of several experiments becomes several.
     """
+    from ambid.rotor.spectra import experiments_of
+
     speeds = _speeds(speed_rpm, len(records))
     taken = []
     for source, speed in zip(records, speeds, strict=True):
         say("read")
         taken.append(RotorRecord(bench=_read(source, rig, speed, len(records), reading), speed=speed))
     _check_together(taken)
+    assert rig.rotor is not None
+    taken = [replace(r, bench=part) for r in taken for part in experiments_of(r.bench, rig.rotor)]
     turning = [r for r in taken if any(role in r.bench for role in _TURNING)]
     if not turning or len(turning) == len(taken) or speed_rpm is not None:
         return taken

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,11 +18,12 @@ from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.rotor_model import RotorModel
-from ambid.record import Record
+from ambid.record import Record, cut
 from ambid.signals.periodic_response import excited_lines, find_period, transient_ratio
 
 _TRANSIENT = 5.0  # standard deviations by which a first period may differ from the others
 _LEAST_PERIODS = 2
+_OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
 _FIRST_LINE = 5  # of a window's spectrum: below, what leaks from the edges is not small
 _MOST_LINES = 1200
 _LINES_PER_UNKNOWN = 3
@@ -161,8 +163,7 @@ def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
 
     Leading periods with a transient are left out.
     """
-    roles = [role for role in references_of(model) if role in record]
-    signals = [record[role].values for role in (roles or model.inputs) if np.ptp(record[role].values) > 0.0]
+    signals = _excitations(record, model)
     if not signals:
         return None
     try:
@@ -181,6 +182,34 @@ def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
             break
         first, count = first + period, count - 1
     return Excitation(period=period, first=first, count=count)
+
+
+def experiments_of(record: Record, model: LinearModel) -> tuple[Record, ...]:
+    """Return the experiments of a record one after the other: it is cut where its periodic excitation changes for good.
+
+    So are the experiments of an orthogonal excitation. A record of which a part would be too short stays whole.
+    """
+    signals = _excitations(record, model)
+    try:
+        period = find_period(np.column_stack(signals)) if signals else record.n_samples
+    except EstimationError:
+        return (record,)
+    count = record.n_samples // period
+    if count <= 2 * _LEAST_PERIODS:
+        return (record,)
+    parts = np.column_stack(signals)[: count * period].reshape(count, period, -1)
+    moved = np.mean((parts[1:] - parts[:-1]) ** 2, axis=(1, 2)) > _OTHER**2 * np.mean(parts**2)
+    edges = [0, *(np.flatnonzero(moved) + 1).tolist(), count]
+    if len(edges) == 2 or min(np.diff(edges)) <= _LEAST_PERIODS:  # one period more, for its transient
+        return (record,)
+    at = [*(record.start_s + edge * period / record.rate_hz for edge in edges[:-1]), None]
+    return tuple(cut(record, first, last) for first, last in pairwise(at))
+
+
+def _excitations(record: Record, model: LinearModel) -> list[Array]:
+    """Return the references that are logged and not idle, else the inputs."""
+    roles = [role for role in references_of(model) if role in record]
+    return [record[role].values for role in (roles or model.inputs) if np.ptp(record[role].values) > 0.0]
 
 
 def period_spectra(record: Record, model: LinearModel, found: Excitation, speed: float = 0.0) -> PeriodSpectra:
