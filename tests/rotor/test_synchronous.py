@@ -272,4 +272,5 @@ def test_a_bending_rotor_needs_two_speeds_or_the_plane_of_its_unbalance():
     known = estimate_unbalance(disc, [fast])
     assert known.names == ("disc", "A.z_sensor", "B.z_sensor")
     assert deviations(known, np.array([true])).max() < 3.5
-    assert abs(known.value[0] / true - 1.0) < 0.01
+    assert abs(known.value[0] / true - 1.0) < 0.04  # of 0.75 s
+    assert known.entry("disc")["identifiable"]

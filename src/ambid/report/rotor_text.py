@@ -8,6 +8,7 @@ from ambid.errors import counted
 from ambid.estimation.estimate import Delay, EstimatedParameter
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.report.numbers import quantity, sized
+from ambid.report.orbit_panels import synchronous_lines
 from ambid.report.text import (
     WIDTH,
     Paint,
@@ -42,6 +43,7 @@ def rotor_text(estimate: RotorEstimate, *, width: int = WIDTH, paint: Paint = pl
             columns(mode_rows(e)) if e.modes else [],
             *of_bearings,
             [f"{paint(_UNSEEN, 'bad')} not identifiable from these data"] if unseen else [],
+            synchronous_lines(e, width),
             check_lines(e.checks, width=width, paint=paint, above=True),
             warning_lines(other_warnings(e.checks, e.warnings), width=width, paint=paint),
             timing_lines(e.timing_s, paint=paint),

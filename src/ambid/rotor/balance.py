@@ -31,6 +31,7 @@ _ROUNDS = 3  # the plant's share of the covariance follows the unbalance
 _SEEN = 0.25  # standard deviation over size, up to which an unbalance or a run-out is identified
 _LINES = 16  # excited lines on either side that show the response to the excitation at a harmonic
 _ONE_PLANE = 3.0  # standard deviations within which an unbalance is that of one plane
+_SHOWN = 240  # samples of an orbit that a result keeps for its figure
 _FAR = 4.5  # standard deviations from which the response is not explained
 _CIRCLE_95 = 2.4477468306808166  # radius that holds 95 % of a round normal distribution, in standard deviations
 
@@ -386,9 +387,12 @@ def _record(model: RotorModel, t: Turned, clearance: float | None) -> dict[str, 
             k = [r.roles.index(f"{axis}_position") for axis in b.axes]
             x, y = (complex(parts[0][0][j]) for j in k)
             forward, backward = abs(x + 1j * y) / 2.0, abs(x - 1j * y) / 2.0
+            rest = r.left[:, k] - r.left[:, k].mean(axis=0)
+            some = rest[np.linspace(0, rest.shape[0] - 1, min(_SHOWN, rest.shape[0])).astype(int)]
             orbits[b.name] = {
                 "major": forward + backward, "minor": abs(forward - backward), "forward": bool(forward >= backward),
-                "non_synchronous": float(np.max(np.hypot(*r.left[:, k].T))), "clearance": clearance,
+                "non_synchronous": float(np.max(np.hypot(*rest.T))), "clearance": clearance,
+                "samples": [[float(f"{value:.4g}") for value in row] for row in some.T],
             }  # fmt: skip
     return {
         "record": t.record, "speed": r.speed, "drift": r.rotation.drift, "source": r.rotation.source,

@@ -81,7 +81,7 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
           ``source`` of the angle, harmonics (``orders``); ``response`` by role with ``amplitude``, ``phase`` and ``sd``
           of each harmonic, the part of the excitation taken out (``excitation_apart``); ``orbits`` by bearing at its
           first sensors: ``major`` and ``minor`` radius of the synchronous orbit in m, whether it turns ``forward``,
-          the largest radius of the rest (``non_synchronous``), and the ``clearance``.
+          the largest radius of the rest (``non_synchronous``) with some ``samples`` of x and y, and the ``clearance``.
         - ``used``: numbers of the records that the following comes from, with ``misfit``, the mean square of what it
           leaves over the noise, and its degrees of ``freedom``; ``hint``: what stands against it.
         - ``unbalance``: ``planes`` (the outer bearing planes, kg m, at ``z``), their sum ``static`` with ``grade_mm_s``
