@@ -62,7 +62,8 @@ def identify_rotor(
     turning = [separate(r.bench, model, r.speed) for r in taken]
     warnings = [said for r in taken for said in r.warnings]
     for r, x in zip(taken, turning, strict=True):
-        warnings += x.warnings(r.name, model.speed if r.speed is None else r.speed)
+        given = model.speed if len(taken) == 1 else 0.0  # the rig's is that of one record
+        warnings += x.warnings(r.name, given if r.speed is None else r.speed)
     clean, speeds, excitations = ([getattr(x, q) for x in turning] for q in ("record", "speed", "excitation"))
     clock.lap("periods")
     with one_thread():

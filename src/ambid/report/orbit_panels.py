@@ -42,21 +42,18 @@ def unbalance_rows(s: Mapping[str, Any]) -> list[tuple[str, ...]]:
     known = all(p["identifiable"] for p in s["unbalance"]["planes"].values())
     rows: list[tuple[str, ...]] = [("turns with the rotor", "value ± sd", "phase ± sd", "")]
     rows += [
-        _row(f"unbalance in {_plane(name)}", p, f"at {sized(p['z'], 'm', 5)}", 1e6, "g mm")
+        _row(f"unbalance, {_plane(name)}", p, f"at {sized(p['z'], 'm', 5)}", 1e6, "g mm")
         for name, p in s["unbalance"]["planes"].items()
     ]
     if known:
-        said = f"G {whole['grade_mm_s']:.3g} by ISO 21940-11"
+        rows.append(_row("unbalance, static", {**whole, "identifiable": True}, _grade(whole), 1e6, "g mm"))
         if one and one["fits"]:
-            said += f"; in one plane at {quantity(one['z'], one['sd'], 'm').text}"
-        rows.append(_row("unbalance, static", {**whole, "identifiable": True}, said, 1e6, "g mm"))
-    rows += [
-        _row(f"{name} beyond the planes", m, "kg^(1/2) mm", 1e3, "") for name, m in s["unbalance"]["modes"].items()
-    ]
-    rows += [_row(f"run-out at {_plane(place)}", r, "", 1e6, "um") for place, r in s["runout"].items()]
+            rows.append(("  all in one plane", quantity(one["z"], one["sd"], "m").text, "", ""))
+    rows += [_row(f"{name} beyond", m, "kg^(1/2) mm", 1e3, "") for name, m in s["unbalance"]["modes"].items()]
+    rows += [_row(f"run-out, {_plane(place)}", r, "", 1e6, "um") for place, r in s["runout"].items()]
     if "balancing" in s:
         rows += [
-            _row(f"correction in {_plane(name)}", {**c, "identifiable": True}, "mass times radius", 1e6, "g mm")
+            _row(f"to add, {_plane(name)}", {**c, "identifiable": True}, "", 1e6, "g mm")
             for name, c in s["balancing"]["correction"].items()
         ]
     return rows
@@ -80,14 +77,19 @@ def _row(what: str, x: Mapping[str, Any], said: str, scale: float, unit: str) ->
         return f"  {what}", f"{scale * x['value']:.3g} {unit}".rstrip(), "", _UNSEEN
     size = f"{pure(scale * x['value'], scale * x['sd'])} {unit}".rstrip()
     certain = x["phase_sd"] < 1.0
-    degrees = [float(np.degrees(x[q])) for q in ("phase", "phase_sd")]
+    degrees = float(np.degrees(x["phase"]) % 360.0), float(np.degrees(x["phase_sd"]))
     return f"  {what}", size, f"{pure(*degrees)} deg" if certain else "any", said
+
+
+def _grade(whole: Mapping[str, Any]) -> str:
+    """Return the balance quality grade of ISO 21940-11: e W in mm/s."""
+    return f"grade G {whole['grade_mm_s']:.3g}"
 
 
 def _plane(name: str) -> str:
     """Return a plane in words: that of a bearing or of its sensors, or one of the rig's."""
     first, _, last = name.partition(".")
-    return f"bearing {first}" if last == "z" else f"the sensors of {first}" if last.startswith("z_sensor") else first
+    return f"bearing {first}" if last == "z" else f"sensors of {first}" if last.startswith("z_sensor") else first
 
 
 # --- figures --------------------------------------------------------------------------------------------------------
@@ -112,11 +114,8 @@ def orbit_blocks(estimate: RotorEstimate) -> list[Block]:
     return found
 
 
-def balance_block(estimate: RotorEstimate) -> Block | None:
+def balance_block(s: Mapping[str, Any]) -> Block:
     """Return unbalance and correction by plane, and the synchronous motion before and after it."""
-    s = estimate.synchronous
-    if not s:
-        return None
     sides: list[list[Panel]] = [[panel(_unbalance, s, height=3.6)]]
     if s.get("balancing", {}).get("vibration"):
         sides.append([panel(_vibration, s, height=3.6)])
@@ -193,7 +192,7 @@ def _unbalance(axes: Axes, s: Mapping[str, Any]) -> None:
             "", xy=(value.real, value.imag), xytext=(0, 0),
             arrowprops={"arrowstyle": "-|>", "color": color, "linewidth": 1.8, "shrinkA": 0, "shrinkB": 0},
         )  # fmt: skip
-        axes.plot([0, value.real], [0, value.imag], color=color, label=f"unbalance in {_plane(name)}")
+        axes.plot([0, value.real], [0, value.imag], color=color, label=f"unbalance, {_plane(name)}")
         turn = np.linspace(0.0, 2.0 * np.pi, 61)
         spread = _CIRCLE_95 * (1e6 * p["sd"] * np.cos(turn) + 1j * abs(value) * p["phase_sd"] * np.sin(turn))
         region = value + spread * np.exp(1j * p["phase"])
@@ -203,7 +202,7 @@ def _unbalance(axes: Axes, s: Mapping[str, Any]) -> None:
             at = 1e6 * c["value"] * np.exp(1j * c["phase"])
             axes.plot(
                 at.real, at.imag, "o", color=color, markersize=8, markerfacecolor="white", linestyle="none",
-                label=f"add in {_plane(name)}",
+                label=f"to add, {_plane(name)}",
             )  # fmt: skip
     axes.axhline(0, color=MEASURED, linewidth=0.5)
     axes.axvline(0, color=MEASURED, linewidth=0.5)
@@ -214,7 +213,7 @@ def _unbalance(axes: Axes, s: Mapping[str, Any]) -> None:
     if unseen:
         head(axes, f"not identifiable: {', '.join(_plane(name) for name in unseen)}", good=False)
     else:
-        head(axes, f"unbalance {1e6 * whole['value']:.4g} g mm, G {whole['grade_mm_s']:.3g}; 95 % regions")
+        head(axes, f"unbalance {1e6 * whole['value']:.4g} g mm, {_grade(whole)}; 95 % regions")
 
 
 def _vibration(axes: Axes, s: Mapping[str, Any]) -> None:

@@ -27,6 +27,7 @@ from ambid.report.drawing import (
     stacked,
 )
 from ambid.report.numbers import prefixed, response_unit
+from ambid.report.orbit_panels import balance_block, orbit_blocks
 from ambid.report.response_panels import (
     Pole,
     correlations_panel,
@@ -94,6 +95,10 @@ class RotorEvidence:
         whirl = _whirl(e, self.shaft)
         if whirl is not None:
             found["campbell"] = Block(columns=[[whirl]])
+        for k, block in enumerate(orbit_blocks(e)):
+            found["orbits" if k == 0 else f"orbits_{k + 1}"] = block
+        if e.synchronous:
+            found["unbalance"] = balance_block(e.synchronous)
         found["poles"] = _poles(e)
         found["correlations"] = _correlations(e)
         return found

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from ambid.report.drawing import single
 from ambid.report.estimate_page import correlations
 from ambid.report.numbers import sized
+from ambid.report.orbit_panels import unbalance_rows, vibration_rows
 from ambid.report.page import Page, Section, check_table
 from ambid.report.rotor_figures import RotorEvidence
 from ambid.report.rotor_text import TURN, bearing_rows, machine, mode_rows, taken
@@ -44,6 +45,15 @@ _CAPTIONS: Mapping[str, tuple[str, str]] = {
         "Whirl of the rotor without its bearings over speed: from the identified modes and gyroscopic terms with 95 % "
         "bands, and from the drawing where the rig holds one. Unbalance excites a forward line where it meets 1x.",
     ),
+    "orbits": (
+        "Orbits",
+        "Above what turns with the rotor, run-out of the sensors included, below what does not, beside the clearance.",
+    ),
+    "unbalance": (
+        "Unbalance",
+        "Unbalance by plane as seen on the rotor, with 95 % regions, and where mass times radius is to be added; "
+        "motion at the sensors now and with that correction. Phases count from the mark of angle zero, from x to y.",
+    ),
     "poles": ("Poles", "Of the identified rotor in its magnets, in open loop, with their 95 % regions."),
     "correlations": (
         "Uncertainty of the parameters",
@@ -60,6 +70,7 @@ def rotor_page(evidence: RotorEvidence) -> Page:
         _parameters(e),
         *([Section(title="Bending modes", tables=[mode_rows(e)])] if e.modes else []),
         Section(title="Bearings", tables=[bearing_rows(e, b, b.axes) for b in e.plant.bearings], note=_SIGNS),
+        *([_turning(e)] if e.synchronous else []),
         Section(title="Checks", tables=[check_table(e.checks)]),
         *(Section(title=t, caption=c, figure=partial(single, drawn[n])) for n, t, c in _titles(drawn, e)),
         Section(title="Noise", caption="Levels of white sources, rms of samples.", tables=[noise_rows(e)]),
@@ -91,12 +102,18 @@ def _titles(drawn: Mapping[str, object], e: RotorEstimate) -> list[tuple[str, st
     """Return name, title and caption of each figure; of several records residuals have the record's name."""
     found = []
     for name in drawn:
-        title, caption = _CAPTIONS[name.split("_")[0] if name.startswith("residuals") else name]
+        title, caption = _CAPTIONS[name.split("_")[0] if name.startswith(("residuals", "orbits")) else name]
         if name.startswith("residuals") and len(e.records) > 1:
             k = int(name.split("_")[1]) - 1 if "_" in name else 0
             title = f"{title} of {e.records[k].get('file') or f'record {k + 1}'}"
         found.append((name, title, caption))
     return found
+
+
+def _turning(e: RotorEstimate) -> Section:
+    s = e.synchronous
+    tables = [rows for rows in (unbalance_rows(s), vibration_rows(s)) if rows]
+    return Section(title="Unbalance and run-out", tables=tables, note=s["hint"] or "1 g mm is 1e-6 kg m.")
 
 
 def _parameters(e: RotorEstimate) -> Section:

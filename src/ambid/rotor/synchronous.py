@@ -287,11 +287,11 @@ class Separated:
                 "are doubtful. Hold the speed, or use a shorter part"
             )
         if turned.source == "rig":
-            found.append(f"{name}: no synchronous line near the speed that the rig gives; it is taken as it is")
+            found.append(f"{name}: no synchronous line near the given speed, which is taken as it is")
         elif given and abs(self.speed / given - 1.0) > 10.0 * DRIFT_LIMIT:
             found.append(
                 f"{name}: the speed is {30 / np.pi * self.speed:.5g} rpm, by its {turned.source}, not "
-                f"{30 / np.pi * given:.5g} rpm as the rig says"
+                f"{30 / np.pi * given:.5g} rpm as given"
             )
         return found
 
