@@ -101,13 +101,6 @@ def test_loop_of_a_rig_has_the_controller_of_the_truth():
     np.testing.assert_allclose(K[:, 1, 5], bench.kc)
 
 
-@pytest.fixture(scope="module")
-def rigid():
-    """A bench and what is identified of its record alone."""
-    bench = replace(truth.BENCHES["rigid"], **SHORT)
-    return bench, ambid.identify(record_of(bench), free_rig(bench))
-
-
 def test_identified_rotor_knows_its_sensitivity(rigid):
     bench, estimate = rigid
     for axis, exact in zip(truth.AXES, peaks_of(bench), strict=True):

@@ -10,8 +10,8 @@ import ambid
 from ambid.errors import EstimationError
 from ambid.rig.preset_rig import rig_of_preset
 from ambid.simulation.margins import loop_margins
-from tests.control.test_closed import SHORT, free_rig, peaks_of, record_of
-from tests.rotor_benches import needs_simulator, rig_of, truth
+from tests.control.test_closed import free_rig, peaks_of, record_of
+from tests.rotor_benches import needs_simulator, rig_of
 
 
 @pytest.fixture(scope="module")
@@ -85,9 +85,8 @@ def test_a_loop_that_does_not_hold_the_plant_is_another_one(axis):
 
 
 @needs_simulator
-def test_margins_of_a_rotor_with_the_estimate_of_another_record():
-    bench = replace(truth.BENCHES["rigid"], **SHORT)
-    estimate = ambid.identify(record_of(bench, 1), free_rig(bench))
+def test_margins_of_a_rotor_with_the_estimate_of_another_record(rigid):
+    bench, estimate = rigid
     found = ambid.margins(record_of(bench, 2), free_rig(bench), estimate=estimate)
     peaks = [s.peak_db.value for s in found.sensitivity.values()]
     assert peaks == pytest.approx(peaks_of(bench), abs=0.1)
@@ -98,3 +97,63 @@ def test_margins_of_a_rotor_with_the_estimate_of_another_record():
     assert not wrong.checks["agreement"].passed
     ruled = ambid.margins(record_of(bench, 2), replace(free_rig(bench), loop=rig_of(bench).loop), estimate=estimate)
     assert ruled.controller["source"] == "record"
+
+
+def test_an_excitation_that_is_logged_shows_controller_and_sensitivity_of_one_axis(axis):
+    rig = axis[0]
+    record = ambid.simulate(
+        "rmit-axis", duration=1.0, periods=5, band=(5.0, 2000.0), excitation="multisine", seed=1, log_excitation=True
+    )
+    found = ambid.margins(record, replace(rig, loop=None), reference="excitation")
+    ruled = axis[2]
+    assert found.controller["source"] == "record"
+    assert found.sensitivity["x"].peak_db.value == pytest.approx(ruled.sensitivity["x"].peak_db.value, abs=0.1)
+    assert found.sensitivity["x"].measured_peak_db == pytest.approx(found.sensitivity["x"].peak_db.value, abs=0.5)
+    assert found.checks["agreement"].passed
+    assert found.margins["x"].command.gain_up == pytest.approx(ruled.margins["x"].command.gain_up, rel=0.02)
+
+
+def test_a_reference_without_periods_serves_too(axis):
+    from ambid.rig.rig import RigChannel
+
+    estimate, rig = ambid.identify(axis[1], axis[0]), axis[0]
+    rig = replace(rig, channels=(*rig.channels, RigChannel(role="reference", column="reference")))
+    moved = 2e-6 * np.random.default_rng(1).standard_normal(10_000)
+    record = ambid.simulate_rig(rig, np.zeros(10_000), rate_hz=20_000.0, seed=1, setpoint=moved).record
+    found = ambid.margins(record, replace(rig, loop=None), estimate=estimate)
+    assert found.sensitivity["x"].peak_db.value == pytest.approx(axis[2].sensitivity["x"].peak_db.value, abs=0.1)
+    assert found.checks["controller"].values["misfit"] < 1e-6
+    assert found.curves.measured["x"].frequency_hz.size > 100
+
+
+def test_a_noisy_measured_sensitivity_has_no_peak():
+    from ambid.control.measured import MeasuredSensitivity
+
+    rng, f = np.random.default_rng(1), np.linspace(1.0, 100.0, 200)
+    noisy = MeasuredSensitivity(
+        frequency_hz=f, ratio=1.0 + 0.5 * np.abs(rng.standard_normal(200)), sd=np.full(200, 0.5)
+    )
+    assert noisy.peak is None
+    ratio = np.ones(200)
+    ratio[50], sd = 2.0, np.full(200, 0.01)
+    assert MeasuredSensitivity(frequency_hz=f, ratio=ratio, sd=sd).peak == (2.0, f[50])
+
+
+def test_the_command_writes_text_json_figure_and_page(axis, tmp_path, monkeypatch, capsys):
+    from ambid.cli import main
+    from ambid.rig import write_rig
+
+    monkeypatch.chdir(tmp_path)
+    write_rig(axis[0], "rig.toml")
+    ambid.write_record(axis[1], "record.csv")
+    words = ["margins", "record.csv", "--rig", "rig.toml", "--json", "m.json", "--plot", "m.png", "--report", "m.html"]
+    monkeypatch.setattr("sys.argv", ["ambid", *words, "--strict"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert not end.value.code
+    said = capsys.readouterr().out
+    assert "zone" in said
+    assert "least dynamic stiffness" in said
+    assert json.loads((tmp_path / "m.json").read_text())["verdict"]["word"] == "usable"
+    assert (tmp_path / "m.png").stat().st_size > 10_000
+    assert "margins of the loop" in (tmp_path / "m.html").read_text()

@@ -18,6 +18,9 @@ def command(
         Path | None,
         option("--estimate E.json", "Plant, as 'ambid identify --json' wrote it.", "identified from the record"),
     ] = None,
+    reference: Annotated[
+        str | None, option("--reference COL", "Column of the excitation, of one axis.", "as the rig says")
+    ] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
     rate: opt.Rate = None,
@@ -36,7 +39,8 @@ def command(
 
     with Outputs(record, rig, estimate, json=json, plot=plot, report=report) as outputs, progress("margins") as show:
         found = margins(
-            record, rig, estimate=estimate, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, tick=show
+            record, rig, estimate=estimate, reference=reference, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps,
+            tick=show,
         )  # fmt: skip
         outputs.give(found, show)
     outputs.show(found, strict=strict)

@@ -131,10 +131,11 @@ def sensitivity_by_axis(
     """Return the peak of the sensitivity of each axis."""
     found: dict[str, AxisSensitivity] = {}
     for axis, peak, seen in zip(loop.plant.axes, loop.peaks(), measured or (None,) * len(loop.plant.axes), strict=True):
+        top = None if seen is None else seen.peak
         found[axis] = AxisSensitivity(
             peak_db=EstimatedNumber.of(peak.decibel, peak.sd_db, size=1.0), frequency_hz=peak.frequency_hz,
-            zone=zone_of(peak.ratio), measured_peak_db=None if seen is None else float(20.0 * np.log10(seen.peak[0])),
-            measured_frequency_hz=None if seen is None else seen.peak[1],
+            zone=zone_of(peak.ratio), measured_peak_db=None if top is None else float(20.0 * np.log10(top[0])),
+            measured_frequency_hz=None if top is None else top[1],
         )  # fmt: skip
     return found
 

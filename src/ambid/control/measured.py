@@ -12,12 +12,14 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop
-from ambid.rotor.spectra import PeriodSpectra
+from ambid.rotor.spectra import PeriodSpectra, smoothed
 from ambid.signals.response import FrequencyResponse
 
 _SILENT = 1e-6  # of the largest line, below which a reference has no power
 _COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
 _LINES_PER_UNKNOWN = 3
+_BOUND = 3.0  # standard deviations
+_SEEN = 0.1  # relative standard deviation of a peak that the record shows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -29,10 +31,14 @@ class MeasuredSensitivity:
     sd: Array
 
     @property
-    def peak(self) -> tuple[float, float]:
-        """Largest ratio, and its frequency in Hz."""
-        k = int(np.argmax(self.ratio))
-        return float(self.ratio[k]), float(self.frequency_hz[k])
+    def peak(self) -> tuple[float, float] | None:
+        """Ratio and frequency in Hz of the line that surely stands highest; None where noise hides all of them.
+
+        The largest ratio of many noisy lines is that of the largest noise; the largest lower bound is not.
+        """
+        sd = np.sqrt(smoothed(self.sd[:, None] ** 2)[:, 0])
+        k = int(np.argmax(self.ratio - _BOUND * sd))
+        return (float(self.ratio[k]), float(self.frequency_hz[k])) if sd[k] <= _SEEN * self.ratio[k] else None
 
 
 def measured_sensitivity(

@@ -102,6 +102,7 @@ def load_bench(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    beside: Sequence[str] = (),
 ) -> Record:
     """Read a record through a rig and cut it to the part that is to be used.
 
@@ -115,6 +116,8 @@ def load_bench(
     rate_hz : float, optional
     gaps : {"error", "interpolate", "cut"}, optional
     units : Mapping of str to str, optional
+    beside : sequence of str, optional
+        Columns of the file that are no role of the rig, kept under their own names.
 
     Returns
     -------
@@ -126,7 +129,7 @@ def load_bench(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    return _cut_by(rig, read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units), (from_s, to_s))
+    return _cut_by(rig, read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units, beside=beside), (from_s, to_s))
 
 
 def signals_of(record: Record, plant: LinearModel) -> Signals:

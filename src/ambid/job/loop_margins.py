@@ -40,6 +40,7 @@ def margins(
     rig: Rig | str | Path | None = None,
     *,
     estimate: Numbers | str | Path | None = None,
+    reference: str | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -60,6 +61,8 @@ def margins(
         What is known of the bench; default: that of the estimate, else as `ambid.identify`.
     estimate : Estimate, RotorEstimate, str or Path, optional
         The plant; default: identified from the record first.
+    reference : str, optional
+        Of one axis: column of the excitation, in any unit; default: the rig's ``[channels.reference]``, if any.
     from_s, to_s, rate_hz, gaps, units : optional
         As `ambid.identify`.
     tick : callable, optional
@@ -97,12 +100,25 @@ def margins(
         known, bench = _given(estimate, rig)
         say("read")
         used = load_bench(record, bench, **reading)
+    if reference is not None:
+        used = _with_reference(load_bench(record, bench, beside=(reference,), **reading), bench, reference)
     clock.lap("identify")
     say("margins")
     with one_thread():
         found = _margins(known, bench, used)
     clock.lap("margins")
     return replace(found, timing_s=clock.laps, rig=rig_entry(bench))
+
+
+def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
+    """Return a record of one axis whose excitation is a column of its own."""
+    if rig.rotor is not None:
+        raise EstimationError(
+            "--reference is of one axis; of a rotor the rig names the reference of each axis. Give "
+            "[channels.<axis>_reference] and omit it"
+        )
+    others = [c for c in bench.channels if c.name not in ("reference", column)]
+    return replace(bench, channels=(*others, replace(bench.channel(column), name="reference")))
 
 
 def _given(estimate: Numbers | str | Path, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
