@@ -23,6 +23,7 @@ from ambid.report.text import SPREAD, WIDTH, WORDS, Paint, joined, plain, verdic
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
+    from ambid.physics.shaft import Shaft
     from ambid.report.page import Page
     from ambid.report.signal_panels import Traces
 
@@ -463,15 +464,17 @@ def _rotor() -> View:
     from ambid.report.rotor_page import rotor_page
     from ambid.report.rotor_text import rotor_text
 
-    def evidence(e: Any, used: Any) -> RotorEvidence:
+    def shaft(e: Any) -> Shaft | None:
         try:
-            shaft = rig_of(e, "the estimate").shaft
+            return rig_of(e, "the estimate").shaft
         except AmbidError:  # its text alone may say no more where it lies now
-            shaft = None
-        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=shaft)
+            return None
+
+    def evidence(e: Any, used: Any) -> RotorEvidence:
+        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=shaft(e))
 
     return View(
-        text=rotor_text,
+        text=lambda e, **how: rotor_text(e, shaft=shaft(e), **how),
         figure=lambda e, used, width: rotor_overview(evidence(e, used), width),
         page=lambda e, used: rotor_page(evidence(e, used)),
         document=lambda e: str(e.dumps()),

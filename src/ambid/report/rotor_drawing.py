@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 _STEEL, _DISC = "#d9dde2", "#b9c2cc"
 _WIDEST = 0.45  # of the length: what a disc given by its mass alone is drawn like, at most
 _FORWARD, _BACKWARD = PREDICTED, ORANGE
+_EXPECTED = 3  # modes of a drawing that are looked at beyond those identified
 _PLANAR = 0.02  # of a circular orbit, under which a whirl has no direction
 
 
@@ -41,15 +42,42 @@ def shapes_block(
     """Draw a rotor from the side, and below it each mode: identified at the planes, with a drawing along the shaft.
 
     `planes`: of bearings and sensors by the names of the model (``A.z``, ``A.z_sensor``), m from the datum; the shapes
-    of `modes` have the same names and modal mass 1 kg. With a drawing, modes it expects beyond these follow.
+    of `modes` have the same names and modal mass 1 kg. With a drawing, modes that it expects below the highest
+    identified one are shown, too; without identified ones its first three.
     """
-    drawn = None if shaft is None else shaft.free_rotor(max(len(modes), 3), planes=list(planes.values()))
+    drawn = None if shaft is None else expected_rotor(modes, shaft, list(planes.values()))
+    partners = partners_of(modes, drawn)
+    shown: list[tuple[Mode | None, int | None]] = list(zip(modes, partners, strict=True))
+    if drawn is not None:
+        top = max((k for k in partners if k is not None), default=_EXPECTED - 1)
+        shown += [(None, k) for k in range(top + 1) if k not in partners]
+        shown.sort(key=lambda pair: _hertz(drawn, pair[1]) if pair[0] is None else pair[0].frequency_hz.value)
     ends = _ends(planes, shaft)
     rows = [panel(_side, planes, shaft, drawn, ends, height=1.7)]
-    for k in range(max(len(modes), 0 if drawn is None else drawn.omega.size - 2)):
-        mode = modes[k] if k < len(modes) else None
-        rows.append(panel(_shape, k, planes, mode, drawn, ends, k + 1, height=1.35))
+    rows += [panel(_shape, mode, k, planes, drawn, ends, modes, height=1.35) for mode, k in shown]
     return Block(columns=[rows], title=title)
+
+
+def expected_rotor(modes: Sequence[Mode], shaft: Shaft, planes: Sequence[float] = ()) -> FreeRotor:
+    """Return the rotor of a drawing with as many bending modes as identified ones are looked for among."""
+    return shaft.free_rotor(len(modes) + _EXPECTED, planes=planes)
+
+
+def partners_of(modes: Sequence[Mode], drawn: FreeRotor | None) -> list[int | None]:
+    """Return which bending mode of a drawing, from 0, each identified mode is: the nearest in frequency, in order.
+
+    None where there is no drawing, or it has no mode left.
+    """
+    from scipy.optimize import linear_sum_assignment
+
+    found: list[int | None] = [None] * len(modes)
+    if drawn is None or not modes:
+        return found
+    own = np.log([mode.frequency_hz.value for mode in modes])
+    apart = np.abs(own[:, None] - np.log(drawn.omega[2:] / (2 * np.pi)))
+    for row, k in zip(*linear_sum_assignment(apart), strict=True):
+        found[row] = int(k)
+    return found
 
 
 def campbell_panel(
@@ -66,6 +94,11 @@ def campbell_panel(
     were taken, rad/s. Where a line meets the speed itself (1x), a critical speed is marked.
     """
     return panel(_campbell, identified, drawn, sd, speeds, height=4.2)
+
+
+def _hertz(drawn: FreeRotor, k: int | None) -> float:
+    """Natural frequency of a bending mode of a drawing, from 0."""
+    return math.inf if k is None else float(drawn.omega[k + 2]) / (2 * math.pi)
 
 
 def _ends(planes: Mapping[str, float], shaft: Shaft | None) -> tuple[float, float]:
@@ -144,41 +177,42 @@ def _diameter_at(shaft: Shaft, z: float) -> float:
 
 def _shape(
     axes: Axes,
-    k: int,
-    planes: Mapping[str, float],
     mode: Mode | None,
+    k: int | None,
+    planes: Mapping[str, float],
     drawn: FreeRotor | None,
     ends: tuple[float, float],
-    number: int,
+    modes: Sequence[Mode],
 ) -> None:
-    """One mode along the shaft: the drawing's turned to the side of the identified one."""
-    said = [f"mode {number}"]
+    """One mode along the shaft, identified, from the drawing (its mode `k`), or both; the drawing takes its sign."""
+    said = ["not identified"]
     at = [name for name in planes if mode is not None and name in mode.shape]
     z = np.array([planes[name] for name in at])
     value = np.array([mode.shape[name].value for name in at]) if mode is not None else np.zeros(0)
     if mode is not None:
+        number = 1 + next(i for i, x in enumerate(modes) if x is mode)
         f, damping = mode.frequency_hz, mode.damping
-        said.append(f"{f.value:.5g} Hz ± {NORMAL_95 * f.sd:.2g}, damping {100 * damping.value:.3g} %")
+        said = [f"mode {number}: {f.value:.5g} Hz ± {NORMAL_95 * f.sd:.2g}, damping {100 * damping.value:.3g} %"]
         sd = np.array([mode.shape[name].sd for name in at])
         axes.errorbar(
             1e3 * z, value, NORMAL_95 * sd, fmt="o", color=PREDICTED, markersize=4.5, elinewidth=1.0, capsize=2.5,
             label="identified, 95 %", zorder=4,
         )  # fmt: skip
-    if drawn is not None and k + 2 < drawn.omega.size:
+    if drawn is not None and k is not None:
         along = np.linspace(drawn.z[0], drawn.z[-1], 301)
         line = drawn.deflection(along)[:, k + 2]
         side = float(value @ drawn.deflection(z)[:, k + 2]) if z.size else 1.0
         axes.plot(
             1e3 * along, math.copysign(1.0, side) * line, color=MEASURED, linestyle="--", label="from the drawing"
         )
-        said.append(f"drawing {drawn.omega[k + 2] / (2 * np.pi):.5g} Hz")
+        said.append(f"drawing {_hertz(drawn, k):.5g} Hz")
     for name, plane in planes.items():
         axes.axvline(1e3 * plane, color=BOUND if name.endswith(".z") else GREEN, linewidth=0.7, linestyle=":", zorder=1)
     axes.axhline(0, color=MEASURED, linewidth=0.6)
     axes.set_xlim(*(1e3 * x for x in ends))
     axes.set_ylabel("shape [kg$^{-1/2}$]")
     axes.set_xlabel("along the shaft, from the datum [mm]")
-    head(axes, ": ".join(said[:2]) + "".join(f"; {x}" for x in said[2:]))
+    head(axes, "; ".join(said))
 
 
 def _campbell(

@@ -222,7 +222,7 @@ def _whirl(e: RotorEstimate, shaft: Shaft | None) -> Panel | None:
     if most == 0.0 or (shaft is None and not (n and e.plant.turning)):
         return None
     speeds = np.linspace(0.0, most, _SPEEDS)
-    drawn = None if shaft is None else campbell(shaft, speeds, lines=2 * max(n, 1))
+    drawn = None if shaft is None else campbell(shaft, speeds, lines=2 * max(n, 1) + 1)
     found = sd = None
     if n and e.plant.turning:
         free = e.plant.with_modes(n)  # those above the band are a guess

@@ -68,7 +68,7 @@ def rotor_page(evidence: RotorEvidence) -> Page:
     drawn = evidence.drawings()
     sections = [
         _parameters(e),
-        *([Section(title="Bending modes", tables=[mode_rows(e)])] if e.modes else []),
+        *([Section(title="Bending modes", tables=[mode_rows(e, evidence.shaft)])] if e.modes else []),
         Section(title="Bearings", tables=[bearing_rows(e, b, b.axes) for b in e.plant.bearings], note=_SIGNS),
         *([_turning(e)] if e.synchronous else []),
         Section(title="Checks", tables=[check_table(e.checks)]),

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 from ambid.errors import counted
 from ambid.estimation.estimate import Delay, EstimatedParameter
 from ambid.physics.rotor_model import Bearing, position_role
+from ambid.physics.shaft import Shaft
 from ambid.report.numbers import quantity, sized
 from ambid.report.orbit_panels import synchronous_lines
+from ambid.report.rotor_drawing import expected_rotor, partners_of
 from ambid.report.text import (
     WIDTH,
     Paint,
@@ -30,8 +33,8 @@ _UNSEEN = "✗"
 TURN = 30.0 / 3.141592653589793  # 1/min in a rad/s
 
 
-def rotor_text(estimate: RotorEstimate, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write the estimate of a rotor, below its verdict."""
+def rotor_text(estimate: RotorEstimate, *, shaft: Shaft | None = None, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write the estimate of a rotor, below its verdict; `shaft`: its drawing."""
     e = estimate
     of_rotor = parameter_lines(machine(e), width=width, paint=paint, found=e.verdict)
     of_bearings = [bearing_lines(e, b, width=width, paint=paint) for b in e.plant.bearings]
@@ -40,7 +43,7 @@ def rotor_text(estimate: RotorEstimate, *, width: int = WIDTH, paint: Paint = pl
         [
             record_lines(e, paint),
             ["rotor" + of_rotor[0][5:], *of_rotor[1:]],
-            columns(mode_rows(e)) if e.modes else [],
+            columns(mode_rows(e, shaft)) if e.modes else [],
             *of_bearings,
             [f"{paint(_UNSEEN, 'bad')} not identifiable from these data"] if unseen else [],
             synchronous_lines(e, width),
@@ -77,13 +80,17 @@ def machine(estimate: RotorEstimate) -> list[EstimatedParameter]:
     return [p for p in estimate.parameters if "." not in p.name]
 
 
-def mode_rows(estimate: RotorEstimate) -> list[tuple[str, ...]]:
-    """Return a table of the bending modes."""
-    rows: list[tuple[str, ...]] = [("bending mode", "frequency", "damping ratio", "")]
-    for r, m in enumerate(estimate.modes, 1):
+def mode_rows(estimate: RotorEstimate, shaft: Shaft | None = None) -> list[tuple[str, ...]]:
+    """Return a table of the bending modes, beside what a drawing expects of each."""
+    rotor = None if shaft is None else expected_rotor(estimate.modes, shaft)
+    expected = [] if rotor is None else ["from the drawing"]
+    rows: list[tuple[str, ...]] = [("bending mode", "frequency", "damping ratio", *expected, "")]
+    for r, (m, k) in enumerate(zip(estimate.modes, partners_of(estimate.modes, rotor), strict=True), 1):
         f, z = m.frequency_hz, m.damping
         shown = "" if m.identifiable else f"{_UNSEEN} not identifiable"
-        rows.append((f"  {r}", quantity(f.value, f.sd, "Hz").text, f"{pure(100 * z.value, 100 * z.sd)} %", shown))
+        cells = [] if rotor is None else ["–" if k is None else f"{rotor.omega[k + 2] / (2 * math.pi):.5g} Hz"]
+        ratio = f"{pure(100 * z.value, 100 * z.sd)} %"
+        rows.append((f"  {r}", quantity(f.value, f.sd, "Hz").text, ratio, *cells, shown))
     return rows
 
 
