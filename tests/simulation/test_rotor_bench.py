@@ -16,7 +16,7 @@ from ambid.physics.named_bench import Preset
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.presets import preset, preset_names
 from ambid.rig import RigChannel, preset_text, rig_from_text, rig_of_preset
-from ambid.signals import multisine
+from ambid.signals import excitation_of_axes, multisine
 from ambid.simulation import LinearPlant
 from ambid.simulation import simulate as simulate_plant
 from ambid.simulation.rotor_bench import RotorBench
@@ -161,6 +161,28 @@ def test_nonlinear_magnets_levitate_and_are_linear_for_small_motion(name: str) -
         assert np.abs(bent[role] - linear[role]).max() <= 2e-4 * np.abs(linear[role]).max()
     done, _ = simulate_used(name, duration=0.2, periods=2, nonlinear=True)
     assert done.within_limits
+
+
+def test_flux_linkages_of_conical_magnets_are_the_integral_of_the_voltages() -> None:
+    """Without resistance every volt goes into dW'/di of one co-energy, whose coupling of axes counts here."""
+    conical = preset("camb")
+    ideal = {f"{axis}.R": 1e-12 for axis in ("ax", "ay", "bx", "by", "az")}
+    conical = replace(conical, parameters={**conical.parameters, **ideal}, noise=Noise())
+    rig = rig_of_preset(replace(conical, loop=replace(conical.loop, delay=0.0)))
+    bench = RotorBench.of(rig, None, None, nonlinear=True)
+    u = excitation_of_axes("gaussian", 2000, 20_000.0, axes=5, amplitude=12.0, band=(10.0, 1000.0), seed=3)
+    done = bench.simulate(u, seed=1)
+    assert bench.poles is not None
+    x, i, found = done.states[:, :5], done.states[:, 5:], done.states[:, 5:] * bench.poles.leakage
+    for (k, gap, bias, sigma, *acts), axes in zip(bench.poles.numbers, bench.poles.axes, strict=True):
+        directions, windings = acts[0::2], acts[1::2]
+        d = gap - sum(c * x[:, j] for c, j in zip(directions, axes, strict=True))
+        current = bias + sum(w * i[:, j] for w, j in zip(windings, axes, strict=True))
+        for w, j in zip(windings, axes, strict=True):
+            found[:, j] += w * k / d * current / np.sqrt(1.0 + sigma * current**2)
+    volts = np.column_stack([done.record[f"{axis}_voltage"] for axis in bench.model.axes])
+    assert np.abs(x).max() > 0.1 * 0.4e-3
+    np.testing.assert_allclose(np.diff(found, axis=0), volts[:-1] / 20_000.0, rtol=0, atol=1e-7 * np.ptp(found))
 
 
 def test_a_rig_that_names_them_gets_speed_and_pulses() -> None:

@@ -41,23 +41,24 @@ def models() -> None:
     from ambid.physics.bearing_numbers import BEARING_NUMBERS
     from ambid.physics.linear_model import model, model_names
     from ambid.physics.presets import preset, preset_names
+    from ambid.physics.rotor_model import Bearing, RotorModel
     from ambid.report.text import columns
     from ambid.signals import AXES_EXCITATIONS, EXCITATIONS
     from ambid.simulation import scenario, scenario_names
 
     paint = painter()
-    for name in model_names():
-        of = model(name)
+    bearing = Bearing(name="A", axes=("ax",))
+    rotor = RotorModel(bearings=(bearing,), polar=True, extras=("a", "ax.gain", "ax.sensor_pole"))
+    for name, of in [*((name, model(name)) for name in model_names()), ("rotor on many axes, here ax", rotor)]:
         signals = [f"{role} [{of.units[role]}]" for role in (*of.inputs, *of.outputs)]
         count = len(of.inputs)
         typer.echo(paint(name, "strong"))
         _entries([("  ", of.summary)], indent=2)
         typer.echo(f"  in: {', '.join(signals[:count])}; out: {', '.join(signals[count:])}")
-        rows = [
-            (f"  {p.name}", f"[{p.unit}]", p.meaning + ("" if p.default is None else f" ({p.default:g} unless given)"))
-            for p in of.parameters
-        ]
-        typer.echo("\n".join(columns(rows)) + "\n")
+        left = columns([(f"  {p.name}", f"[{p.unit}]") for p in of.parameters])
+        defaults = ["" if p.default is None else f" ({p.default:g} unless given)" for p in of.parameters]
+        _entries(zip(left, (p.meaning + x for p, x in zip(of.parameters, defaults, strict=True)), strict=True))
+        typer.echo()
     use = "  one-axis with 'ambid identify --nonlinear', with m, R and c; known values belong in [magnet.parameters]"
     typer.echo(textwrap.fill(f"{paint('nonlinear magnet', 'strong')}{use}", 80, subsequent_indent="  "))
     left = columns([(f"  {p.name}", f"[{p.unit}]") for p in BEARING_NUMBERS])
