@@ -155,8 +155,8 @@ def model_of(bench: Any) -> tuple[RotorModel, dict[str, float]]:
     modal, eddy = truth.modal_of(bench), bool(np.isfinite(bench.eddy_pole_hz))
     n = modal.mass.size - 2
     bearings = tuple(
-        Bearing(name=x, axes=(f"{x.lower()}x", f"{x.lower()}y"), z=DATUM + modal.bearing[j, 1],
-                z_sensors=(DATUM + modal.sensor[j, 1],))
+        Bearing(name=x, axes=(f"{x.lower()}x", f"{x.lower()}y"), z=float(DATUM + modal.bearing[j, 1]),
+                z_sensors=(float(DATUM + modal.sensor[j, 1]),))
         for j, x in enumerate("AB")
     )  # fmt: skip
     speed = bench.rpm * 2 * np.pi / 60

@@ -87,6 +87,10 @@ def command(
         ),
     ] = None,
     report: opt.Report = None,
+    export: Annotated[
+        Path | None,
+        option("--export FILE.mat", "Write the plant for other programs: .mat, or of a rotor .py, a script for ROSS."),
+    ] = None,
     strict: opt.Strict = False,
 ) -> None:
     """Identify the physical parameters of a bench from a record of voltage, current and position.
@@ -96,12 +100,14 @@ def command(
     of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
     from ambid.job import identification as job
+    from ambid.job.files import EXPORT_ENDINGS
 
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
     with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
         opt.refuse_twice([*records, *kept])
+        outputs.claim(export, "--export", EXPORT_ENDINGS)
         if nonlinear:
             if off_below is not None and not isfinite(off_below):
                 raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
@@ -119,6 +125,8 @@ def command(
             )
             stop.torn()
             outputs.give(estimate, show)
+            if export is not None:
+                outputs.stage(export, estimate.export)
     outputs.show(estimate)
     search = getattr(estimate, "global_search", None)
     if stop.wished() or (search is not None and search["interrupted"]):

@@ -231,3 +231,15 @@ class Linear:
             SI units, about the operating point; without the delay of the input where the plant is continuous.
         """
         return _predicted("to_control")(self)
+
+    def export(self, path: str | Path) -> None:
+        """Write the plant for another program.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ending in ``.mat``: matrices, names, parameters with standard deviations. In ``.py``: of a rotor a script
+            that builds it for ROSS, its bearings at the synchronous frequency, the state space beside them. A file
+            that exists is replaced.
+        """
+        _predicted("exported")(self, path)

@@ -15,7 +15,10 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm")
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
-_BEGINNINGS = {FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<",)}
+EXPORT_ENDINGS = (".mat", ".py")
+_BEGINNINGS = {
+    FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<",), EXPORT_ENDINGS: (b"MATLAB 5.0", b'"""'),
+}  # fmt: skip
 _STREAMED = ("--json",)  # options that take - for standard output
 
 

@@ -16,12 +16,13 @@ from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, signals_of
+from ambid.job.exchange import export, plant_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.physics.linear_model import StateSpace, discretise, model
 from ambid.rotor.estimate import RotorEstimate
 
-validated = validate
+validated, exported = validate, export
 
 
 def predict(result: AnyEstimate | AnyFit, record: Any, ahead: int, **reading: Unpack[Reading]) -> dict[str, Array]:
@@ -126,6 +127,6 @@ def to_control(result: Any) -> Any:
         return found
     at = linearised(result) if isinstance(result, NonlinearBearingEstimate) else result.continuous
     found = state_space_to_control(at.A, at.B, at.C)
-    plant = model(result.model)
+    plant = plant_of(result)
     found.update_names(inputs=list(plant.inputs), outputs=list(plant.outputs), states=list(at.states))
     return found

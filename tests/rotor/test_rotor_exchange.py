@@ -1,0 +1,111 @@
+"""A rotor for other programs: python-control, MATLAB, and a script for ROSS that is run against a stand-in of it."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.errors import EstimationError
+from ambid.rotor.estimate import RotorEstimate
+from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
+
+pytestmark = needs_simulator
+
+
+@pytest.fixture(scope="module")
+def bench() -> Any:
+    return replace(truth.BENCHES["rigid-spin"], period=0.25, periods=4)
+
+
+@pytest.fixture(scope="module")
+def estimate(bench: Any) -> RotorEstimate:
+    found = ambid.identify(record_of(bench, 5), free_rig(bench))
+    assert isinstance(found, RotorEstimate)
+    return found
+
+
+def _built(path: Path, monkeypatch: pytest.MonkeyPatch) -> tuple[dict[str, Any], dict[str, list[dict[str, Any]]]]:
+    """Run a script with a stand-in for ROSS; return its names, and what it made of each kind."""
+    made: dict[str, list[dict[str, Any]]] = {
+        "Material": [],
+        "ShaftElement": [],
+        "DiskElement": [],
+        "BearingElement": [],
+    }
+    parts = {kind: lambda kind=kind, **words: made[kind].append(words) or words for kind in made}
+    monkeypatch.setitem(sys.modules, "ross", SimpleNamespace(**parts, Rotor=lambda *parts: parts))  # type: ignore[arg-type]
+    names: dict[str, Any] = {"__name__": "script"}
+    exec(compile(path.read_text(encoding="utf-8"), str(path), "exec"), names)
+    names["rotor"]()
+    return names, made
+
+
+def test_the_script_for_ross_holds_the_rotor_with_synchronous_bearings(
+    bench: Any, estimate: RotorEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate.export(tmp_path / "r.py")
+    names, made = _built(tmp_path / "r.py", monkeypatch)
+    assert "synchronous" in names["__doc__"]
+    (disc,) = made["DiskElement"]
+    assert (disc["m"], disc["Id"], disc["Ip"]) == (estimate["m"].value, estimate["Id"].value, estimate["Ip"].value)
+    span = estimate.numbers["B.z_sensor"] - estimate.numbers["A.z_sensor"]
+    assert sum(e["L"] for e in made["ShaftElement"]) == pytest.approx(span)
+    f = np.array([bench.rpm / 60.0])
+    s, late = 2j * np.pi * f[0], np.exp(-2j * np.pi * f[0] * (bench.delay + 0.5) / bench.rate)
+    back = bench.kc * truth.controller_frf(bench, f)[0] * late
+    for k, one in enumerate(made["BearingElement"]):
+        for plane, j in (("x", 2 * k), ("y", 2 * k + 1)):
+            i = (back + bench.k_i[j] * s) / (bench.R[j] + bench.L[j] * s + bench.kc * late)
+            stiffness = bench.k_x[j] + bench.k_i[j] * i
+            assert one[f"k{plane}{plane}"] == pytest.approx(stiffness.real, rel=0.03)
+            assert one[f"c{plane}{plane}"] == pytest.approx(stiffness.imag / abs(s), rel=0.03)
+    A, B, C = names["state_space"]()
+    np.testing.assert_array_equal(A, estimate.continuous.A)
+    assert B.shape[1] == len(names["INPUTS"])
+    assert C.shape[0] == len(names["OUTPUTS"])
+
+
+def test_an_estimate_without_its_record_knows_no_controller(
+    estimate: RotorEstimate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    estimate.save(tmp_path / "e.json")
+    ambid.load(tmp_path / "e.json").export(tmp_path / "r.py")
+    names, made = _built(tmp_path / "r.py", monkeypatch)
+    assert "the magnets alone" in names["__doc__"]
+    assert made["BearingElement"][0]["kxx"] == pytest.approx(estimate["ax.k_x"].value)
+    assert made["BearingElement"][0]["cxx"] == 0.0
+
+
+def test_matlab_reads_the_plant_and_the_numbers(estimate: RotorEstimate, tmp_path: Path) -> None:
+    from scipy.io import loadmat
+
+    estimate.export(tmp_path / "r.mat")
+    found = loadmat(tmp_path / "r.mat", squeeze_me=True)
+    np.testing.assert_array_equal(found["A"], estimate.continuous.A)
+    assert list(found["inputs"]) == list(estimate.plant.inputs)
+    at = list(found["parameters"]).index("ax.k_i")
+    assert (found["value"][at], found["sd"][at]) == (estimate["ax.k_i"].value, estimate["ax.k_i"].sd)
+    assert list(found["delay_samples"]) == [1.0] * 4
+
+
+def test_python_control_gets_named_signals(estimate: RotorEstimate) -> None:
+    pytest.importorskip("control")
+    plant = estimate.to_control()
+    assert plant.input_labels == list(estimate.plant.inputs)
+    assert plant.output_labels == list(estimate.plant.outputs)
+
+
+def test_other_endings_and_results_are_refused(estimate: RotorEstimate, tmp_path: Path) -> None:
+    with pytest.raises(EstimationError, match=r"\.mat, \.py"):
+        estimate.export(tmp_path / "r.txt")
+    axis = ambid.identify(ambid.simulate("thesis", duration=0.5, seed=1))
+    with pytest.raises(EstimationError, match="holds a rotor"):
+        axis.export(tmp_path / "r.py")
+    axis.export(tmp_path / "r.mat")
