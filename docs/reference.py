@@ -24,12 +24,14 @@ GROUPS: dict[str, dict[str, str]] = {
     "Estimators": {
         "ambid.estimation": "the estimate",
         "ambid.bearing": "physical parameters of one axis",
+        "ambid.rotor": "physical parameters of rotors on many axes",
         "ambid.blackbox": "linear black boxes",
         "ambid.nonlinear": "nonlinear black boxes",
         "ambid.recursive": "recursive estimators and filters",
         "ambid.tracking": "the supervised tracker",
     },
     "Jobs and hardware": {
+        "ambid.control": "the loop as it is: margins and sensitivity",
         "ambid.job": "whole jobs and their parts",
         "ambid.report": "figures",
         "ambid.acquisition": "records from a controller",
