@@ -98,9 +98,12 @@ def _measured(part: str) -> Iterator[Any]:
 
         return nonlinear_tables()
     if part == "rotor":
-        from rotor_ross import rotor_tables
+        from itertools import chain
 
-        return rotor_tables()
+        import rotor_montecarlo
+        import rotor_ross
+
+        return chain(rotor_ross.rotor_tables(), rotor_montecarlo.rotor_tables())
     from records import record_tables
 
     return record_tables()

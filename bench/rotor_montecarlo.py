@@ -1,0 +1,201 @@
+"""Rotors: how often the 95 % intervals hold the truth, and what a wrong model makes of them.
+
+Records are simulated from the presets, and identified with a rig that knows nothing but the planes. Alone:
+``python bench/rotor_montecarlo.py``.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.signal import lfilter
+
+import ambid
+from ambid.physics.linear_model import Parameter
+from ambid.physics.presets import preset
+from ambid.record import Record
+from ambid.rig import Rig, rig_of_preset
+from ambid.rig.rig import RigModes
+from ambid.rotor import RotorEstimate
+from table import Table
+
+RUNS, SEEDS = 100, (1, 2, 3)
+_Z, _FAR = 1.959964, 3.5
+_SECONDS, _PERIODS = 2.0, 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Case:
+    """A bench, how it is excited, and what is wrong with its record or its rig."""
+
+    name: str
+    bench: str
+    amplitude: float | None = None  # V; None: half of the limits
+    nonlinear: bool = False
+    simulated: Callable[[Rig], Rig] = lambda rig: rig
+    recorded: Callable[[Record], Record] = lambda record: record
+    known: Callable[[Rig], Rig] = lambda rig: rig
+
+
+def run(case: Case, seed: int) -> tuple[RotorEstimate, dict[str, float], float]:
+    """Return the estimate of one record, its errors in standard deviations, and the CPU time in s."""
+    rig = rig_of_preset(preset(case.bench))
+    assert rig.rotor is not None
+    truth = {p.name: p.value for p in rig.parameters}
+    blind = tuple(p if p.name in rig.rotor.places else Parameter(name=p.name, unit=p.unit) for p in rig.parameters)
+    record = ambid.simulate(
+        case.simulated(rig), duration=_SECONDS, periods=_PERIODS, excitation="zippered", amplitude=case.amplitude,
+        nonlinear=case.nonlinear, seed=seed,
+    )  # fmt: skip
+    began = time.process_time()
+    found = ambid.identify(case.recorded(record), case.known(replace(rig, parameters=blind, modes=RigModes())))
+    took = time.process_time() - began
+    assert isinstance(found, RotorEstimate)
+    errors = {p.name: (p.value - float(truth[p.name] or 0.0)) / p.sd for p in found.parameters if p.sd}
+    return found, errors, took
+
+
+def coverage() -> Table:
+    """Return how often the intervals of each parameter hold the truth."""
+    cases = (
+        Case(name="rigid", bench="rmit"),
+        Case(name="rigid, a tenth", bench="rmit", amplitude=2.5),
+        Case(name="two bending modes", bench="central-mass"),
+    )
+    rows, data = [], {}
+    for case in cases:
+        runs = [run(case, seed) for seed in range(RUNS)]
+        z = np.array([list(errors.values()) for _, errors, _ in runs])
+        each = np.mean(np.abs(z) < _Z, axis=0)
+        words = [found.verdict.word for found, *_ in runs]
+        rows.append(
+            (
+                case.name,
+                f"{np.mean(np.abs(z) < _Z):.3f}",
+                f"{each.min():.2f} to {each.max():.2f}",
+                f"{np.sqrt(np.mean(z**2)):.2f}",
+                f"{np.max(np.abs(z)):.1f}",
+                f"{words.count('usable')} of {RUNS}",
+                f"{np.median([took for *_, took in runs]):.2f} s",
+            )
+        )
+        data[case.name] = {"covered": dict(zip(runs[0][1], each.tolist(), strict=True))}
+    return Table(
+        group="Rotors: coverage of the 95 % intervals",
+        columns=("bench", "all", "by parameter", "rms of z", "largest", "usable", "CPU"),
+        rows=tuple(rows),
+        before=f"{RUNS} records of {_SECONDS:g} s each; z: error over standard deviation.",
+        data=data,
+    )
+
+
+def robustness() -> Table:
+    """Return what errors of sensors, planes, magnets and amplifiers do, and whether they are told."""
+    rows = []
+    for case in _wrong():
+        worst, words, checks = 0.0, [], set[str]()
+        for seed in SEEDS:
+            found, errors, _ = run(case, seed)
+            worst = max(worst, *(abs(x) for x in errors.values()))
+            words.append(found.verdict.word)
+            checks |= {r.check for r in found.verdict.reasons}
+        told = all(word != "usable" for word in words)
+        kept = "yes" if worst <= _FAR else "told" if told else "NO"
+        rows.append((case.name, f"{worst:.1f}", ", ".join(sorted(checks)) or "none", kept))
+    return Table(
+        group="Rotors: errors of sensors, planes, magnets and amplifiers",
+        columns=("case", "largest error in sd", "failed checks", "within 3.5 sd or told"),
+        rows=tuple(rows),
+        before=f"{len(SEEDS)} records each.",
+    )
+
+
+def _wrong() -> Iterator[Case]:
+    yield Case(name="nothing", bench="rmit")
+    for color in (0.9, 0.99):
+        yield Case(
+            name=f"sensor noise with a pole at {color}", bench="rmit", recorded=lambda r, c=color: _colored(r, c)
+        )
+    for mm in (1.0, 2.0):
+        yield Case(name=f"a sensor plane {mm:g} mm off", bench="rmit", known=lambda rig, mm=mm: _moved(rig, mm))
+    yield Case(name="sensors with poles at 2.2 to 3.5 kHz", bench="rmit", recorded=_lagged)
+    yield Case(name="1 % of cross-talk", bench="rmit", recorded=_mixed)
+    yield Case(name="converters of 12 bits", bench="rmit", simulated=_quantised)
+    yield Case(name="voltage at its limit in 1 % of the samples", bench="rmit", recorded=_clipped)
+    yield Case(name="nonlinear magnets, half of the limits", bench="rmit", nonlinear=True)
+
+
+def _positions(record: Record, change: Callable[[np.ndarray, int], np.ndarray]) -> Record:
+    found = (
+        replace(c, values=np.ascontiguousarray(change(c.values, k))) if c.name.endswith("_position") else c
+        for k, c in enumerate(record.channels)
+    )
+    return replace(record, channels=tuple(found))
+
+
+def _colored(record: Record, pole: float) -> Record:
+    def add(x: np.ndarray, k: int) -> np.ndarray:
+        e = np.random.default_rng(k).standard_normal(x.size) * np.sqrt(1.0 - pole**2)
+        return np.asarray(x + 3e-7 * lfilter([1.0], [1.0, -pole], e))
+
+    return _positions(record, add)
+
+
+def _lagged(record: Record) -> Record:
+    def through(x: np.ndarray, k: int) -> np.ndarray:
+        a = np.exp(-2.0 * np.pi * (2200.0 + 433.0 * (k % 4)) / record.rate_hz)
+        return np.asarray(lfilter([0.5 * (1.0 - a), 0.5 * (1.0 - a)], [1.0, -a], x))  # linear between the samples
+
+    return _positions(record, through)
+
+
+def _mixed(record: Record) -> Record:
+    names = [c.name for c in record.channels if c.name.endswith("_position")]
+    other = dict(zip(names, [*names[1::-1], *names[:1:-1]], strict=True))
+    channels = (
+        replace(c, values=c.values + 0.01 * record[other[c.name]].values) if c.name in other else c
+        for c in record.channels
+    )
+    return replace(record, channels=tuple(channels))
+
+
+def _clipped(record: Record) -> Record:
+    """Return a record whose voltages were logged before a limit that 1 % of the samples reach."""
+    found: list[Any] = []
+    for c in record.channels:
+        if c.name.endswith("_voltage"):
+            most = float(np.quantile(np.abs(c.values), 0.99))
+            over = np.sign(c.values) * np.maximum(np.abs(c.values) - most, 0.0)
+            c = replace(c, values=c.values + over)  # what was commanded beyond what the coil saw
+        found.append(c)
+    return replace(record, channels=tuple(found))
+
+
+def _moved(rig: Rig, mm: float) -> Rig:
+    assert rig.rotor is not None
+    name = rig.rotor.bearings[0].sensor_parameter(0)
+    found = (
+        replace(p, value=p.value + 1e-3 * mm) if p.name == name and p.value is not None else p for p in rig.parameters
+    )
+    return replace(rig, parameters=tuple(found))
+
+
+def _quantised(rig: Rig) -> Rig:
+    assert rig.noise is not None
+    steps = {"position_resolution": 2 * 350e-6 / 4096, "current_resolution": 2 * 5.0 / 4096}
+    return replace(rig, noise=replace(rig.noise, **steps))
+
+
+def rotor_tables() -> Iterator[Table]:
+    """Yield the tables of coverage and robustness."""
+    yield coverage()
+    yield robustness()
+
+
+if __name__ == "__main__":
+    for table in rotor_tables():
+        print(table.as_markdown(), flush=True)
