@@ -31,7 +31,8 @@ _REACH = 10.0  # of a window to either side, in half bandwidths of its mode
 _FEWEST = 24  # lines of a window to either side, at least
 _SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
 _LEVERAGE = 0.9  # most that a line's own share in its fit counts
-_PASSES = 2
+_PASSES = 5  # at most
+_ALIKE, _WEAK = 0.9, 0.1  # likeness of two shapes, and size of one beside the other, that make them one mode
 _SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's frequency that must be the mode's ...
 _CLEAR = 10.0  # ... the less where it stands so many times out of what is left
 _MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
@@ -221,18 +222,40 @@ def _window(lines: Spectra, k: int, poles: Complex) -> tuple[_Window, Complex, i
 
 def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
     """Fit each candidate in its window, drop what is no mode, and again with those that are left."""
-    for turn in range(_PASSES + 2):
+    for turn in range(_PASSES):
         poles = np.array([c.pole for c in candidates])
         for k, c in enumerate(candidates):
             _fit(lines, k, poles, c, judge=turn > 0)
-            say((turn + (k + 1) / len(candidates)) / (_PASSES + 2))
+            say((turn + (k + 1) / len(candidates)) / _PASSES)
         kept = _kept(candidates, lines, judged=turn > 0)
-        if turn >= _PASSES - 1 and len(kept) == len(candidates):
-            return kept
-        candidates = kept
-        if not candidates:
-            return []
+        before, candidates = len(candidates), kept
+        if turn == 1:
+            poles = np.array([c.pole for c in kept])
+            candidates = [x for k, c in enumerate(kept) for x in _split(lines, k, poles, c)]
+        if not candidates or (turn > 0 and len(candidates) == before == len(kept)):
+            return candidates
     return candidates
+
+
+def _split(lines: Spectra, k: int, poles: Complex, c: _Candidate) -> list[_Candidate]:
+    """Two modes of different shape where one pole stands for both, else the one."""
+    window, inside, at = _window(lines, k, poles)
+    n, m = lines.Y.shape[1], lines.U.shape[1]
+    if n < 2 or window.lines.omega.size < 2 * (window.smooth.shape[1] + m * (inside.size + 1)):
+        return [c]
+    apart = 0.4j * abs(c.pole.real)
+    found = window.fit(np.r_[c.pole - apart, c.pole + apart, np.delete(inside, at)])
+    two = window.project(found)
+    one = window.project(window.search(inside))
+    gain = 2 * (one.cost - two.cost) - (2 + 2 * n * m) * np.log(2 * two.e.size)
+    damped = np.all((found[:2].real < 0) & (-found[:2].real < MOST_DAMPED * np.abs(found[:2])))
+    near = np.all(np.abs(found[:2] - c.pole) < 2 * abs(c.pole.real))
+    shapes = principal(np.array([two.c[:, r * m + 1 : (r + 1) * m] for r in (0, 1)]))
+    strength = np.linalg.norm(shapes, axis=1)
+    alike = assurance(shapes[0].tolist(), shapes[1].tolist()) > _ALIKE or strength.min() < _WEAK * strength.max()
+    if gain < 0 or alike or not (damped and near):
+        return [c]
+    return [_Candidate(pole=complex(p)) for p in found[:2]]
 
 
 def _fit(lines: Spectra, k: int, poles: Complex, c: _Candidate, *, judge: bool) -> None:
@@ -306,7 +329,7 @@ def _same(one: _Candidate, other: _Candidate, step: float) -> bool:
         return True
     if one.shape.size < 2 or other.shape.size < 2:
         return apart < (0.1 if not one.shape.size else 0.5) * width
-    return apart < width and assurance(one.shape.tolist(), other.shape.tolist()) > 0.9
+    return apart < width and assurance(one.shape.tolist(), other.shape.tolist()) > _ALIKE
 
 
 # --- the result -----------------------------------------------------------------------------------------------------
