@@ -32,6 +32,7 @@ _FEWEST = 24  # lines of a window to either side, at least
 _SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
 _LEVERAGE = 0.9  # most that a line's own share in its fit counts
 _PASSES = 5  # at most
+_WHITE = 0.3  # correlation of what is left from line to line, up to which it is noise
 _ALIKE, _WEAK = 0.9, 0.1  # likeness of two shapes, and size of one beside the other, that make them one mode
 _SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's frequency that must be the mode's ...
 _CLEAR = 10.0  # ... the less where it stands so many times out of what is left
@@ -239,6 +240,8 @@ def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float],
 
 def _split(lines: Spectra, k: int, poles: Complex, c: _Candidate) -> list[_Candidate]:
     """Two modes of different shape where one pole stands for both, else the one."""
+    if c.correlation < _WHITE:  # what one pole leaves of two is no noise
+        return [c]
     window, inside, at = _window(lines, k, poles)
     n, m = lines.Y.shape[1], lines.U.shape[1]
     if n < 2 or window.lines.omega.size < 2 * (window.smooth.shape[1] + m * (inside.size + 1)):
