@@ -9,6 +9,7 @@ import ambid
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop, identify_controller
 from ambid.control.measured import measured_sensitivity
+from ambid.errors import EstimationError
 from ambid.rotor.spectra import find_excitation, period_spectra
 from ambid.simulation.plant import fed_back
 from tests.rotor_benches import model_of, needs_simulator, rig_of, truth
@@ -116,3 +117,25 @@ def test_estimate_of_a_rotor_comes_back_from_its_file(rigid, tmp_path):
     again = ambid.load(tmp_path / "e.json")
     assert again.sensitivity == rigid[1].sensitivity
     np.testing.assert_array_equal(again.covariance, rigid[1].covariance)
+
+
+def test_a_controller_that_computes_with_other_signals_than_are_logged_is_not_taken(rigid):
+    """With noise of the log the coil's equation passes for the controller: the peaks would be wrong by 20 dB."""
+    from ambid.job.closed_loop import controller_of, loop_of
+
+    bench, estimate = rigid
+    rng, record = np.random.default_rng(5), record_of(bench)
+    sizes = {"V": 0.0, "A": 1e-3, "m": 1e-7}
+    noise = {c.name: sizes[c.unit] * rng.standard_normal(record.n_samples) for c in record.channels}
+    noisy = replace(
+        record,
+        channels=tuple(
+            c if c.name.endswith("reference") else replace(c, values=c.values + noise[c.name]) for c in record.channels
+        ),
+    )
+    spectra = period_spectra(noisy, estimate.plant, find_excitation(noisy, estimate.plant))
+    with pytest.raises(EstimationError, match="misses"):
+        controller_of(plant_of(bench), free_rig(bench), spectra)
+    ruled = loop_of(estimate, replace(free_rig(bench), loop=rig_of(bench).loop), bench.rate, spectra)
+    assert ruled.controller.source == "rig"
+    assert [p.decibel for p in ruled.peaks()] == pytest.approx(peaks_of(bench), abs=0.1)

@@ -10,6 +10,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import Controller, controller_of_loop, identify_controller
+from ambid.control.margins import MISFIT
 from ambid.control.measured import MeasuredSensitivity, measured_locally, measured_sensitivity
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
@@ -60,30 +61,42 @@ def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:
 
 
 def controller_of(plant: Plant, rig: Rig, spectra: PeriodSpectra | None) -> Controller:
-    """Return the controller: of the record, else of the rig; EstimationError where neither says what it is."""
+    """Return the controller: of the record, else of the rig; EstimationError where neither says what it is.
+
+    With noise between what is logged and what the controller computes with, the coil's own equation fits as well as the
+    controller's: one that misses more than `MISFIT` of the inputs is not taken.
+    """
+    missed: float | None = None
     if spectra is not None and spectra.R is not None:
         own = [[k for k in pair if k >= 0] for pair in fed_back(plant.model)]
         found = identify_controller(
             spectra.frequency_hz, spectra.mean_u, spectra.mean_y, spectra.R, rate_hz=spectra.rate_hz, own=own
         )
         back = np.einsum("kuy,ky->ku", found.response(spectra.frequency_hz)[0], spectra.mean_y)
-        if np.max(np.abs(back)) >= _NO_FEEDBACK * np.max(np.abs(spectra.mean_u)):
+        if np.max(np.abs(back)) < _NO_FEEDBACK * np.max(np.abs(spectra.mean_u)):
+            raise EstimationError(
+                "the inputs of the record follow its references alone: no loop is closed, and none has margins. Record "
+                "the levitated rotor"
+            )
+        if found.misfit <= MISFIT:
             return found
-    elif rig.loop is not None and rig.loop.closed and not rig.open_loop:
+        missed = found.misfit
+    if rig.loop is not None and rig.loop.closed and not rig.open_loop:
         return controller_of_loop(rig.loop, plant.model, plant.rate_hz)
-    elif rig.open_loop:
+    if rig.open_loop:
         raise EstimationError(
             "the rig declares its records open_loop: no loop is closed, and none has margins. Record the levitated "
             "rotor"
         )
-    else:
+    if missed is not None:
         raise EstimationError(
-            "neither a reference in the record nor [loop] in the rig says what the controller is. Log the excitation "
-            "as reference, or give [loop]"
+            f"a linear controller misses {missed:.2g} of the inputs of the record, and what it seems to be may be far "
+            "off: it computes with other signals than those that are logged, or inputs are limited. Log what it "
+            "computes with, or give [loop] in the rig"
         )
     raise EstimationError(
-        "the inputs of the record follow its references alone: no loop is closed, and none has margins. Record the "
-        "levitated rotor"
+        "neither a reference in the record nor [loop] in the rig says what the controller is. Log the excitation as "
+        "reference, or give [loop]"
     )
 
 
@@ -124,13 +137,13 @@ def measure(
 ) -> tuple[MeasuredSensitivity | None, ...]:
     """Return the sensitivity as the record shows it, by axis.
 
-    Without a reference, the excitation is what the inputs hold beside the controller's own answer.
+    Where the controller is the rig's, the excitation is what the inputs hold beside the controller's own answer.
     """
     none = (None,) * len(loop.plant.axes)
     if spectra is None:
         return none
     at = loop.at(spectra.frequency_hz)
-    if spectra.R is None:
+    if spectra.R is None or loop.controller.source == "rig":
         implied = spectra.mean_u + np.einsum("kuy,ky->ku", at.K, spectra.mean_y)
         return measured_sensitivity(replace(spectra, R=implied), at, silent=_IMPLIED)
     if spectra.n_periods > 1:

@@ -79,10 +79,13 @@ def identify_rotor(
             rig=rig_entry(rig), warnings=[*warnings, *found.warnings],
         )  # fmt: skip
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
-        loop, sensitivity = _loop(estimate, rig, clean[fastest], found.seen[fastest])
+        loop, sensitivity, said = _loop(estimate, rig, clean[fastest], found.seen[fastest])
         synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
     clock.lap("checks")
-    return replace(estimate, sensitivity=sensitivity, synchronous=synchronous, timing_s=clock.laps, used=tuple(benches))
+    return replace(
+        estimate, sensitivity=sensitivity, synchronous=synchronous, warnings=(*estimate.warnings, *said),
+        timing_s=clock.laps, used=tuple(benches),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -181,17 +184,17 @@ def _delays(rig: Rig) -> list[float | None]:
 
 def _loop(
     estimate: RotorEstimate, rig: Rig, bench: Record, spectra: PeriodSpectra | None
-) -> tuple[ClosedLoop | None, Mapping[str, Any]]:
-    """Return the closed loop of a record, and the peaks of its sensitivity; None where its controller is not known."""
+) -> tuple[ClosedLoop | None, Mapping[str, Any], tuple[str, ...]]:
+    """Return the closed loop of a record, the peaks of its sensitivity, warnings; None: its controller is not known."""
     from ambid.control.margins import sensitivity_by_axis
     from ambid.job.closed_loop import loop_of, measure, spectra_of
 
     seen = spectra_of(bench, estimate.plant, estimate.speed) if spectra is None else spectra
     try:
         loop = loop_of(estimate, rig, bench.rate_hz, seen, estimate.speed)
-    except EstimationError:
-        return None, {}
-    return loop, plain_json(sensitivity_by_axis(loop, measure(loop, bench, seen)))
+    except EstimationError as error:
+        return None, {}, (f"no sensitivity: {error}",) if seen is not None and seen.R is not None else ()
+    return loop, plain_json(sensitivity_by_axis(loop, measure(loop, bench, seen))), ()
 
 
 def _synchronous(
