@@ -18,6 +18,7 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, origin, rig_entry
 from ambid.job.rotor_records import read_records
+from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
@@ -65,6 +66,7 @@ def identify_rotor(
         given = model.speed if len(taken) == 1 else 0.0  # the rig's is that of one record
         warnings += x.warnings(r.name, given if r.speed is None else r.speed)
     clean, speeds, excitations = ([getattr(x, q) for x in turning] for q in ("record", "speed", "excitation"))
+    rig = _turning_rig(rig, max(speeds, key=abs))
     clock.lap("periods")
     with one_thread():
         periodic = [x for x in excitations if x is not None]
@@ -86,6 +88,15 @@ def identify_rotor(
         estimate, sensitivity=sensitivity, synchronous=synchronous, warnings=(*estimate.warnings, *said),
         timing_s=clock.laps, used=tuple(benches),
     )  # fmt: skip
+
+
+def _turning_rig(rig: Rig, speed: float) -> Rig:
+    """Return a rig with the polar moment of inertia of a rotor that turns, also where it thinks of a rotor at rest."""
+    assert rig.rotor is not None
+    if not rig.rotor.at_speed(speed).turning or any(p.name == "Ip" for p in rig.parameters):
+        return rig
+    polar = Parameter(name="Ip", unit="kg m^2", role="free")
+    return replace(rig, rotor=replace(rig.rotor, polar=True), parameters=(*rig.parameters, polar))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

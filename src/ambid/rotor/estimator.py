@@ -40,6 +40,7 @@ _LEAST_LINES = 24
 _MOST_MODES = 9
 _WHOLE = 2e-3  # samples by which a delay may miss a whole number however exact it is
 _SAME_SPEED = 0.01  # relative difference of speeds that count as one for the start
+_POLAR = np.concatenate([[1e-6], np.geomspace(0.01, 2.0, 32)])  # of Ip over Id, and of gyroscopic terms over w/W
 _EDDY_STARTS = tuple(2.0 * np.pi * f for f in (300.0, 1000.0, 3000.0))
 
 
@@ -252,16 +253,13 @@ class _Work:
         theta = dict(at.theta)
         theta.setdefault("Ip", 0.2 * theta["Id"])
         theta |= {p.name: theta.get(p.name, 0.0) for p in model.at_speed(1.0).mode_parameters}
-        at = replace(at, theta=theta)
-        for name in ["Ip", *(f"gyro.{r}{r}" for r in range(1, model.n_modes + 1))] * 2:
-            W = abs(fast[-1].speed)
-            size = theta["Id"] if name == "Ip" else theta[f"mode{name[5:][: len(name[5:]) // 2]}.omega"] / W
-            costs = []
-            for x in size * np.concatenate([[0.0], np.geomspace(0.01, 1.0, 30)]):
-                trial = replace(at, theta={**at.theta, name: float(x) if x else 1e-6 * size})
-                problem = self.problem(fast, model, trial, [rough_weight(e, model, trial, _RELATIVE) for e in fast])
-                costs.append((problem.cost(problem.pack(trial)), trial))
-            at = min(costs, key=lambda c: c[0])[1]
+        at, W = replace(at, theta=theta), abs(fast[-1].speed)
+        sizes = {} if any(p.name == "Ip" and p.role == "fixed" for p in self.parameters) else {"Ip": theta["Id"]}
+        sizes |= {f"gyro.{r}{r}": theta[f"mode{r}.omega"] / W for r in range(1, model.n_modes + 1)}
+        for name, size in list(sizes.items()) * 2:
+            problem = self.problem(fast, model, at, [rough_weight(e, model, at, _RELATIVE) for e in fast])
+            trials = [replace(at, theta={**at.theta, name: float(x * size)}) for x in _POLAR]
+            at = min(trials, key=lambda t: replace(problem, base=t).cost(problem.pack(t)))
         return at
 
     def finish(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> RotorFit:
