@@ -140,4 +140,6 @@ def test_a_whirl_diagram_is_drawn_where_what_turns_is_known() -> None:
     blocks = RotorEvidence(estimate=turning).drawings()
     assert {"campbell", "shapes", "response_across"} <= set(blocks)
     heads = [a.get_title(loc="left") for a in single(blocks["campbell"]).axes]
-    assert heads[0] == f"critical speed {918.0 / np.sqrt(1 - 0.1) * 30 / np.pi:.0f} 1/min"  # W²(1 - g) = w²
+    assert (
+        heads[0] == f"critical speed {918.0 / np.sqrt(1 - 0.1) * 30 / np.pi:.0f} 1/min, without bearings"
+    )  # W²(1 - g) = w²

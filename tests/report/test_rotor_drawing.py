@@ -65,7 +65,7 @@ def test_the_campbell_diagram_marks_the_critical_speeds_of_the_identified_lines(
     marked = [float(x.get_xdata()[0]) for x in axes.lines if x.get_label() == "critical speed"]
     forward = [c.speed / RPM for c in found.critical_speeds() if c.direction > 0]
     assert marked == pytest.approx(forward)
-    assert axes.get_title(loc="left") == f"critical speed {forward[0]:.0f} 1/min"
+    assert axes.get_title(loc="left") == f"critical speed {forward[0]:.0f} 1/min, without bearings"
     assert len(axes.collections) == found.frequency.shape[1]  # a band for every line
 
 
