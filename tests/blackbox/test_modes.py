@@ -95,6 +95,15 @@ def test_a_resonance_that_wanders_is_one_mode_and_said_to_be_no_linear_one():
     assert bent.verdict.word == "caution"
 
 
+def test_two_modes_within_a_bandwidth_are_two():
+    rng, u = np.random.default_rng(12), sweep(8.0)
+    y, _ = structure(((120.0, 0.003), (120.2, 0.003)), u, rng, quadratic=0.03)
+    near = find_modes(io(y, u), band=(60.0, 200.0))
+    assert len(near.modes) == 2
+    for m, f in zip(near.modes, (120.0, 120.2), strict=True):
+        assert abs(m.frequency_hz.value - f) < 4 * m.frequency_hz.sd < 0.1
+
+
 def test_one_output_is_enough():
     rng, u = np.random.default_rng(7), sweep(8.0)
     y, _ = structure(((120.0, 0.004), (260.0, 0.005)), u, rng, n_outputs=1, noise=0.02)
