@@ -34,6 +34,7 @@ _REFINED = 0.01  # the same, of a model that is complete but for small modes
 _FITS = 1.6  # mean square of residuals up to which a band is explained
 _WIDER = 1.5  # by which the band grows
 _ABOVE = 1.5  # how far above the band a mode may be that shows in it
+_CLEAR = 0.5  # part of the residuals that a mode explains, from which no sensor is asked
 _FAR_ABOVE = 2.0
 _BESIDE = 1.05  # how far a mode may stand from where the rig says, or from the highest line
 _LEAST_LINES = 24
@@ -212,7 +213,10 @@ class _Work:
             while cost > _FITS:
                 weight = rough_weight(band[0], model, at, _RELATIVE)
                 found = self.missing(band[0], model, at, weight, _ABOVE, last)
-                if found is None or self._sensors(band, model, at, [weight]) > found.gain:
+                if found is None:
+                    break
+                unclear = found.gain < _CLEAR * cost * 2 * band[0].spectra.mean_y.size
+                if unclear and self._sensors(band, model, at, [weight]) > found.gain:
                     break
                 more = model.with_modes(model.n_modes + 1)
                 trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))

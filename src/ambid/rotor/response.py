@@ -13,7 +13,7 @@ D_ij = (h_z(s_i) - h_z(s_j))/(s_i - s_j) (Daleckii and Krein 1965; Higham 2008, 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -22,6 +22,7 @@ from ambid.arrays import Array, Complex
 from ambid.physics.linear_model import StateSpace
 
 _SAME = 1e-7  # distance of eigenvalues, over their size, from which the divided difference is the derivative
+_BLOCK = 512  # lines
 _SMALL = 1e-5  # s T below which series are taken
 _REST = 1e-9  # an eigenvalue at 0 stands here, 1/s
 
@@ -128,6 +129,11 @@ class Sampled:
 
         `U`: (n_lines, n_u). Returns (n_lines, n_y, n_directions + n_delays).
         """
+        if self.omega.size > _BLOCK:  # a block's arrays stay in the cache
+            blocks = [slice(k, k + _BLOCK) for k in range(0, self.omega.size, _BLOCK)]
+            return np.concatenate(
+                [replace(self, omega=self.omega[b]).slopes(U[b], directions, n_delays) for b in blocks]
+            )
         s, V, inverse = self.eigen
         n, left, late = s.size, self.space.C @ V, U * self.late()
         right = inverse @ self.space.B
