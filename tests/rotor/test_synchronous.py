@@ -1,4 +1,4 @@
-"""Speed, synchronous response, unbalance and run-out of the independent simulator's spinning rotor."""
+"""Speed, synchronous response, unbalance and runout of the independent simulator's spinning rotor."""
 
 import dataclasses
 import functools
@@ -8,7 +8,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.record import Channel, Record
-from ambid.rotor.balance import Machine, Turned, balance_rotor, estimate_unbalance, read_by
+from ambid.rotor.balance import Machine, Turned, balance_by_trials, balance_rotor, estimate_unbalance, read_by
 from ambid.rotor.likelihood import Point
 from ambid.rotor.spectra import period_spectra
 from ambid.rotor.synchronous import rotation_of, separate
@@ -168,7 +168,7 @@ def _mirrored(covariance):
 
 
 def test_a_rotor_without_voltages_needs_two_speeds():
-    """Far above its rigid modes a rotor turns about its centre of gravity at any speed, as a run-out does."""
+    """Far above its rigid modes a rotor turns about its centre of gravity at any speed, as a runout does."""
     parts = []
     for rpm in (17777.0, 12000.0):
         bench, model, theta, record = spinning(rpm)
@@ -208,7 +208,7 @@ def test_influence_and_feedback_predict_the_synchronous_response():
     reference = separate(quiet, quiet_model).response
     silent = np.array([reference.of(role) for role in (*machine.model.inputs, *machine.model.outputs)])
     assert np.abs((measured - silent) / sd).max() < 5.0
-    # what it makes of the true unbalance and run-out, at both ends of the loop
+    # what it makes of the true unbalance and runout, at both ends of the loop
     model, loop = machine.model, turned.loop(machine)
     planes, run_out = planes_of(bench), sum(read_by(model).values()) * bench.runout * np.exp(1.1j)
     of_unbalance = machine.forced(turned.response.speed, machine.shapes) @ planes
@@ -274,3 +274,36 @@ def test_a_bending_rotor_needs_two_speeds_or_the_plane_of_its_unbalance():
     assert deviations(known, np.array([true])).max() < 3.5
     assert abs(known.value[0] / true - 1.0) < 0.04  # of 0.75 s
     assert known.entry("disc")["identifiable"]
+
+
+def test_trial_weights_balance_without_a_model():
+    """The rotor answers linearly: with noise, the correction scatters as its standard deviations say."""
+    rng = np.random.default_rng(3)
+    A = rng.standard_normal((4, 2)) + 1j * rng.standard_normal((4, 2))
+    true, sd = np.array([3e-6 + 1e-6j, -2e-6j]), 2e-8
+    weights = {"A.z": (2e-6, 0.3), "B.z": (3e-6, -1.0)}
+
+    def run(u):
+        y = A @ (true + u) + sd * (rng.standard_normal(4) + 1j * rng.standard_normal(4))
+        of = zip(truth.AXES, y, strict=True)
+        response = {
+            f"{a}_position": {"amplitude": [abs(x)], "phase": [np.angle(x)], "sd": [sd]} for a, x in of
+        }  # fmt: skip
+        return {"record": 0, "speed": 900.0, "response": response}
+
+    deviations = []
+    for _ in range(60):
+        trials = {
+            p: (run(size * np.exp(1j * phase) * np.eye(2)[k]), size, phase)
+            for k, (p, (size, phase)) in enumerate(weights.items())
+        }
+        said = balance_by_trials(run(np.zeros(2)), trials)["balancing"]
+        for u, c in zip(-true, said["correction"].values(), strict=True):
+            deviations += [
+                (c["value"] - abs(u)) / c["sd"],
+                np.angle(np.exp(1j * (c["phase"] - np.angle(u)))) / c["phase_sd"],
+            ]
+    assert 0.8 < np.sqrt(np.mean(np.square(deviations))) < 1.2
+    assert all(x["after"] < 0.2 * x["before"] for x in said["vibration"])
+    with pytest.raises(EstimationError, match="same speed"):
+        balance_by_trials(run(np.zeros(2)), {"A.z": ({**run(np.zeros(2)), "speed": 950.0}, 1e-6, 0.0)})

@@ -215,7 +215,7 @@ def _synchronous(
     loop: ClosedLoop | None,
     rig: Rig,
 ) -> Mapping[str, Any]:
-    """Return what the synchronous responses say of unbalance and run-out; empty where the rotor stood still."""
+    """Return what the synchronous responses say of unbalance and runout; empty where the rotor stood still."""
     from ambid.rotor.balance import Machine, Turned, balance_rotor
 
     def controller(speed: float) -> Complex | None:

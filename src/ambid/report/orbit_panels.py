@@ -1,4 +1,4 @@
-"""What turns with a rotor, as text and panels: unbalance, run-out, correction masses, orbits against the clearance."""
+"""What turns with a rotor, as text and panels: unbalance, runout, correction masses, orbits against the clearance."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ _UNSEEN = "✗ not identifiable"
 
 
 def synchronous_lines(estimate: RotorEstimate, width: int) -> list[str]:
-    """Return unbalance, run-out and correction masses as text; nothing of a rotor that stood still."""
+    """Return unbalance, runout and correction masses as text; nothing of a rotor that stood still."""
     s = estimate.synchronous
     if not s:
         return []
@@ -50,7 +50,7 @@ def unbalance_rows(s: Mapping[str, Any]) -> list[tuple[str, ...]]:
         if one and one["fits"]:
             rows.append(("  all in one plane", quantity(one["z"], one["sd"], "m").text, "", ""))
     rows += [_row(f"{name} beyond", m, "kg^(1/2) mm", 1e3, "") for name, m in s["unbalance"]["modes"].items()]
-    rows += [_row(f"run-out, {_plane(place)}", r, "", 1e6, "um") for place, r in s["runout"].items()]
+    rows += [_row(f"runout, {_plane(place)}", r, "", 1e6, "um") for place, r in s["runout"].items()]
     if "balancing" in s:
         rows += [
             _row(f"to add, {_plane(name)}", {**c, "identifiable": True}, "", 1e6, "g mm")
@@ -234,4 +234,4 @@ def _vibration(axes: Axes, s: Mapping[str, Any]) -> None:
     names = [x["sensor"].removesuffix("_position") + (f"\n{speed[x['record']]:.0f}" if many else "") for x in found]
     axes.set_xticks(at, names)
     axes.set_ylabel(f"amplitude [{unit}]")
-    head(axes, "synchronous motion at the sensors, run-out taken off")
+    head(axes, "synchronous motion at the sensors, runout taken off")

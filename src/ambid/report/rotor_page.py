@@ -47,7 +47,7 @@ _CAPTIONS: Mapping[str, tuple[str, str]] = {
     ),
     "orbits": (
         "Orbits",
-        "Above what turns with the rotor, run-out of the sensors included, below what does not, beside the clearance.",
+        "Above what turns with the rotor, runout of the sensors included, below what does not, beside the clearance.",
     ),
     "unbalance": (
         "Unbalance",
@@ -113,7 +113,7 @@ def _titles(drawn: Mapping[str, object], e: RotorEstimate) -> list[tuple[str, st
 def _turning(e: RotorEstimate) -> Section:
     s = e.synchronous
     tables = [rows for rows in (unbalance_rows(s), vibration_rows(s)) if rows]
-    return Section(title="Unbalance and run-out", tables=tables, note=s["hint"] or "1 g mm is 1e-6 kg m.")
+    return Section(title="Unbalance and runout", tables=tables, note=s["hint"] or "1 g mm is 1e-6 kg m.")
 
 
 def _parameters(e: RotorEstimate) -> Section:

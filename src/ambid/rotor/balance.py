@@ -1,10 +1,10 @@
-"""Unbalance, run-out and balancing of a rotor from synchronous responses and its identified model.
+"""Unbalance, runout and balancing of a rotor from synchronous responses and its identified model.
 
 At the speed W the outputs obey y = H(jW) v + X u + r whatever controller holds the rotor: H the plant from its inputs,
 X its response to unbalances u = U exp(j phase), whose force is U W² (cos, sin)(angle + phase) in the planes x and y, so
-that they turn with the rotor from x to y, and r the run-out of the sensors. Both u and r are found by generalised least
+that they turn with the rotor from x to y, and r the runout of the sensors. Both u and r are found by generalised least
 squares over all records; weights count the noise between lines and the covariance of the plant, which is common to all.
-Currents see the rotor through the voltage that its motion induces, and no run-out; two speeds tell the two apart by W².
+Currents see the rotor through the voltage that its motion induces, and no runout; two speeds separate the two by W².
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array, Complex
+from ambid.errors import EstimationError
 from ambid.estimation.linear import directions
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.estimate import RotorEstimate
@@ -28,10 +29,11 @@ from ambid.rotor.synchronous import SynchronousResponse
 _NO_PLANES: Mapping[str, tuple[float, ...]] = MappingProxyType({})
 _BEYOND = 3.0  # prior of what a mode sees beyond the planes, over mass, motion and shape
 _ROUNDS = 3  # the plant's share of the covariance follows the unbalance
-_SEEN = 0.25  # standard deviation over size, up to which an unbalance or a run-out is identified
+_SEEN = 0.25  # standard deviation over size, up to which an unbalance or a runout is identified
 _LINES = 16  # excited lines on either side that show the response to the excitation at a harmonic
 _ONE_PLANE = 3.0  # standard deviations within which an unbalance is that of one plane
 _SHOWN = 240  # samples of an orbit that a result keeps for its figure
+_SAME_SPEED = 0.01
 _FAR = 4.5  # standard deviations from which the response is not explained
 _CIRCLE_95 = 2.4477468306808166  # radius that holds 95 % of a round normal distribution, in standard deviations
 
@@ -117,7 +119,7 @@ class Machine:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unbalance:
-    """Unbalance by plane, modal unbalance and run-out, as one vector of complex numbers with its covariance."""
+    """Unbalance by plane, modal unbalance and runout, as one vector of complex numbers with its covariance."""
 
     names: tuple[str, ...]  # of planes, "mode1" …, sensor planes
     value: Complex  # (n,); kg m, kg^(1/2) m, m
@@ -155,7 +157,7 @@ def estimate_unbalance(
     *,
     runout: Mapping[str, complex] | None = None,
 ) -> Unbalance:
-    """Estimate unbalance in planes, what bending modes see beyond it, and run-out of the sensors.
+    """Estimate unbalance in planes, what bending modes see beyond it, and runout of the sensors.
 
     `runout`: of sensor planes where it is known, m; the others' is estimated. What modes see beyond the planes has a
     wide prior, by the mass times the largest motion.
@@ -204,7 +206,7 @@ def _sizes(A: Array, b: Array, u: Complex) -> Array:
 
 
 def read_by(model: RotorModel) -> dict[str, Complex]:
-    """Return by sensor plane what its run-out exp(j phase) does to the outputs: cos(angle + phase) in x, sin in y."""
+    """Return by sensor plane what its runout exp(j phase) does to the outputs: cos(angle + phase) in x, sin in y."""
     found: dict[str, Complex] = {}
     for row, (j, k) in enumerate(model.sensors):
         bearing, plane = model.placed[j]
@@ -348,7 +350,7 @@ def balance_rotor(
     runout: Mapping[str, complex] | None = None,
     clearance: float | None = None,
 ) -> dict[str, Any]:
-    """Return unbalance, run-out, influence and a proposal for balancing as `RotorEstimate.synchronous` keeps them.
+    """Return unbalance, runout, influence and a proposal for balancing as `RotorEstimate.synchronous` keeps them.
 
     `clearance`: radius in m within which the rotor may move.
     """
@@ -435,7 +437,7 @@ def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance) -> dict[st
             opposite = {p: polar(-complex(u.value[j]), u.part([p])[1]) for j, p in enumerate(planes)}
             return {} if machine.model.n_modes else {"balancing": {"correction": opposite, "vibration": []}}
         X = loop @ machine.forced(t.response.speed, machine.shapes)
-        shaken = [(loop - np.eye(loop.shape[0])) @ sensors[p] for p in free]  # by a run-out that the loop follows
+        shaken = [(loop - np.eye(loop.shape[0])) @ sensors[p] for p in free]  # by a runout that the loop follows
         moved.append(np.column_stack([X, *shaken])[rows])
         influence += [
             {
@@ -478,18 +480,110 @@ def _hint(unseen: Sequence[str], u: Unbalance, machine: Machine, *, marked: bool
     """Say what stands against the numbers; empty where nothing does."""
     if unseen and machine.beyond:
         return (
-            f"unbalance in {', '.join(unseen)}, what bending modes see and run-out cannot be told apart: take records "
+            f"unbalance in {', '.join(unseen)}, what bending modes see and runout cannot be separated: take records "
             "at more speeds, or give the planes in which it stands ([unbalance.X], with [shaft])"
         )
     if unseen:
         more = "a second record at another speed" if records == 1 else "a record at a speed further off"
         return (
-            f"unbalance in {', '.join(unseen)} and run-out of the sensors cannot be told apart: take {more}, log the "
-            "voltages, or give the run-out in the rig"
+            f"unbalance in {', '.join(unseen)} and runout of the sensors cannot be separated: take {more}, log the "
+            "voltages, or give the runout in the rig"
         )
     if u.freedom and (u.misfit - 1.0) * np.sqrt(u.freedom / 2.0) > _FAR:
         return (
-            f"unbalance and run-out leave {u.misfit:.3g} times the noise of the synchronous response: speed, planes or "
+            f"unbalance and runout leave {u.misfit:.3g} times the noise of the synchronous response: speed, planes or "
             "modes may be wrong, or another force turns with the rotor"
         )
     return "" if marked else "phases count from the first sample: log the angle or pulses to know where the mass is"
+
+
+# --- trial weights --------------------------------------------------------------------------------------------------
+
+
+def balance_by_trials(
+    base: Mapping[str, Any], trials: Mapping[str, tuple[Mapping[str, Any], float, float]]
+) -> dict[str, Any]:
+    """Balance a rotor by trial weights: from how each one changed the synchronous motion, without any model.
+
+    Influence coefficients are a = (y_trial - y_base)/u_trial; the correction is the least-squares solution of
+    y_base + a u = 0 (Goodman 1964, J. Eng. Ind. 86, 273). Runout is in these motions and is balanced as if it were
+    motion: far below a critical speed, take it off before.
+
+    Parameters
+    ----------
+    base : Mapping
+        Entry of ``synchronous["records"]`` of an estimate, without trial weight.
+    trials : Mapping of str to (Mapping, float, float)
+        By plane such an entry at the same speed, mass times radius in kg m of the trial weight, and its angle in rad.
+
+    Returns
+    -------
+    dict
+        ``influence`` and ``balancing`` as in `RotorEstimate.synchronous`.
+
+    Raises
+    ------
+    EstimationError
+        If the speeds differ by more than 1 %, or the records have no position in common.
+
+    Examples
+    --------
+    >>> def run(amplitude, phase):
+    ...     seen = {"amplitude": [amplitude], "phase": [phase], "sd": [1e-9]}
+    ...     return {"record": 0, "speed": 1e3, "orders": [1], "response": {"ax_position": seen}}
+    >>> found = balance_by_trials(run(4e-6, 0.0), {"A": (run(6e-6, 0.0), 1e-6, 0.0)})
+    >>> add = found["balancing"]["correction"]["A"]
+    >>> f"{1e6 * add['value']:.3f} g mm at {add['phase']:.3f} rad"
+    '2.000 g mm at 3.142 rad'
+    """
+    runs = [base, *(run for run, _, _ in trials.values())]
+    if any(abs(run["speed"] / base["speed"] - 1.0) > _SAME_SPEED for run in runs):
+        said = ", ".join(f"{run['speed'] * 30.0 / np.pi:.5g}" for run in runs)
+        raise EstimationError(
+            f"the runs are at {said} rpm; influence holds at one speed. Repeat them at the same speed"
+        )
+    roles = [x for x in base["response"] if "_position" in x and all(x in run["response"] for run in runs)]
+    if not roles:
+        raise EstimationError("the runs have no position in common. Take them with the same sensors")
+    weights = np.array([size * np.exp(1j * phase) for _, size, phase in trials.values()])
+    seen = [[run["response"][role] for role in roles] for run in runs]
+    Y = np.array([[x["amplitude"][0] * np.exp(1j * x["phase"][0]) for x in row] for row in seen])
+    sd = np.array([[x["sd"][0] for x in row] for row in seen])
+
+    def solve(Y: Complex) -> tuple[Complex, Complex, Complex]:
+        A = ((Y[1:] - Y[0]) / weights[:, None]).T
+        add = -np.linalg.pinv(A) @ Y[0]
+        return A, add, Y[0] + A @ add
+
+    A, add, left = solve(Y)
+    steps = [(k, 1j**part) for k in np.ndindex(Y.shape) for part in (0, 1)]
+    slopes = []  # what one standard deviation of each measured number does to the correction
+    for k, way in steps:
+        moved = Y.copy()
+        moved[k] += way * sd[k]
+        slopes.append(solve(moved)[1] - add)
+    D = np.array(slopes).T
+    half = np.concatenate([D.real, D.imag])
+    spread = [float(np.linalg.norm(_through(row[None, :], half), 2)) for row in A]
+    return {
+        "influence": [
+            {
+                "record": base["record"], "plane": plane,
+                "sensors": {
+                    role: {"value": float(abs(A[k, j])), "phase": float(np.angle(A[k, j]))}
+                    for k, role in enumerate(roles)
+                },
+            }
+            for j, plane in enumerate(trials)
+        ],
+        "balancing": {
+            "correction": {p: polar(complex(add[j]), half[[j, len(trials) + j]]) for j, p in enumerate(trials)},
+            "vibration": [
+                {
+                    "record": base["record"], "sensor": role, "before": float(abs(Y[0, k])),
+                    "after": float(abs(left[k])), "at_most": float(abs(left[k]) + _CIRCLE_95 * spread[k]),
+                }
+                for k, role in enumerate(roles)
+            ],
+        },
+    }  # fmt: skip

@@ -89,7 +89,7 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
           ``one_plane``: where along the shaft it stands if ``fits`` one plane.
         - ``runout``: of the sensors by their plane, m; x reads value cos(angle + phase), y the sine.
         - ``influence``: by record and plane, motion at each position sensor of 1 kg m, m.
-        - ``balancing``: ``correction`` by plane in kg m, and ``vibration`` at each sensor in m without run-out:
+        - ``balancing``: ``correction`` by plane in kg m, and ``vibration`` at each sensor in m without runout:
           ``before``, expected ``after``, and ``at_most`` with 95 %.
     validation : Mapping[str, object] or None
     warnings : tuple of str
