@@ -9,11 +9,12 @@ import pytest
 
 import ambid
 from ambid.errors import EstimationError
+from ambid.job.fits import physics
 from ambid.job.rotor import replays_of
 from ambid.report.drawing import NARROW, single
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
 from ambid.report.rotor_page import rotor_page
-from tests.report.rotor_record import estimate, record
+from tests.report.rotor_record import estimate, record, rig
 
 
 def test_a_rotor_has_one_table_for_itself_and_one_for_each_bearing() -> None:
@@ -143,3 +144,22 @@ def test_a_whirl_diagram_is_drawn_where_what_turns_is_known() -> None:
     assert (
         heads[0] == f"critical speed {918.0 / np.sqrt(1 - 0.1) * 30 / np.pi:.0f} 1/min, without bearings"
     )  # W²(1 - g) = w²
+
+
+def test_a_second_record_given_with_the_first_is_judged_beside_it(tmp_path: Path) -> None:
+    e = ambid.identify(record(), rig(known=False), validate=record(2))
+    assert e.validation is not None
+    assert "on the second record (15000 samples)" in e.summary()
+    assert "On the second record" in [s.title for s in rotor_page(RotorEvidence(estimate=e)).sections]
+    e.save(tmp_path / "e.json")
+    assert ambid.load(tmp_path / "e.json").summary() == e.summary()
+
+
+def test_a_rig_of_a_rotor_is_refused_where_one_axis_is_meant() -> None:
+    for verb in (
+        lambda: ambid.frf(record(), rig=rig(known=False)),
+        lambda: physics(ambid.fit(record(), structure="arx", orders="na=1,nb=1,nk=1", input="ax_voltage",
+                                  output="ax_current", rig=rig(known=False)), rig(known=False)),
+    ):  # fmt: skip
+        with pytest.raises(EstimationError, match="--rig of a rotor on many axes is for 'ambid identify'"):
+            verb()

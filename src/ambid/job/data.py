@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
 
 from ambid.errors import EstimationError
-from ambid.physics.linear_model import model
 from ambid.record import GapPolicy, Record, cut, read_record
 from ambid.record import Source as Source
 from ambid.rig import Rig, default_rig, load_rig, read_bench, rig_text
@@ -219,7 +218,7 @@ class Channels:
     def _through(self, rig: Rig, record: Source, part: Part) -> IOData:
         from ambid.blackbox.data import io_data
 
-        plant = model(rig.model)
+        plant = rig.plant
         bench = read_bench(record, rig, rate_hz=self.rate_hz, gaps=self.gaps, units=self.units, beside=self.references)
         bench = _cut_by(rig, bench, part)
         inputs = [_role(x, rig, plant.inputs, "input") for x in self.inputs] or list(plant.inputs)

@@ -138,7 +138,7 @@ def fit(
     else:
         _check_linear(structure, sources, {"--settings": settings, "--seed": seed is not None})
         _check_criterion(criterion, wanted)
-        taken = channels.inputs if channels.rig is None else channels.inputs or model(channels.rig.model).inputs
+        taken = channels.inputs if channels.rig is None else channels.inputs or channels.rig.plant.inputs
         _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
     if validate is None and (validate_from_s, validate_to_s) != (None, None):
         raise EstimationError("--validate-from and --validate-to need a second record. Give --validate, or omit them")
@@ -227,6 +227,11 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
     from ambid.bearing.physical import physical_parameters
 
     bench = known_rig(rig)
+    if bench.rotor is not None:
+        raise EstimationError(
+            "--rig of a rotor on many axes is for 'ambid identify'; a fit does not lead to its parameters. Omit --rig, "
+            "and name columns by --input and --output"
+        )
     plant = model(bench.model)
     return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
 

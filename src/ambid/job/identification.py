@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.estimate import Estimate, plain_json
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
@@ -93,11 +93,13 @@ def identify(
     bench, sources = known_rig(rig), sources_of(record)
     reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
     if bench.rotor is not None:
-        from ambid.job.rotor import identify_rotor
+        from ambid.job.rotor import identify_rotor, validated
 
-        if validate is not None:
-            raise EstimationError("a second record validates one axis only; a rotor takes all records at once. Omit it")
-        return identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
+        found = identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
+        if validate is None:
+            return found
+        second = validated(found, (load_bench(validate, bench, **reading),))
+        return replace(found, validation={**second, "checks": plain_json(second["checks"])})
     if speed_rpm is not None:
         raise EstimationError("--speed is of a rotor's records; the rig has no [bearings.X]. Omit it")
     if len(sources) != 1:

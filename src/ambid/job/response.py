@@ -120,6 +120,11 @@ def frf(
         rig=rig,
     )  # fmt: skip
     bench, wanted = channels.rig, orders_of(orders)
+    if bench is not None and bench.rotor is not None:
+        raise EstimationError(
+            "--rig of a rotor on many axes is for 'ambid identify', not for a frequency response. Name columns by "
+            "--input and --output instead"
+        )
     if orders is not None and wanted is None:
         raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
     _check(wanted, state_space, feedthrough, domain, delay, bench)

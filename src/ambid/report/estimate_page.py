@@ -90,7 +90,7 @@ def estimate_page(evidence: Evidence | BearingEvidence) -> Page:
         *([] if isinstance(e, Estimate) else [_curves(e)]),
         Section(title="Delay and fit", paragraphs=delay_lines(e), tables=[output_rows(e)]),
         Section(title="Checks", tables=[check_table(e.checks)]),
-        *([] if e.validation is None else [_second(e.validation)]),
+        *([] if e.validation is None else [second_section(e.validation)]),
         *(
             Section(title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=partial(single, block))
             for name, block in evidence.drawings().items()
@@ -123,7 +123,8 @@ def _curves(e: Any) -> Section:
     return Section(title="Curves over position and current", tables=curve_rows(e), note=note)
 
 
-def _second(validation: Mapping[str, Any]) -> Section:
+def second_section(validation: Mapping[str, Any]) -> Section:
+    """Return how an estimate does on a second record, as a section."""
     tables: list[Table] = [validation_rows(validation), check_table(checks_of(validation))]
     return Section(title="On the second record", tables=tables)
 

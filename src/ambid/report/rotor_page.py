@@ -7,7 +7,7 @@ from functools import partial
 from typing import TYPE_CHECKING
 
 from ambid.report.drawing import single
-from ambid.report.estimate_page import correlations
+from ambid.report.estimate_page import correlations, second_section
 from ambid.report.numbers import sized
 from ambid.report.orbit_panels import unbalance_rows, vibration_rows
 from ambid.report.page import Page, Section, check_table
@@ -72,6 +72,7 @@ def rotor_page(evidence: RotorEvidence) -> Page:
         Section(title="Bearings", tables=[bearing_rows(e, b, b.axes) for b in e.plant.bearings], note=_SIGNS),
         *([_turning(e)] if e.synchronous else []),
         Section(title="Checks", tables=[check_table(e.checks)]),
+        *([] if e.validation is None else [second_section(e.validation)]),
         *(Section(title=t, caption=c, figure=partial(single, drawn[n])) for n, t, c in _titles(drawn, e)),
         Section(title="Noise", caption="Levels of white sources, rms of samples.", tables=[noise_rows(e)]),
         Section(

@@ -9,6 +9,7 @@ from ambid.errors import counted
 from ambid.estimation.estimate import Delay, EstimatedParameter
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.physics.shaft import Shaft
+from ambid.report.estimate_text import validation_lines
 from ambid.report.numbers import quantity, sized
 from ambid.report.orbit_panels import synchronous_lines
 from ambid.report.rotor_drawing import expected_rotor, partners_of
@@ -48,6 +49,7 @@ def rotor_text(estimate: RotorEstimate, *, shaft: Shaft | None = None, width: in
             [f"{paint(_UNSEEN, 'bad')} not identifiable from these data"] if unseen else [],
             synchronous_lines(e, width),
             check_lines(e.checks, width=width, paint=paint, above=True),
+            [] if e.validation is None else validation_lines(e.validation, width=width, paint=paint),
             warning_lines(other_warnings(e.checks, e.warnings), width=width, paint=paint),
             timing_lines(e.timing_s, paint=paint),
         ]
