@@ -47,6 +47,7 @@ _KINDS = (
     ("stable in frequency", "^", _FREQUENCY),
     ("stable in frequency, damping and shape", "o", _STABLE),
 )  # of poles, those that are stable in everything last
+_NEAR_MODE = 0.02  # of its frequency, within which a mode's peak lies
 _WIDE = 100.0  # largest over smallest frequency from which the axis is logarithmic
 
 
@@ -92,7 +93,9 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], 
     axes.set_yscale("log")
     if f.size > 1:
         axes.set_xlim(f[0], f[-1])
-    axes.set_ylim(bottom, 2.0 * float(np.max(size)))
+    # a sweep leaves noise beyond its ends, far above the modes
+    near = [size[np.abs(f / m.frequency_hz.value - 1) < _NEAR_MODE] for m in measured.modes]
+    axes.set_ylim(bottom, 2.0 * float(np.max(np.concatenate(near) if near else size)))
     _mark_modes(axes, measured.modes)
 
 
