@@ -9,12 +9,14 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.estimation.linear import one_thread
 from ambid.job.data import load_bench
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
+from ambid.rotor.conclusion import numbers_of
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.likelihood import Point
-from ambid.rotor.prediction import predictor_problem
+from ambid.rotor.prediction import predict_rotor, predictor_problem
 from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -79,3 +81,18 @@ def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
     e = innovations(problem, vector)
     assert e is not None
     assert slopes.r @ (slopes.J @ step) == pytest.approx(float(np.sum(e * along)), rel=1e-4)
+
+
+def test_both_estimators_agree_on_a_periodic_record() -> None:
+    bench = replace(truth.BENCHES["rigid"], period=0.25, periods=4)
+    record, rig = record_of(bench, 5), free_rig(bench)
+    assert isinstance(rig.rotor, RotorModel)
+    by_periods = ambid.identify(record, rig)
+    with one_thread():
+        fit = predict_rotor(load_bench(record, rig), rig.rotor, rig.parameters, speed=0.0, delays=[None] * 4)
+    numbers = numbers_of(fit)
+    apart = [(numbers.theta[p.name] - p.value) / p.sd for p in by_periods.parameters if p.role == "free"]
+    ratio = [numbers.sd(p.name) / p.sd for p in by_periods.parameters if p.role == "free"]
+    assert by_periods.method == "periods"
+    assert np.sqrt(np.mean(np.square(apart))) < 0.5
+    assert np.median(ratio) == pytest.approx(1.0, abs=0.1)

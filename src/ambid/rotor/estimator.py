@@ -31,6 +31,8 @@ from ambid.rotor.unknowns import Unknowns
 
 _RELATIVE = 0.03  # error of the model beside noise while it is incomplete
 _REFINED = 0.01  # the same, of a model that is complete but for small modes
+_UNFIT = 1.3  # mean square of its residuals from which modes are missing
+_CLEARLY = 5.0  # times what a mode costs, that it must explain to be clearly there
 _FITS = 1.6  # mean square of residuals up to which a band is explained
 _WIDER = 1.5  # by which the band grows
 _ABOVE = 1.5  # how far above the band a mode may be that shows in it
@@ -105,22 +107,36 @@ def estimate_rotor(
     return work.finish(ordered, *work.start(ordered))
 
 
-def begin_rotor(
-    experiments: Sequence[Experiment],
-    model: RotorModel,
-    parameters: Sequence[Parameter],
-    *,
-    delays: Sequence[float | None],
-    modes: RigModes = RigModes(),  # noqa: B008 - a frozen value
-    tick: Tick = silent,
-) -> tuple[RotorModel, Point]:
-    """Return start values from spectra whose noise is known beforehand: the model with its modes, and its numbers."""
-    ordered = sorted(experiments, key=lambda e: abs(e.speed))
-    work = _Work(
-        model=model.at_speed(ordered[0].speed), parameters=tuple(parameters), delays=tuple(delays), modes=modes,
-        tick=tick,
-    )  # fmt: skip
-    return work.refine(ordered, *work.start(ordered))
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Starter:
+    """Start values from spectra whose noise is known beforehand."""
+
+    model: RotorModel
+    parameters: Sequence[Parameter]
+    delays: Sequence[float | None]  # of each input in samples, None where it is searched
+    modes: RigModes
+    tick: Tick
+
+    def begin(self, experiments: Sequence[Experiment]) -> tuple[RotorModel, Point]:
+        """Return the model with the modes that are clearly there, and its numbers."""
+        ordered = sorted(experiments, key=lambda e: abs(e.speed))
+        work = self._work(self.model.at_speed(ordered[0].speed))
+        return work.refine(ordered, *work.start(ordered))
+
+    def one_more(
+        self, experiments: Sequence[Experiment], model: RotorModel, at: Point
+    ) -> tuple[RotorModel, Point] | None:
+        """Return model and numbers with one mode more, None where the spectra do not ask for it."""
+        ordered, work = sorted(experiments, key=lambda e: abs(e.speed)), self._work(model)
+        at, cost = work.rough(ordered, model, at, relative=_REFINED)
+        more = work.candidate(ordered, model, at, cost)
+        return None if more is None else _in_order(*more[:2])
+
+    def _work(self, model: RotorModel) -> _Work:
+        return _Work(
+            model=model, parameters=tuple(self.parameters), delays=tuple(self.delays), modes=self.modes,
+            tick=self.tick,
+        )  # fmt: skip
 
 
 def unknowns_at(model: RotorModel, parameters: Sequence[Parameter], at: Point, free: Sequence[int]) -> Unknowns:
@@ -231,26 +247,33 @@ class _Work:
             model, at = _without(model, at, above)  # what was seen from below is found again from within
 
     def refine(self, experiments: Sequence[Experiment], model: RotorModel, at: Point) -> tuple[RotorModel, Point]:
-        """Add the modes that a smaller relative error shows, as long as the likelihood wants them."""
-        slowest = [_together(_slowest(experiments))]
-        n_real, last = 2 * slowest[0].spectra.Y.size, float(slowest[0].spectra.frequency_hz.max())
+        """Add the modes without which nothing fits even with a smaller relative error."""
         at, cost = self.rough(experiments, model, at, relative=_REFINED)
-        while True:
-            weight = rough_weight(slowest[0], model, at, _REFINED)
-            found = self.missing(slowest[0], model, at, weight, _ABOVE, last)
-            price = np.log(n_real) * (3 + len(model.places))
-            if found is None or found.gain < price:
+        while cost > _UNFIT:
+            more = self.candidate(experiments, model, at, cost, _CLEARLY)
+            if more is None:
                 break
-            more = model.with_modes(model.n_modes + 1)
-            trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
-            try:
-                trial, lower = self.rough(experiments, more, trial, relative=_REFINED)
-            except np.linalg.LinAlgError:  # ran off
-                break
-            if not (cost - lower) * n_real > price:
-                break
-            model, at, cost = more, trial, lower
+            model, at, cost = more
         return _in_order(model, at)
+
+    def candidate(
+        self, experiments: Sequence[Experiment], model: RotorModel, at: Point, cost: float, price: float = 1.0
+    ) -> tuple[RotorModel, Point, float] | None:
+        """Return the model with the mode that the residuals ask for most, None where it is not worth its `price`."""
+        slowest = _together(_slowest(experiments))
+        spectra, n_real = slowest.spectra, sum(2 * e.spectra.mean_y.size for e in experiments)
+        price *= float(np.log(n_real)) * (3 + len(model.places))
+        weight, last = rough_weight(slowest, model, at, _REFINED), float(spectra.frequency_hz.max())
+        found = self.missing(slowest, model, at, weight, _ABOVE, last)
+        if found is None or found.gain < price:
+            return None
+        more = model.with_modes(model.n_modes + 1)
+        trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
+        try:
+            trial, lower = self.rough(experiments, more, trial, relative=_REFINED)
+        except np.linalg.LinAlgError:  # ran off
+            return None
+        return (more, trial, lower) if (cost - lower) * n_real > price else None
 
     def turn(self, fast: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
         """Find polar inertia and gyroscopic terms of records at higher speeds by scans of the criterion."""

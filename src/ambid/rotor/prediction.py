@@ -23,7 +23,7 @@ from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, dis
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
 from ambid.rig.rig import RigModes
-from ambid.rotor.estimator import Ending, begin_rotor, unknowns_at
+from ambid.rotor.estimator import Ending, Starter, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
 from ambid.rotor.unknowns import Unknowns
@@ -124,24 +124,31 @@ def predict_rotor(
     """
     tick("start", 0.0)
     spectra = windowed_spectra(record, model, speed)
-    experiment = Experiment(spectra=spectra, speed=speed)
-    model, at = begin_rotor([experiment], model, parameters, delays=delays, modes=modes, tick=tick)
-    model = model.at_speed(speed)
-    free = tuple(k for k, d in enumerate(delays) if d is None)
+    experiments = [Experiment(spectra=spectra, speed=speed)]
+    starter = Starter(model=model, parameters=parameters, delays=delays, modes=modes, tick=tick)
+    found, at = starter.begin(experiments)
     near = np.array([np.round(x) if d is None else d for x, d in zip(at.delays, delays, strict=True)])
     skip = int(near.max()) + _REST
-    problem, vector = predictor_problem(record, model, parameters, replace(at, delays=near), skip=skip)
-    fit = _search(problem, vector, tick)
 
-    def again(delays: Array, free: Sequence[int], last: Fit) -> tuple[PredictorProblem, Array]:
-        point = replace(_point_of(last), delays=delays)
+    def problem_at(
+        model: RotorModel, point: Point, free: Sequence[int] = (), last: Fit | None = None
+    ) -> tuple[PredictorProblem, Array]:
         problem, vector = predictor_problem(record, model, parameters, point, free, skip=skip)
-        for group in ("noise", "offset", "initial"):
-            vector[problem.slices[group]] = last.vector[last.problem.slices[group]]
-        return replace(problem, scales=last.problem.scales), vector
+        if last is not None:  # offsets and first state follow by themselves
+            vector[problem.slices["noise"]] = last.vector[last.problem.slices["noise"]]
+            problem = replace(problem, scales=replace(last.problem.scales, state=problem.scales.state))
+        return problem, vector
 
+    fit = _search(*problem_at(found.at_speed(speed), replace(at, delays=near)), tick)
+    while (more := starter.one_more(experiments, _rotor_of(fit), _point_of(fit))) is not None:
+        price = float(np.log(fit.problem.y.size)) * (3 + len(model.places))
+        trial = search(*problem_at(more[0].at_speed(speed), replace(more[1], delays=near), last=fit))
+        if trial.status == "failed" or not fit.criterion - trial.criterion > price:
+            break
+        fit = trial
+    free = tuple(k for k, d in enumerate(delays) if d is None)
     if free:
-        fit = _with_delays(fit, free, again, lambda: tick("fit", 0.9))
+        fit = _with_delays(fit, free, problem_at, lambda: tick("fit", 0.9))
     return _ended(fit, spectra, speed)
 
 
@@ -220,30 +227,32 @@ def _search(problem: PredictorProblem, vector: Array, tick: Tick) -> Fit:
     return fit
 
 
-_Again = Callable[[Array, Sequence[int], Fit], tuple[PredictorProblem, Array]]
+_ProblemAt = Callable[[RotorModel, Point, Sequence[int], Fit], tuple[PredictorProblem, Array]]
 
 
-def _with_delays(fit: Fit, free: tuple[int, ...], again: _Again, tick: Callable[[], None]) -> Fit:
+def _with_delays(fit: Fit, free: tuple[int, ...], problem_at: _ProblemAt, tick: Callable[[], None]) -> Fit:
     """Estimate delays as real numbers where the score test says that they are not those whole samples.
 
     Those that come to rest at whole samples, where the criterion has an edge, are held there, and the others searched
     once more.
     """
-    loose, vector = again(_point_of(fit).delays, free, fit)
+    rotor = _rotor_of(fit)
+    loose, vector = problem_at(rotor, _point_of(fit), free, fit)
     price = len(free) * float(np.log(fit.problem.n_used))
     if score_statistic(fit, loose, vector) < price:
         return fit
     found = search(loose, vector, tick=tick)
     if found.status == "failed" or not fit.criterion - found.criterion > price:
         return fit
-    delays = _point_of(found).delays
-    whole = np.round(delays)
+    at = _point_of(found)
+    delays, whole = at.delays.copy(), np.round(at.delays)
     sd = np.sqrt(np.diag(directions(found.J).inverse()))[loose.slices["fraction"]]
     held = [k for k, s in zip(free, sd.tolist(), strict=True) if abs(delays[k] - whole[k]) < max(3.0 * s, _WHOLE)]
     if not held:
         return found
     delays[held] = whole[held]
-    settled = search(*again(delays, [k for k in free if k not in held], found), tick=tick)
+    rest = [k for k in free if k not in held]
+    settled = search(*problem_at(rotor, replace(at, delays=delays), rest, found), tick=tick)
     return settled if settled.criterion - found.criterion < price else found
 
 
@@ -264,6 +273,13 @@ def _freed(fit: Fit, free: tuple[int, ...]) -> tuple[PredictorProblem, Array]:
     more = replace(searched, unknowns=replace(searched.unknowns, free_delays=free))
     loose = replace(old, model=more, fractional=True, late=free, joint_priors=_joint_priors(more))
     return loose, np.insert(fit.vector, old.n_physical, np.zeros(len(free)))
+
+
+def _rotor_of(fit: Fit) -> RotorModel:
+    """Return the rotor of a fit, with its modes."""
+    searched = fit.problem.model
+    assert isinstance(searched, Searched)
+    return searched.rotor
 
 
 def _point_of(fit: Fit) -> Point:

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.estimation.predictor import noise_floor
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record, cut
@@ -24,7 +25,7 @@ from ambid.signals.periodic_response import excited_lines, find_period, transien
 _TRANSIENT = 5.0  # standard deviations by which a first period may differ from the others
 _LEAST_PERIODS = 2
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
-_FIRST_LINE = 5  # of a window's spectrum: below, what leaks from the edges is not small
+_FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
 _MOST_LINES = 1200
 _LINES_PER_UNKNOWN = 3
 _FLOOR = 1e-3  # power of the reference, over its largest, from which a line is excited
@@ -260,7 +261,9 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
         return np.fft.rfft((x - x.mean(axis=0)) * window[:, None], axis=0)[: (n + 1) // 2] / n
 
     U, Y = spectra(model.inputs), spectra(model.outputs)
-    noise = _scatter(U, Y)
+    # where nothing but noise goes round a closed loop, inputs explain the outputs all too well: a sensor's own is there
+    white = noise_floor(np.column_stack([record[role].values for role in model.outputs]))
+    noise = np.maximum(_scatter(U, Y), white**2 * float(np.mean(window**2)) / n)
     frequency: Array = np.arange(U.shape[0], dtype=np.float64) * (rate / n)
     half = max(2, U.shape[0] // 2000)
     n_x = len(model.sensors)
