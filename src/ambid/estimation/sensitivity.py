@@ -17,6 +17,7 @@ from ambid.estimation.predictor import Predictor, PredictorProblem, assemble
 
 _BLOCK = 1024  # samples: sensitivities of one block stay in the second-level cache
 _QR_ROWS = 256  # rows of one small QR: below the size at which the linear algebra library starts threads
+_MOST_BLOCKS = 64  # that are held before they are reduced together
 _WELL = 1e-6  # least eigenvalue of a Gram matrix with unit diagonal that a triangle is taken from
 _TURNED = 1e-9  # least singular value, over the largest, of the scaled triangle that others are taken along
 
@@ -155,6 +156,8 @@ def linearise(
             e = rows[:, :, p]
             moment += e.T @ e
             blocks.append(reduce_rows(rows.reshape(-1, p + 1)))
+            if len(blocks) == _MOST_BLOCKS:
+                blocks = [reduce_rows(np.vstack(blocks), last=True)]
         if not blocks or not np.all(np.isfinite(moment)):
             return None
         reduced = reduce_rows(np.vstack(blocks), last=True)

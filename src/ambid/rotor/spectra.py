@@ -27,6 +27,7 @@ _LEAST_PERIODS = 2
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
 _FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
 _MOST_LINES = 1200
+_MOST_WINDOWS = 4000  # in which noise is looked at
 _LINES_PER_UNKNOWN = 3
 _FLOOR = 1e-3  # power of the reference, over its largest, from which a line is excited
 _CLEAR = 25.0  # power of a position, over its noise, from which it is seen
@@ -296,7 +297,7 @@ def _scatter(U: Complex, Y: Complex) -> Array:
     """
     n, n_u = U.shape
     width = min(_LINES_PER_UNKNOWN * 2 * (n_u + 1), n)
-    starts = np.unique(np.linspace(0, n - width, max(2, 2 * n // width)).round().astype(int))
+    starts = np.unique(np.linspace(0, n - width, min(max(2, 2 * n // width), _MOST_WINDOWS)).round().astype(int))
     at = starts[:, None] + np.arange(width)
     own = np.concatenate([U[at], np.ones((*at.shape, 1))], axis=2)
     regressors = np.concatenate([own, own * np.linspace(-1.0, 1.0, width)[:, None]], axis=2)
