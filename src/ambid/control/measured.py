@@ -15,7 +15,7 @@ from ambid.control.closed import ClosedLoop
 from ambid.rotor.spectra import PeriodSpectra, smoothed
 from ambid.signals.response import FrequencyResponse
 
-_SILENT = 1e-6  # of the largest line, below which a reference has no power
+_SILENT = 1e-3  # of the largest line, below which a reference has no power
 _COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
 _LINES_PER_UNKNOWN = 3
 _BOUND = 3.0  # standard deviations
@@ -85,12 +85,14 @@ def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Compl
     """Return positions over a reference at its lines, by period, (n_periods, n_lines of it, n_p)."""
     assert spectra.R is not None
     R, at = spectra.R, np.flatnonzero(on[:, mine])
-    if not np.any(on[at].sum(axis=1) > 1):
-        return np.asarray(spectra.Y[:, at][:, :, p] / R[at, mine][:, None])
+    alone = np.asarray(spectra.Y[:, at][:, :, p] / R[at, mine][:, None])
+    shared = np.flatnonzero(on[at].sum(axis=1) > 1)
+    if not shared.size:
+        return alone
     others = np.flatnonzero(np.any(on[at], axis=0))
     window = min(2 * _LINES_PER_UNKNOWN * others.size, R.shape[0])
-    found = np.empty((spectra.n_periods, at.size, len(p)), dtype=complex)
-    for m, k in enumerate(at):
+    found = alone
+    for m, k in zip(shared, at[shared], strict=True):
         first = int(np.clip(k - window // 2, 0, R.shape[0] - window))
         near = slice(first, first + window)
         run = (spectra.frequency_hz[near] - spectra.frequency_hz[k])[:, None] / np.ptp(spectra.frequency_hz[near])
