@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, RigError
 from ambid.job.fits import physics
 from ambid.job.rotor import replays_of
 from ambid.report.drawing import NARROW, single
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
 from ambid.report.rotor_page import rotor_page
+from ambid.rig import draft_rig, rig_from_text
 from tests.report.rotor_record import estimate, record, rig
 
 
@@ -163,3 +164,13 @@ def test_a_rig_of_a_rotor_is_refused_where_one_axis_is_meant() -> None:
     ):  # fmt: skip
         with pytest.raises(EstimationError, match="--rig of a rotor on many axes is for 'ambid identify'"):
             verb()
+
+
+def test_a_rig_of_a_rotor_is_drafted_from_the_names_of_columns() -> None:
+    text = draft_rig(record())
+    with pytest.raises(RigError, match=r"bearings\.A\.z is missing"):  # a plane is measured, not guessed
+        rig_from_text(text, "bench.toml")
+    drafted = rig_from_text(text.replace("# z", "z"), "bench.toml")
+    assert drafted.plant.inputs == rig(known=False).plant.inputs
+    assert [b.axes for b in drafted.plant.bearings] == [("ax", "ay"), ("bx", "by")]
+    assert drafted.parameter("bx.k_i").role == "free"

@@ -72,10 +72,13 @@ def command(
 def _of_record(record: Path | None, rate: Rate, gaps: Gaps, outputs: Outputs, plot: Path | None, *, ask: bool) -> str:
     from ambid.record import read_record
     from ambid.rig import draft_rig
+    from ambid.rig.draft import axes_of
     from ambid.rig.roles import rank_roles
 
     assert record is not None
     read = read_record(record, rate_hz=rate, gaps=gaps or "error")
+    if plot is None and len(axes_of(read)) > 1:
+        return draft_rig(read)
     ranked = rank_roles(read)
     if ask and _on_terminal():
         ranked = {role: _chosen(role, found) for role, found in ranked.items()}

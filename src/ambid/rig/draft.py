@@ -25,8 +25,12 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
     Returns
     -------
     str
-        TOML text that :func:`ambid.rig.load_rig` reads, with a comment on each guess.
+        TOML text that :func:`ambid.rig.load_rig` reads, with a comment on each guess; of a rotor on many axes once the
+        planes of its bearings are given.
     """
+    axes = axes_of(record)
+    if len(axes) > 1:
+        return _draft_rotor(record, axes)
     ranked = rank_roles(record) if ranked is None else ranked
     coil, held = bool(ranked["voltage"] and ranked["current"]), at_rest(ranked)
     plant = model("coil" if coil and (held or not ranked["position"]) else "one-axis")
@@ -60,6 +64,41 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         '# gaps = "error"      # or "interpolate", "cut"',
     ]
     return "\n".join(lines) + "\n"
+
+
+def axes_of(record: Record) -> list[str]:
+    """Return the axes of a record whose columns are named ``<axis>_position`` with ``<axis>_voltage`` or a current."""
+    names = set(record.names)
+    found = [name.removesuffix("_position") for name in record.names if name.endswith("_position")]
+    return [axis for axis in found if axis and names & {f"{axis}_voltage", f"{axis}_current"}]
+
+
+def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
+    """Guess the rig of a rotor on many axes: two axes a bearing; without its planes, to be measured, it is refused."""
+    name = record.provenance.get("file", "a record")
+    lines = [
+        f"# Guessed from {name}: complete every line marked CHECK, then run: ambid identify {name} --rig <this file>",
+        'schema = "ambid.rig/1"', f"name   = {toml_text(f'bench of {name}')}", 'model  = "rotor"',
+        *([] if _turning(record) else ['# speed = { value = 3000, unit = "rpm" }   # 0 unless given']), "",
+        "# Two axes a bearing, planes x and y, bearings in their order along the shaft; axial = true for an axial one.",
+    ]  # fmt: skip
+    for k in range(0, len(axes), 2):
+        lines += [
+            f"[bearings.{chr(ord('A') + k // 2)}]",
+            f"axes     = [{', '.join(toml_text(axis) for axis in axes[k : k + 2])}]   # CHECK",
+            '# z        = { value = 0.0, unit = "mm" }   # CHECK: measure the plane of the magnets, from any datum',
+            '# z_sensor = { value = 0.0, unit = "mm" }   # CHECK: measure the plane of the sensors', "",
+        ]  # fmt: skip
+    for axis in axes:
+        for what in ("voltage", "current", "position", "reference"):
+            if f"{axis}_{what}" in record:
+                lines += [f"[channels.{axis}_{what}]", f"column = {toml_text(f'{axis}_{what}')}", ""]
+    for role, column in _turning(record).items():
+        lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
+    return "\n".join(
+        [*lines, "# What is not named here is free. A weighed rotor:", "# [parameters]",
+         '# m = { value = 6.2, unit = "kg", role = "fixed" }', "# [modes]", '# count = "auto"', ""]
+    )  # fmt: skip
 
 
 def _turning(record: Record) -> dict[str, Channel]:
