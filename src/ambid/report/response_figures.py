@@ -94,8 +94,10 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], 
     if f.size > 1:
         axes.set_xlim(f[0], f[-1])
     # a sweep leaves noise beyond its ends, far above the modes
-    near = [size[np.abs(f / m.frequency_hz.value - 1) < _NEAR_MODE] for m in measured.modes]
-    axes.set_ylim(bottom, 2.0 * float(np.max(np.concatenate(near) if near else size)))
+    near = np.concatenate(
+        [size[:0], *(size[np.abs(f / m.frequency_hz.value - 1) < _NEAR_MODE] for m in measured.modes)]
+    )
+    axes.set_ylim(bottom, 2.0 * float(np.max(near if near.size else size)))
     _mark_modes(axes, measured.modes)
 
 
