@@ -128,8 +128,11 @@ class Starter:
     ) -> tuple[RotorModel, Point] | None:
         """Return model and numbers with one mode more, None where the spectra do not ask for it."""
         ordered, work = sorted(experiments, key=lambda e: abs(e.speed)), self._work(model)
-        at, cost = work.rough(ordered, model, at, relative=_REFINED)
-        more = work.candidate(ordered, model, at, cost)
+        try:
+            at, cost = work.rough(ordered, model, at, relative=_REFINED)
+            more = work.candidate(ordered, model, at, cost)
+        except np.linalg.LinAlgError:  # ran off
+            return None
         return None if more is None else _in_order(*more[:2])
 
     def _work(self, model: RotorModel) -> _Work:
