@@ -397,7 +397,7 @@ def test_what_the_identification_refuses_is_its_reason(tmp_path, monkeypatch):
     def refuse(*_, **__):
         raise EstimationError("the record says nothing. Take another")
 
-    monkeypatch.setattr("ambid.job.commissioning.identify", refuse)
+    monkeypatch.setattr("ambid.job.commissioning.identify_axis", refuse)
     done = ran(tmp_path, SimulatedDevice(prototype()), plan=replace(SHORT, amplitude_v=1.4))
     stopped_at("identify", done, "the record says nothing. Take another")
     assert files(tmp_path) == {"rig.toml", "commission.json", "report.html", "record.h5", "second.h5"}
