@@ -114,8 +114,10 @@ def orbit_blocks(estimate: RotorEstimate) -> list[Block]:
     return found
 
 
-def balance_block(s: Mapping[str, Any]) -> Block:
-    """Return unbalance and correction by plane, and the synchronous motion before and after it."""
+def balance_block(s: Mapping[str, Any]) -> Block | None:
+    """Return unbalance and correction by plane, and the synchronous motion before and after it; None: none is seen."""
+    if not any(p["identifiable"] for p in s["unbalance"]["planes"].values()):
+        return None
     sides: list[list[Panel]] = [[panel(_unbalance, s, height=3.6)]]
     if s.get("balancing", {}).get("vibration"):
         sides.append([panel(_vibration, s, height=3.6)])

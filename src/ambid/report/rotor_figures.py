@@ -97,8 +97,9 @@ class RotorEvidence:
             found["campbell"] = Block(columns=[[whirl]])
         for k, block in enumerate(orbit_blocks(e)):
             found["orbits" if k == 0 else f"orbits_{k + 1}"] = block
-        if e.synchronous:
-            found["unbalance"] = balance_block(e.synchronous)
+        unbalance = balance_block(e.synchronous) if e.synchronous else None
+        if unbalance is not None:
+            found["unbalance"] = unbalance
         found["poles"] = _poles(e)
         found["correlations"] = _correlations(e)
         return found
