@@ -48,7 +48,8 @@ def nearest(word: object, known: Sequence[str]) -> str:
 
     `word`: what was written; `known`: what may be written. Returns a sentence that begins with a space, or ``""``.
     """
-    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
+    turned = [k for k in known if sorted(k) == sorted(str(word))]  # two letters exchanged come before another word
+    close = turned[:1] or difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
     return f" Did you mean {close[0]!r}?" if close else ""
 
 
