@@ -28,6 +28,7 @@ VERBS = {
     "init": ("init", "r.csv", "-o"),
     "identify": ("identify", "r.csv", "--json"),
     "validate": ("validate", "e.json", "r.csv", "--json"),
+    "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
             "na=1,nb=1,nk=1", "--json"),
     "compare": ("compare", "r.csv", "arx:na=1,nb=1,nk=1", "--input", "voltage", "--output", "current", "--json"),
