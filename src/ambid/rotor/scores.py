@@ -67,7 +67,7 @@ def sensor_gain(problem: Likelihood, v: Array) -> float:
 
 def _causes(problem: Likelihood, model: RotorModel) -> list[tuple[str, str]]:
     """Return kind and name of all causes that are tried."""
-    fixed = [("fixed", p.name) for p in problem.unknowns.known if p.role == "fixed" and p.value]
+    fixed = [("fixed", p.name) for p in problem.unknowns.known if p.role == "fixed"]
     positions = model.outputs[: len(model.sensors)]
     extra = set(model.extras)
     axes = [model.axes[j] for j, _ in model.sensors]
