@@ -5,7 +5,7 @@ force of each magnet. At speed W a gyroscopic term g splits it: for the circular
 
     D± = 1/(w² - W_l² ± g W W_l + 2 j zeta w W_l),   W_l: frequency of the line,
 
-whose resonances stand at w exp(±d), 2 sinh d = g W/w: they are tried as pairs of modes at rest.
+whose resonances stand at w exp(±d), 2 sinh d = g W/w: they are tried as pairs of modes at rest, with g > 0.
 
 The products s bᵀ are linear in the residuals; the best rank-one part is the start of a search. Beside it stands a
 static compliance, so that modes above the band do not look like one within. The magnets' stiffness moves the pole that
@@ -68,7 +68,7 @@ def scan(
         sums = [_sums(m, experiment.spectra.omega, omega, zeta) for m in motions]
         for n in [k for k in _SPLITS if 2 * k < omega.size] if turning else (0,):
             middle = np.arange(n, omega.size - n)
-            ways = [middle + n * m.direction for m in motions]
+            ways = [middle + n * m.direction * (1 if experiment.speed > 0.0 else -1) for m in motions]
             gains, products = _explained(
                 sum(G[w] for (G, _), w in zip(sums, ways, strict=True)),
                 sum(r[w] for (_, r), w in zip(sums, ways, strict=True)),
@@ -91,7 +91,7 @@ def scan(
     own = own if 0.5 * seen**2 < own < 2.0 * seen**2 else seen**2
     return Candidate(
         omega=float(np.sqrt(own)), zeta=float(np.clip(zeta, *_START_DAMPING)),
-        gyro=split * seen / experiment.speed if turning else 0.0,
+        gyro=split * seen / abs(experiment.speed) if turning else 0.0,
         bearings=dict(zip(at_b, shape_b.tolist(), strict=True)), sensors=dict(zip(at_s, shape_s.tolist(), strict=True)),
         gain=gain,
     )  # fmt: skip
