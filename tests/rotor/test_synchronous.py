@@ -52,6 +52,17 @@ def true_machine(model, theta, bench, sd=0.0):
     )  # fmt: skip
 
 
+def test_steps_along_a_covariance_keep_the_smallest_numbers():
+    bench, model, theta, _ = spinning(9000.0)
+    machine = true_machine(model, theta, bench, sd=1e-4)
+    sd, n = np.sqrt(np.diag(machine.covariance)), len(machine.names)
+    loads = np.random.default_rng(1).standard_normal((n, 2 * n))
+    R = loads @ loads.T
+    R /= np.sqrt(np.outer(np.diag(R), np.diag(R)))
+    steps = dataclasses.replace(machine, covariance=R * np.outer(sd, sd)).steps / sd
+    np.testing.assert_allclose(steps.T @ steps, R, atol=1e-9)
+
+
 def planes_of(bench):
     """Return the unbalance by bearing plane that does what that of the bench does."""
     a, b = bench.z_bearing

@@ -73,6 +73,17 @@ class Machine:
         """Return where a plane stands along the shaft, m."""
         return self.beside[place][0] if place in self.beside else self.theta[place]
 
+    @property
+    def steps(self) -> Array:
+        """One standard deviation along each direction of the covariance, (n, n).
+
+        From the correlations: in SI the variance of a stiffness drowns that of an inductance in rounding.
+        """
+        sd = np.sqrt(np.diag(self.covariance))
+        size = np.where(sd > 0.0, sd, 1.0)
+        values, vectors = np.linalg.eigh(self.covariance / np.outer(size, size))
+        return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T * size)
+
     def moved(self, by: Array) -> Machine:
         """Return the machine with estimated numbers moved."""
         theta, delays = dict(self.theta), self.at.delays.copy()
@@ -254,8 +265,6 @@ class _Part:
 
     def plant_half(self, machine: Machine, u: Complex) -> Array:
         """Return what one standard deviation along each direction of the plant's covariance does, (2 n_y, n)."""
-        values, vectors = np.linalg.eigh(machine.covariance)
-        steps = (vectors * np.sqrt(np.maximum(values, 0.0))).T
         W = self.response.speed
 
         def expected(step: Array) -> Complex:
@@ -263,7 +272,7 @@ class _Part:
             H = of.transfer(np.array([W]), W, self.response.rate_hz)[0]
             return np.asarray(H @ self.V + of.forced(W, of.shapes) @ u[: machine.shapes.shape[1]])
 
-        slopes = [0.5 * (expected(s) - expected(-s)) for s in steps]
+        slopes = [0.5 * (expected(s) - expected(-s)) for s in machine.steps]
         return np.column_stack([_real(x) for x in slopes]) if slopes else np.zeros((2 * self.left.size, 0))
 
 
