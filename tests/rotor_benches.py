@@ -103,39 +103,45 @@ def record_of(bench: Any, seed: int) -> Record:
     return read_record(columns, rate_hz=bench.rate, units=units)
 
 
-def stepped(bench: Any, changes: dict[int, Any], seed: int) -> Record:
-    """Return a record of a bench whose plant becomes that of another one at a sample of it, in the same loop."""
+def stepped(bench: Any, changes: dict[int, Any], seed: int, fraction: float = 0.0) -> Record:
+    """Return a record of a bench whose plant becomes that of another one at a sample of it, in the same loop.
+
+    `fraction`: of a sample, by which voltages act later than the whole samples of the bench.
+    """
     rng = np.random.default_rng(seed)
     reference = np.tile(truth.multisine(bench, rng), (bench.settle + bench.periods, 1))
     off, T = reference.shape[0] * bench.settle // (bench.settle + bench.periods), 1.0 / bench.rate
     c = 1.0 - np.exp(-2.0 * np.pi * bench.kd_pole_hz * T)
     held = rng.standard_normal((reference.shape[0], 8)) * np.repeat([bench.voltage_noise, bench.force_noise], 4)
     read = rng.standard_normal((reference.shape[0], 8)) * np.repeat([bench.position_noise, bench.current_noise], 4)
-    A, B, C = _sampled(bench)
-    x, slow, whole = np.zeros(A.shape[0]), np.zeros(4), np.zeros(4)
+    early, late, C = _sampled(bench, fraction), _sampled(bench, 1.0 - fraction), truth.plant(bench)[2]
+    x, slow, whole, before = np.zeros(C.shape[1]), np.zeros(4), np.zeros(4), np.zeros(4)
     waiting, rows = [np.zeros(4)] * bench.delay, np.empty((reference.shape[0], 16))
     for k, r in enumerate(reference):
         if k - off in changes:
-            A, B, C = _sampled(changes[k - off])
+            now = changes[k - off]
+            early, late, C = _sampled(now, fraction), _sampled(now, 1.0 - fraction), truth.plant(now)[2]
         y = C @ x + read[k]
         rate = (y[:4] - slow) * (c / T)
         slow, whole = slow + c * (y[:4] - slow), whole + bench.ki * T * y[:4]
         v = bench.kc * (r - bench.kp * y[:4] - whole - bench.kd * rate - y[4:])
         rows[k] = np.concatenate([v, y[4:], y[:4], r])
         waiting.append(v)
-        x = A @ x + B @ np.concatenate([waiting.pop(0), held[k]])
+        for (A, B), volts in ((early, before), (late, waiting[0])):
+            x = A @ x + B @ np.concatenate([volts, held[k]])
+        before = waiting.pop(0)
     names = [f"{axis}_{q}" for q in _UNITS for axis in truth.AXES]
     units = {name: _UNITS[name.split("_")[1]] for name in names}
     return read_record(dict(zip(names, rows[off:].T, strict=True)), rate_hz=bench.rate, units=units)
 
 
-def _sampled(bench: Any) -> tuple[Any, Any, Any]:
-    """Return the plant of a bench over one sample, all inputs held."""
-    A, B, C = truth.plant(bench)
+def _sampled(bench: Any, part: float) -> tuple[Any, Any]:
+    """Return the plant of a bench over a part of a sample, all inputs held."""
+    A, B, _ = truth.plant(bench)
     n, both = A.shape[0], np.zeros((A.shape[0] + B.shape[1],) * 2)
-    both[:n] = np.column_stack([A, B]) / bench.rate
+    both[:n] = np.column_stack([A, B]) * part / bench.rate
     both = expm(both)
-    return both[:n, :n], both[:n, n:], C
+    return both[:n, :n], both[:n, n:]
 
 
 def _channels(model: RotorModel) -> Iterator[RigChannel]:

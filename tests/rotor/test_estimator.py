@@ -14,7 +14,10 @@ from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rig.rig import RigModes
 from ambid.rotor import RotorEstimate
-from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, truth
+from ambid.rotor.likelihood import Experiment, Point, rough_weight
+from ambid.rotor.modes import scan
+from ambid.rotor.spectra import find_excitation, period_spectra
+from tests.rotor_benches import free_rig, model_of, needs_simulator, record_of, stepped, truth
 
 pytestmark = needs_simulator
 _FAR = 3.8  # standard deviations
@@ -128,6 +131,53 @@ def test_a_plane_that_is_wrong_is_named(rigid: tuple[Any, Record, Rig, RotorEsti
     assert not check.passed
     assert check.detail.split(":")[0].removeprefix("the record contradicts ") in ("A.z_sensor", "A.z")
     assert found.verdict.word != "usable"
+
+
+def test_a_plane_at_the_datum_can_be_wrong_too(rigid: tuple[Any, Record, Rig, RotorEstimate]) -> None:
+    bench, record, rig, _ = rigid
+    model, _ = model_of(bench)
+    true = next(b.z for b in model.bearings if b.name == "A")
+    assert true is not None
+    moved = tuple(
+        p if p.role != "fixed" or p.value is None else replace(p, value=p.value - true + 4e-3 * (p.name != "A.z"))
+        for p in rig.parameters
+    )
+    assert next(p.value for p in moved if p.name == "A.z") == 0.0
+    detail = ambid.identify(record, replace(rig, parameters=moved)).checks["fixed_agree"].detail
+    assert detail.startswith("the record contradicts A.z: +4")
+
+
+def test_a_delay_that_is_not_whole_is_not_held_at_a_whole_sample() -> None:
+    bench = _bench("rigid", amplitude=0.3)
+    found = ambid.identify(stepped(bench, {}, 3, fraction=0.0013), free_rig(bench))
+    assert not _far(found, bench)
+    for d in found.delay.values():
+        assert d.sd is not None
+        assert abs(d.samples + d.fraction - 1.0013) < _FAR * d.sd
+        assert d.sd < 5e-4
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_a_mode_of_a_turning_rotor_is_seen_whichever_way_it_turns(sign: float) -> None:
+    bench = _bench("utrc", rpm=12_000.0, unbalance=0.0, runout=0.0)
+    model, theta = model_of(bench)
+    record, W = record_of(bench, 1), sign * bench.rpm * np.pi / 30.0
+    if sign < 0.0:  # seen from the other end, where x and y change places
+        other = {"x": "y", "y": "x"}
+        record = replace(
+            record, channels=tuple(replace(c, name=f"{c.name[0]}{other[c.name[1]]}{c.name[2:]}") if "_" in c.name else c
+                                   for c in record.channels),
+        )  # fmt: skip
+        theta = {**theta, **{f"{b}{x}.{q}": theta[f"{b}{y}.{q}"] for b in "ab" for x, y in other.items()
+                             for q in ("k_i", "k_x", "R", "L")}}  # fmt: skip
+    less = replace(model, n_modes=0, speed=W)
+    excitation = find_excitation(record, less)
+    assert excitation is not None
+    e = Experiment(spectra=period_spectra(record, less, excitation), speed=W)
+    at = Point(theta=theta, delays=np.full(4, float(bench.delay)))
+    mode = scan(e, less, at, rough_weight(e, less, at, 0.03), (50.0, 300.0))
+    assert mode is not None
+    assert mode.gyro == pytest.approx(theta["gyro.11"], rel=0.1)
 
 
 def test_a_sensor_at_fault_is_named_and_no_mode_stands_in_for_it(rigid: tuple[Any, Record, Rig, RotorEstimate]) -> None:
