@@ -209,10 +209,17 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
             weighted = L[:, a] / np.real(spread[part][:, a, a])[:, None]
             np.add.at(shared[:, a], window.ravel(), weighted.ravel())
     own = np.sum(1.0 / np.real(np.diagonal(spread, axis1=1, axis2=2)), axis=0)
+    try:
+        weight = np.linalg.inv(np.swapaxes(spread, 1, 2))
+    except np.linalg.LinAlgError:
+        raise EstimationError(
+            "at some lines the excitation does not move all inputs; a response needs each of them. Excite all inputs over "
+            "the whole band, or give a narrower band"
+        ) from None
     return _Fitted(
         Z=found,
         covariance=np.asarray(0.5 * (covariance + np.conj(np.swapaxes(covariance, 1, 2))), dtype=complex),
-        weight=np.asarray(np.linalg.inv(np.swapaxes(spread, 1, 2)), dtype=complex),
+        weight=np.asarray(weight, dtype=complex),
         condition=condition,
         # variance of the weighted mean over all lines, beside that of as many independent ones
         lines_per_independent=float(np.mean(np.sum(np.abs(shared) ** 2, axis=0) / own)),
