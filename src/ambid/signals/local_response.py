@@ -213,8 +213,8 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
         weight = np.linalg.inv(np.swapaxes(spread, 1, 2))
     except np.linalg.LinAlgError:
         raise EstimationError(
-            "at some lines the excitation does not move all inputs; a response needs each of them. Excite all inputs over "
-            "the whole band, or give a narrower band"
+            "at some lines the excitation does not move all inputs; a response needs each of them. Excite all inputs "
+            "over the whole band, or give a narrower band"
         ) from None
     return _Fitted(
         Z=found,
