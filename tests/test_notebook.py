@@ -266,7 +266,7 @@ REFUSED: dict[str, tuple[Callable[[Session], Any], str]] = {
         lambda s: ambid.identify(s.arrays, rate_hz=1e4), r"column 'voltage' has no unit.*'voltage \[unit\]'"
     ),
     "no rate": (lambda s: ambid.identify(s.arrays, units=beside(s)), "no rate is given"),
-    "a list": (lambda s: ambid.identify([s.record]), "of type list"),
+    "two records": (lambda s: ambid.identify([s.record, s.record]), "the linear model takes one"),
     "an array": (lambda s: ambid.fit(s.arrays["current"], **ARX), "dict of arrays"),
     "orders that are none": (lambda s: ambid.fit(s.record, **{**ARX, "orders": "na=two"}), "NAME=NUMBER"),
     "a rate beside a record": (lambda s: ambid.identify(s.record, rate_hz=5e3), "10000 Hz but rate_hz"),
