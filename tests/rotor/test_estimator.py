@@ -118,6 +118,10 @@ def test_without_voltages_and_mass_no_force_is_claimed(rigid: tuple[Any, Record,
     )
     fixed = ambid.identify(record, replace(bare, parameters=weighed))
     assert not [n for n in ("Id", "z_cg", "ax.k_i", "bx.k_x") if abs(fixed[n].value - theta[n]) > _FAR * fixed[n].sd]
+    guess = Parameter(name="m", unit="kg", role="prior", value=bench.m, sd=0.1)
+    guessed = ambid.identify(record, replace(bare, parameters=tuple(guess if p.name == "m" else p for p in weighed)))
+    assert guessed["m"].sd == pytest.approx(0.1, rel=0.01)
+    assert guessed["m"].data_share == pytest.approx(0.0, abs=0.02)  # it is what was put in
 
 
 def test_a_plane_that_is_wrong_is_named(rigid: tuple[Any, Record, Rig, RotorEstimate]) -> None:

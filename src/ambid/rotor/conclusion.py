@@ -135,7 +135,9 @@ def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Num
         value = numbers.theta[p.name]
         size = sizes.get(p.name, abs(value))
         seen = {p.name: p.role == "fixed" or bool(sd <= _LENGTH_SEEN * size)}
-        found.append(EstimatedParameter.of(p, numbers.theta, {p.name: sd}, seen))
+        # of independent information 1/sd² = 1/alone² + 1/prior²
+        left = max(1.0 - (sd / p.sd) ** 2, 1e-12) if p.role == "prior" and p.sd else 1.0
+        found.append(EstimatedParameter.of(p, numbers.theta, {p.name: sd}, seen, {p.name: sd / float(np.sqrt(left))}))
     return tuple(found)
 
 
