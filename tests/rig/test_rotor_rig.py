@@ -54,6 +54,11 @@ def test_a_rotor_rig_is_written_as_it_was_read() -> None:
     )  # fmt: skip
 
 
+def test_bearings_in_one_plane_are_refused() -> None:
+    with pytest.raises(RigError, match=r"bearings\.A\.z and bearings\.B\.z are both 0\.342 m.*Correct one"):
+        rig_from_text(TEXT.replace("72.0", "342.0"), "bench.toml")
+
+
 TURNING = """
 [unbalance.disc]
 value = 12.0

@@ -17,7 +17,7 @@ from ambid.estimation.estimate import Check, plain_json
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, origin, rig_entry
-from ambid.job.rotor_records import read_records
+from ambid.job.rotor_records import RotorRecord, read_records
 from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig
@@ -66,6 +66,7 @@ def identify_rotor(
         given = model.speed if len(taken) == 1 else 0.0  # the rig's is that of one record
         warnings += x.warnings(r.name, given if r.speed is None else r.speed)
     clean, speeds, excitations = ([getattr(x, q) for x in turning] for q in ("record", "speed", "excitation"))
+    _check_speeds(taken, speeds)
     rig = _turning_rig(rig, max(speeds, key=abs))
     clock.lap("periods")
     with one_thread():
@@ -80,6 +81,7 @@ def identify_rotor(
             more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=found.why)},
             rig=rig_entry(rig), warnings=[*warnings, *found.warnings],
         )  # fmt: skip
+        estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = _loop(estimate, rig, clean[fastest], found.seen[fastest])
         synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
@@ -306,6 +308,24 @@ def _check(bench: Record, rig: Rig) -> None:
             raise EstimationError(
                 f"{name_of(bench)}: channel {role!r} is constant in the whole record. Check its column and unit"
             )
+
+
+def _check_speeds(taken: Sequence[RotorRecord], speeds: Sequence[float]) -> None:
+    """Refuse a speed that no record of its rate shows."""
+    for one, speed in zip(taken, speeds, strict=True):
+        if abs(speed) >= np.pi * one.bench.rate_hz:
+            raise EstimationError(
+                f"{one.name}: a speed of {speed * 30.0 / np.pi:.4g} rpm is more than half of its sampling rate, "
+                f"{one.bench.rate_hz:g} Hz; it would not show. Correct --speed, or [speed] and its unit in the rig"
+            )
+
+
+def _plausible(estimate: RotorEstimate, rig: Rig, bench: Record) -> Mapping[str, Check]:
+    """Judge signs and sizes of an estimate."""
+    from ambid.validation.rotor_sizes import plausible_checks
+
+    sd = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
+    return plausible_checks(estimate.plant, estimate.numbers, sd, rig.parameters, bench)
 
 
 def _record_checks(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:

@@ -32,6 +32,7 @@ def rotor_of(file: RigFile, where: str) -> RotorModel:
     if file.model != "rotor":
         raise RigError(f'{where}: [bearings] are given, but the model is {file.model!r}. Set model = "rotor"')
     bearings = tuple(_bearing(name, entry, f"{where}: bearings.{name}") for name, entry in file.bearings.items())
+    _apart(bearings, where)
     speed = _speed(file, where)
     axes = [axis for b in bearings for axis in b.axes]
     drives: list[Drive] = []
@@ -155,6 +156,20 @@ def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
         z=None if given.z.value is None else _si(given.z, "m", place),
         z_sensors=tuple(values),
     )
+
+
+def _apart(bearings: tuple[Bearing, ...], where: str) -> None:
+    """Refuse radial bearings, or their sensors, in one plane: a slope of the rotor would not show."""
+    radial = [b for b in bearings if not b.axial]
+    for what, planes in {
+        "z": [b.z for b in radial],
+        "z_sensor": [z for b in radial for z in b.z_sensors],
+    }.items():
+        if len(radial) > 1 and None not in planes and len(set(planes)) == 1:
+            raise RigError(
+                f"{where}: bearings.{radial[0].name}.{what} and bearings.{radial[-1].name}.{what} are both "
+                f"{planes[0]:g} m; in one plane the rotor's slope does not show. Correct one"
+            )
 
 
 def _read_at(given: BearingEntry) -> list[PlaneEntry]:
