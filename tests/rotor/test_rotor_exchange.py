@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.errors import EstimationError
+from ambid.errors import AmbidError, EstimationError
 from ambid.rotor.estimate import RotorEstimate
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
@@ -109,3 +110,14 @@ def test_other_endings_and_results_are_refused(estimate: RotorEstimate, tmp_path
     with pytest.raises(EstimationError, match="holds a rotor"):
         axis.export(tmp_path / "r.py")
     axis.export(tmp_path / "r.mat")
+
+
+@pytest.mark.parametrize(("value", "said"), [(None, "numbers.m is missing"), (-6.2, "numbers.m is not positive")])
+def test_a_file_without_a_number_of_the_rotor_is_refused(
+    estimate: RotorEstimate, tmp_path: Path, value: float | None, said: str
+) -> None:
+    document = json.loads(estimate.dumps())
+    document["numbers"] = {n: x for n, x in document["numbers"].items() if n != "m"} | ({"m": value} if value else {})
+    (tmp_path / "e.json").write_text(json.dumps(document))
+    with pytest.raises(AmbidError, match=said):
+        ambid.load(tmp_path / "e.json")

@@ -188,6 +188,11 @@ def rotor_estimate_from_json(document: Mapping[str, Any], where: str) -> RotorEs
             raise ValueError("the covariance is not of the numbers")
         if found.continuous.A.shape != (len(found.continuous.states),) * 2:
             raise ValueError("the continuous plant is not of its states' size")
+        for spec in found.plant.parameters:
+            if spec.name not in found.numbers:
+                raise ValueError(f"numbers.{spec.name} is missing")
+            if spec.positive and not found.numbers[spec.name] > 0.0:
+                raise ValueError(f"numbers.{spec.name} is not positive")
         if any(p.sd < 0 for p in found.parameters):
             raise EstimationError("a standard deviation is negative")
         return found
