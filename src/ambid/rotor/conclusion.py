@@ -10,7 +10,6 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, OutputFit
-from ambid.estimation.linear import directions
 from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
@@ -49,8 +48,8 @@ def numbers_of(fit: Ending) -> Numbers:
     named, chain = unknowns.chain(fit.vector)
     roles = [f"{role}.delay" for role in unknowns.model.inputs]
     keep = [*range(len(named)), *(len(named) + k for k in unknowns.free_delays)]
-    half = chain[keep] @ fit.seen.root()
-    data = directions(fit.triangle[:, :-1])
+    data = fit.seen
+    half = chain[keep] @ data.root()
     last = data.Vt[-1] if data.Vt.size else np.zeros(0)
     heavy = np.argsort(-np.abs(last))[:4]
     return Numbers(

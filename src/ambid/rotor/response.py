@@ -45,11 +45,6 @@ class Sampled:
         return values, V, np.linalg.inv(V)
 
     @cached_property
-    def condition(self) -> float:
-        """Condition number of the eigenvectors."""
-        return float(np.linalg.cond(self.eigen[1]))
-
-    @cached_property
     def groups(self) -> tuple[tuple[Array, bool, float], ...]:
         """Inputs that are treated alike: which, whether held, and their fraction of a sample."""
         fraction = self.delays - np.floor(self.delays)

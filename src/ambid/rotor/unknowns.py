@@ -8,7 +8,7 @@ prior N(0, 1); shapes without it run off where no voltage shows the bearings' pa
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -139,10 +139,6 @@ class Unknowns:
             rows.append(row)
             left.append(-0.5 * float(np.log(b2 / s2)) / _GAUGE_SD)
         return np.array(rows).reshape(-1, v.size), np.array(left)
-
-    def with_model(self, model: RotorModel) -> Unknowns:
-        """Return the unknowns of the same machine with other modes."""
-        return replace(self, model=model)
 
     @property
     def _modes(self) -> Sequence[int]:
