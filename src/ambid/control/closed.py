@@ -254,9 +254,7 @@ class ClosedLoop:
         seen = np.zeros(H.shape[0], dtype=complex)
         seen[p], seen[q] = right, -H[q] @ driven
         weights = scale * (left @ H[p] @ inner)
-        d = complex(self.controller.backward(self.frequency_hz)[0])
-        for law, weight in zip(self.controller.laws, weights, strict=True):
-            variance += law.variance(d, seen[list(law.outputs)], complex(weight))
+        variance += self.controller.variance(self.frequency_hz, seen, weights)
         return float(np.sqrt(max(variance, 0.0)))
 
     def _slopes(self, driven: Complex) -> Complex:

@@ -18,10 +18,11 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel
 from ambid.physics.loop import Loop
 from ambid.rotor.spectra import smoothed
-from ambid.simulation.plant import fed_back
+from ambid.simulation.plant import fed_back, law_on, signals_fed_back
 
 _ORDERS = 8  # highest degree that is tried
 _PASSES = 6
@@ -74,16 +75,23 @@ class Controller:
     n_outputs: int
     n_references: int
     source: str  # "record" where it was identified, "rig" where it is the rig's [loop]
+    state: StateLaw | None = None  # of a [loop] that has one, in place of `laws`
+    fed_back: tuple[int, ...] = ()  # the outputs that `state` sees
+
+    @property
+    def n_inputs(self) -> int:
+        """Commands that it gives."""
+        return len(self.laws) if self.state is None else self.state.D.shape[0]
 
     @property
     def misfit(self) -> float:
         """Largest residual of the laws over their inputs."""
-        return max(law.misfit for law in self.laws)
+        return max((law.misfit for law in self.laws), default=0.0)
 
     @property
     def orders(self) -> tuple[int, ...]:
         """Degree of each law."""
-        return tuple(law.coefficients.shape[1] - 1 for law in self.laws)
+        return tuple(law.coefficients.shape[1] - 1 for law in self.laws) if self.state is None else (self.state.order,)
 
     def backward(self, frequency_hz: Array) -> Complex:
         """Return d = 1 - 1/z at some frequencies."""
@@ -92,20 +100,37 @@ class Controller:
     def response(self, frequency_hz: Array) -> tuple[Complex, Complex]:
         """Return K (n, n_inputs, n_outputs) and F (n, n_inputs, n_references) at some frequencies in Hz."""
         d = self.backward(frequency_hz)
-        K = np.zeros((d.size, len(self.laws), self.n_outputs), dtype=complex)
-        F = np.zeros((d.size, len(self.laws), self.n_references), dtype=complex)
+        K = np.zeros((d.size, self.n_inputs, self.n_outputs), dtype=complex)
+        F = np.zeros((d.size, self.n_inputs, self.n_references), dtype=complex)
+        if self.state is not None:
+            K[:, :, list(self.fed_back)] = -self.state.response(frequency_hz)
+            F[:] = np.eye(self.n_inputs)
         for j, law in enumerate(self.laws):
             found = law.ratios(d)
             K[:, j, list(law.outputs)] = found[:, : len(law.outputs)]
             F[:, j, list(law.references)] = found[:, len(law.outputs) :]
         return K, F
 
+    def variance(self, frequency_hz: Array, seen: Complex, weights: Complex) -> float:
+        """Return the variance of Re(weights K seen) at one frequency."""
+        d = complex(self.backward(frequency_hz)[0])
+        return sum(
+            law.variance(d, seen[list(law.outputs)], complex(w)) for law, w in zip(self.laws, weights, strict=False)
+        )
+
 
 def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controller:
-    """Return the controller of a rig's [loop], the same on every axis; its law is that of `ambid.physics.loop.Loop`.
+    """Return the controller of a rig's [loop], of which a PID is the same on every axis; see `ambid.physics.loop.Loop`.
 
     The reference of an axis is what is added to the controller's output.
     """
+    n_u, n_y = len(of.inputs), len(of.outputs)
+    law = law_on(loop, of, rate_hz)
+    if law is not None:
+        seen = tuple(int(k) for k in signals_fed_back(of))
+        return Controller(
+            laws=(), rate_hz=rate_hz, n_outputs=n_y, n_references=n_u, source="rig", state=law, fed_back=seen
+        )  # fmt: skip
     T, tau = 1.0 / rate_hz, loop.filter_s
     lag = np.polynomial.Polynomial([T, tau])  # of the derivative, over which d stands
     integrates, one = bool(loop.ki), np.polynomial.Polynomial([0.0, 1.0])
@@ -120,7 +145,6 @@ def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controlle
         for row, polynomial in zip(table, rows, strict=True):
             row[: polynomial.coef.size] = polynomial.coef
         laws.append(Law(outputs=tuple(own), references=(j,), scale=1.0, coefficients=table))
-    n_u, n_y = len(of.inputs), len(of.outputs)
     return Controller(laws=tuple(laws), rate_hz=rate_hz, n_outputs=n_y, n_references=n_u, source="rig")
 
 

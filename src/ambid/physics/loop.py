@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ambid.errors import ModelError
+from ambid.physics.law import StateLaw
 
 Interval = tuple[float, float]
 UNLIMITED: Interval = (-math.inf, math.inf)
@@ -16,7 +17,7 @@ UNLIMITED: Interval = (-math.inf, math.inf)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loop:
-    """Discrete-time PID on the position, with current feedback, and the delay of its output.
+    """Discrete-time PID on the position, with current feedback, or a `StateLaw`; and the delay of its output.
 
     u[k] = u0 + kp e[k] + I[k] + D[k] - kc (i[k] - i0) + excitation[k], with e = setpoint - x, I[k+1] = I[k] + ki T
     e[k], D[k] = (tau D[k-1] - kd (x[k] - x[k-1])) / (tau + T), tau = 1/(2 pi cutoff). While u is limited, I may only
@@ -32,8 +33,11 @@ class Loop:
     derivative_cutoff_hz: float = math.inf  # cut-off of the derivative filter in Hz; infinite for none
     # delay between the logged voltage and the coil in samples; fractions allowed. It acts in open loop too.
     delay: float = 0.0
+    law: StateLaw | None = None  # in place of the gains, which are then zero
 
     def __post_init__(self) -> None:
+        if self.law is not None and any((self.kp, self.ki, self.kd, self.kc)):
+            raise ModelError("the loop has gains and a state-space law; one of them orders. Give the one or the other")
         for name in ("kp", "ki", "kd", "kc"):
             if not math.isfinite(getattr(self, name)):
                 raise ModelError(f"loop.{name} is {getattr(self, name)}; a gain must be a finite number. Correct it")
@@ -48,12 +52,42 @@ class Loop:
     @property
     def closed(self) -> bool:
         """True where any gain acts."""
-        return any((self.kp, self.ki, self.kd, self.kc))
+        return self.law is not None or any((self.kp, self.ki, self.kd, self.kc))
 
     @property
     def filter_s(self) -> float:
         """Time constant tau of the derivative filter in s; 0 for none."""
         return 0.0 if math.isinf(self.derivative_cutoff_hz) else 1.0 / (2.0 * math.pi * self.derivative_cutoff_hz)
+
+    def scaled(self, position: float, current: float) -> Loop:
+        """Return the loop that sees position and current multiplied by these factors."""
+        if self.law is not None:
+            each = [position, current] if self.law.D.shape[1] > self.law.D.shape[0] else [position]
+            return replace(self, law=self.law.scaled(each * self.law.D.shape[0]))
+        p = position
+        return replace(self, kp=p * self.kp, ki=p * self.ki, kd=p * self.kd, kc=current * self.kc)
+
+    def as_law(self, rate_hz: float, *, current: bool = True) -> StateLaw:
+        """Return the law of one axis, of the gains with the states I and tau D + kd x.
+
+        Its integral is tracked back with the time constant kp/ki where the command is limited, which a PID stops.
+        `current`: whether the axis feeds it back.
+        """
+        if self.law is not None:
+            return self.law
+        period, tau = 1.0 / rate_hz, self.filter_s
+        pole = tau / (tau + period)
+        fast = self.kd / (tau + period)
+        back = min(abs(self.ki * period / self.kp), 1.0) if self.kp else float(bool(self.ki))
+        n_y = 1 + current
+        return StateLaw(
+            A=np.diag([1.0, pole]),
+            B=np.array([[-self.ki * period, 0.0], [self.kd * (1.0 - pole), 0.0]])[:, :n_y],
+            C=np.array([[1.0, 1.0 / (tau + period)]]),
+            D=np.array([[-self.kp - fast, -self.kc]])[:, :n_y],
+            G=np.array([[back], [0.0]]),
+            rate_hz=rate_hz,
+        )
 
     def opened(self) -> Loop:
         """Return the open loop with the same delay."""

@@ -13,8 +13,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
+import numpy as np
+
 from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
+from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
@@ -149,7 +152,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         runout=runout,
         magnet=None if file.magnet is None else magnet_of(file.magnet, plant, where),
         operating_point=_operating_point(file.operating_point, plant, where),
-        loop=_loop(file.loop) if file.loop else None,
+        loop=_loop(file.loop, where) if file.loop else None,
         limits=limits,
         noise=_noise(file.noise) if file.noise else None,
         record=RecordSettings(
@@ -288,9 +291,28 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
     return MappingProxyType(values)
 
 
-def _loop(entry: LoopEntry) -> Loop:
-    cutoff = math.inf if entry.derivative_cutoff_hz is None else entry.derivative_cutoff_hz
-    return Loop(kp=entry.kp, ki=entry.ki, kd=entry.kd, kc=entry.kc, derivative_cutoff_hz=cutoff, delay=entry.delay)
+def _loop(entry: LoopEntry, where: str) -> Loop:
+    """Return the controller; matrices and gains exclude each other."""
+    gains = {name: getattr(entry, name) for name in ("kp", "ki", "kd", "kc", "derivative_cutoff_hz")}
+    matrices = {name: getattr(entry, name) for name in (*"ABCD", "rate_hz")}
+    if entry.kind == "pid":
+        given = [name for name, x in {**matrices, "G": entry.G}.items() if x is not None]
+        if given:
+            raise RigError(
+                f'{where}: loop.{given[0]} is of a state-space law, and loop.kind is "pid". Omit it, or give kind = '
+                '"state-space"'
+            )
+        cutoff = math.inf if entry.derivative_cutoff_hz is None else entry.derivative_cutoff_hz
+        return Loop(**{**gains, "derivative_cutoff_hz": cutoff}, delay=entry.delay)
+    missing = [name for name, x in matrices.items() if x is None]
+    extra = [name for name, x in gains.items() if x]
+    if missing or extra:
+        what = f"has no loop.{missing[0]}" if missing else f"has loop.{extra[0]}, which is of a PID"
+        raise RigError(f'{where}: [loop] of kind "state-space" {what}. Give A, B, C, D and rate_hz alone')
+    try:
+        return Loop(delay=entry.delay, law=StateLaw(**matrices, G=np.array(entry.G) if entry.G is not None else None))
+    except ModelError as failure:
+        raise RigError(f"{where}: {failure}") from None
 
 
 def _limits(entry: LimitsEntry, where: str) -> Limits:

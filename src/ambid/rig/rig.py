@@ -531,9 +531,13 @@ def _magnet_lines(magnet: RigMagnet) -> list[str]:
 
 
 def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
-    lines = ["[loop]", 'kind = "pid"']
-    numbers: Mapping[str, float] = {"kp": loop.kp, "ki": loop.ki, "kd": loop.kd, "kc": loop.kc}
-    lines += [f"{name} = {value!r}" for name, value in numbers.items()]
+    lines = ["[loop]", f'kind = "{"pid" if loop.law is None else "state-space"}"']
+    if loop.law is None:
+        numbers: Mapping[str, float] = {"kp": loop.kp, "ki": loop.ki, "kd": loop.kd, "kc": loop.kc}
+        lines += [f"{name} = {value!r}" for name, value in numbers.items()]
+    else:
+        lines += [f"rate_hz = {loop.law.rate_hz!r}"]
+        lines += [f"{name} = {getattr(loop.law, name).tolist()!r}" for name in "ABCDG"]
     if math.isfinite(loop.derivative_cutoff_hz):
         lines.append(f"derivative_cutoff_hz = {loop.derivative_cutoff_hz!r}")
     lines.append(f"delay = {loop.delay!r}")

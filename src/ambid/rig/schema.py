@@ -20,6 +20,7 @@ SCHEMA = "ambid.rig/1"
 Number = Annotated[float, Field(allow_inf_nan=False, strict=True)]
 Positive = Annotated[float, Field(allow_inf_nan=False, strict=True, gt=0)]
 NotNegative = Annotated[float, Field(allow_inf_nan=False, strict=True, ge=0)]
+Matrix = tuple[tuple[Number, ...], ...]
 Samples = Annotated[int, Field(strict=True, ge=0)]
 Whole = Annotated[int, Field(strict=True, ge=0)]
 Text = Annotated[str, Field(strict=True, min_length=1)]
@@ -81,7 +82,7 @@ class LimitsEntry(_Entry):
 class LoopEntry(_Entry):
     """``[loop]``: the controller, for simulation; see :class:`ambid.physics.loop.Loop` for its law and units."""
 
-    kind: Literal["pid"] = "pid"
+    kind: Literal["pid", "state-space"] = "pid"
     kp: Number = 0.0
     ki: Number = 0.0
     kd: Number = 0.0
@@ -89,6 +90,12 @@ class LoopEntry(_Entry):
     derivative_cutoff_hz: Positive | None = None
     delay: NotNegative = 0.0
     limits: LimitsEntry | None = None
+    rate_hz: Positive | None = None
+    A: Matrix | None = None
+    B: Matrix | None = None
+    C: Matrix | None = None
+    D: Matrix | None = None
+    G: Matrix | None = None
 
 
 class ResolutionsEntry(_Entry):

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 
 import numpy as np
@@ -20,10 +20,11 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import ModelError
+from ambid.physics.law import StateLaw
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.record.record import Channel, Record, Step
-from ambid.simulation.plant import LinearPlant, Standing, closed_loop_poles, nonlinear_truth
+from ambid.simulation.plant import LinearPlant, Standing, closed_loop_poles, law_on, matrices_of, nonlinear_truth
 from ambid.simulation.variation import Pieces, Tables, Variation, check_variation
 
 GRID_S = 1e-3
@@ -220,7 +221,8 @@ class VaryingLoop:
         self._run: Callable[..., int] = run
         self._rng, self.current_offset = np.random.default_rng(seed), current_offset
         self._x = self.standing.centre.copy() if start is None else _vector("start", start, self.standing.centre.size)
-        self._memory, self.counts = np.zeros(3), np.array([0, -1, -1, 0])
+        law = law_on(self.loop, of, rate_hz)
+        self._memory, self.counts = np.zeros(3 + (law.order if law else 0)), np.array([0, -1, -1, 0])
         self._line = np.full(whole + 2, self.standing.centre_input)
         self.n_over_current = 0
         force, voltage = self.noise.held_rms(rate_hz)
@@ -232,6 +234,8 @@ class VaryingLoop:
             np.array([of.states.index(o) for o in of.outputs]),
             self._roles,
             np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
+            matrices_of(law),
+            current_offset,
             np.array(resolution[:-1]),
             (*getattr(self.limits, of.inputs[0]), resolution[-1]),
             self.limits.position,
@@ -263,7 +267,6 @@ class VaryingLoop:
         u = np.array(excitation, dtype=np.float64)
         if self.current_offset and "current" in of.outputs:
             noise[:, self._roles[1]] += self.current_offset
-            u += self.loop.kc * self.current_offset
         force, speed, angle, loads = self._loads(first, n)
         column = of.disturbances.index("force") if "force" in of.disturbances else -1
         measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, self._x.size))
@@ -360,8 +363,11 @@ def _channels(running: VaryingLoop, stretches: Sequence[Stretch]) -> tuple[Chann
 def acting(values: Loop | Noise | Limits) -> dict[str, object]:
     """Return the settings that act, as JSON-able values: zeros and infinite limits are left out."""
     found: dict[str, object] = {}
-    for name, value in asdict(values).items():
-        if isinstance(value, tuple):
+    for name in values.__slots__:
+        value = getattr(values, name)
+        if isinstance(value, StateLaw):
+            found[name] = f"state space of order {value.order}"
+        elif isinstance(value, tuple):
             ends = {end: v for end, v in zip(("low", "high"), value, strict=True) if math.isfinite(v)}
             if ends:
                 found[name] = ends
@@ -384,8 +390,8 @@ def _largest_pole(running: VaryingLoop) -> float:
     for k in range(at.size):
         here = {**running.standing.parameters(), **{name: float(x[k]) for name, x in theta.items()}}
         p, c = (float(gains[o][k]) if o in gains else 1.0 for o in ("position", "current"))
-        seen = replace(loop, kp=p * loop.kp, ki=p * loop.ki, kd=p * loop.kd, kc=c * loop.kc)
-        largest = max(largest, float(np.abs(closed_loop_poles(here, seen, rate, of=of.name)[0])))
+        found = closed_loop_poles(here, loop.scaled(p, c), rate, of=of.name)
+        largest = max(largest, float(np.abs(found[0])))
     return largest
 
 

@@ -22,6 +22,9 @@ Integers = NDArray[np.int64]
 Linear = tuple[Array, Array, Array, Array]
 Nonlinear = tuple[Array, Array, tuple[float, float, int]]
 
+# Of a `StateLaw`: A, B, C, D and G; all empty where there is none
+Law = tuple[Array, Array, Array, Array, Array]
+
 _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 
@@ -129,6 +132,34 @@ def order(
     if beyond * growth <= 0.0:
         integral += growth
     return min(max(quantise(wanted, step), low), high), integral, derivative, beyond != 0.0
+
+
+@compiled(error_model="numpy", inline="always")
+def multiply(matrix: Array, vector: Array, into: Array) -> None:
+    """Add a product to `into`; written out, so that no library's threads are asked for matrices as small as these."""
+    for row in range(matrix.shape[0]):
+        s = 0.0
+        for column in range(matrix.shape[1]):
+            s += matrix[row, column] * vector[column]
+        into[row] += s
+
+
+@compiled(error_model="numpy")
+def ordered(law: Law, z: Array, seen: Array, into: Array) -> None:
+    """Write what a `StateLaw` orders; zero without one."""
+    into[:] = 0.0
+    multiply(law[2], z, into)
+    multiply(law[3], seen, into)
+
+
+@compiled(error_model="numpy")
+def carry_law(law: Law, z: Array, seen: Array, lost: Array) -> None:
+    """Carry the states of a `StateLaw` over one sample in place; `lost`: what was ordered less what was wanted."""
+    after = np.zeros(z.size)
+    multiply(law[0], z, after)
+    multiply(law[1], seen, after)
+    multiply(law[4], lost, after)
+    z[:] = after
 
 
 @compiled(error_model="numpy")
@@ -246,6 +277,8 @@ def run(
     outputs: Integers,
     roles: tuple[int, int],
     gains: Array,
+    law: Law,
+    shown: float,
     resolution: Array,
     limits: tuple[float, float, float],
     stops: tuple[float, float],
@@ -259,11 +292,12 @@ def run(
     `noise` (n, n_outputs + n_disturbances); `force` (n,) adds to the disturbance `force_column`, or is empty. `edges`
     (n_pieces + 1) bound the stretches of `sensor_gain` (n_pieces, n_outputs) and of a linear plant's matrices, each
     with one axis more in front. `outputs` are the states that are measured, `roles` the columns among them of position
-    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `limits` low, high and resolution of the command, and
-    `gap` the positions between which the equations hold.
+    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `shown` what the current's sensor shows without current,
+    `limits` low, high and resolution of the command, and `gap` the positions between which the equations hold.
 
-    Kept between calls: x (n_states,), memory = integral, derivative, last position; line = the newest commands, newest
-    first (whole delay + 2); counts = samples done, first contact, first limited command (-1: none), limited commands.
+    Kept between calls: x (n_states,), memory = integral, derivative, last position, law; line = the
+    newest commands, newest first (whole delay + 2); counts = samples done, first contact, first limited command (-1:
+    none), limited commands.
     Filled: measured, command, states. Returns the first sample of these that is not finite or outside the gap, -1 for
     none.
     """
@@ -271,6 +305,7 @@ def run(
     integral, derivative, last = memory[0], memory[1], memory[2]
     whole, n_outputs, n = line.size - 2, outputs.size, command.size
     disturbance, room = np.empty(noise.shape[1] - n_outputs), np.empty(x.size)
+    z, seen, wanted, lost = memory[3:], np.zeros(law[3].shape[1]), np.zeros(1), np.zeros(1)
     for piece in range(edges.size - 1):
         gain = sensor_gain[piece]
         if len(equations) == 3:
@@ -292,11 +327,19 @@ def run(
                 moved = y - last if counts[0] > 0 else 0.0
                 last = y
             if current_at >= 0:
-                carried = measured[k, current_at] - centre[outputs[current_at]]
+                carried = measured[k, current_at] - centre[outputs[current_at]] - shown
             feed = centre_input + excitation[k]
+            if seen.size > 0:
+                seen[0] = -error
+                seen[seen.size - 1] = carried if current_at >= 0 else -error
+                ordered(law, z, seen, wanted)
+                feed += wanted[0]
             command[k], integral, derivative, limited = order(
                 feed, error, moved, carried, integral, derivative, gains, limits
             )
+            if seen.size > 0:
+                lost[0] = command[k] - quantise(feed, limits[2])
+                carry_law(law, z, seen, lost)
             if limited:
                 counts[3] += 1
                 if counts[2] < 0:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -163,10 +163,7 @@ def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *,
 
     poles = closed_loop_poles(parameters, loop, rate_hz, of=of)
     stable = float(np.abs(poles[0])) <= 1.0 + _SLACK
-    others = {
-        "kp, ki and kd": replace(loop, kp=-loop.kp, ki=-loop.ki, kd=-loop.kd),
-        "kc": replace(loop, kc=-loop.kc),
-    }
+    others = {"kp, ki and kd": loop.scaled(-1.0, 1.0), "kc": loop.scaled(1.0, -1.0)}
     own = np.abs(np.angle(poles)) * rate_hz / (2.0 * np.pi)  # a narrow peak of the sensitivity stands there
     own = own[(own > _SPAN * rate_hz) & (own < 0.5 * rate_hz)]
     frequency = np.union1d(np.geomspace(_SPAN * rate_hz, 0.5 * rate_hz, _FREQUENCIES), own)
@@ -179,15 +176,11 @@ def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *,
     return LoopMargins(
         poles=poles,
         rate_hz=rate_hz,
-        gain=_stable_gains(lambda g: largest(_scaled(loop, g)), stable),
+        gain=_stable_gains(lambda g: largest(loop.scaled(g, g)), stable),
         reversed=None if stable else next((name for name, other in others.items() if largest(other) < 1.0), None),
         frequency_hz=frequency,
         open_loop=open_loop,
     )
-
-
-def _scaled(loop: Loop, factor: float) -> Loop:
-    return replace(loop, kp=factor * loop.kp, ki=factor * loop.ki, kd=factor * loop.kd, kc=factor * loop.kc)
 
 
 def _stable_gains(largest: Callable[[float], float], stable: bool) -> Interval | None:

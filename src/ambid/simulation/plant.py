@@ -14,6 +14,7 @@ from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.coenergy_law import law_numbers
+from ambid.physics.law import StateLaw
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop
@@ -139,7 +140,7 @@ def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
 def closed_loop_matrix(
     parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
 ) -> Array:
-    """Return the matrix that carries [plant states, u[k-1], u[k-2], ..., I, D, x[k-1]] over one sample.
+    """Return the matrix that carries [plant states, u[k-1], u[k-2], ..., controller states] over one sample.
 
     Parameters
     ----------
@@ -150,11 +151,12 @@ def closed_loop_matrix(
     rate_hz : float
         Sampling rate in Hz.
     of : str or LinearModel
-        The linear model, or its name; commands u and controller states I, D, x[k-1] are one for each of its inputs.
+        The linear model, or its name; commands u and a PID's states I, D, x[k-1] are one for each of its inputs, those
+        of a `StateLaw` are its own.
 
     Returns
     -------
-    ndarray, shape (n_states + (n_delayed + 3) n_inputs, ...)
+    ndarray, shape (n_states + n_delayed n_inputs + n_controller, ...)
         The loop's matrix; limits and quantisation are left out.
     """
     return excited_loop(parameters, loop, rate_hz, of=of)[0]
@@ -173,6 +175,25 @@ def fed_back(of: LinearModel) -> NDArray[np.int64]:
     return np.array([[place(f"{axis}position"), place(f"{axis}current")] for axis in axes], dtype=np.int64)
 
 
+def signals_fed_back(of: LinearModel) -> NDArray[np.int64]:
+    """Return the outputs that a `StateLaw` sees, in its order: position and current of one axis after the other."""
+    pairs = fed_back(of).ravel()
+    return pairs[pairs >= 0]
+
+
+def law_on(loop: Loop, of: LinearModel, rate_hz: float) -> StateLaw | None:
+    """Return the state-space law of a loop, if it has one; refuse another plant or rate than the law's."""
+    if loop.law is not None:
+        loop.law.check(len(of.inputs), signals_fed_back(of).size, rate_hz)
+    return loop.law
+
+
+def matrices_of(law: StateLaw | None) -> tuple[Array, Array, Array, Array, Array]:
+    """Return A, B, C, D and G as the compiled loops take them; empty without a law."""
+    none = np.zeros((0, 0))
+    return (none,) * 5 if law is None else (law.A, law.B, law.C, law.D, law.windup)
+
+
 def excited_loop(
     parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
 ) -> tuple[Array, Array, Array]:
@@ -185,17 +206,26 @@ def excited_loop(
     whole = math.floor(loop.delay)
     d, _ = discretise(plant.matrices(parameters), period, fraction=loop.delay - whole)
     n, line, inputs = d.A.shape[0], whole + (loop.delay > whole), d.B.shape[1]
-    total = n + (line + 3) * inputs
+    law = law_on(loop, plant, rate_hz)
+    first = n + line * inputs  # of the controller's states
+    total = first + (3 * inputs if law is None else law.order)
     unit = np.eye(total)
-    slots = [slice(n + j * inputs, n + (j + 1) * inputs) for j in range(line + 3)]
-    i, dd, last = slots[line:]
+    slots = [slice(n + j * inputs, n + (j + 1) * inputs) for j in range(line)]
     measured = np.zeros((d.C.shape[0] + 1, total))
     measured[:-1, :n] = d.C  # the last row is what is not fed back
-    position, current = measured[fed_back(plant).T]
-    derivative = (loop.filter_s * unit[dd] - loop.kd * (position - unit[last])) / (loop.filter_s + period)
-    command = -loop.kp * position + unit[i] + derivative - loop.kc * current
-    history = [command, *(unit[s] for s in slots[:line])]  # rows that give u[k], u[k-1], ...
     z, excited = np.zeros((total, total)), np.zeros((total, inputs))
+    if law is None:
+        i, dd, last = (slice(first + j * inputs, first + (j + 1) * inputs) for j in range(3))
+        position, current = measured[fed_back(plant).T]
+        derivative = (loop.filter_s * unit[dd] - loop.kd * (position - unit[last])) / (loop.filter_s + period)
+        command = -loop.kp * position + unit[i] + derivative - loop.kc * current
+        z[i] = unit[i] - loop.ki * period * position
+        z[dd], z[last] = derivative, position
+    else:
+        seen = measured[signals_fed_back(plant)]
+        command = law.C @ unit[first:] + law.D @ seen
+        z[first:] = law.A @ unit[first:] + law.B @ seen
+    history = [command, *(unit[s] for s in slots)]  # rows that give u[k], u[k-1], ...
     z[:n, :n] = d.A
     z[:n] += d.B @ history[whole]
     if line > whole:
@@ -206,8 +236,6 @@ def excited_loop(
         excited[slots[0]] = np.eye(inputs)
     for j in range(line):
         z[slots[j]] = history[j]
-    z[i] = unit[i] - loop.ki * period * position
-    z[dd], z[last] = derivative, position
     return (z, command[0], excited[:, 0]) if inputs == 1 else (z, command, excited)
 
 
@@ -244,7 +272,7 @@ def closed_loop_poles(
     if not np.isfinite(z).all():
         given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
         raise ModelError(f"the loop at {rate_hz:g} Hz diverges ({given}). Correct the parameters")
-    if loop.ki == 0.0:
+    if loop.ki == 0.0 and loop.law is None:
         count = len((model(of) if isinstance(of, str) else of).inputs)
         keep = np.r_[: z.shape[0] - 3 * count, z.shape[0] - 2 * count : z.shape[0]]
         z = z[np.ix_(keep, keep)]

@@ -28,7 +28,7 @@ from ambid.physics.shaft import Shaft
 from ambid.record.record import Channel, Record, Step
 from ambid.rig.rig import Rig
 from ambid.simulation.bench import Simulation, acting, largest_amplitude
-from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back
+from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back, law_on, matrices_of
 from ambid.simulation.rig_bench import FINE, as_columns, loop_of_rig
 from ambid.simulation.rotor_magnets import Poles, poles_of
 
@@ -234,7 +234,8 @@ class RotorBench:
             run_rotor(
                 u, self._noise(rng, u.shape[0]), self._runout(angle),
                 equations, np.ascontiguousarray(continuous.C), fed_back(of),
-                np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]), np.array(steps[:-1]),
+                np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
+                matrices_of(law_on(c, of, self.rate_hz)), np.array(steps[:-1]),
                 (*getattr(self.limits, _kind(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
                 self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), x, counts,
                 measured, command, truth,

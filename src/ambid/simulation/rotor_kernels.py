@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.simulation.kernels import order, quantise
+from ambid.simulation.kernels import Law, carry_law, multiply, order, ordered, quantise
 
 Integers = NDArray[np.int64]
 
@@ -20,16 +20,6 @@ Linear = tuple[Array, Array, Array, Array]  # A, B, B_late and E of a sample
 # Of `rate`: entries of A without magnets, their places (n, 2), what forces do to the states (n_states, n_axes), poles
 # and their axes, resistances, leakages; first states of the currents that flow and that act; fraction, period, steps
 Nonlinear = tuple[Array, Integers, Array, Array, Integers, Array, Array, tuple[int, int], tuple[float, float, int]]
-
-
-@compiled(error_model="numpy", inline="always")
-def multiply(matrix: Array, vector: Array, into: Array) -> None:
-    """Add a product to `into`; written out, so that no library's threads are asked for matrices as small as these."""
-    for row in range(matrix.shape[0]):
-        s = 0.0
-        for column in range(matrix.shape[1]):
-            s += matrix[row, column] * vector[column]
-        into[row] += s
 
 
 @compiled(error_model="numpy")
@@ -170,6 +160,7 @@ def run_rotor(
     read: Array,
     roles: Integers,
     gains: Array,
+    law: Law,
     resolution: Array,
     limits: tuple[float, float, float],
     line: Array,
@@ -195,6 +186,7 @@ def run_rotor(
     n, n_inputs, n_outputs = command.shape[0], command.shape[1], measured.shape[1]
     n_axes = magnets.shape[0]
     memory = np.zeros((n_inputs, 3))
+    z, fed, wanted, lost = np.zeros(law[0].shape[0]), np.zeros(law[3].shape[1]), np.zeros(n_inputs), np.zeros(n_inputs)
     disturbance, after, seen = np.empty(noise.shape[1] - n_outputs), np.empty(x.size), np.empty(n_outputs)
     whole = line.shape[0] - 2
     for k in range(n):
@@ -212,6 +204,13 @@ def run_rotor(
         beyond = False
         for row in range(whole + 1, 0, -1):
             line[row] = line[row - 1]
+        if fed.size > 0:
+            m = 0
+            for j in range(2 * n_inputs):
+                if roles[j // 2, j % 2] >= 0:
+                    fed[m] = measured[k, roles[j // 2, j % 2]]
+                    m += 1
+            ordered(law, z, fed, wanted)
         for j in range(n_inputs):
             error, moved, current = 0.0, 0.0, 0.0
             if roles[j, 0] >= 0:
@@ -221,10 +220,13 @@ def run_rotor(
             if roles[j, 1] >= 0:
                 current = measured[k, roles[j, 1]]
             command[k, j], memory[j, 0], memory[j, 1], limited = order(
-                excitation[k, j], error, moved, current, memory[j, 0], memory[j, 1], gains, limits
+                excitation[k, j] + wanted[j], error, moved, current, memory[j, 0], memory[j, 1], gains, limits
             )
             line[0, j] = command[k, j]
+            lost[j] = command[k, j] - quantise(excitation[k, j] + wanted[j], limits[2])
             beyond = beyond or limited
+        if fed.size > 0:
+            carry_law(law, z, fed, lost)
         if beyond:
             counts[2] += 1
             if counts[1] < 0:
