@@ -1,0 +1,310 @@
+"""Plants that a loop must hold: drawn around an estimate, each with what was changed.
+
+What was identified scatters by its covariance. What matters more was not in the record: a rotor away from its rest
+and another load, at which k_x, k_i and L are those of the co-energy there (thesis eq. 1.9, 2.7); a delay that the
+controller realises only roughly; eddy currents; a coil that became warm; bending modes of another assembly, less
+damped. Draw 0 is the estimate itself.
+
+Without the numbers of a magnet the law is that of two opposed ones: k_i = 4 k' i0/s0² cos alpha and -k_x = 4 k' i0²/s0³
+cos alpha give i0/s0 = -k_x/k_i and, without leakage, L = -k_i²/k_x, so that the gap s0 alone has to be assumed: twice
+the travel inside the limits, as retainer bearings stand at half of the gap.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.control.closed import Plant
+from ambid.errors import EstimationError, ModelError, RigError
+from ambid.physics.linear_model import LinearModel, OneAxis, ParameterSpec, StateSpace
+from ambid.physics.loop import UNLIMITED, Interval
+from ambid.physics.magnet import CoEnergy, Energy
+from ambid.physics.rotor_model import EDDY, RotorModel
+from ambid.rig import Rig
+from ambid.simulation.rig_bench import plant_of_rig, rest_of_rig
+
+COPPER = 0.0039
+"""Rise of the resistance of copper over its value at 20 °C, 1/K."""
+
+_GAP_OF_TRAVEL = 2.0  # air gap over the travel to the retainer bearing
+_NARROW = 0.3  # relative standard deviation up to which a number is drawn in its logarithm
+_TRIES = 100  # of one draw
+_STEPS = 6  # of Newton's method; the force is nearly a square of the current
+_TOLD = 3  # numbers that `Drawn.words` names
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Spread:
+    """How far plants are drawn from the estimate; 0 switches a source off."""
+
+    covariance: float = 1.0  # factor on the standard deviations of what was identified
+    delay: float = 0.5  # samples by which the delay is longer or shorter at most
+    # share of the way to the limits by which the rotor is away from rest at most, and the current from what holds the
+    # rotor there
+    position: float = 0.25
+    current: float = 0.25
+    # largest time constant of the eddy currents in samples; where the rig's [magnet] has their pole, over its own
+    eddy: float = 0.5
+    warm_k: tuple[float, float] = (-10.0, 60.0)  # kelvin by which the coil is colder or warmer than it was
+    frequency: float = 0.03  # relative change of the frequencies of bending modes at most
+    damping: float = 0.5  # share of their damping that may be missing
+
+    def __post_init__(self) -> None:
+        for name in (f.name for f in fields(self) if f.name != "warm_k"):
+            value = getattr(self, name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise ModelError(f"spread.{name} is {value}; it must be zero or positive. Correct it")
+        if max(self.position, self.current, self.damping, self.frequency) >= 1.0:
+            raise ModelError("spread.position, current, damping and frequency are shares below 1. Correct them")
+        if not -200.0 < self.warm_k[0] <= self.warm_k[1]:
+            raise ModelError(f"spread.warm_k is {self.warm_k}; the colder comes first. Swap or correct them")
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Drawn:
+    """One plant, and what was changed."""
+
+    plant: Plant  # without covariance
+    number: int  # of the draw; 0 is the estimate
+    # "position" (m) from rest and "current" (A) from what holds the rotor there, "delay" (samples), "eddy_s" (s),
+    # "warm_k" (K), and the relative change of every number of the model by its name; of a rotor by axis
+    changed: Mapping[str, float]
+
+    def words(self) -> str:
+        """Say what was changed, on one line."""
+        said = []
+        for name, x in self.changed.items():
+            kind = name.rsplit(".", 1)[-1]
+            if kind in _WORDS:
+                said.append(_WORDS[kind].format(x if kind not in ("position", "eddy_s") else 1e6 * x))
+        sizes = sorted(
+            ((n, x) for n, x in self.changed.items() if n.rsplit(".", 1)[-1] not in _WORDS), key=lambda x: -abs(x[1])
+        )
+        said += [f"{n} {100.0 * x:+.2g} %" for n, x in sizes[:_TOLD] if abs(x) >= 0.005]
+        return ", ".join(said) or "the estimate itself"
+
+
+_WORDS = {
+    "position": "rotor {:+.3g} µm from rest", "current": "current {:+.2g} A", "delay": "delay {:+.2f} samples",
+    "eddy_s": "eddy currents {:.3g} µs", "warm_k": "coil {:+.0f} K",
+}  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Draws:
+    """Plants as they were drawn."""
+
+    plants: tuple[Drawn, ...]  # the estimate first
+    rejected: int  # draws without physical sense, which were drawn again
+    assumed: tuple[str, ...]  # what the draws take for granted, a line each
+
+
+def draw_plants(
+    plant: Plant, rig: Rig, n: int, *, seed: int, spread: Spread | None = None,
+    point: Mapping[str, float] | None = None,
+) -> Draws:  # fmt: skip
+    """Return `n` plants, the estimate first; draw k of a seed is the same whatever `n` is.
+
+    `rig`: its magnet and limits are used; `point`: where rotor and current rest, as an estimate's ``operating_point``;
+    default: the rig's. EstimationError where hardly any draw is physical.
+    """
+    spread = spread or Spread()
+    at = rig.operating_point if point is None else point
+    laws, assumed = _laws(plant, rig, at)
+    found, rejected = [Drawn(plant=replace(plant, names=(), covariance=None), number=0, changed=_NONE)], 0
+    for number in range(1, n):
+        rng = np.random.default_rng([seed, number])
+        for _ in range(_TRIES):
+            drawn = _drawn(plant, rig, laws, spread, rng)
+            if drawn is not None:
+                break
+            rejected += 1
+        else:
+            raise EstimationError(
+                f"none of {_TRIES} plants drawn by the estimate's covariance is physical: the record does not show the "
+                "numbers. Identify them from a longer or stronger record, or lower the spread of the covariance"
+            )
+        found.append(replace(drawn, number=number))
+    return Draws(plants=tuple(found), rejected=rejected, assumed=assumed)
+
+
+_NONE: Mapping[str, float] = MappingProxyType({})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Law:
+    """The magnet of one axis: its law, where it rests, and the ways from there that are open."""
+
+    energy: Energy
+    rest: tuple[float, float]  # position, m, and current, A
+    position: Interval  # from rest, m
+    current: Interval  # from rest, A
+
+    def numbers(self, x: float, i: float) -> Array:
+        """Return k_x, k_i, L at some position and current."""
+        w = self.energy
+        return np.array([w.displacement_coefficient(x, i), w.force_per_current(x, i), w.inductance(x, i)])
+
+    def holding(self, x: float) -> float:
+        """Return the current with the force of rest at another position, by Newton's steps."""
+        i, load = self.rest[1], self.energy.force(*self.rest)
+        for _ in range(_STEPS):
+            i -= (self.energy.force(x, i) - load) / self.energy.force_per_current(x, i)
+        return i
+
+
+def _drawn(plant: Plant, rig: Rig, laws: Mapping[str, _Law], spread: Spread, rng: np.random.Generator) -> Drawn | None:
+    """Return one plant; None where it is not physical."""
+    theta, delays = _scattered(plant, spread.covariance, rng)
+    changed: dict[str, float] = {}
+    for axis, law in laws.items():
+        ends = (*law.position, *law.current)
+        shares = rng.uniform(-1.0, 1.0, size=2) * (spread.position, spread.current)
+        way = [float(s * abs(ends[2 * k + (s > 0.0)])) for k, s in enumerate(shares)]
+        x = law.rest[0] + way[0]
+        ratio = law.numbers(x, law.holding(x) + way[1]) / law.numbers(*law.rest)
+        if not np.all(ratio > 0.0):
+            return None
+        for name, factor in zip(("k_x", "k_i", "L"), ratio.tolist(), strict=True):
+            if axis + name in theta:
+                theta[axis + name] *= factor
+        changed |= {f"{axis}{n}": x for n, x, s in zip(("position", "current"), way, shares, strict=True) if s}
+    warm = float(rng.uniform(*spread.warm_k))
+    coils = [name for name in theta if name.rsplit(".", 1)[-1] == "R"]
+    for name in coils:
+        theta[name] *= 1.0 + COPPER * warm
+    changed |= {"warm_k": warm} if coils and warm else {}
+    for name in theta:
+        if name.startswith("mode") and name.endswith((".omega", ".zeta")):
+            u = float(rng.uniform(-1.0, 1.0))
+            theta[name] *= 1.0 + spread.frequency * u if name.endswith("omega") else 1.0 - spread.damping * (1 - u) / 2
+    shift = float(rng.uniform(max(-spread.delay, -float(delays.min())), spread.delay))
+    changed |= {"delay": shift} if shift else {}
+    of, eddy_s = _lagged(plant, rig, theta, spread, rng)
+    changed |= {"eddy_s": eddy_s} if eddy_s else {}
+    if not all(math.isfinite(theta[s.name]) and (theta[s.name] > 0.0 or not s.positive) for s in of.parameters):
+        return None
+    rates = {n: x / plant.theta[n] - 1.0 for n, x in theta.items() if n in plant.theta and plant.theta[n] != 0.0}
+    if any(rates.get(n, 0.0) <= -1.0 for n in theta if n.rsplit(".", 1)[-1] in ("k_i", "k_x")):
+        return None  # a sign turned round is not scatter but another plant
+    drawn = replace(plant, model=of, theta=theta, delays=delays + shift, names=(), covariance=None)
+    return Drawn(plant=drawn, number=-1, changed=changed | {n: x for n, x in rates.items() if x})
+
+
+def _scattered(plant: Plant, factor: float, rng: np.random.Generator) -> tuple[dict[str, float], Array]:
+    """Return numbers and delays drawn from the covariance, through the correlations.
+
+    Well-known and positive numbers scatter in their logarithm, so that a direction that only scales all of them stays
+    that direction.
+    """
+    theta, delays = dict(plant.theta), plant.delays.copy()
+    if plant.covariance is None or not plant.names:
+        return theta, delays
+    sd = np.sqrt(np.maximum(np.diag(plant.covariance), 0.0))
+    scale = np.where(sd > 0.0, sd, 1.0)
+    values, vectors = np.linalg.eigh(plant.covariance / np.outer(scale, scale))
+    drawn = factor * scale * (vectors @ (np.sqrt(np.maximum(values, 0.0)) * rng.standard_normal(sd.size)))
+    positive = {s.name for s in plant.model.parameters if s.positive}
+    roles = [f"{role}.delay" for role in plant.model.inputs]
+    for name, step, spread in zip(plant.names, drawn.tolist(), sd.tolist(), strict=True):
+        if name in roles:
+            delays[roles.index(name)] = max(delays[roles.index(name)] + step, 0.0)
+        elif name in theta:
+            value = theta[name]
+            narrow = value != 0.0 and (name in positive or spread < _NARROW * abs(value))
+            theta[name] = value * math.exp(min(step / value, 50.0)) if narrow else value + step
+    return theta, delays
+
+
+@dataclass(frozen=True, slots=True)
+class _EddyAxis(OneAxis):
+    """One axis whose force follows current and position behind a pole a: p' = a (k_i i - k_x x - p)."""
+
+    parameters: tuple[ParameterSpec, ...] = (*OneAxis().parameters, EDDY)
+    states: tuple[str, ...] = ("position", "velocity", "current", "force")
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return A (4, 4), B (4, 1), E (4, 2), C (2, 4)."""
+        space = OneAxis().matrices(theta)
+        A, a = np.zeros((4, 4)), theta["a"]
+        A[:3, :3] = space.A
+        A[1] = [0.0, space.A[1, 1], 0.0, 1.0 / theta["m"]]
+        A[3] = [-a * theta["k_x"], 0.0, a * theta["k_i"], -a]
+        below = np.zeros((1, 2))
+        return StateSpace(
+            A=A, B=np.vstack([space.B, below[:, :1]]), E=np.vstack([space.E, below]),
+            C=np.hstack([space.C, below.T]),
+        )  # fmt: skip
+
+
+def _lagged(
+    plant: Plant, rig: Rig, theta: dict[str, float], spread: Spread, rng: np.random.Generator
+) -> tuple[LinearModel, float]:
+    """Return the model with eddy currents, whose pole is written into `theta`, and their further time constant in s.
+
+    A model of an estimate that has their pole keeps it: the covariance says how it scatters.
+    """
+    known = None if rig.magnet is None or not rig.magnet.eddy else rig.magnet.known("a")
+    own = 1.0 / plant.rate_hz if known is None or not known.value else 1.0 / known.value
+    lag = float(rng.uniform(0.0, 1.0)) * spread.eddy * own
+    of = plant.model
+    if lag == 0.0 or not isinstance(of, OneAxis | RotorModel):
+        return of, 0.0
+    if "a" in theta:
+        theta["a"] = 1.0 / (1.0 / theta["a"] + lag)
+        return of, lag
+    theta["a"] = 1.0 / lag
+    return (replace(of, extras=(*of.extras, "a")) if isinstance(of, RotorModel) else _EddyAxis()), lag
+
+
+def _laws(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, _Law], tuple[str, ...]]:
+    """Return the law of each axis by the prefix of its numbers, and what is assumed of it."""
+    of, theta = plant.model, plant.theta
+    prefixes = [f"{axis}." for axis in of.axes] if isinstance(of, RotorModel) else [""]
+    prefixes = [p for p in prefixes if f"{p}k_x" in theta and f"{p}k_i" in theta]
+    travel, most = (UNLIMITED, UNLIMITED) if rig.limits is None else (rig.limits.position, rig.limits.current)
+    if not isinstance(of, RotorModel) and rig.magnet is not None:
+        try:
+            known = plant_of_rig(rig)
+            rest = rest_of_rig(rig, known)
+            law = _Law(
+                energy=known.magnet.coenergy, rest=(rest.position, rest.current),
+                position=_ways(rest.position, travel), current=_ways(rest.current, most),
+            )  # fmt: skip
+            return {"": law}, ("the law of the magnet is the rig's [magnet]",)
+        except (RigError, ModelError):  # some numbers are to be found by an identification
+            pass
+    if not all(map(math.isfinite, travel)):
+        return {}, ("limits.position is not given: the plants are those of the rotor at rest",)
+    pulled = [p for p in prefixes if theta[f"{p}k_x"] < 0.0 and theta[f"{p}k_i"] != 0.0]
+    if not pulled:
+        return {}, ("k_x is not negative, which no magnet's law explains: the plants are those of the rotor at rest",)
+    given = None if rig.magnet is None else rig.magnet.known("s")
+    half = (travel[1] - travel[0]) / 2.0
+    gap = given.value if given is not None and given.value else _GAP_OF_TRAVEL * half
+    laws = {}
+    for p in pulled:
+        k_x, k_i, L = theta[f"{p}k_x"], abs(theta[f"{p}k_i"]), theta.get(f"{p}L", 0.0)
+        bias = -k_x * gap / k_i
+        k = k_i * gap**2 / (2.0 * bias)
+        energy = CoEnergy(k_a=k, s_a=gap, k_b=k, s_b=gap, i0=bias, leakage=max(L - 2.0 * k / gap, 0.0))
+        middle = at.get("position", 0.0) if not isinstance(of, RotorModel) else 0.0
+        inside = middle if travel[0] < middle < travel[1] else (travel[0] + travel[1]) / 2.0
+        laws[p] = _Law(
+            energy=energy, rest=(0.0, 0.0), position=_ways(inside, travel),
+            current=_ways(0.0, most) if all(map(math.isfinite, most)) else (-bias, bias),
+        )  # fmt: skip
+    whose = "the rig's gap" if given is not None and given.value else "a gap of twice the travel inside limits.position"
+    return laws, (f"the law of the magnets is that of two opposed ones with {whose}, {1e6 * gap:.4g} µm",)
+
+
+def _ways(rest: float, ends: Interval) -> Interval:
+    """Return the ways down and up from rest that limits leave; none where there is no limit."""
+    low, high = rest - ends[0], ends[1] - rest
+    return (-low if math.isfinite(low) else 0.0, high if math.isfinite(high) else 0.0)
