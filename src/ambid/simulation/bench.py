@@ -254,8 +254,11 @@ class VaryingLoop:
         """Samples so far."""
         return int(self.counts[0])
 
-    def advance(self, excitation: Array, setpoint: ArrayLike | None = None) -> Stretch:
-        """Run on for as many samples as there are of the excitation, new arrays each time."""
+    def advance(self, excitation: Array, setpoint: ArrayLike | None = None, load: Array | None = None) -> Stretch:
+        """Run on for as many samples as there are of the excitation, new arrays each time.
+
+        `load` (n_samples,): force over each sample in N, beside what varies.
+        """
         of, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
         wanted = _vector("setpoint", standing.point.position if setpoint is None else setpoint, n)
         if self.tables is None:
@@ -268,6 +271,8 @@ class VaryingLoop:
         if self.current_offset and "current" in of.outputs:
             noise[:, self._roles[1]] += self.current_offset
         force, speed, angle, loads = self._loads(first, n)
+        if load is not None:
+            force = force + load if force.size else np.ascontiguousarray(load, dtype=np.float64)
         column = of.disturbances.index("force") if "force" in of.disturbances else -1
         measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, self._x.size))
         lost = self._run(

@@ -75,6 +75,7 @@ class Standing:
             if math.isfinite(plant.eddy_pole):
                 more = [plant.magnet.coenergy.force(point.position, point.current)]
         known = {"position": point.position, "velocity": 0.0, "current": point.current, "voltage": point.voltage}
+        known["force"] = 0.0  # behind an eddy pole, from rest
         return cls(
             plant=plant,
             model=of,

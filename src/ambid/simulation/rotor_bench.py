@@ -115,11 +115,15 @@ class RotorBench:
                 "parameters, or go on with --force"
             )
 
-    def simulate(self, excitation: ArrayLike, *, seed: int, columns: bool = True, settle: int = 0) -> Simulation:
-        """Simulate the bench from rest, excited at the controllers' outputs, (n_samples, n_axes).
+    def simulate(
+        self, excitation: ArrayLike, *, seed: int, columns: bool = True, settle: int = 0, load: Array | None = None,
+        start: Array | None = None,
+    ) -> Simulation:  # fmt: skip
+        """Simulate the bench, excited at the controllers' outputs, (n_samples, n_axes).
 
-        Of `settle` samples at the beginning nothing is logged but that limits were met. The record holds voltage,
-        current, position and reference of each axis and, of a rotor that turns, its angle.
+        `load` (n_samples, n_axes): force over each sample in N; `start` (n_states,): default at rest. Of `settle`
+        samples at the beginning nothing is logged but that limits were met. The record holds voltage, current, position
+        and reference of each axis and, of a rotor that turns, its angle.
         """
         of, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != len(of.inputs) or u.shape[0] <= settle:
@@ -132,7 +136,10 @@ class RotorBench:
         truth = np.empty((n, len(of.axes) + len(self._currents)))
         counts = np.array([-1, -1, 0], dtype=np.int64)
         angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
-        lost = self._run(u, np.random.default_rng(seed), angle, counts, measured, command, truth)
+        disturbed = self._noise(np.random.default_rng(seed), n)
+        if load is not None:
+            disturbed[:, len(of.outputs) : len(of.outputs) + len(of.axes)] += load
+        lost = self._run(u, disturbed, start, angle, counts, measured, command, truth)
         if lost >= 0:
             at = f"sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s)"
             raise ModelError(
@@ -206,7 +213,8 @@ class RotorBench:
     def _run(
         self,
         u: Array,
-        rng: np.random.Generator,
+        disturbed: Array,
+        start: Array | None,
         angle: Array,
         counts: NDArray[np.int64],
         measured: Array,
@@ -228,11 +236,12 @@ class RotorBench:
         continuous = self._continuous()
         equations = self._sampled(continuous, fraction) if self.poles is None else self._nonlinear(self.poles, fraction)
         x = np.zeros(continuous.A.shape[0])
+        x[: len(of.states)] = 0.0 if start is None else start
         x[len(of.states) :: 2] = 1.0
         states = [of.states.index(name) for name in self._currents]
         return int(
             run_rotor(
-                u, self._noise(rng, u.shape[0]), self._runout(angle),
+                u, disturbed, self._runout(angle),
                 equations, np.ascontiguousarray(continuous.C), fed_back(of),
                 np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
                 matrices_of(law_on(c, of, self.rate_hz)), np.array(steps[:-1]),
