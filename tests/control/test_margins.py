@@ -66,6 +66,29 @@ def test_margins_come_back_from_their_file(axis, tmp_path):
     assert again.summary() == found.summary()
 
 
+def test_an_estimate_alone_has_the_margins_of_its_record_without_what_is_measured(axis, tmp_path):
+    rig, record, found = axis
+    ambid.identify(record, rig).save(tmp_path / "e.json")
+    alone = ambid.margins(tmp_path / "e.json", rig)
+    assert alone.of == "estimate"
+    assert alone.margins == found.margins
+    assert alone.sensitivity["x"].measured_peak_db is None
+    assert "loop of an estimate" in alone.summary()
+    with pytest.raises(EstimationError, match="nothing but the rig"):
+        ambid.margins(tmp_path / "e.json", rig, from_s=0.1)
+
+
+def test_stiffness_and_damping_are_those_of_the_compliance(axis):
+    """At low frequency the loop is a spring of its static stiffness; both parts say the compliance together."""
+    curves = axis[2].curves
+    dynamic = curves.stiffness["x"] + 2j * np.pi * curves.frequency_hz * curves.damping["x"]
+    np.testing.assert_allclose(1.0 / np.abs(dynamic), curves.compliance["x"], rtol=1e-12)
+    f = curves.frequency_hz
+    mass = next(p.value for p in axis[0].parameters if p.name == "m")
+    high = f > 4000.0  # above the loop the rotor is a mass
+    np.testing.assert_allclose(curves.stiffness["x"][high], -mass * (2.0 * np.pi * f[high]) ** 2, rtol=1e-3)
+
+
 def test_an_open_loop_has_no_margins():
     record = ambid.simulate("thesis", duration=0.3, seed=1)
     with pytest.raises(EstimationError, match="open_loop"):

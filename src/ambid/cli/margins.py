@@ -1,4 +1,4 @@
-"""``ambid margins``: the loop of a record as it is."""
+"""``ambid margins``: the loop of a record, or of an estimate, as it is."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from ambid.cli.terminal import progress
 
 
 def command(
-    record: opt.RecordFile,
+    record: Annotated[
+        Path, opt.argument("RECORD|ESTIMATE", "Record of the levitated rotor, or what 'ambid identify --json' wrote.")
+    ],
     rig: opt.RigFile = None,
     estimate: Annotated[
         Path | None,
@@ -32,8 +34,8 @@ def command(
 ) -> None:
     """Show the margins of the loop: sensitivity by ISO 14839-3, gain, phase, delay, compliance.
 
-    The controller is identified where the excitation is logged as reference, else it is the rig's [loop]. Without
-    --rig, that of the estimate is used.
+    The controller is identified where the excitation is logged as reference, else it is the rig's [loop], as for an
+    estimate alone. Without --rig, that of the estimate is used.
     """
     from ambid.job import margins
 

@@ -16,6 +16,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.control.controller import Controller
@@ -24,10 +25,14 @@ from ambid.physics.linear_model import LinearModel, StateSpace
 from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.rotor.response import Sampled
 
-_SPAN = 1e-4  # of the rate: the lowest frequency
-_FREQUENCIES = 2400
+_SPAN = 1e-4  # of the rate: the lowest frequency that is shown
+_FREQUENCIES = 1200
+_ENDS = 1e-6  # of the rate: how near the frequencies come to rest and to half the rate
+_BELOW = 60  # frequencies below those shown
 _AROUND = np.array([0.0, 0.5, 1.0, 2.0, 4.0, 8.0])  # half widths of a resonance
-_FINE = 121  # frequencies around a peak
+_PASSES = 4  # by which the frequencies come closer where something happens, each by a factor of 9
+_WITHIN = np.arange(1, 9) / 9.0
+_TURN = 0.25  # change of the logarithm of det(I + K H) between neighbours, from which they are too far apart
 DECIBEL = 20.0 / np.log(10.0)
 
 
@@ -94,8 +99,9 @@ class Plant:
             for k in np.flatnonzero(narrow) for side in (-1.0, 1.0) for width in _AROUND
         ]  # fmt: skip
         low, high = _SPAN * self.rate_hz, 0.499 * self.rate_hz
-        near = np.array([f for f in around if low < f < high], dtype=np.float64)
-        return np.union1d(np.geomspace(low, high, _FREQUENCIES), near)
+        near = [f for f in around if low < f < high]
+        below = np.geomspace(_ENDS * self.rate_hz, low, _BELOW)
+        return np.unique(np.r_[below, np.geomspace(low, high, _FREQUENCIES), near, (0.5 - _ENDS) * self.rate_hz])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -122,12 +128,37 @@ class ClosedLoop:
 
     @classmethod
     def of(cls, plant: Plant, controller: Controller) -> ClosedLoop:
-        """Return the loop on the plant's grid."""
-        return cls(plant=plant, controller=controller, frequency_hz=plant.grid())
+        """Return the loop on the plant's grid, closer where the loop resonates, peaks, or passes a margin.
+
+        A resonance of the loop between two frequencies turns det(I + K H), however narrow it is.
+        """
+        loop = cls(plant=plant, controller=controller, frequency_hz=plant.grid())
+        for _ in range(_PASSES):
+            f = loop.frequency_hz
+            k = np.flatnonzero(loop._too_far())
+            loop = loop.at(np.union1d(f, (f[k, None] + (f[k + 1] - f[k])[:, None] * _WITHIN).ravel()))
+        return loop
+
+    def _too_far(self) -> NDArray[np.bool_]:
+        """Return between which frequencies and the next the loop changes too much, (n - 1,)."""
+        det = np.linalg.det(np.eye(self.H.shape[2]) + self.K @ self.H)
+        found: NDArray[np.bool_] = np.abs(np.log(det[1:] / det[:-1])) > _TURN
+        S = np.hstack([self.of_axes, self.at_commands])
+        L = 1.0 / S - 1.0
+        for of in (np.abs(L) > 1.0, L.imag > 0.0):
+            found |= np.any(of[1:] != of[:-1], axis=1)
+        peaks = np.argmax(np.column_stack([np.abs(S), np.abs(S - 0.5), self.singular, np.abs(self.compliance)]), axis=0)
+        found[np.clip(np.concatenate([peaks - 1, peaks]), 0, found.size - 1)] = True
+        return found
 
     def at(self, frequency_hz: Array) -> ClosedLoop:
         """Return the loop at other frequencies."""
         return replace(self, frequency_hz=frequency_hz)
+
+    @property
+    def shown(self) -> NDArray[np.intp]:
+        """Which frequencies are worth showing."""
+        return np.flatnonzero(self.frequency_hz >= _SPAN * self.plant.rate_hz)
 
     @cached_property
     def sampled(self) -> Sampled:
@@ -193,45 +224,62 @@ class ClosedLoop:
         """The diagonal of `sensitivity`, (n, n_axes)."""
         return np.asarray(np.diagonal(self.sensitivity, axis1=1, axis2=2))
 
+    @cached_property
+    def singular(self) -> Array:
+        """The largest singular value of `sensitivity`, (n,)."""
+        return np.asarray(np.linalg.norm(self.sensitivity, ord=2, axis=(1, 2)))
+
     def peaks(self) -> tuple[Peak, ...]:
-        """Return the peak of each axis, refined between the frequencies."""
-        found = []
-        for j, size in enumerate(np.abs(self.of_axes).T):
-            fine = self.at(_around(self.frequency_hz, int(np.argmax(size))))
-            k = int(np.argmax(np.abs(fine.of_axes[:, j])))
-            at = self.at(fine.frequency_hz[k : k + 1])
-            found.append(
-                Peak(ratio=float(np.abs(at.of_axes[0, j])), frequency_hz=float(at.frequency_hz[0]), sd_db=at._sd_db(j))
+        """Return the peak of each axis."""
+        size = np.abs(self.of_axes)
+        at = [(j, int(k)) for j, k in enumerate(np.argmax(size, axis=0))]
+        return tuple(
+            Peak(
+                ratio=float(size[k, j]), frequency_hz=float(self.frequency_hz[k]),
+                sd_db=self.at(self.frequency_hz[k : k + 1])._sd_db(j),
             )
-        return tuple(found)
+            for j, k in at
+        )  # fmt: skip
 
-    def largest_singular(self) -> tuple[float, float]:
-        """Return the peak of the largest singular value of the sensitivity as a ratio, and its frequency in Hz."""
+    @cached_property
+    def pushed(self) -> tuple[Complex, Complex]:
+        """What plant outputs and magnets do in open loop, (n, n_y + n_axes, ...), by disturbances and by inputs.
 
-        def sizes(loop: ClosedLoop) -> Array:
-            return np.asarray(np.linalg.norm(loop.sensitivity, ord=2, axis=(1, 2)))
-
-        fine = self.at(_around(self.frequency_hz, int(np.argmax(sizes(self)))))
-        size = sizes(fine)
-        k = int(np.argmax(size))
-        return float(size[k]), float(fine.frequency_hz[k])
-
-    def compliance(self) -> Complex:
-        """Return the displacement at each magnet by a force there, the loop closed, (n, n_axes), m/N."""
+        Disturbances: those of the model, held over a sample; then a harmonic force at each magnet, (j omega - A)⁻¹.
+        """
         of, space, n = self.plant.model, self.plant.space, len(self.plant.axes)
         if isinstance(of, RotorModel):
             magnets = of.rows(self.plant.theta)[0]
             rows = np.hstack([magnets, np.zeros((n, space.A.shape[0] - magnets.shape[1]))])
         else:
             rows = space.C[[of.outputs.index("position")]]
-        C, forces = np.vstack([space.C, rows]), space.E[:, :n]
-        wide = replace(self.sampled, space=replace(space, C=C))
-        pushed = replace(
-            wide, space=replace(space, B=forces, C=C), delays=np.zeros(n), held=(False,) * n
-        ).transfer()  # fmt: skip
-        n_y, G = space.C.shape[0], wide.transfer()
-        answer = np.linalg.solve(np.eye(G.shape[2]) + self.K @ G[:, :n_y], self.K @ pushed[:, :n_y])
-        return np.asarray(np.diagonal(pushed[:, n_y:] - G[:, n_y:] @ answer, axis1=1, axis2=2))
+        wide = replace(self.sampled, space=replace(space, C=np.vstack([space.C, rows])))
+        values, V, inverse = wide.eigen
+        h = 1.0 / (1j * wide.omega[:, None] - values)
+        harmonic = (h[:, None, :] * (wide.space.C @ V)) @ (inverse @ space.E[:, :n])
+        return np.concatenate([wide.disturbed(), harmonic], axis=2), wide.transfer()
+
+    @cached_property
+    def answers(self) -> Complex:
+        """What the inputs do, (n, n_u, ...), by the disturbances of `pushed`, then by the noise of each output."""
+        n_y = self.H.shape[1]
+        noise = np.broadcast_to(np.eye(n_y), (self.H.shape[0], n_y, n_y))
+        seen = np.concatenate([self.pushed[0][:, :n_y], noise], axis=2)
+        return np.asarray(-np.linalg.solve(np.eye(self.H.shape[2]) + self.K @ self.H, self.K @ seen))
+
+    @cached_property
+    def motions(self) -> Complex:
+        """What plant outputs and magnets do by the causes of `answers`; noise of the sensors is not added to them."""
+        by_forces, by_inputs = self.pushed
+        found = by_inputs @ self.answers
+        found[:, :, : by_forces.shape[2]] += by_forces
+        return np.asarray(found)
+
+    @cached_property
+    def compliance(self) -> Complex:
+        """The displacement at each magnet by a force there, the loop closed, (n, n_axes), m/N."""
+        n_y, n, n_d = self.H.shape[1], len(self.plant.axes), self.plant.space.E.shape[1]
+        return np.asarray(np.diagonal(self.motions[:, n_y:, n_d : n_d + n], axis1=1, axis2=2))
 
     def _sd_db(self, j: int) -> float:
         """Return the standard deviation of 20 lg |S_jj| at the one frequency of this loop (delta method).
@@ -268,8 +316,3 @@ class ClosedLoop:
             len(known) + roles.index(n) if n in roles else known.index(n) for n in names
         ]  # fmt: skip
         return np.asarray(found[:, order])
-
-
-def _around(frequency_hz: Array, k: int) -> Array:
-    """Return frequencies between the neighbours of one."""
-    return np.linspace(frequency_hz[max(k - 1, 0)], frequency_hz[min(k + 1, frequency_hz.size - 1)], _FINE)

@@ -15,7 +15,7 @@ from ambid.control.measured import MeasuredSensitivity
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.modes import EstimatedNumber
 from ambid.rotor.spectra import smoothed
-from ambid.simulation.margins import OpenLoop, zone_of
+from ambid.simulation.margins import STANDARD, ZONES, OpenLoop, zone_of
 
 SCHEMA = "ambid.margins/1"
 _KEPT = 500  # frequencies of the curves that a result keeps, beside those of the peaks
@@ -23,6 +23,13 @@ MISFIT = 0.01
 """Residual of an identified controller over the inputs, up to which it is taken."""
 _FAR = 8.0  # mean square of measured less predicted sensitivity, over its scatter, in its standard deviations
 _NEAR = 0.03  # rms of that difference that is passed whatever the scatter
+_STANDARD: Mapping[str, object] = MappingProxyType(
+    {
+        "edition": STANDARD, "limits_db": [round(float(20.0 * np.log10(x)), 1) for x, _ in ZONES],
+        "note": "check these limits against the text of the standard",
+    }
+)  # fmt: skip
+_NONE: Mapping[str, Array] = MappingProxyType({})
 _LONG_TERM = "AB"  # zones of ISO 14839-3 for unrestricted operation
 
 
@@ -35,6 +42,34 @@ class AxisSensitivity:
     zone: str  # of ISO 14839-3
     measured_peak_db: float | None  # from the record alone, at its excited lines; None where it has no excitation
     measured_frequency_hz: float | None = None
+    # where T = 1 - S last falls through 1/sqrt(2): up to there the rotor follows its set point; None: it never does
+    bandwidth_hz: float | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Disk:
+    """Disk margin of skew 0: gain and phase may change at once by any factor (1 + d)/(1 - d), |d| < size/2, no more.
+
+    size = 2 / max |S - T|; from 2 on any gain above gain_down is borne (Seiler, Packard and Gahinet 2020, sec. 3).
+    """
+
+    size: float
+    frequency_hz: float
+    gain_down: float
+    gain_up: float | None  # None: no limit
+    phase_deg: float
+
+    @classmethod
+    def of(cls, S: Complex, frequency_hz: Array) -> Disk:
+        """Return the disk margin of a sensitivity, (n,), or a lower bound of that of all loops at once, (n, m, m)."""
+        off = np.abs(2.0 * S - 1.0) if S.ndim == 1 else np.linalg.norm(2.0 * S - np.eye(S.shape[1]), ord=2, axis=(1, 2))
+        k = int(np.argmax(off))
+        size = 2.0 / float(off[k])
+        return cls(
+            size=size, frequency_hz=float(frequency_hz[k]), gain_down=max((2.0 - size) / (2.0 + size), 0.0),
+            gain_up=(2.0 + size) / (2.0 - size) if size < 2.0 else None,
+            phase_deg=float(np.degrees(2.0 * np.arctan(size / 2.0))),
+        )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,14 +81,16 @@ class Opening:
     phase_deg: float | None
     delay_s: float | None  # further delay at which it becomes unstable
     peak_db: float  # of the sensitivity there
+    disk: Disk | None = None
 
     @classmethod
-    def of(cls, loop: OpenLoop) -> Opening:
-        """Return the margins of an opened loop."""
+    def of(cls, S: Complex, frequency_hz: Array) -> Opening:
+        """Return the margins of a loop by its sensitivity where it is opened."""
+        loop = OpenLoop(frequency_hz=frequency_hz, open_loop=1.0 / S - 1.0)
         down, up = loop.gain_between
         return cls(
             gain_down=down, gain_up=up, phase_deg=loop.phase_deg, delay_s=loop.delay_s,
-            peak_db=float(20.0 * np.log10(loop.peak[0])),
+            peak_db=float(20.0 * np.log10(loop.peak[0])), disk=Disk.of(S, frequency_hz),
         )  # fmt: skip
 
 
@@ -81,6 +118,9 @@ class Curves:
     sensitivity: Mapping[str, Complex]  # S at the position signal, (n,)
     compliance: Mapping[str, Array]  # modulus, (n,), m/N
     measured: Mapping[str, MeasuredSensitivity]
+    # dynamic: real part of 1/compliance, N/m, and its imaginary part over the angular frequency, N s/m
+    stiffness: Mapping[str, Array] = field(default_factory=lambda: _NONE)
+    damping: Mapping[str, Array] = field(default_factory=lambda: _NONE)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -102,9 +142,15 @@ class Margins(Judged):
     largest_singular : Mapping[str, object]
         ``peak_db``, ``frequency_hz`` and ``zone`` of the largest singular value of the sensitivity of all axes.
     margins : Mapping[str, AxisMargins]
+    disk : Disk or None
+        A lower bound of the disk margin of all position signals at once, from the largest singular value of S - T.
     compliance : Mapping[str, Compliance]
     checks : Mapping[str, Check]
     curves : Curves
+    standard : Mapping[str, object]
+        ``edition`` of ISO 14839-3, its ``limits_db`` between the zones, and a ``note`` to check them against its text.
+    of : {"record", "estimate"}
+        What was looked at: a record, or an estimate alone.
     warnings : tuple of str
     timing_s : Mapping[str, float]
     rig : Mapping[str, object]
@@ -121,6 +167,9 @@ class Margins(Judged):
     compliance: Mapping[str, Compliance]
     checks: Mapping[str, Check]
     curves: Curves
+    standard: Mapping[str, object] = field(default_factory=lambda: _STANDARD)
+    of: Literal["record", "estimate"] = "record"
+    disk: Disk | None = None
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
@@ -131,52 +180,57 @@ def sensitivity_by_axis(
 ) -> dict[str, AxisSensitivity]:
     """Return the peak of the sensitivity of each axis."""
     found: dict[str, AxisSensitivity] = {}
-    for axis, peak, seen in zip(loop.plant.axes, loop.peaks(), measured or (None,) * len(loop.plant.axes), strict=True):
+    measured = measured or (None,) * len(loop.plant.axes)
+    for axis, peak, S, seen in zip(loop.plant.axes, loop.peaks(), loop.of_axes.T, measured, strict=True):
         top = None if seen is None else seen.peak
         found[axis] = AxisSensitivity(
             peak_db=EstimatedNumber.of(peak.decibel, peak.sd_db, size=1.0), frequency_hz=peak.frequency_hz,
             zone=zone_of(peak.ratio), measured_peak_db=None if top is None else float(20.0 * np.log10(top[0])),
-            measured_frequency_hz=None if top is None else top[1],
+            measured_frequency_hz=None if top is None else top[1], bandwidth_hz=_bandwidth(loop.frequency_hz, S),
         )  # fmt: skip
     return found
 
 
+def _bandwidth(frequency_hz: Array, S: Complex) -> float | None:
+    """Return where T = 1 - S last falls through 1/sqrt(2) (Skogestad and Postlethwaite 2005, sec. 2.4.5)."""
+    size = np.abs(1.0 - S)
+    k = np.flatnonzero((size[:-1] > np.sqrt(0.5)) & (size[1:] <= np.sqrt(0.5)))
+    return float(frequency_hz[k[-1]]) if k.size else None
+
+
 def margins_by_axis(loop: ClosedLoop) -> dict[str, AxisMargins]:
     """Return the margins of each axis, its loop opened alone."""
-
-    def opened(S: Complex) -> Opening:
-        return Opening.of(OpenLoop(frequency_hz=loop.frequency_hz, open_loop=1.0 / S - 1.0))
-
+    f = loop.frequency_hz
     return {
-        axis: AxisMargins(position=opened(loop.of_axes[:, j]), command=opened(loop.at_commands[:, j]))
+        axis: AxisMargins(position=Opening.of(loop.of_axes[:, j], f), command=Opening.of(loop.at_commands[:, j], f))
         for j, axis in enumerate(loop.plant.axes)
     }
 
 
-def compliance_by_axis(loop: ClosedLoop) -> tuple[dict[str, Compliance], dict[str, Array]]:
-    """Return the largest compliance of each axis, and its modulus over frequency."""
-    size = dict(zip(loop.plant.axes, np.abs(loop.compliance()).T, strict=True))
-    worst = {axis: int(np.argmax(x)) for axis, x in size.items()}
+def compliance_by_axis(loop: ClosedLoop) -> dict[str, Compliance]:
+    """Return the largest compliance of each axis."""
+    size = np.abs(loop.compliance)
     return {
-        axis: Compliance(largest=float(size[axis][k]), frequency_hz=float(loop.frequency_hz[k]))
-        for axis, k in worst.items()
-    }, size
+        axis: Compliance(largest=float(size[k, j]), frequency_hz=float(loop.frequency_hz[k]))
+        for j, (axis, k) in enumerate(zip(loop.plant.axes, np.argmax(size, axis=0), strict=True))
+    }
 
 
-def curves_of(
-    loop: ClosedLoop, compliance: Mapping[str, Array], measured: Sequence[MeasuredSensitivity | None]
-) -> Curves:
+def curves_of(loop: ClosedLoop, measured: Sequence[MeasuredSensitivity | None]) -> Curves:
     """Return the curves of a loop, thinned between their peaks."""
-    size, axes = np.abs(loop.of_axes), loop.plant.axes
-    even = np.linspace(0, loop.frequency_hz.size - 1, _KEPT).round().astype(int)
-    near = [k for x in (size.T, *([np.array(list(compliance.values()))])) for k in np.argmax(x, axis=1)]
-    kept = np.unique(np.concatenate([even, *(np.arange(k - 3, k + 4) for k in near)]))
-    kept = kept[(kept >= 0) & (kept < loop.frequency_hz.size)]
+    f, axes, S, G = loop.frequency_hz, loop.plant.axes, loop.of_axes, loop.compliance
+    even = loop.shown[np.linspace(0, loop.shown.size - 1, _KEPT).round().astype(int)]
+    near = [k for x in (S, G) for k in np.argmax(np.abs(x), axis=0)]
+    kept = np.unique(np.clip(np.concatenate([even, *(np.arange(k - 3, k + 4) for k in near)]), 0, f.size - 1))
+    stiff = 1.0 / G[kept]
+    damping = stiff.imag / (2.0 * np.pi * f[kept, None])
     return Curves(
-        frequency_hz=loop.frequency_hz[kept],
-        sensitivity={axis: loop.of_axes[kept, j] for j, axis in enumerate(axes)},
-        compliance={axis: x[kept] for axis, x in compliance.items()},
+        frequency_hz=f[kept],
+        sensitivity={axis: S[kept, j] for j, axis in enumerate(axes)},
+        compliance={axis: np.abs(G[kept, j]) for j, axis in enumerate(axes)},
         measured={axis: m for axis, m in zip(axes, measured, strict=True) if m is not None},
+        stiffness={axis: stiff[:, j].real for j, axis in enumerate(axes)},
+        damping={axis: damping[:, j] for j, axis in enumerate(axes)},
     )
 
 

@@ -1,4 +1,4 @@
-"""The job of a loop's margins: a record and an estimate of its plant in, what the loop can bear out.
+"""The job of a loop's margins: a record, an estimate of its plant, or both in; what the loop can bear out.
 
 Read -> identify, or take an estimate -> controller -> closed loop -> judge.
 """
@@ -8,12 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from ambid.control.closed import Plant
 from ambid.control.margins import (
+    Disk,
     Margins,
     checks_of,
     compliance_by_axis,
@@ -36,7 +37,7 @@ from ambid.simulation.plant import closed_loop_poles
 
 
 def margins(
-    record: Source,
+    record: Source | Numbers,
     rig: Rig | str | Path | None = None,
     *,
     estimate: Numbers | str | Path | None = None,
@@ -51,12 +52,12 @@ def margins(
     """Say how much margin the loop of a record has: sensitivity by ISO 14839-3, gain, phase, delay, compliance.
 
     The plant is that of an estimate. The controller is identified from the record where an excitation is logged as
-    reference, else it is the rig's ``[loop]``.
+    reference, else it is the rig's ``[loop]``, as for an estimate alone.
 
     Parameters
     ----------
-    record : file, Record, DataFrame, Dataset or dict of arrays
-        Of the levitated rotor.
+    record : file, Record, DataFrame, Dataset or dict of arrays; Estimate, RotorEstimate or its .json file
+        Of the levitated rotor. Of an estimate alone nothing is measured.
     rig : Rig, str or Path, optional
         What is known of the bench; default: that of the estimate, else as `ambid.identify`.
     estimate : Estimate, RotorEstimate, str or Path, optional
@@ -88,20 +89,30 @@ def margins(
     >>> found.sensitivity["x"].zone, found.verdict.word
     ('A', 'usable')
     """
-    say, clock = tick or silent, Clock()
+    say, clock, source = tick or silent, Clock(), cast(Source, record)
     reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
-    if estimate is None:
+    used: Record | None = None
+    if isinstance(record, Numbers) or (isinstance(record, str | Path) and Path(record).suffix == ".json"):
+        if estimate is not None or reference is not None or any(x is not None for x in reading.values()):
+            raise EstimationError(
+                "margins of an estimate alone take nothing but the rig; --estimate, --reference, --from, --to, --rate, "
+                "--gaps and units are of a record. Omit them, or give a record"
+            )
+        known, bench = _given(record, rig)
+        bench = replace(bench, open_loop=False)  # so were its records; here its [loop] is closed
+    elif estimate is None:
         from ambid.job.identification import identify
 
         bench = known_rig(rig)
-        known: Any = identify(record, bench, tick=say, **reading)
-        used = known.used[0] if isinstance(known.used, tuple) else known.used
+        known = identify(source, bench, tick=say, **reading)
+        taken: Any = known.used
+        used = taken[0] if isinstance(taken, tuple) else taken
     else:
         known, bench = _given(estimate, rig)
         say("read")
-        used = load_bench(record, bench, **reading)
+        used = load_bench(source, bench, **reading)
     if reference is not None:
-        used = _with_reference(load_bench(record, bench, beside=(reference,), **reading), bench, reference)
+        used = _with_reference(load_bench(source, bench, beside=(reference,), **reading), bench, reference)
     clock.lap("identify")
     say("margins")
     with one_thread():
@@ -121,7 +132,7 @@ def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
     return replace(bench, channels=(*others, replace(bench.channel(column), name="reference")))
 
 
-def _given(estimate: Numbers | str | Path, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
+def _given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
     """Return an estimate that is given, and the rig: its own unless another is given."""
     from ambid.job.results import load, rig_of
 
@@ -140,33 +151,36 @@ def _given(estimate: Numbers | str | Path, rig: Rig | str | Path | None) -> tupl
     return known, bench
 
 
-def _margins(estimate: Numbers, rig: Rig, bench: Record) -> Margins:
-    clean, speed = bench, 0.0
-    if isinstance(estimate, RotorEstimate):
+def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
+    clean, speed = bench, estimate.speed if isinstance(estimate, RotorEstimate) else 0.0
+    if bench is not None and isinstance(estimate, RotorEstimate):
         from ambid.rotor.synchronous import separate
 
         apart = separate(bench, estimate.plant.at_speed(0.0 if rig.rotor is None else rig.rotor.speed))
         clean, speed = apart.record, apart.speed
-    spectra = spectra_of(clean, model(estimate.model) if isinstance(estimate, Estimate) else estimate.plant, speed)
-    loop = loop_of(estimate, rig, bench.rate_hz, spectra, speed)
+    plant = model(estimate.model) if isinstance(estimate, Estimate) else estimate.plant
+    spectra = None if clean is None else spectra_of(clean, plant, speed)
+    record = estimate.record if bench is None else origin(bench)
+    loop = loop_of(estimate, rig, float(str(record["rate_hz"])), spectra, speed)
     if loop.controller.source == "rig":
         _refuse_unstable(loop.plant, rig)
     measured = measure(loop, clean, spectra)
     found, of = sensitivity_by_axis(loop, measured), loop.controller
-    compliance, size = compliance_by_axis(loop)
-    ratio, hz = loop.largest_singular()
+    top = int(np.argmax(loop.singular))
+    ratio, hz = float(loop.singular[top]), float(loop.frequency_hz[top])
     band = None if spectra is None else (float(spectra.frequency_hz[0]), float(spectra.frequency_hz[-1]))
     checks = checks_of(loop, found, measured, band)
     if not estimate.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
     return Margins(
-        status=estimate.status, model=estimate.model, record=origin(bench), speed=speed,
+        status=estimate.status, model=estimate.model, of="estimate" if bench is None else "record", record=record,
+        speed=speed,
         controller={"source": of.source, "order": list(of.orders), "misfit": of.misfit},
         sensitivity=found,
         largest_singular={"peak_db": float(20.0 * np.log10(ratio)), "frequency_hz": hz, "zone": zone_of(ratio)},
-        margins=margins_by_axis(loop), compliance=compliance, checks=checks,
-        curves=curves_of(loop, size, measured),
+        margins=margins_by_axis(loop), compliance=compliance_by_axis(loop), checks=checks,
+        curves=curves_of(loop, measured), disk=Disk.of(loop.sensitivity, loop.frequency_hz),
     )  # fmt: skip
 
 
@@ -177,6 +191,6 @@ def _refuse_unstable(plant: Plant, rig: Rig) -> None:
     pole = float(np.abs(closed_loop_poles(plant.theta, loop, plant.rate_hz, of=plant.model)[0]))
     if pole > 1.0 + 1e-6:
         raise EstimationError(
-            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the record is of a "
-            "levitated rotor: it is another controller. Correct [loop], or log the excitation as reference"
+            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the loop of a "
+            "levitated rotor does: it is another controller. Correct [loop], or log the excitation as reference"
         )

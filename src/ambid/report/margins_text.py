@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ambid.control.margins import AxisSensitivity, Margins, Opening
+from ambid.control.margins import AxisSensitivity, Disk, Margins, Opening
 from ambid.report.numbers import sized
 from ambid.report.text import (
     WIDTH,
@@ -19,6 +19,7 @@ from ambid.report.text import (
     title_line,
     warning_lines,
 )
+from ambid.simulation.margins import STANDARD
 
 TURN = 30.0 / np.pi  # 1/min in a rad/s
 _NONE = "–"
@@ -28,7 +29,14 @@ def margins_text(found: Margins, *, width: int = WIDTH, paint: Paint = plain) ->
     """Write the margins of a loop, below their verdict."""
     record = found.record
     samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
-    head = title_line(record.get("file"), "loop of a record", samples, rate, found.status, paint)
+    head = title_line(
+        record.get("file"),
+        f"loop of {'a record' if found.of == 'record' else 'an estimate'}",
+        samples,
+        rate,
+        found.status,
+        paint,
+    )
     return joined(
         [
             [head, _whence(found)],
@@ -53,11 +61,16 @@ def _whence(found: Margins) -> str:
 
 
 def _sensitivity(found: Margins, paint: Paint) -> list[str]:
-    rows: list[tuple[str, ...]] = [("axis", "peak", "at", "zone", "measured")]
+    rows: list[tuple[str, ...]] = [("axis", "peak", "at", "zone", "measured", "bandwidth")]
     for axis, s in found.sensitivity.items():
         peak = f"{pure(s.peak_db.value, s.peak_db.sd)} dB"
-        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.zone, _measured(s)))
-    lines = [paint("sensitivity at the position signals (ISO 14839-3)", "strong"), *columns(rows)]
+        wide = _NONE if s.bandwidth_hz is None else sized(s.bandwidth_hz, "Hz")
+        rows.append((axis, peak, sized(s.frequency_hz, "Hz"), s.zone, _measured(s), wide))
+    limits = found.standard["limits_db"]
+    assert isinstance(limits, list | tuple)
+    lines = [paint(f"sensitivity at the position signals (zones of {STANDARD})", "strong"), *columns(rows)]
+    ends = " and ".join([", ".join(f"{x:g}" for x in limits[:-1]), f"{limits[-1]:g}"])
+    lines.append(f"zones end at {ends} dB; check these limits against the text of the standard")
     if len(found.sensitivity) > 1:
         of = {name: float(str(found.largest_singular[name])) for name in ("peak_db", "frequency_hz")}
         at = f"{of['peak_db']:.2f} dB at {sized(of['frequency_hz'], 'Hz')}"
@@ -72,7 +85,7 @@ def _measured(s: AxisSensitivity) -> str:
 
 
 def _openings(found: Margins, paint: Paint) -> list[str]:
-    rows: list[tuple[str, ...]] = [("axis", "opened at", "gain", "phase", "delay", "peak")]
+    rows: list[tuple[str, ...]] = [("axis", "opened at", "gain", "phase", "delay", "disk margin", "peak")]
     for axis, of in found.margins.items():
         rows += [(axis, "position", *_opening(of.position)), ("", "input", *_opening(of.command))]
     return [paint("margins, one loop opened, the others closed", "strong"), *columns(rows)]
@@ -82,7 +95,11 @@ def _opening(of: Opening) -> tuple[str, ...]:
     gain = f"{_number(of.gain_down)} … {_number(of.gain_up)}"
     phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
     delay = _NONE if of.delay_s is None else sized(of.delay_s, "s")
-    return (gain, phase, delay, f"{of.peak_db:.2f} dB")
+    return (gain, phase, delay, _disk(of.disk), f"{of.peak_db:.2f} dB")
+
+
+def _disk(of: Disk | None) -> str:
+    return _NONE if of is None else f"{_number(of.gain_down)} … {_number(of.gain_up)}, {of.phase_deg:.0f}°"
 
 
 def _number(x: float | None) -> str:

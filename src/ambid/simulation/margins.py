@@ -22,6 +22,8 @@ Complex = NDArray[np.complex128]
 
 ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"))
 """Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio: 9.5, 12 and 14 dB; beyond is zone D."""
+STANDARD = "ISO 14839-3:2006"
+"""The edition that `ZONES` are of; users are asked to check them against its text."""
 
 
 def zone_of(peak: float) -> str:
