@@ -1,0 +1,330 @@
+"""LQG with integral action, in discrete time: a `StateLaw` from a plant, physical weights and noise.
+
+The plant over one sample, x+ = A x + B u + n, y = C x + e, has its own states and the commands still on their way
+(delay). With q+ = q + T p the integral of the positions, u = -K [x̂, q] minimises
+
+    Σ p'p/p₁² + i'i/i₁² + q'q/(p₁ τ)² + effort² u'u/u₁²,
+
+K = (R + B'P B)⁻¹ B'P A, and x̂ is that of the stationary Kalman filter (Kwakernaak and Sivan 1972, ch. 6; Franklin,
+Powell and Workman 1998, ch. 9). Its separation holds for this plant alone and promises no margins (Doyle 1978): the two
+knobs, effort and how strong disturbances are taken, are set by the worst of many plants.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.controller import controller_of_loop
+from ambid.errors import EstimationError, ModelError
+from ambid.physics.law import StateLaw
+from ambid.physics.linear_model import discretise
+from ambid.physics.loop import Limits, Loop, Noise
+from ambid.simulation.plant import fed_back, signals_fed_back
+
+RESIDUAL = 1e-8
+"""Largest residual of a Riccati equation, over its largest term, that is taken."""
+_ROUNDED = 1e-3  # of the largest command: the least noise in it, that of rounding and of what the model leaves out
+_HIDDEN = 1e-4  # of the largest signal: the least noise of a sensor
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Weights:
+    """Largest deviations, in which position, current and command are weighed."""
+
+    position: float  # m
+    command: float  # V, or what the inputs are
+    current: float = math.inf  # A; not weighed where it is infinite
+    integral_s: float = 0.05  # time in which a deviation may be integrated away
+
+    @classmethod
+    def of(cls, limits: Limits, integral_s: float) -> Weights:
+        """Return half of the width of the limits; ModelError where one that is needed is not given."""
+        half = {n: (getattr(limits, n)[1] - getattr(limits, n)[0]) / 2.0 for n in ("position", "voltage", "current")}
+        for name in ("position", "voltage"):
+            if not math.isfinite(half[name]):
+                raise ModelError(f"limits.{name} is not given; LQG weighs by it. Give limits.{name}")
+        return cls(position=half["position"], command=half["voltage"], current=half["current"], integral_s=integral_s)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class SampledPlant:
+    """A plant over one sample, its states followed by the commands on their way; outputs as a `StateLaw` sees them."""
+
+    A: Array
+    B: Array
+    E: Array
+    C: Array
+    plant: Plant
+
+    @classmethod
+    def of(cls, plant: Plant) -> SampledPlant:
+        """Return the plant with the delay of each input, whole and fraction."""
+        space, n = plant.space, plant.space.A.shape[0]
+        whole = np.floor(plant.delays).astype(int)
+        line = whole + (plant.delays > whole)
+        first = n + np.concatenate([[0], np.cumsum(line)])
+        A, B = np.zeros((first[-1], first[-1])), np.zeros((first[-1], whole.size))
+        for j in range(whole.size):
+            d, _ = discretise(space, 1.0 / plant.rate_hz, fraction=float(plant.delays[j] - whole[j]))
+            A[:n, :n] = d.A
+            history = [B[:, j], *(A[:, k] for k in range(first[j], first[j + 1]))]  # what u[k], u[k-1], ... act on
+            history[whole[j]][:n] += d.B[:, j]
+            if line[j] > whole[j]:
+                history[-1][:n] += d.B_late[:, j]
+            for k, column in enumerate(history[: line[j]]):
+                column[first[j] + k] = 1.0
+        E, C = np.zeros((A.shape[0], d.E.shape[1])), np.zeros((signals_fed_back(plant.model).size, A.shape[0]))
+        E[:n], C[:, :n] = d.E, space.C[signals_fed_back(plant.model)]
+        return cls(A=A, B=B, E=E, C=C, plant=plant)
+
+    @cached_property
+    def kinds(self) -> tuple[Array, Array]:
+        """Which outputs are positions, and which are currents, of the axes in their order."""
+        pairs = fed_back(self.plant.model)
+        order = np.cumsum(pairs.ravel() >= 0).reshape(pairs.shape) - 1
+        return order[pairs[:, 0] >= 0, 0], order[pairs[:, 1] >= 0, 1]
+
+    def closed(self, law: StateLaw) -> Array:
+        """Return the matrix of the closed loop, states of the plant before those of the law."""
+        return np.block([[self.A + self.B @ law.D @ self.C, self.B @ law.C], [law.B @ self.C, law.A]])
+
+    def largest_pole(self, law: StateLaw) -> float:
+        """Return the largest modulus of the poles of the closed loop."""
+        return float(np.max(np.abs(np.linalg.eigvals(self.closed(law)))))
+
+    def sensors(self, noise: Noise) -> Array:
+        """Return the standard deviations of the outputs, with those of rounding."""
+        found = np.zeros(self.C.shape[0])
+        for rows, white, step in zip(
+            self.kinds, (noise.position, noise.current), (noise.position_resolution, noise.current_resolution),
+            strict=True,
+        ):  # fmt: skip
+            found[rows] = math.hypot(white, step / math.sqrt(12.0))
+        return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lqg:
+    """A law, its gains, and how well the equations were solved."""
+
+    law: StateLaw
+    regulator: Array  # (n_inputs, n_states + n_axes), K of [x, q]
+    filter: Array  # (n_states, n_outputs), M of x̂ + M (y - C x̂)
+    residual: float  # of both Riccati equations, over their largest term
+    largest_pole: float  # of the closed loop on the plant of the design
+    effort: float
+    disturbance: float
+
+
+def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, disturbance: float = 1.0) -> Lqg:
+    """Return the law for a plant.
+
+    `effort`: factor on the price of the command: small is fast; `disturbance`: factor on the process noise: large
+    trusts the sensors, small the model. EstimationError where the equations have no good solution.
+    """
+    of = SampledPlant.of(plant)
+    scale = _scales(of, weights)
+    A, B, E, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.E / scale[:, None], of.C * scale
+    n, (position, current) = A.shape[0], of.kinds
+    if position.size == 0:
+        raise EstimationError(f"model {plant.model.name!r} has no position to hold. Give one with a position")
+    T, axes, p = 1.0 / plant.rate_hz, position.size, C[position] / weights.position
+    wide = np.block([[A, np.zeros((n, axes))], [(T / weights.integral_s) * p, np.eye(axes)]])
+    Q = np.eye(n + axes)
+    Q[:n, :n] = p.T @ p + C[current].T @ C[current] / weights.current**2
+    wide_B, R = np.vstack([B, np.zeros((axes, B.shape[1]))]) * weights.command, effort**2 * np.eye(B.shape[1])
+    P, first = _riccati(wide, wide_B, Q, R)
+    K = weights.command * np.linalg.solve(R + wide_B.T @ P @ wide_B, wide_B.T @ P @ wide)
+    M, second = _filter(of, A, B, E, C, weights, noise, disturbance)
+    kept = np.eye(n) - M @ C
+    moved, direct = A - B @ K[:, :n], -K[:, :n] @ M
+    total = K[:, n:]
+    back = min(T / weights.integral_s, 1.0)
+    integrates = np.zeros((axes, C.shape[0]))
+    integrates[np.arange(axes), position] = T / (weights.integral_s * weights.position)
+    law = StateLaw(
+        A=np.block([[moved @ kept, -B @ total], [np.zeros((axes, n)), np.eye(axes)]]),
+        B=np.vstack([moved @ M, integrates]),
+        C=np.hstack([-K[:, :n] @ kept, -total]),
+        D=direct,
+        G=np.vstack([B, -back * np.linalg.pinv(total)]),
+        rate_hz=plant.rate_hz,
+    )
+    size, residual = of.largest_pole(law), max(first, second)
+    if not (residual <= RESIDUAL and size < 1.0):
+        raise EstimationError(
+            f"the Riccati equations of LQG are solved to {residual:.1e} of their terms only and the largest pole is "
+            f"{size:.6f}. Change the effort, or give noise and limits that fit the plant"
+        )
+    units = np.concatenate([scale, np.ones(axes)])
+    return Lqg(
+        law=law, regulator=K / units, filter=scale[:, None] * M, residual=residual, largest_pole=size, effort=effort,
+        disturbance=disturbance,
+    )  # fmt: skip
+
+
+def _scales(of: SampledPlant, weights: Weights) -> Array:
+    """Return sizes of the states, powers of two, that make the rows of plant, inputs and outputs alike (Osborne)."""
+    from scipy.linalg import matrix_balance
+
+    n, n_u, (position, current) = of.A.shape[0], of.B.shape[1], of.kinds
+    rows = [of.C[position] / weights.position, *([of.C[current] / weights.current] if current.size else [])]
+    outputs = np.vstack(rows)
+    whole = np.zeros((n + max(n_u, outputs.shape[0]),) * 2)
+    whole[:n, :n], whole[:n, n : n + n_u] = of.A, of.B * weights.command
+    whole[n : n + outputs.shape[0], :n] = outputs
+    return np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0][:n])
+
+
+def _riccati(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, float]:
+    """Return P of the discrete Riccati equation, and the residual over its largest term."""
+    from scipy.linalg import solve_discrete_are
+
+    try:
+        P = solve_discrete_are(A, B, Q, R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise EstimationError(
+            f"a Riccati equation of LQG has no solution ({error}). The inputs do not reach, or the outputs do not "
+            "show, a motion that is not stable; or noise or limits do not fit the plant"
+        ) from None
+    carried = A.T @ P @ A
+    terms = (carried, P, A.T @ P @ B @ np.linalg.solve(R + B.T @ P @ B, B.T @ P @ A), Q)
+    left = terms[0] - terms[1] - terms[2] + terms[3]
+    return P, float(np.max(np.abs(left)) / max(float(np.max(np.abs(t))) for t in terms))
+
+
+def _filter(
+    of: SampledPlant, A: Array, B: Array, E: Array, C: Array, weights: Weights, noise: Noise, disturbance: float
+) -> tuple[Array, float]:
+    """Return the gain M of the stationary filter, and the residual of its equation, outputs counted in their noise."""
+    force, voltage = noise.held_rms(of.plant.rate_hz)
+    size = [force if name.rsplit("_", 1)[-1] == "force" else voltage for name in of.plant.model.disturbances]
+    driven = np.hstack([E * np.array(size), B * (_ROUNDED * weights.command)]) * disturbance
+    sd = of.sensors(noise)
+    for rows, largest in zip(of.kinds, (weights.position, weights.current), strict=True):
+        sd[rows] = np.maximum(sd[rows], _HIDDEN * (largest if math.isfinite(largest) else 0.0))
+    if not np.all(sd > 0.0):
+        raise ModelError("noise.current is not given; the filter of LQG weighs by it. Give noise.current")
+    level = float(np.max(np.abs(driven)))
+    seen, driven = C / sd[:, None] * level, driven / level
+    P, residual = _riccati(A.T, seen.T, driven @ driven.T, np.eye(sd.size))
+    M = np.linalg.solve(seen @ P @ seen.T + np.eye(sd.size), seen @ P).T
+    return M * (level / sd), residual
+
+
+# --- the knobs, by many plants ---------------------------------------------------------------------------------------
+
+_FREQUENCIES = 200
+_FIRST, _FINEST = 4.0, 1.2  # factors on the knobs between tries
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Worst:
+    """What a law does on the worst of several plants."""
+
+    largest_pole: float
+    peak: float  # of the sensitivity, of any axis, at its position signal or its command
+    plant: int  # the one with the peak, or that is not stable
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Family:
+    """Plants that one law must hold, the one it is designed for first."""
+
+    plants: tuple[Plant, ...]
+
+    @cached_property
+    def sampled(self) -> tuple[SampledPlant, ...]:
+        """Each over one sample."""
+        return tuple(SampledPlant.of(p) for p in self.plants)
+
+    @cached_property
+    def frequency_hz(self) -> Array:
+        """Where the sensitivity is looked at, close around the resonances of the first plant."""
+        rate, every = self.plants[0].rate_hz, self.plants[0].grid()
+        even = np.geomspace(1e-4 * rate, 0.499 * rate, _FREQUENCIES)
+        fine = np.diff(np.log(every)) < 0.5 * np.log(every[1] / every[0])
+        return np.union1d(even, every[1:][fine])
+
+    @cached_property
+    def responses(self) -> Complex:
+        """From commands to what is fed back, (n_plants, n_frequencies, n_y, n_u)."""
+        rows = signals_fed_back(self.plants[0].model)
+        return np.stack([p.sampled(self.frequency_hz).transfer()[:, rows] for p in self.plants])
+
+    def worst(self, law: StateLaw) -> Worst:
+        """Return the largest pole, and where all are stable the peak of the sensitivity."""
+        poles = np.array([of.largest_pole(law) for of in self.sampled])
+        k = int(np.argmax(poles))
+        if poles[k] >= 1.0:
+            return Worst(largest_pole=float(poles[k]), peak=math.inf, plant=k)
+        H, W = self.responses, law.response(self.frequency_hz)
+        position = self.sampled[0].kinds[0]
+        signals = np.linalg.inv(np.eye(H.shape[2]) - H @ W)[..., position, position]
+        commands = np.linalg.inv(np.eye(H.shape[3]) - W @ H)
+        both = np.concatenate([signals, np.diagonal(commands, axis1=2, axis2=3)], axis=2)
+        peaks = np.max(np.abs(both), axis=(1, 2))
+        return Worst(largest_pole=float(poles[k]), peak=float(np.max(peaks)), plant=int(np.argmax(peaks)))
+
+
+def command_noise(of: SampledPlant, law: StateLaw, noise: Noise) -> Array:
+    """Return the standard deviations of the commands that the sensors' noise makes, (n_inputs,)."""
+    from scipy.linalg import solve_discrete_lyapunov
+
+    sd = np.diag(of.sensors(noise))
+    driven = np.vstack([of.B @ law.D, law.B]) @ sd
+    P = solve_discrete_lyapunov(of.closed(law), driven @ driven.T, method="bilinear")
+    row = np.hstack([law.D @ of.C, law.C])
+    return np.sqrt(np.diag(row @ P @ row.T + law.D @ sd @ sd @ law.D.T))
+
+
+def score_of(family: Family, noise: Noise, peak: float) -> Callable[[StateLaw], float]:
+    """Return a score of laws: ln(noise in the commands · largest compliance) on the first plant.
+
+    Infinite where any plant is unstable or has a larger peak of the sensitivity than `peak`.
+    """
+    plant, rate_hz = family.plants[0], family.plants[0].rate_hz
+
+    def score(law: StateLaw) -> float:
+        if family.worst(law).peak > peak:
+            return math.inf
+        controller = controller_of_loop(Loop(law=law), plant.model, rate_hz)
+        loop = ClosedLoop(plant=plant, controller=controller, frequency_hz=family.frequency_hz)
+        voltage = float(np.max(command_noise(family.sampled[0], law, noise)))
+        return math.log(voltage * float(np.max(np.abs(loop.compliance))))
+
+    return score
+
+
+def search_lqg(plant: Plant, weights: Weights, noise: Noise, score: Callable[[StateLaw], float]) -> Lqg | None:
+    """Return the law of least score over effort and disturbance; None where none has a finite one.
+
+    The knobs are tried on a coarse grid, then around the best by ever smaller steps.
+    """
+    tried: dict[tuple[float, float], tuple[float, Lqg | None]] = {}
+
+    def at(effort: float, disturbance: float) -> float:
+        key = (round(math.log(effort), 6), round(math.log(disturbance), 6))
+        if key not in tried:
+            try:
+                found = lqg(plant, weights, noise, effort=effort, disturbance=disturbance)
+                tried[key] = (score(found.law), found)
+            except EstimationError:  # no law with these knobs
+                tried[key] = (math.inf, None)
+        return tried[key][0]
+
+    step = _FIRST
+    grid = [(step**a, step**b) for a in range(-3, 2) for b in range(-2, 4)]
+    best = min(grid, key=lambda k: at(*k))
+    while (step := math.sqrt(step)) > _FINEST:
+        around = [(best[0] * step**a, best[1] * step**b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+        best = min(around, key=lambda k: at(*k))
+    value, found = min(tried.values(), key=lambda x: x[0])
+    return found if math.isfinite(value) else None
