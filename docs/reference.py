@@ -31,7 +31,7 @@ GROUPS: dict[str, dict[str, str]] = {
         "ambid.tracking": "the supervised tracker",
     },
     "Jobs and hardware": {
-        "ambid.control": "the loop as it is: margins and sensitivity",
+        "ambid.control": "the loop as it is, and what is designed on it",
         "ambid.job": "whole jobs and their parts",
         "ambid.report": "figures",
         "ambid.acquisition": "records from a controller",
@@ -87,14 +87,21 @@ def _room(room: str, what: str) -> Iterator[str]:
     yield "```"
 
 
-def _commands() -> Iterator[str]:
+def verbs() -> Iterator[tuple[str, Any]]:
+    """Yield every verb with its command, those of a group one by one."""
     import typer
 
     from ambid.cli.app import app
 
     top: Any = typer.main.get_command(app)
-    yield from ("# Commands", "", "What `ambid COMMAND --help` says, made from the program itself.", "")
     for name, command in top.commands.items():
+        inner = getattr(command, "commands", None)
+        yield from ((name, command),) if inner is None else ((f"{name} {n}", c) for n, c in inner.items())
+
+
+def _commands() -> Iterator[str]:
+    yield from ("# Commands", "", "What `ambid COMMAND --help` says, made from the program itself.", "")
+    for name, command in verbs():
         yield from _command(name, command)
 
 

@@ -29,6 +29,7 @@ VERBS = {
     "identify": ("identify", "r.csv", "--json"),
     "validate": ("validate", "e.json", "r.csv", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
+    "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),
     "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
             "na=1,nb=1,nk=1", "--json"),
     "compare": ("compare", "r.csv", "arx:na=1,nb=1,nk=1", "--input", "voltage", "--output", "current", "--json"),
@@ -101,6 +102,8 @@ def test_every_verb_that_writes_stands_here():
 
     reads_only = {"info", "models", "demo"}
     others = {verb.name for verb in app.registered_commands} - reads_only - {"commission", "recover"}
+    for group in app.registered_groups:
+        others |= {f"{group.name} {verb.name}" for verb in group.typer_instance.registered_commands}
     assert others == set(VERBS)
 
 

@@ -115,6 +115,7 @@ def test_commands_on_the_pages_have_known_verbs_and_options(words):
 
     top = typer.main.get_command(app)
     command = top if words[0].startswith("-") else top.commands[words[0]]
+    command = getattr(command, "commands", {}).get(words[1], command) if words[1:] and command is not top else command
     known = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}
     assert {word for word in words[1:] if word.startswith("-") and not re.fullmatch(r"-?[\d.]+", word)} <= known
 

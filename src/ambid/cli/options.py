@@ -111,6 +111,15 @@ def band_of(text: str | None) -> tuple[float, float] | None:
     return found
 
 
+def share_of(text: str, name: str) -> float:
+    """Read a share: a number, or one with a percent sign."""
+    number, percent = text.strip().removesuffix("%"), text.strip().endswith("%")
+    try:
+        return float(number) / (100.0 if percent else 1.0)
+    except ValueError:
+        raise AmbidError(f"{name} is {text!r}; it must be a share such as 0.01 or 1%. Correct it") from None
+
+
 def preset_of(name: str) -> Preset | None:
     """Take a word for a preset if it is one, or cannot be a file; None for a path."""
     from ambid.physics.presets import preset, preset_names

@@ -11,7 +11,7 @@ others stay closed, is L = 1/S_jj - 1. At the commands the same is said of (I + 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -88,6 +88,14 @@ class Plant:
         return Sampled(
             space=self.space, omega=2.0 * np.pi * frequency_hz, rate_hz=self.rate_hz, delays=self.delays, held=held
         )
+
+    def slopes(self, at: Sampled, driven: Complex) -> Complex:
+        """Return the derivatives of H by `names` at spectra of the inputs `driven` (n, n_u): (n, n_y, n_names)."""
+        roles = [f"{role}.delay" for role in self.model.inputs]
+        known = [n for n in self.names if n not in roles]
+        found = at.slopes(driven, [self.model.derivative(self.theta, n) for n in known], len(roles))
+        order = [len(known) + roles.index(n) if n in roles else known.index(n) for n in self.names]
+        return np.asarray(found[:, :, order])
 
     def grid(self) -> Array:
         """Return frequencies up to half the rate, closer around the plant's resonances."""
@@ -297,22 +305,10 @@ class ClosedLoop:
         variance = 0.0
         covariance = self.plant.covariance
         if covariance is not None and self.plant.names:
-            g = np.real(scale * (row @ self._slopes(driven)))
+            g = np.real(scale * (row @ self.plant.slopes(self.sampled, driven[None, :])[0]))
             variance += float(g @ covariance @ g)
         seen = np.zeros(H.shape[0], dtype=complex)
         seen[p], seen[q] = right, -H[q] @ driven
         weights = scale * (left @ H[p] @ inner)
         variance += self.controller.variance(self.frequency_hz, seen, weights)
         return float(np.sqrt(max(variance, 0.0)))
-
-    def _slopes(self, driven: Complex) -> Complex:
-        """Return the derivatives of H driven by what was estimated, (n_y, n_names)."""
-        of, names = self.plant.model, self.plant.names
-        roles = [f"{role}.delay" for role in of.inputs]
-        known = [n for n in names if n not in roles]
-        steps = [of.derivative(self.plant.theta, name) for name in known]
-        found = self.sampled.slopes(driven[None, :], steps, len(roles))[0]
-        order: Sequence[int] = [
-            len(known) + roles.index(n) if n in roles else known.index(n) for n in names
-        ]  # fmt: skip
-        return np.asarray(found[:, order])

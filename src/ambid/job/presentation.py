@@ -501,6 +501,21 @@ def _margins() -> View:
     )  # fmt: skip
 
 
+def _experiment() -> View:
+    from ambid.control.experiment import SCHEMA
+    from ambid.report.experiment_figures import experiment_figure
+    from ambid.report.experiment_text import experiment_text, title_of
+
+    def table(x: Any) -> Table:
+        rows = [fields_json(e) for e in x.expected.values()]
+        return "name", {"name": list(x.expected), **_numbers_of(rows)}
+
+    return View(
+        text=experiment_text, figure=lambda x, _, width: experiment_figure(x, title_of(x), width),
+        document=_fields_of(SCHEMA), table=table, title=title_of,
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
     "RotorEstimate": _rotor,
     "Estimate": _estimate,
@@ -511,6 +526,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Measured": _measured,
     "Modal": _modal,
     "Margins": _margins,
+    "Experiment": _experiment,
     "Track": _track,
     "Inspection": _inspection,
     "Acquired": _acquired,

@@ -118,6 +118,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     FIT_SCHEMA: _fit,
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
+    "ambid.experiment/1": _whole("control.experiment", "Experiment", "design experiment"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),

@@ -1,0 +1,302 @@
+"""The excitation that shows the parameters of a model best within limits; file schema ``ambid.experiment/1``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from ambid.acquisition.device import Program
+from ambid.acquisition.program import FULL, expected
+from ambid.arrays import Array, Complex
+from ambid.control.excited import ExcitedLoop, begin_at, from_rest
+from ambid.control.information import Information, Innovation, informed_lines, power_design
+from ambid.control.waves import Limited, Lines, joint_design, spread_power
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Check, Judged
+from ambid.signals.excitations import schroeder_phases
+
+SCHEMA = "ambid.experiment/1"
+_CANDIDATES = 3000  # lines from which those of the design are taken
+_HARD = 4  # drawn plants beside the nominal one for which amplitudes and phases are searched
+_SILENT = 1e-9  # of the largest line
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Expected:
+    """What a record is expected to show of a parameter."""
+
+    value: float  # by which it was designed, SI
+    unit: str
+    sd: float  # SI
+    relative_sd: float
+    flat_sd: float  # of a flat multisine with Schroeder's phases in the same band, at the same use of the limits
+    identifiable: bool
+    seconds: float | None  # of record until the relative sd that is aimed at; None where it never comes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SignalUse:
+    """What the excitation moves a signal, as deviations from rest."""
+
+    unit: str
+    low: float | None  # limits; None: no limit
+    high: float | None
+    steady: float  # largest part of the way to a limit in steady state, 0 to 1
+    from_rest: float  # while it sets in
+    drawn: float  # the larger of both, of the worst drawn plant
+    peak: float  # largest deviation, SI
+    noise_sd: float  # SI; four of them are kept free
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Table:
+    """The excitation as a controller's table."""
+
+    amplitude: float  # V at the coil, of an element of 127
+    hold: int  # ticks an element
+    elements: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Shown:
+    """Curves of a design."""
+
+    waves: Mapping[str, Array]  # signals over one period in steady state, SI, by name
+    seconds: Array  # (n,), lengths of a record
+    by_length: Mapping[str, Array]  # relative sd by parameter, (n,)
+    levels: Array  # (n,), amplitudes over that of the design
+    by_level: Mapping[str, Array]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Experiment(Judged):
+    """An excitation that was designed, and what a record of it will show.
+
+    Attributes
+    ----------
+    status : {"converged"}
+    model : str
+    criterion : str
+        "all", "worst" or the name of a parameter.
+    rate_hz : float
+    period : int
+        Samples of one period.
+    periods : int
+        Of the record.
+    frequency_hz : ndarray, shape (n_lines,)
+    amplitude, phase : Mapping[str, ndarray], shape (n_lines,)
+        Of the lines, by input; peak in its unit, rad.
+    excitation : Mapping[str, ndarray], shape (period,)
+        What is added to the controller's output over one period, by input.
+    table : Table or None
+        The same for the controller, of a rig with ``[daq]``.
+    closed : bool
+        Whether it is for the closed loop.
+    signals : Mapping[str, SignalUse]
+    expected : Mapping[str, Expected]
+    target : float
+        Relative standard deviation to which `Expected.seconds` belong.
+    gap : float
+        By how much a design of the powers alone could be better than the one that the search began with, relative.
+    drawn : int
+        Plants for which the limits are kept.
+    checks : Mapping[str, Check]
+    shown : Shown
+    warnings : tuple of str
+    timing_s : Mapping[str, float]
+    rig : Mapping[str, object]
+    """
+
+    status: Literal["converged"] = "converged"
+    model: str
+    criterion: str
+    rate_hz: float
+    period: int
+    periods: int
+    frequency_hz: Array
+    amplitude: Mapping[str, Array]
+    phase: Mapping[str, Array]
+    excitation: Mapping[str, Array]
+    table: Table | None
+    closed: bool
+    signals: Mapping[str, SignalUse]
+    expected: Mapping[str, Expected]
+    target: float
+    gap: float
+    drawn: int
+    checks: Mapping[str, Check]
+    shown: Shown
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+    @property
+    def seconds(self) -> float:
+        """Length of the record."""
+        return self.periods * self.period / self.rate_hz
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Task:
+    """What an experiment is designed for."""
+
+    loops: Sequence[ExcitedLoop]  # the nominal plant's, then those of drawn plants
+    noises: Sequence[Innovation]  # of each
+    low: Array  # (n_signals,), limits of what the excitation moves, noise taken off; -inf: none
+    high: Array
+    period: int
+    periods: int
+    band_hz: tuple[float, float]
+    n_lines: int
+    criterion: str
+    prior_sd: Mapping[str, float]
+    hold: int = 1  # samples an element of the excitation
+
+    @property
+    def samples(self) -> float:
+        """Samples of the record."""
+        return float(self.period * self.periods)
+
+    @property
+    def rate_hz(self) -> float:
+        """Sampling rate."""
+        return self.loops[0].plant.rate_hz
+
+    def frequency_hz(self, lines: Lines) -> Array:
+        """Return the frequencies of lines."""
+        return np.asarray(lines * (self.rate_hz / self.period))
+
+    def candidates(self) -> Lines:
+        """Return the lines of the band, thinned by octave where they are very many."""
+        first = max(1, int(np.ceil(self.band_hz[0] * self.period / self.rate_hz - 1e-9)))
+        last = min((self.period // self.hold - 1) // 2, int(self.band_hz[1] * self.period / self.rate_hz + 1e-9))
+        if last < first:
+            raise EstimationError(
+                f"a period of {self.period / self.rate_hz:.4g} s has no line between {self.band_hz[0]:g} and "
+                f"{self.band_hz[1]:g} Hz. Widen the band, or make the period longer"
+            )
+        every = np.arange(first, last + 1)
+        if every.size <= _CANDIDATES:
+            return every
+        half = _CANDIDATES // 2
+        return np.union1d(every[:half], np.geomspace(every[half], last, _CANDIDATES).astype(np.int64))
+
+    def inputs(self, lines: Lines) -> Lines:
+        """Return the input that each line excites: neighbours belong to inputs in turn (zippered)."""
+        return np.asarray(np.arange(lines.size) % self.loops[0].e.shape[1])
+
+    def limited(self, lines: Lines, plants: Sequence[int]) -> Limited:
+        """Return the signals of some of the plants."""
+        on, many = self.inputs(lines), len(plants)
+        T = np.hstack([self.loops[k].response(lines, self.period, on) for k in plants])
+        return Limited(
+            lines=lines, period=self.period, T=T, low=np.tile(self.low, many), high=np.tile(self.high, many)
+        )  # fmt: skip
+
+    def information(self, lines: Lines, plants: Sequence[int]) -> Information:
+        """Return the information of lines, of some of the plants."""
+        on, n_u = self.inputs(lines), self.loops[0].e.shape[1]
+        n_y = len(self.loops[0].plant.model.outputs)
+        driven = []
+        for k in plants:
+            of = self.loops[k]
+            driven.append(of.states(lines, self.period, on) @ of.rows[n_y:].T + np.eye(n_u)[on])
+        return Information.of(
+            [self.loops[k].plant for k in plants], [self.noises[k] for k in plants], self.frequency_hz(lines), driven,
+            prior_sd=self.prior_sd, criterion=self.criterion,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Design:
+    """Amplitudes and phases of the lines, and how far their start was from the best powers."""
+
+    lines: Lines  # (n_lines,)
+    c: Complex  # (n_lines,), of the elements where these are held
+    gap: float
+
+
+def design(task: Task, *, tick: Callable[[], object] = lambda: None) -> Design:
+    """Return the lines, amplitudes and phases of least criterion that keep the limits for all plants, from rest too."""
+    every = task.candidates()
+    of_all, all_limited = task.information(every, [0]), task.limited(every, [0])
+    size = np.minimum(-all_limited.low, all_limited.high)
+    cost = 0.5 * np.sum(np.abs(all_limited.T / size) ** 2, axis=1)
+    power, gap = power_design(of_all, cost, task.samples)
+    tick()
+    keep = informed_lines(power, cost, task.n_lines)
+    lines, information, limited = every[keep], of_all.among(keep), task.limited(every[keep], [0])
+    starts = [_with_schroeder(spread_power(p)) for p in (power[keep], np.ones(keep.size), np.sqrt(power[keep]))]
+    c = joint_design(information, limited, starts, task.samples, tick=tick)
+    hard = hardest(task, lines, c)
+    if hard:
+        plants = [0, *hard]
+        c = joint_design(
+            task.information(lines, plants), task.limited(lines, plants), [c], task.samples, tick=tick
+        )  # fmt: skip
+    start, _ = begin_at(task.loops[0], task.limited(lines, [0]), c, task.inputs(lines))
+    start -= start % task.hold
+    c = c * np.exp(2j * np.pi * lines * start / task.period)
+    return Design(lines=lines, c=c / np.max(uses(task, lines, c)), gap=gap)
+
+
+def _with_schroeder(power: Array) -> Complex:
+    size = np.sqrt(power)
+    return np.asarray(size * np.exp(1j * schroeder_phases(size)))
+
+
+def hardest(task: Task, lines: Lines, c: Complex) -> list[int]:
+    """Return the drawn plants whose signals come nearest to their limits."""
+    use = [task.limited(lines, [k]).use(c).max() for k in range(1, len(task.loops))]
+    return [1 + int(k) for k in np.argsort(-np.array(use))[:_HARD]]
+
+
+def uses(task: Task, lines: Lines, c: Complex) -> Array:
+    """Return the largest part of each signal's way to its limits, (n_plants, 2, n_signals): steady, and from rest."""
+    on = task.inputs(lines)
+    found = []
+    for k, of in enumerate(task.loops):
+        limited = task.limited(lines, [k])
+        found.append([limited.use(c), from_rest(of, limited, c, on, 0)])
+    return np.array(found)
+
+
+def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Table | None]:
+    """Return one period of the excitation, (period, n_inputs), and the controller's table that plays it.
+
+    `quantum`: step of the voltage that the controller orders; None: there is no table.
+    """
+    n_u, X = task.loops[0].e.shape[1], np.zeros((task.period // 2 + 1, task.loops[0].e.shape[1]), dtype=complex)
+    X[design.lines, task.inputs(design.lines)] = 0.5 * task.period * design.c
+    if quantum is None:
+        return np.asarray(np.fft.irfft(X, task.period, axis=0)), None
+    assert n_u == 1
+    ticks = np.arange(task.hold)
+    turn = np.exp(-2j * np.pi * np.outer(design.lines, ticks) / task.period).mean(axis=1)  # what holding does
+    X[design.lines, 0] /= turn
+    wave = np.fft.irfft(X[:, 0], task.period)[:: task.hold]
+    counts = max(1, int(np.floor(np.max(np.abs(wave)) / quantum)))
+    elements = np.rint(FULL * wave / np.max(np.abs(wave))).astype(int)
+    table = Table(amplitude=counts * quantum, hold=task.hold, elements=tuple(elements.tolist()))
+    return table_wave(table, quantum)[:, None], table
+
+
+def table_wave(table: Table, quantum: float) -> Array:
+    """Return one period of what a controller makes of a table, V."""
+    program = Program(
+        kind="table", amplitude=table.amplitude, hold=table.hold, length=len(table.elements), table=table.elements
+    )  # fmt: skip
+    ticks = table.hold * len(table.elements)
+    return np.asarray(quantum * expected(program, ticks, counts=round(table.amplitude / quantum)))
+
+
+def lines_of(wave: Array) -> tuple[Lines, Complex]:
+    """Return the lines of one period of an excitation of one input, and their amplitudes."""
+    X = np.fft.rfft(wave) / (0.5 * wave.size)
+    lines = np.flatnonzero(np.abs(X) > _SILENT * np.max(np.abs(X)))
+    lines = lines[(lines > 0) & (2 * lines < wave.size)]
+    return lines, np.asarray(X[lines])

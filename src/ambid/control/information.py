@@ -1,0 +1,171 @@
+"""What a periodic excitation tells of a model's parameters, line by line, before a record is made.
+
+With the innovations form y = G u + H e, S = cov e, the prediction error moves with a parameter as H⁻¹ dG/dθ u (Ljung
+1999, sec. 9.4 and 13.4); the parameters of H alone do not enter, nor do offsets, which stand at frequency 0. An
+excitation c exp(jωt) that reaches the inputs as T c gives of each sample the information
+
+    M = |c|² Re(Φ* S⁻¹ Φ)/2,   Φ = H⁻¹ dG/dθ T,   H⁻¹ = I - C (z - A + K C)⁻¹ K,
+
+K the gain of the stationary predictor. Lines add up: M is linear in the powers, and the best powers are a convex
+problem (Fedorov 1972; Goodwin and Payne 1977, ch. 6). What feedback of the noise tells and what the initial state costs
+is left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import Plant
+from ambid.errors import EstimationError
+from ambid.estimation.predictor import predictor_gain, scales_for
+from ambid.estimation.uncertainty import natural_sizes
+from ambid.physics.linear_model import discretise
+from ambid.physics.loop import Noise
+
+_ROUNDS = 2000  # of the multiplicative algorithm
+_SETTLED = 1e-3  # of the equivalence theorem: largest slope over the mean
+_SHARP = 8.0  # power mean by which the worst of several is taken
+_QUANTISED = 12.0**-0.5  # sd of a step's rounding
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Innovation:
+    """The noise of a record: x[k+1] = A x + B u + K e, y = C x + e, SI."""
+
+    gain: Array  # (n_states, n_outputs)
+    covariance: Array  # (n_outputs, n_outputs)
+
+    @classmethod
+    def of(cls, plant: Plant, noise: Noise) -> Innovation:
+        """Return that of a bench's noise; EstimationError where an output has none, and could be known exactly."""
+        of, force, voltage = plant.model, *noise.held_rms(plant.rate_hz)
+        sensors = np.array([_sensor_sd(noise, role) for role in of.outputs])
+        if not np.all(sensors > 0.0):
+            silent = of.outputs[int(np.argmin(sensors))]
+            raise EstimationError(
+                f"nothing is known of the noise of {silent!r}, and without noise any excitation would do. Give [noise] "
+                "in the rig, or an estimate"
+            )
+        sc = scales_for(of, plant.theta, np.ones(len(of.inputs)), sensors, plant.rate_hz)
+        pushed = np.array([force if "force" in name else voltage for name in of.disturbances])
+        d, _ = discretise(plant.space, 1.0 / plant.rate_hz)
+        A, E, C = d.A * sc.state / sc.state[:, None], d.E * pushed / sc.state[:, None], d.C * sc.state
+        at = predictor_gain(A, C / sensors[:, None], E @ E.T, np.eye(sensors.size))
+        return cls(gain=sc.state[:, None] * at.K / sensors, covariance=at.S * np.outer(sensors, sensors))
+
+    def whiten(self, plant: Plant, omega: Array) -> Complex:
+        """Return W H⁻¹ at some frequencies in rad/s, W* W = S⁻¹, (n, n_outputs, n_outputs)."""
+        d, _ = discretise(plant.space, 1.0 / plant.rate_hz)
+        z = np.exp(1j * omega / plant.rate_hz)[:, None, None]
+        inner = z * np.eye(d.A.shape[0]) - (d.A - self.gain @ d.C)
+        right = np.broadcast_to(self.gain.astype(complex), (omega.size, *self.gain.shape))
+        inverse = np.eye(d.C.shape[0]) - d.C @ np.linalg.solve(inner, right)
+        return np.asarray(np.linalg.inv(np.linalg.cholesky(self.covariance)) @ inverse)
+
+
+def _sensor_sd(noise: Noise, role: str) -> float:
+    """Return the noise of an output's sensor with that of its resolution."""
+    kind = role.split("_")[-1].rstrip("0123456789")
+    return float(np.hypot(getattr(noise, kind), _QUANTISED * getattr(noise, f"{kind}_resolution")))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Information:
+    """Information of lines, each of one input, over the sizes of what is estimated; of one plant or of several."""
+
+    names: tuple[str, ...]  # as estimated; the delay of an input is "<input>.delay", in samples
+    sizes: Array  # (n,), what a standard deviation is judged against; of a delay one sample
+    lines: Array  # (n_plants, n_lines, n, n), of one sample and unit squared amplitude
+    prior: Array  # (n, n), what is known before
+    weights: Array  # (n,), of the squared relative standard deviations in the criterion; their sum is 1
+    worst: bool = False  # whether the criterion is the largest of them instead of the mean
+
+    @classmethod
+    def of(
+        cls, plants: Sequence[Plant], noises: Sequence[Innovation], frequency_hz: Array, driven: Sequence[Complex], *,
+        prior_sd: Mapping[str, float], criterion: str = "all",
+    ) -> Information:  # fmt: skip
+        """Return the information of `names` of the plants; `driven` (n_lines, n_inputs): T of each line's input."""
+        first = plants[0]
+        roles, names = {f"{role}.delay" for role in first.model.inputs}, first.names
+        known = [n for n in names if n not in roles]
+        sizes = np.ones(len(names))
+        sizes[[names.index(n) for n in known]] = natural_sizes(
+            known, dict(first.theta), first.model.references(first.theta)
+        )
+        prior = np.array([sizes[k] / prior_sd[n] if n in prior_sd else 0.0 for k, n in enumerate(names)])
+        chosen = known if criterion in ("all", "worst") else [criterion]
+        found = []
+        for plant, noise, T in zip(plants, noises, driven, strict=True):
+            rows = noise.whiten(plant, 2.0 * np.pi * frequency_hz) @ plant.slopes(plant.sampled(frequency_hz), T)
+            rows = rows * sizes
+            found.append(0.5 * np.real(np.swapaxes(rows.conj(), 1, 2) @ rows))
+        return cls(
+            names=names, sizes=sizes, lines=np.array(found), prior=np.diag(prior**2),
+            weights=np.array([(n in chosen) / len(chosen) for n in names]), worst=criterion == "worst",
+        )  # fmt: skip
+
+    def among(self, keep: NDArray[np.int64]) -> Information:
+        """Return that of some of the lines."""
+        return replace(self, lines=self.lines[:, keep])
+
+    def total(self, power: Array, samples: float) -> Array:
+        """Return the information of a record, priors included, (n_plants, n, n); `power`: squared amplitudes."""
+        return np.asarray(samples * np.einsum("k,pkij->pij", power, self.lines) + self.prior)
+
+    def relative_sd(self, power: Array, samples: float) -> Array:
+        """Return what a record of the first plant will show, (n,); very large where it shows nothing."""
+        M = self.total(power, samples)[0]
+        scale = np.sqrt(np.maximum(np.diag(M), 1e-300))
+        values, V = np.linalg.eigh(M / np.outer(scale, scale))
+        return np.asarray(np.sqrt((V**2) @ (1.0 / np.maximum(values, 1e-16))) / scale)
+
+    def judge(self, M: Array) -> tuple[float, Array]:
+        """Return the criterion at informations (n_plants, n, n), meaned over the plants, and its slopes by them."""
+        V = np.linalg.inv(M)
+        each = np.diagonal(V, axis1=1, axis2=2) * self.weights
+        pull = np.broadcast_to(self.weights, each.shape)
+        value = each.sum(axis=1)
+        if self.worst:
+            top = each.max(axis=1, keepdims=True)
+            powers = (each / top) ** (_SHARP - 1.0)
+            mean = np.sum(powers * each / top, axis=1, keepdims=True) ** (1.0 / _SHARP)
+            pull, value = self.weights * powers * mean ** (1.0 - _SHARP), (mean * top)[:, 0]
+        return float(value.mean()), -(V * pull[:, None, :]) @ V / value.size
+
+
+def power_design(information: Information, cost: Array, samples: float) -> tuple[Array, float]:
+    """Return the powers of lines with the least criterion at a total cost of 1, and how far that is proven.
+
+    Multiplicative algorithm (Silvey, Titterington and Torsney 1978; Yu 2010): each share of the cost grows with the
+    root of its slope. By the equivalence theorem (Kiefer 1974) no design is better by more than the largest slope less
+    the mean, over the mean. `cost` (n_lines,): of unit power. Returns powers (n_lines,) and that bound.
+    """
+    lines = information.lines / cost[:, None, None]
+    share, gap = np.full(cost.size, 1.0 / cost.size), np.inf
+    for _ in range(_ROUNDS):
+        _, slope = information.judge(samples * np.einsum("k,pkij->pij", share, lines) + information.prior)
+        gain = -np.einsum("pkij,pij->k", lines, slope)
+        mean = float(share @ gain)
+        gap = float(np.max(gain)) / mean - 1.0
+        if gap < _SETTLED:
+            break
+        share = share * np.sqrt(gain / mean)
+        share /= share.sum()
+    return share / cost, gap
+
+
+def informed_lines(power: Array, cost: Array, count: int) -> NDArray[np.int64]:
+    """Return which lines are kept of many: half those with the largest share of the cost, the rest evenly by octave."""
+    if cost.size <= count:
+        return np.arange(cost.size)
+    best = np.argsort(-power * cost)[: count // 2]
+    rest = np.setdiff1d(np.arange(cost.size), best)
+    spread = rest[np.unique(np.geomspace(1, rest.size, 20 * count).round().astype(int)) - 1]
+    taken = np.linspace(0, spread.size - 1, min(count - best.size, spread.size)).round().astype(int)
+    return np.union1d(best, spread[taken])

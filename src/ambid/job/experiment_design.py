@@ -1,0 +1,421 @@
+"""The job of designing an experiment: a bench in, an excitation out, and what a record of it will show."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ambid.acquisition.amplitude import Room
+from ambid.acquisition.default_daq import with_default_daq
+from ambid.acquisition.scales import TABLE_LENGTH, scale_of
+from ambid.acquisition.settings import controller_settings
+from ambid.arrays import Array
+from ambid.control.closed import Plant
+from ambid.control.excited import SLEW, ExcitedLoop
+from ambid.control.experiment import (
+    Design,
+    Expected,
+    Experiment,
+    Shown,
+    SignalUse,
+    Task,
+    design,
+    lines_of,
+    played,
+    uses,
+)
+from ambid.control.information import Innovation
+from ambid.errors import AmbidError, check_positive, nearest
+from ambid.estimation.estimate import Check, Estimate
+from ambid.estimation.linear import one_thread
+from ambid.estimation.progress import Tick, silent
+from ambid.estimation.uncertainty import WEAK
+from ambid.job.data import Clock, known_rig, rig_entry
+from ambid.job.results import load, rig_of
+from ambid.job.simulation import BenchSource, bench_of_source
+from ambid.physics.linear_model import Parameter
+from ambid.physics.presets import Preset
+from ambid.record import Channel, Record
+from ambid.rig import Rig, rig_of_preset
+from ambid.signals.excitations import schroeder_phases
+from ambid.simulation.rig_bench import Bench
+
+USE = 0.5
+"""Part of the way from rest to the limits of position and current that an experiment uses by default."""
+SPREAD = 0.1
+"""Part of their values within which free parameters of a rig are drawn."""
+TARGET = 0.01
+"""Relative standard deviation for which the length of the record is told."""
+_VOLTAGE = 0.8  # part of the voltage that is used
+_PLANTS = 40  # drawn
+_RESERVE = 4.0  # standard deviations of noise that are kept free
+_SECONDS = 10.0
+_PERIODS = 4  # of a record
+_LONGEST = 8192  # samples of a period, unless another is given
+_LINES = 100
+_WHOLE = 0.1  # of a sample, from which identify estimates a fraction of the delay
+_KEPT = 1.0 + 1e-6
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Wanted:
+    """Settings of a design."""
+
+    seconds: float | None = None
+    period_s: float | None = None
+    band: tuple[float, float] | None = None
+    lines: int = _LINES
+    criterion: str = "all"
+    target: float = TARGET
+    use: float = USE
+    slew: float | None = None  # V/s
+    spread: float = SPREAD
+    seed: int = 0
+
+
+def design_experiment(
+    source: BenchSource,
+    rig: Rig | str | Path | None = None,
+    *,
+    seconds: float | None = None,
+    period: float | None = None,
+    band: tuple[float, float] | None = None,
+    lines: int = _LINES,
+    criterion: str = "all",
+    target: float = TARGET,
+    use: float = USE,
+    slew: float | None = None,
+    spread: float = SPREAD,
+    rate_hz: float | None = None,
+    closed: bool | None = None,
+    seed: int = 0,
+    tick: Tick | None = None,
+) -> Experiment:
+    """Design the periodic excitation that shows the parameters of a bench best within its limits.
+
+    Amplitudes and phases of a multisine are optimised together: the criterion is the mean square relative standard
+    deviation that `ambid.identify` will report, by the Fisher information of the plant in its loop and its noise; the
+    limits are peaks of position, current and voltage, as the model predicts them, for drawn plants and from rest too.
+
+    Parameters
+    ----------
+    source : str, Path, Rig, Preset or Estimate
+        A preset by its name; a rig or its file, designed for its values; a linear estimate or its file, designed for
+        what it found, with its noise.
+    rig : Rig, str or Path, optional
+        Of an estimate: with other limits, loop or controller than its own.
+    seconds : float, optional
+        Length of the record in s; default: as the target needs, 1 to 60 s.
+    period : float, optional
+        Of the excitation, s; default: a quarter of the record, at most 8192 samples; of a rig with ``[daq]`` what the
+        controller's table of 1000 elements holds.
+    band : (float, float), optional
+        Hz; default from one line to a fifth of the rate.
+    lines : int, optional
+        How many are excited, at most.
+    criterion : str, optional
+        ``"all"``: mean over the parameters; ``"worst"``: the worst of them; or the name of one.
+    target : float, optional
+        Relative standard deviation for which the length of the record is told.
+    use : float, optional
+        Part of the way from rest to the limits of position and current that may be used.
+    slew : float, optional
+        Largest rate of change of the voltage, V/s.
+    spread : float, optional
+        Free parameters of a rig are drawn within this part of their values; priors and estimates bring their own.
+    rate_hz : float, optional
+        Sampling rate; default the bench's.
+    closed : bool, optional
+        With or without the loop; default: as the bench usually works.
+    seed : int, optional
+        Of the drawn plants.
+    tick : callable, optional
+        Called with the name of the present stage; may raise to interrupt.
+
+    Returns
+    -------
+    Experiment
+
+    Raises
+    ------
+    AmbidError
+        If a setting breaks a rule, or the bench lacks a value, a limit, a loop or its noise.
+
+    Examples
+    --------
+    >>> import ambid
+    >>> found = ambid.design_experiment("prototype", seconds=1.0, lines=20)
+    >>> found.expected["k_x"].sd < 0.5 * found.expected["k_x"].flat_sd
+    True
+    """
+    say, clock = tick or silent, Clock()
+    check_positive({"--seconds": seconds, "--period": period, "--target": target, "--slew": slew, "--rate": rate_hz})
+    if not 0.0 < use <= 1.0 or not 0.0 <= spread < 1.0 or lines < 2:
+        raise AmbidError(
+            f"--use {use:g}, --spread {spread:g}, --lines {lines}; --use must be above 0 and at most 1, --spread 0 to "
+            "below 1, --lines at least 2. Correct it"
+        )
+    wanted = Wanted(
+        seconds=seconds, period_s=period, band=band, lines=lines, criterion=criterion, target=target, use=use,
+        slew=slew, spread=spread, seed=seed,
+    )  # fmt: skip
+    say("read")
+    known, bench = _given(source, rig, rate_hz, closed)
+    clock.lap("read")
+    with one_thread():
+        found = _designed(known, bench, wanted, say)
+    clock.lap("design")
+    assert bench.rig is not None
+    return replace(found, timing_s=clock.laps, rig=rig_entry(bench.rig))
+
+
+def _given(
+    source: BenchSource, rig: Rig | str | Path | None, rate_hz: float | None, closed: bool | None
+) -> tuple[Estimate | None, Bench]:
+    """Return the estimate, where that is the source, and the bench with the numbers that are designed for."""
+    if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
+        source = load(source)
+    if not isinstance(source, (str, Path, Rig, Preset, Estimate)):
+        raise AmbidError(
+            f"a {type(source).__name__} is no linear estimate of one axis, for which an experiment is designed. Give "
+            "what 'ambid identify --json' wrote, or a rig"
+        )
+    of = bench_of_source(source)
+    of = rig_of_preset(of) if isinstance(of, Preset) else of
+    if rig is not None:
+        given = known_rig(rig)
+        if not isinstance(source, Estimate):
+            raise AmbidError("--rig is for an estimate; a rig is there already. Omit --rig")
+        loop = None if given.loop is None else replace(given.loop, delay=of.loop.delay if of.loop else 0.0)
+        of = replace(given, parameters=of.parameters, operating_point=of.operating_point, loop=loop)
+    if rate_hz is None and of.daq is not None:
+        rate_hz = of.daq.rate_hz
+    return source if isinstance(source, Estimate) else None, Bench.of(of, rate_hz, closed)
+
+
+def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -> Experiment:
+    """Draw plants, set the task, design, and say what comes of it."""
+    plant, prior_sd = _plant(known, bench)
+    loop = ExcitedLoop.of(plant, bench.loop)
+    if bench.loop.closed:
+        bench.refuse_unstable()
+    elif loop.pole > _KEPT:
+        raise AmbidError(
+            f"the plant is unstable (largest pole {loop.pole:.4f}) and has no loop; no excitation keeps it within "
+            "limits. Give [loop] in the rig"
+        )
+    noise = _innovation(known, bench, plant)
+    loops, noises, unstable = [loop], [noise], 0
+    for theta in _drawn(known, bench, wanted):
+        other = ExcitedLoop.of(replace(plant, theta=theta), bench.loop)
+        if other.pole > _KEPT:
+            unstable += 1
+            continue
+        loops.append(other)
+        noises.append(noise if known is not None else Innovation.of(other.plant, bench.noise))
+    low, high = _room(bench, loop, wanted)
+    spare = _RESERVE * loop.noise_sd(noise)
+    _refuse_full(loop.signals, spare, low, high)
+    task = _task(bench, loops, noises, (low + spare, high - spare), wanted, prior_sd)
+    say("design")
+    found = design(task, tick=lambda: say("design"))
+    return _told(bench, task, found, (low, high, spare / _RESERVE), wanted, unstable)
+
+
+def _plant(known: Estimate | None, bench: Bench) -> tuple[Plant, dict[str, float]]:
+    """Return the nominal plant with the names that identify estimates, and the priors' standard deviations."""
+    rig = bench.rig if known is None else rig_of(known, "the estimate")
+    assert rig is not None
+    of = bench.linear.model
+    names = [p.name for p in rig.parameters if p.role != "fixed"]
+    if not names:
+        raise AmbidError("every parameter of the rig is fixed, and none is left to identify. Free at least one")
+    part = bench.loop.delay % 1.0
+    if known is not None:
+        late = known.delay[of.inputs[0]].sd is not None
+    else:
+        late = rig.channel(of.inputs[0]).delay == "auto" and _WHOLE <= part <= 1.0 - _WHOLE
+    plant = Plant(
+        model=of, theta=bench.linear.parameters, delays=np.full(len(of.inputs), bench.loop.delay),
+        rate_hz=bench.rate_hz, names=(*names, *([f"{of.inputs[0]}.delay"] if late else [])),
+    )  # fmt: skip
+    return plant, {p.name: p.sd for p in rig.parameters if p.sd is not None}
+
+
+def _innovation(known: Estimate | None, bench: Bench, plant: Plant) -> Innovation:
+    """Return the noise that an estimate found, else that of the rig."""
+    if known is None:
+        return Innovation.of(plant, bench.noise)
+    return Innovation(gain=known.noise.gain, covariance=known.noise.innovation_covariance)
+
+
+def _drawn(known: Estimate | None, bench: Bench, wanted: Wanted) -> list[dict[str, float]]:
+    """Return the parameters of drawn plants: of an estimate by its covariance, of a rig by priors and spread."""
+    rng, theta = np.random.default_rng(wanted.seed), dict(bench.linear.parameters)
+    if known is not None:
+        moved = rng.multivariate_normal(np.zeros(len(known.covariance_names)), known.covariance, _PLANTS)
+        return [
+            theta | {n: theta[n] + x for n, x in zip(known.covariance_names, row, strict=True)} for row in moved
+        ]  # fmt: skip
+    assert bench.rig is not None
+
+    def one(p: Parameter) -> float:
+        if p.role == "prior":
+            return float(theta[p.name] + (p.sd or 0.0) * rng.standard_normal())
+        return theta[p.name] * (1.0 + (wanted.spread * rng.uniform(-1.0, 1.0) if p.role == "free" else 0.0))
+
+    return [{p.name: one(p) for p in bench.rig.parameters} for _ in range(_PLANTS)]
+
+
+def _room(bench: Bench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array]:
+    """Return how far each signal may go down and up from rest, SI."""
+    assert bench.rig is not None
+    room, point = Room.of(bench.rig), bench.point._asdict()
+    low, high = [], []
+    for name in loop.signals:
+        if name.endswith(SLEW):
+            most = np.inf if wanted.slew is None else wanted.slew
+            ends, share = (-most, most), 1.0
+        else:
+            ends, share = (room.voltage, _VOLTAGE) if name == "voltage" else (room.trips[name], wanted.use)
+        rest = 0.0 if name.endswith(SLEW) else point[name]
+        low.append(share * (ends[0] - rest))
+        high.append(share * (ends[1] - rest))
+    if not np.any(np.isfinite([*low, *high])):
+        raise AmbidError(
+            f"rig {bench.name!r} has no limits of voltage, current or position; an excitation is designed for them. "
+            "Give [loop.limits]"
+        )
+    return np.array(low), np.array(high)
+
+
+def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array) -> None:
+    """Refuse where noise alone, or rest, uses the limits."""
+    room = np.minimum(-low, high) - spare
+    k = int(np.argmin(room))
+    if room[k] <= 0.0:
+        raise AmbidError(
+            f"{signals[k]} may move {min(-low[k], high[k]):.3g} from rest, noise needs {spare[k]:.3g} of it (4 sd), "
+            "so that nothing is left for an excitation. Extend the limit, correct [noise], or raise --use"
+        )
+
+
+def _task(
+    bench: Bench, loops: list[ExcitedLoop], noises: list[Innovation], ends: tuple[Array, Array], wanted: Wanted,
+    prior_sd: dict[str, float],
+) -> Task:  # fmt: skip
+    """Return the task: period, lines and length beside plants and limits."""
+    rate, names = bench.rate_hz, loops[0].plant.names
+    assert bench.rig is not None
+    seconds = wanted.seconds or _SECONDS
+    hold, period = 1, min(round(seconds * rate / _PERIODS), _LONGEST)
+    if wanted.period_s is not None:
+        period = round(wanted.period_s * rate)
+    if bench.rig.daq is not None:
+        if wanted.period_s is None:
+            period = TABLE_LENGTH if wanted.band is None else int(np.ceil(rate / wanted.band[0] - 1e-9))
+        hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
+        period -= period % hold
+    if wanted.criterion not in ("all", "worst", *(n for n in names if not n.endswith(".delay"))):
+        raise AmbidError(
+            f"--criterion {wanted.criterion!r}; it must be all, worst or an estimated parameter: {', '.join(names)}."
+            f"{nearest(wanted.criterion, list(names))} Correct it"
+        )
+    band = wanted.band or (rate / period, rate / 5.0)
+    periods = max(1, round(seconds * rate / period))
+    return Task(
+        loops=loops, noises=noises, low=ends[0], high=ends[1], period=period, periods=periods,
+        band_hz=(band[0], min(band[1], 0.4 * rate / hold)), n_lines=wanted.lines, criterion=wanted.criterion,
+        prior_sd=prior_sd, hold=hold,
+    )  # fmt: skip
+
+
+def _told(
+    bench: Bench, task: Task, found: Design, ends: tuple[Array, Array, Array], wanted: Wanted, unstable: int
+) -> Experiment:
+    """Play the design, and say what it uses and what a record of it will show."""
+    assert bench.rig is not None
+    loop, of = task.loops[0], task.loops[0].plant.model
+    full = with_default_daq(bench.rig)
+    quantum = None
+    if bench.rig.daq is not None:
+        quantum = abs(scale_of(full, "voltage").slope(controller_settings(full).duty_bias))
+    wave, table = played(found, task, quantum)
+    lines, c = lines_of(wave[:, 0])
+    used = uses(task, lines, c)
+    information = task.information(lines, [0])
+    power = np.abs(c) ** 2
+    flat_lines = task.candidates()
+    flat = np.exp(1j * schroeder_phases(np.ones(flat_lines.size)))
+    flat = flat / max(task.limited(flat_lines, [k]).use(flat).max() for k in range(len(task.loops)))
+    of_flat = task.information(flat_lines, [0]).relative_sd(np.abs(flat) ** 2, task.samples)
+    relative = information.relative_sd(power, task.samples)
+    lengths = np.geomspace(0.1, 100.0, 31)
+    levels = np.geomspace(0.1, 1.0, 11)
+    by_length = np.array([information.relative_sd(power, x * task.samples) for x in lengths])
+    by_level = np.array([information.relative_sd(power * x**2, task.samples) for x in levels])
+    units = {p.name: p.unit for p in of.parameters}
+    expected = {}
+    for k, name in enumerate(information.names):
+        value = loop.plant.theta.get(name, float(loop.plant.delays[0]))
+        needed = None if relative[k] > 1e6 else float(task.samples / task.rate_hz * (relative[k] / wanted.target) ** 2)
+        expected[name] = Expected(
+            value=value, unit=units.get(name, "1"), sd=float(relative[k] * information.sizes[k]),
+            relative_sd=float(relative[k]), flat_sd=float(of_flat[k] * information.sizes[k]),
+            identifiable=bool(relative[k] < WEAK), seconds=needed,
+        )  # fmt: skip
+    low, high, noise_sd = ends
+    waves = task.limited(lines, [0]).waves(c)
+    signals = {}
+    for k, name in enumerate(loop.signals):
+        finite = [float(x) if np.isfinite(x) else None for x in (low[k], high[k])]
+        signals[name] = SignalUse(
+            unit="V/s" if name.endswith(SLEW) else of.units[name], low=finite[0], high=finite[1],
+            steady=float(used[0, 0, k]), from_rest=float(used[0, 1, k]), drawn=float(used[:, :, k].max()),
+            peak=float(np.max(np.abs(waves[:, k]))), noise_sd=float(noise_sd[k]),
+        )  # fmt: skip
+    return Experiment(
+        model=of.name, criterion=task.criterion, rate_hz=task.rate_hz, period=task.period, periods=task.periods,
+        frequency_hz=task.frequency_hz(lines), amplitude={of.inputs[0]: np.abs(c)}, phase={of.inputs[0]: np.angle(c)},
+        excitation={of.inputs[0]: wave[:, 0]}, table=table, closed=bench.loop.closed, signals=signals,
+        expected=expected, target=wanted.target, gap=found.gap, drawn=len(task.loops) - 1,
+        checks=_checks(used, expected, unstable),
+        shown=Shown(
+            waves={n: waves[:, k] for k, n in enumerate(loop.signals)}, seconds=lengths * task.samples / task.rate_hz,
+            by_length=dict(zip(information.names, by_length.T, strict=True)), levels=levels,
+            by_level=dict(zip(information.names, by_level.T, strict=True)),
+        ),
+    )  # fmt: skip
+
+
+def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dict[str, Check]:
+    """Judge limits, drawn plants and what stays unseen."""
+    weak = [name for name, x in expected.items() if not x.identifiable]
+    most = float(used.max())
+    return {
+        "limits": Check(
+            passed=most <= 1.0 + 1e-3, values={"use": most},
+            detail=f"the nominal plant and {used.shape[0] - 1} drawn ones stay within the limits, from rest too",
+        ),
+        "loop": Check(
+            passed=unstable == 0, values={"unstable": float(unstable)},
+            detail="the loop holds all drawn plants" if not unstable else
+            f"the loop does not hold {unstable} of {_PLANTS} drawn plants; the limits are kept for the others alone. "
+            "Know the plant better (--spread, priors, an estimate)",
+        ),
+        "identifiable": Check(
+            passed=not weak,
+            detail="every parameter will be seen" if not weak else
+            f"the record will not show {', '.join(weak)} (25 % or worse). Record longer, use more of the limits, or "
+            "give a prior",
+        ),
+    }  # fmt: skip
+
+
+def one_period(found: Experiment) -> Record:
+    """Return one period of the excitation as a record, a column an input."""
+    channels = tuple(Channel(name=f"{name}.excitation", unit="V", values=x) for name, x in found.excitation.items())
+    return Record(channels=channels, rate_hz=found.rate_hz)
