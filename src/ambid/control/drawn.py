@@ -32,7 +32,9 @@ from ambid.simulation.rig_bench import plant_of_rig, rest_of_rig
 COPPER = 0.0039
 """Rise of the resistance of copper over its value at 20 °C, 1/K."""
 
-_GAP_OF_TRAVEL = 2.0  # air gap over the travel to the retainer bearing
+GAP_OF_TRAVEL = 2.0
+"""Air gap over the travel to the retainer bearing, where no gap is given."""
+
 _NARROW = 0.3  # relative standard deviation up to which a number is drawn in its logarithm
 _TRIES = 100  # of one draw
 _STEPS = 6  # of Newton's method; the force is nearly a square of the current
@@ -287,18 +289,16 @@ def _laws(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, _L
         return {}, ("k_x is not negative, which no magnet's law explains: the plants are those of the rotor at rest",)
     given = None if rig.magnet is None else rig.magnet.known("s")
     half = (travel[1] - travel[0]) / 2.0
-    gap = given.value if given is not None and given.value else _GAP_OF_TRAVEL * half
+    gap = given.value if given is not None and given.value else GAP_OF_TRAVEL * half
     laws = {}
     for p in pulled:
         k_x, k_i, L = theta[f"{p}k_x"], abs(theta[f"{p}k_i"]), theta.get(f"{p}L", 0.0)
-        bias = -k_x * gap / k_i
-        k = k_i * gap**2 / (2.0 * bias)
-        energy = CoEnergy(k_a=k, s_a=gap, k_b=k, s_b=gap, i0=bias, leakage=max(L - 2.0 * k / gap, 0.0))
+        energy = CoEnergy.opposed(k_i=k_i, k_x=k_x, L=max(L, -(k_i**2) / k_x), gap=gap)
         middle = at.get("position", 0.0) if not isinstance(of, RotorModel) else 0.0
         inside = middle if travel[0] < middle < travel[1] else (travel[0] + travel[1]) / 2.0
         laws[p] = _Law(
             energy=energy, rest=(0.0, 0.0), position=_ways(inside, travel),
-            current=_ways(0.0, most) if all(map(math.isfinite, most)) else (-bias, bias),
+            current=_ways(0.0, most) if all(map(math.isfinite, most)) else (-energy.i0, energy.i0),
         )  # fmt: skip
     whose = "the rig's gap" if given is not None and given.value else "a gap of twice the travel inside limits.position"
     return laws, (f"the law of the magnets is that of two opposed ones with {whose}, {1e6 * gap:.4g} µm",)

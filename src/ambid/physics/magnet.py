@@ -44,6 +44,16 @@ class CoEnergy:
     leakage: float  # inductance in H that does not depend on x
     i0_asym: float = 0.0  # half the difference of the two bias currents in A
 
+    @classmethod
+    def opposed(cls, *, k_i: float, k_x: float, L: float, gap: float, x: float = 0.0, i: float = 0.0) -> CoEnergy:
+        """Return two equal magnets `gap` away that have these numbers, and no force, at `x` and `i` (theory.md sec. 1).
+
+        i0 = -k_x s0/k_i, k = k_i s0²/(2 i0), and the leakage is what L has beyond k_i²/abs(k_x); `k_x` is negative.
+        """
+        bias = -k_x * gap / k_i
+        k = 0.5 * k_i * gap**2 / bias
+        return cls(k_a=k, s_a=gap + x, k_b=k, s_b=gap - x, i0=bias, leakage=L - 2.0 * k / gap, i0_asym=-i)
+
     def value(self, x: Number, i: Number) -> Number:
         """Return W' in J at position `x` in m and axis current `i` in A."""
         j = self.i0_asym + i

@@ -192,7 +192,9 @@ TOP_SPEED = 15_000 * math.pi / 30
 HEAVY_SPOT = 0.6
 """Phase of the unbalance in rad."""
 
-_GRADE = 2.5e-3  # m/s: eccentricity times speed of balance quality G 2.5 (ISO 21940-11)
+GRADE = 2.5e-3
+"""Eccentricity times speed in m/s of balance quality G 2.5 (ISO 21940-11)."""
+
 _MAX_LOAD = 0.1  # of the force that the current's limit allows
 
 
@@ -342,7 +344,7 @@ def _load(_: Bench, at: float, size: float, __: float) -> Variation:
 
 
 def _unbalance_of(bench: Bench) -> float:
-    return _parameter(bench, "m") * _GRADE / TOP_SPEED
+    return _parameter(bench, "m") * GRADE / TOP_SPEED
 
 
 def _load_of(bench: Bench) -> float:
