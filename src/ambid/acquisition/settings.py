@@ -42,7 +42,7 @@ from ambid.rig.rig import Daq, Rig
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
 """Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
 
-_FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
+FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
 _FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state, CRC, COBS, end
 STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
 """Roles of what a sample may carry, in the order of the bits of the stream mask and of a block's columns."""
@@ -236,9 +236,9 @@ def _gain(rig: Rig, name: str, value: float) -> int:
             "correct the calibrations"
         )
     steps = round(value)
-    if value != 0.0 and abs(steps) < _FEWEST_STEPS:
+    if value != 0.0 and abs(steps) < FEWEST_STEPS:
         raise RigError(
-            f"{who(rig)}: loop.{name} is {value:.2g} steps of the controller, fewer than {_FEWEST_STEPS}: too "
+            f"{who(rig)}: loop.{name} is {value:.2g} steps of the controller, fewer than {FEWEST_STEPS}: too "
             f"small to be represented. Raise loop.{name}, set it to 0, or use a sensor with fewer counts"
         )
     return steps

@@ -97,8 +97,8 @@ class Plant:
         order = [len(known) + roles.index(n) if n in roles else known.index(n) for n in self.names]
         return np.asarray(found[:, :, order])
 
-    def grid(self) -> Array:
-        """Return frequencies up to half the rate, closer around the plant's resonances."""
+    def grid(self, n: int = _FREQUENCIES) -> Array:
+        """Return `n` frequencies up to half the rate, and more around the plant's resonances."""
         poles = np.linalg.eigvals(self.space.A)
         size = np.abs(poles)
         narrow = (np.abs(poles.imag) > 0.9 * size) & (poles.imag > 0.0)
@@ -109,7 +109,7 @@ class Plant:
         low, high = _SPAN * self.rate_hz, 0.499 * self.rate_hz
         near = [f for f in around if low < f < high]
         below = np.geomspace(_ENDS * self.rate_hz, low, _BELOW)
-        return np.unique(np.r_[below, np.geomspace(low, high, _FREQUENCIES), near, (0.5 - _ENDS) * self.rate_hz])
+        return np.unique(np.r_[below, np.geomspace(low, high, n), near, (0.5 - _ENDS) * self.rate_hz])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

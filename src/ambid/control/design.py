@@ -1,0 +1,355 @@
+"""What is asked of a controller, what it does on one plant and on many, and the design as a result.
+
+A design is judged on plants of `ambid.control.drawn` that its method has not seen. Figures that are to be small are
+minimised together, as the largest over the plants of each over that of the present loop; every other figure is limited,
+by what the present loop has where nothing else is said. So the peak of the sensitivity, which is smallest without an
+integrator, is never the only thing that is looked at.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Literal, Protocol
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.controller import controller_of_loop
+from ambid.control.drawn import Drawn
+from ambid.control.margins import AxisMargins, AxisSensitivity, Compliance
+from ambid.errors import EstimationError, ModelError, nearest
+from ambid.estimation.estimate import Check, Judged
+from ambid.estimation.progress import Tick, silent
+from ambid.physics.linear_model import discretise
+from ambid.physics.loop import Loop, Noise
+from ambid.rig import Rig
+from ambid.simulation.margins import zone_of
+from ambid.simulation.plant import closed_loop_matrix
+
+SCHEMA = "ambid.design/1"
+FIGURES: Mapping[str, str] = MappingProxyType(
+    {
+        "peak": "", "compliance": "m/N", "noise": "V", "settling": "s",
+    }
+)  # fmt: skip
+"""What a design is judged by, with units: peak of the sensitivity, largest displacement by a force, noise of the
+sensors in the command, and the time in which a force step is settled."""
+GOALS = ("peak", "compliance")
+SETTLED = 0.05
+"""Part of the largest deflection by a force step, below which it is settled."""
+CIRCLE = 1e-9  # a pole no nearer to the unit circle is stable
+FREQUENCIES = 320
+"""At which many plants are looked at, beside those around their resonances."""
+_LONGEST = 20.0  # time constants of the slowest pole over which a force step is looked at
+_MOST = 2**17  # samples of it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Figures:
+    """What a loop does on one plant, each the worst of its axes."""
+
+    peak: float  # of the sensitivity at the position signals, as a ratio
+    compliance: float  # largest, m/N
+    noise: float  # of the sensors in the command, V rms
+    settling: float  # of a force step, s
+    pole: float  # decay of the slowest pole, 1/s; negative where it grows
+
+    @property
+    def stable(self) -> bool:
+        """Whether the loop holds the plant."""
+        return self.pole > 0.0
+
+    @property
+    def peak_db(self) -> float:
+        """Peak of the sensitivity in dB."""
+        return float(20.0 * np.log10(self.peak))
+
+
+UNSTABLE = Figures(peak=math.inf, compliance=math.inf, noise=math.inf, settling=math.inf, pole=-math.inf)
+"""The figures of a loop that does not hold the plant."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Goals:
+    """What is minimised, over which figures of reference, and what limits the others."""
+
+    minimise: tuple[str, ...]
+    reference: Mapping[str, float]
+    limits: Mapping[str, float]
+
+    @classmethod
+    def of(cls, minimise: Sequence[str], limits: Mapping[str, float], before: Figures) -> Goals:
+        """Return the goals of a design; a figure that is no goal and has no limit must not become worse."""
+        for name in (*minimise, *limits):
+            if name not in FIGURES:
+                known = f"{', '.join(FIGURES)}.{nearest(name, list(FIGURES))}"
+                raise ModelError(f"figure {name!r} of a design is unknown; known: {known} Give one of them")
+        if not minimise:
+            raise ModelError("a design needs a goal. Give at least one of " + ", ".join(FIGURES))
+        for name, x in limits.items():
+            if not x > (1.0 if name == "peak" else 0.0):
+                raise ModelError(f"limit {name} is {x:g} {FIGURES[name]}; no loop is that good. Raise it")
+        kept = {name: getattr(before, name) for name in FIGURES if name not in minimise}
+        return cls(
+            minimise=tuple(minimise), reference={name: getattr(before, name) for name in FIGURES},
+            limits={**kept, **limits},
+        )  # fmt: skip
+
+    def missed(self, worst: Figures, slack: float = 1.0) -> tuple[str, ...]:
+        """Return the limits that figures pass by more than a factor."""
+        return tuple(name for name, x in self.limits.items() if getattr(worst, name) > slack * x)
+
+
+class Method(Protocol):
+    """How a controller is designed: for plants, the estimate's first, in a rig whose [loop] is the present one."""
+
+    def __call__(self, plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+        """Return the loop; EstimationError where none meets the limits, with the one to move."""
+        ...
+
+
+def on(loop: Loop, plant: Plant) -> Loop:
+    """Return a loop with the delay of a plant."""
+    return replace(loop, delay=float(np.max(plant.delays)))
+
+
+def closed_loop_of(plant: Plant, loop: Loop) -> ClosedLoop:
+    """Return the closed loop of a plant and a rig's [loop]."""
+    return ClosedLoop.of(plant, controller_of_loop(loop, plant.model, plant.rate_hz))
+
+
+def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float, float, str]:
+    """Return the noise of position and current, m and A rms, with what is assumed of it.
+
+    `noise`: the rig's; `sensor_sd`: as estimated, where the rig says nothing.
+    """
+    given = noise or Noise()
+    found = [
+        math.hypot(white, step / math.sqrt(12.0))
+        for white, step in ((given.position, given.position_resolution), (given.current, given.current_resolution))
+    ]
+    if any(found):
+        return found[0], found[1], "the noise of the sensors is the rig's [noise]"
+    known = [[x for name, x in sensor_sd.items() if name.endswith(kind)] for kind in ("position", "current")]
+    if any(map(any, known)):
+        return max(known[0], default=0.0), max(known[1], default=0.0), "the noise of the sensors is as estimated"
+    return 1e-6, 0.0, "nothing says how noisy the sensors are: 1 µm rms is taken"
+
+
+def figures_of(plant: Plant, loop: Loop, noise: tuple[float, float], frequency_hz: Array | None = None) -> Figures:
+    """Return what a loop does on a plant, by poles, sampled response and a force step."""
+    held = on(loop, plant)
+    z = closed_loop_matrix(plant.theta, held, plant.rate_hz, of=plant.model)
+    if not np.isfinite(z).all():
+        return UNSTABLE
+    if loop.law is None and loop.ki == 0.0:  # an integral that nothing feeds
+        count = len(plant.model.inputs)
+        keep = np.r_[: z.shape[0] - 3 * count, z.shape[0] - 2 * count : z.shape[0]]
+        z = z[np.ix_(keep, keep)]
+    largest = float(np.max(np.abs(np.linalg.eigvals(z))))
+    if largest > 1.0 - CIRCLE:
+        return UNSTABLE
+    pole = -math.log(max(largest, 1e-300)) * plant.rate_hz
+    f = plant.grid(FREQUENCIES) if frequency_hz is None else frequency_hz
+    of = ClosedLoop(plant=plant, controller=controller_of_loop(loop, plant.model, plant.rate_hz), frequency_hz=f)
+    return Figures(
+        peak=float(np.max(np.abs(of.of_axes))), compliance=float(np.max(np.abs(of.compliance()))),
+        noise=float(np.max(noise_in_command(of, noise))), settling=settling_of(plant, z, pole)[0], pole=pole,
+    )  # fmt: skip
+
+
+def mean_over(frequency_hz: Array, power: Array) -> Array:
+    """Return the mean of a power over all frequencies up to half the rate, along the first axis (trapezoidal rule)."""
+    f = np.concatenate([[0.0], frequency_hz])
+    of = np.concatenate([power[:1], power])
+    return np.asarray(np.trapezoid(of, f, axis=0) / f[-1])
+
+
+def noise_in_command(loop: ClosedLoop, noise: tuple[float, float]) -> Array:
+    """Return the rms of each command by white noise of the sensors, (n_u,)."""
+    sd = np.where(np.isin(np.arange(loop.H.shape[1]), loop.positions), *noise)
+    answer = np.linalg.solve(np.eye(loop.H.shape[2]) + loop.K @ loop.H, loop.K)
+    return np.asarray(np.sqrt(mean_over(loop.frequency_hz, np.sum(np.abs(answer * sd) ** 2, axis=2))))
+
+
+def force_step(plant: Plant, z: Array, n: int) -> Array:
+    """Return the positions of the axes after a step of 1 N on each, one at a time, (n, n_axes), m.
+
+    `z`: matrix of the closed loop. Samples by doubling: x[k + m] = z^m x[k] + x[m].
+    """
+    whole = float(np.max(plant.delays))
+    d, _ = discretise(plant.space, 1.0 / plant.rate_hz, fraction=whole - math.floor(whole))
+    axes, first = len(plant.axes), [group[0] for group in plant.sensors]
+    pushed = np.zeros((z.shape[0], axes))
+    pushed[: d.A.shape[0]] = d.E[:, :axes]
+    states = pushed[None]
+    power = z
+    while states.shape[0] < n:
+        more = np.einsum("ij,kjl->kil", power, states) + states[-1]
+        states, power = np.concatenate([states, more]), power @ power
+    found = np.einsum("ij,kjl->kil", d.C[first], states[:n, : d.A.shape[0]])
+    return np.asarray(np.einsum("kii->ki", found))
+
+
+def settling_of(plant: Plant, z: Array, pole: float) -> tuple[float, Array, Array]:
+    """Return when the deflection by a force step last leaves `SETTLED` of its largest; times in s, and deflections."""
+    n = int(min(max(_LONGEST / pole * plant.rate_hz, 64.0), _MOST))
+    x = force_step(plant, z, n)
+    final = x[-1]
+    off = np.abs(x - final)
+    last = [int(np.flatnonzero(o > SETTLED * max(o.max(), 1e-300))[-1]) + 2 if o.max() else 0 for o in off.T]
+    return max(last) / plant.rate_hz, np.arange(1, n + 1) / plant.rate_hz, x
+
+
+def worst_of(figures: Sequence[Figures]) -> Figures:
+    """Return the worst of each figure over the plants that are held; `UNSTABLE` where none is."""
+    held = [f for f in figures if f.stable]
+    if not held:
+        return UNSTABLE
+    worst = {name: max(getattr(f, name) for f in held) for name in FIGURES}
+    return Figures(**worst, pole=min(f.pole for f in held))
+
+
+def verify(plants: Sequence[Drawn], loop: Loop, noise: tuple[float, float], tick: Tick = silent) -> tuple[Figures, ...]:
+    """Return the figures of a loop on each plant, in their order."""
+    found = []
+    for k, drawn in enumerate(plants):
+        tick("verify", k / len(plants))
+        found.append(figures_of(drawn.plant, loop, noise))
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Situation:
+    """A loop, on the estimate and on the plants that judge."""
+
+    loop: Mapping[str, object]  # gains, or matrices, as [loop] has them
+    figures: Figures  # on the estimate
+    worst: Figures  # the worst of each over the plants that are held
+    unstable: int  # plants that are not held
+    sensitivity: Mapping[str, AxisSensitivity]
+    margins: Mapping[str, AxisMargins]
+    compliance: Mapping[str, Compliance]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorstPlant:
+    """The plant with the highest peak of the sensitivity in the new loop."""
+
+    number: int  # of its draw
+    words: str  # what was changed
+    changed: Mapping[str, float]
+    peak_db: float
+    zone: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class LoopCurves:
+    """What is drawn of one loop: of an axis, on the estimate, and between which the drawn plants lie."""
+
+    sensitivity: Mapping[str, Array]  # modulus, (n,)
+    highest: Mapping[str, Array]  # over the drawn plants
+    compliance: Mapping[str, Array]  # m/N
+    softest: Mapping[str, Array]
+    time_s: Array  # (n_samples,)
+    step: Mapping[str, Array]  # m, by 1 N
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class DesignCurves:
+    """Curves of both loops."""
+
+    frequency_hz: Array
+    before: LoopCurves
+    after: LoopCurves
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Design(Judged):
+    """A controller, designed on an estimate and verified on plants around it.
+
+    Attributes
+    ----------
+    status : {"converged", "stalled", "failed"}
+        Of the estimate that the plant comes from.
+    model : str
+    method : str
+    record : Mapping[str, object]
+        That the estimate comes from.
+    goals : Goals
+    before, after : Situation
+    worst_plant : WorstPlant
+    plants : Mapping[str, object]
+        ``tuning`` and ``verification``: how many plants; ``rejected``: draws without physical sense; ``seeds``;
+        ``assumed``: what the draws take for granted.
+    checks : Mapping[str, Check]
+    curves : DesignCurves
+    warnings : tuple of str
+    timing_s : Mapping[str, float]
+    rig : Mapping[str, object]
+        With the new [loop].
+    """
+
+    status: Literal["converged", "stalled", "failed"]
+    model: str
+    method: str
+    record: Mapping[str, object]
+    goals: Goals
+    before: Situation
+    after: Situation
+    worst_plant: WorstPlant
+    plants: Mapping[str, object]
+    checks: Mapping[str, Check]
+    curves: DesignCurves
+    warnings: tuple[str, ...] = ()
+    timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
+
+
+def worst_plant(plants: Sequence[Drawn], figures: Sequence[Figures]) -> WorstPlant:
+    """Return the plant with the highest peak, or the first that is not held."""
+    k = int(np.argmax([f.peak for f in figures]))
+    drawn, peak = plants[k], figures[k].peak
+    return WorstPlant(
+        number=drawn.number, words=drawn.words(), changed=drawn.changed, zone=zone_of(peak),
+        peak_db=float(20.0 * np.log10(peak)),
+    )  # fmt: skip
+
+
+def checks_of(goals: Goals, before: Situation, after: Situation, worst: WorstPlant, n: int) -> dict[str, Check]:
+    """Judge stability, limits and zone of the new loop over the plants, and whether it is better at all."""
+    missed = goals.missed(after.worst, 1.0 + 1e-6)
+    held = f"{n - after.unstable} of {n} plants drawn around the estimate are held"
+    gains = [getattr(after.worst, g) < getattr(before.worst, g) for g in goals.minimise] or [True]
+    return {
+        "stability": Check(
+            passed=after.unstable == 0, values={"unstable": after.unstable, "plants": n},
+            detail=held if not after.unstable else f"only {held}; the worst: {worst.words}. Lower the spread, or "
+            "give up some goals",
+        ),
+        "limits": Check(
+            passed=not missed,
+            detail="the limits are met on all plants" if not missed else
+            f"over the plants that judge, {', '.join(missed)} is beyond its limit. Raise it, or tune over more plants",
+        ),
+        "zone": Check(
+            passed=worst.zone in "AB", values={"peak_db": worst.peak_db},
+            detail=f"the largest sensitivity of all plants is {worst.peak_db:.1f} dB, zone {worst.zone} of ISO 14839-3",
+        ),
+        "improvement": Check(
+            passed=any(gains), detail="the new loop is better than the present one" if any(gains) else
+            f"the new loop is no better in {', '.join(goals.minimise)} than the present one. Keep that",
+        ),
+    }  # fmt: skip
+
+
+def refuse_unheld(figures: Figures, what: str) -> None:
+    """Refuse a present loop that does not hold the estimate: nothing can be compared with it."""
+    if not figures.stable:
+        raise EstimationError(
+            f"the rig's [loop] does not hold {what}; a design is compared with the present loop. Correct [loop]"
+        )

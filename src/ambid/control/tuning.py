@@ -1,0 +1,379 @@
+"""The PID of `ambid.physics.loop.Loop` tuned over many plants of one axis at once.
+
+Its five numbers kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) + q (1 - 1/z)/(1 -
+p/z) and, each alone, in the matrix of the closed loop: the responses H of the plants are computed once, and slopes are
+exact. With x, i by a voltage (H) and by a force (G), D = 1 + kc H_i + K H_x:
+
+    S = (1 + kc H_i)/D,   x/f = (G_x + kc (G_x H_i - H_x G_i))/D,   u/n = (K, kc)/D.
+
+The largest over the plants of each figure's logarithm is minimised as an epigraph, with the limits as further
+constraints and a common excess of all of them that is penalised exactly (Nocedal and Wright 2006, sec. 17.2 and 18.5):
+where it stays, no design meets them. The decay of the slowest pole stands for settling, and is corrected by what the
+force steps show.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import Plant
+from ambid.control.design import FIGURES, FREQUENCIES, Goals, figures_of, mean_over, noise_of, on, worst_of
+from ambid.errors import EstimationError, ModelError
+from ambid.estimation.progress import Tick
+from ambid.physics.linear_model import OneAxis
+from ambid.physics.loop import Loop, placed_loop
+from ambid.rig import Rig
+from ambid.simulation.plant import closed_loop_matrix
+
+_SHARP = 200.0  # exponent of the smooth maximum over the frequencies
+_SLOW = 0.02  # decay over that of the present loop, from which its logarithm goes on as a straight line
+_RANGE = math.log(30.0)  # of each gain, up and down from the present one
+_STEPS = 60  # of a search
+_PENALTY = 10.0  # of the common excess over the limits
+_MET = 2e-3  # excess in logarithms that counts as none
+_SLACK = 0.01  # by which limits are kept from, in logarithms: other plants judge
+_ROUNDS = 4  # of corrections by the force steps
+_PLACED = (0.6, 1.0, 1.6)  # over the plant's own rate, where poles are placed to start from
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Pid:
+    """What may change in a loop: its numbers as `AxisLoops` takes them, with the signs of the present ones."""
+
+    signs: Array  # (4,): of kp, ki, kd, kc; 0 where the present loop has none, and keeps none
+    period: float
+
+    @classmethod
+    def of(cls, loop: Loop, rate_hz: float) -> Pid:
+        """Return the structure of a loop."""
+        return cls(signs=np.sign([loop.kp, loop.ki, loop.kd, loop.kc]), period=1.0 / rate_hz)
+
+    @property
+    def free(self) -> Array:
+        """Which of the five numbers are searched."""
+        return np.append(self.signs != 0.0, self.signs[2] != 0.0)
+
+    def at(self, loop: Loop) -> Array:
+        """Return the logarithms of |kp|, |ki| T, |q|, |kc| and tau; of a loop without filter, a tau of T/10."""
+        T = self.period
+        tau = max(loop.filter_s, T / 10.0)
+        sizes = np.abs([loop.kp, loop.ki * T, loop.kd / (loop.filter_s + T), loop.kc, tau])
+        return np.asarray(np.log(np.where(sizes > 0.0, sizes, 1.0)))
+
+    def numbers(self, at: Array) -> tuple[Array, Array]:
+        """Return kp, ki T, q, kc and p, and their slopes by the logarithms."""
+        tau, T = math.exp(at[4]), self.period
+        v = np.append(self.signs * np.exp(at[:4]), tau / (tau + T) if self.signs[2] else 0.0)
+        return v, np.append(v[:4], tau * T / (tau + T) ** 2 if self.signs[2] else 0.0)
+
+    def loop(self, at: Array, present: Loop) -> Loop:
+        """Return the loop."""
+        v, _ = self.numbers(at)
+        tau = math.exp(at[4])
+        return replace(
+            present, kp=float(v[0]), ki=float(v[1] / self.period), kd=float(v[2] * (tau + self.period)),
+            kc=float(v[3]), derivative_cutoff_hz=1.0 / (2.0 * math.pi * tau) if self.signs[2] else math.inf,
+        )  # fmt: skip
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class AxisLoops:
+    """Many plants of one axis, of one rate."""
+
+    plants: Sequence[Plant]
+    noise: tuple[float, float]  # of position and current, m and A rms
+    frequency_hz: Array
+
+    @cached_property
+    def rate_hz(self) -> float:
+        """Sampling rate in Hz."""
+        return self.plants[0].rate_hz
+
+    @cached_property
+    def responses(self) -> tuple[Complex, ...]:
+        """H_x, H_i, G_x and G_x H_i - H_x G_i, each (n_plants, n)."""
+        found = []
+        for plant in self.plants:
+            x, i = (plant.model.outputs.index(name) for name in ("position", "current"))
+            sampled = plant.sampled(self.frequency_hz)
+            H = sampled.transfer()[:, [x, i], 0]
+            force = replace(sampled.space, B=sampled.space.E[:, :1])
+            G = replace(sampled, space=force, delays=np.zeros(1), held=(False,)).transfer()[:, [x, i], 0]
+            found.append((*H.T, G[:, 0], G[:, 0] * H[:, 1] - H[:, 0] * G[:, 1]))
+        return tuple(np.array(x) for x in zip(*found, strict=True))
+
+    @cached_property
+    def matrices(self) -> Array:
+        """Matrix of the closed loop without gains, and its slopes by the five numbers, (6, n_plants, n, n)."""
+        T = 1.0 / self.rate_hz
+        probes = (Loop(), Loop(kp=1.0), Loop(ki=1.0 / T), Loop(kd=T), Loop(kc=1.0))
+        lagged = Loop(derivative_cutoff_hz=1.0 / (2.0 * math.pi * T))  # p = 1/2
+        found = []
+        for plant in self.plants:
+            z = np.array([closed_loop_matrix(plant.theta, on(p, plant), self.rate_hz, of=plant.model)
+                          for p in (*probes, lagged)])  # fmt: skip
+            found.append(np.concatenate([z[:1], z[1:] - z[0]]) * np.array([1, 1, 1, 1, 1, 2])[:, None, None])
+        size = max(z.shape[1] for z in found)
+        wide = np.zeros((6, len(found), size, size))
+        for k, z in enumerate(found):
+            wide[:, k, : z.shape[1], : z.shape[1]] = z
+        return wide
+
+    def decays(self, v: Array, *, integrates: bool) -> tuple[Array, Array]:
+        """Return the decay of the slowest pole of each plant in 1/s, and its slopes by the numbers, (n_plants, 5)."""
+        z = self.matrices[0] + np.einsum("j,jkab->kab", v, self.matrices[1:])
+        if not integrates:  # what nothing feeds stays where it is: no pole of the loop
+            z = z - self._integral
+        values, right = np.linalg.eig(z)
+        others, left = np.linalg.eig(np.swapaxes(z, 1, 2))
+        k, many = np.argmax(np.abs(values), axis=1), np.arange(len(values))
+        at = values[many, k]
+        j = np.argmin(np.abs(others - at[:, None]), axis=1)
+        w, x = left[many, :, j], right[many, :, k]
+        slopes = np.einsum("ka,jkab,kb->kj", w, self.matrices[1:], x) / np.sum(w * x, axis=1)[:, None]
+        return -np.log(np.abs(at)) * self.rate_hz, -np.real(slopes / at[:, None]) * self.rate_hz
+
+    @cached_property
+    def _integral(self) -> Array:
+        """The place of the integral that stays, (n_plants, n, n)."""
+        found = np.zeros(self.matrices.shape[1:])
+        k, i, _ = np.nonzero(self.matrices[2])  # what ki changes is the integral's own row
+        found[k, i, i] = 1.0
+        return found
+
+    def figures(self, v: Array) -> tuple[Array, Array]:
+        """Return the logarithms of peak, compliance and noise, (n_plants, 3), and their slopes, (n_plants, 3, 5)."""
+        H_x, H_i, G_x, W = self.responses
+        back = np.exp(-2j * np.pi * self.frequency_hz / self.rate_hz)
+        kp, ki, q, kc, p = v
+        sum_, lag = back / (1.0 - back), 1.0 / (1.0 - p * back)
+        rise = (1.0 - back) * lag
+        K = kp + ki * sum_ + q * rise
+        by = (1.0 + 0.0 * back, sum_, rise, None, q * rise * back * lag)  # of K
+        inner, lent = 1.0 + kc * H_i, G_x + kc * W
+        D = inner + K * H_x
+        d = [H_i if b is None else b * H_x for b in by]  # of D
+        far = np.stack([-x / D for x in d], axis=2)
+        S, soft = far.copy(), far
+        S[:, :, 3] += H_i / inner
+        soft = far.copy()
+        soft[:, :, 3] += W / lent
+        found, slopes = [], []
+        for size, slope in ((np.abs(inner / D), S), (np.abs(lent / D), soft)):
+            ln = np.log(size)
+            top = ln.max(axis=1)
+            weight = np.exp(_SHARP * (ln - top[:, None]))
+            total = weight.sum(axis=1)
+            found.append(top + np.log(total) / _SHARP)
+            slopes.append(np.einsum("kf,kfj->kj", weight / total[:, None], slope.real))
+        power, change = 0.0, 0.0
+        for sd, A, own in ((self.noise[0], K / D, by), (self.noise[1], kc / D, (None, None, None, 1.0, None))):
+            power = power + sd**2 * np.abs(A) ** 2
+            rates = [A * far[:, :, j] + (0.0 if b is None else b / D) for j, b in enumerate(own)]
+            change = change + sd**2 * 2.0 * np.real(np.conj(A)[:, :, None] * np.stack(rates, axis=2))
+        mean = mean_over(self.frequency_hz, np.transpose(power))
+        found.append(0.5 * np.log(mean))
+        slopes.append(0.5 * mean_over(self.frequency_hz, np.transpose(change, (1, 0, 2))) / mean[:, None])
+        return np.stack(found, axis=1), np.stack(slopes, axis=1)
+
+
+@dataclass(kw_only=True, eq=False)
+class _Search:
+    """One problem: what is minimised and limited, over plants; evaluated once for each point."""
+
+    loops: AxisLoops
+    pid: Pid
+    reference: Mapping[str, float]
+    decay: float  # 1/s, of the present loop, by which settling is judged
+
+    def __post_init__(self) -> None:
+        self._last: tuple[bytes, tuple[Array, Array]] | None = None
+
+    def at(self, point: Array) -> tuple[Array, Array]:
+        """Return ln(figure/reference), (n_plants, 4) in the order of `FIGURES`, and slopes by the logarithms."""
+        key = point.tobytes()
+        if self._last is None or self._last[0] != key:
+            v, chain = self.pid.numbers(point)
+            found, slopes = self.loops.figures(v)
+            decay, fall = self.loops.decays(v, integrates=bool(self.pid.signs[1]))
+            share = np.maximum(decay / self.decay, _SLOW)
+            slow = -np.log(share) + (share - decay / self.decay) / _SLOW
+            values = np.column_stack([found - np.log([self.reference[n] for n in list(FIGURES)[:3]]), slow])
+            rates = np.concatenate([slopes, (-fall / self.decay / share[:, None])[:, None]], axis=1) * chain
+            self._last = key, (values, rates)
+        return self._last[1]
+
+    def solve(
+        self,
+        minimise: Sequence[str],
+        limits: Mapping[str, float],
+        start: Array,
+        bounds: Array,
+        tick: Callable[[], None],
+    ) -> tuple[Array, float, float]:
+        """Return the best point from a start, the largest logarithm of the goals there, and the excess over limits.
+
+        `limits`: largest ln(figure/reference); a pole that hardly decays is always beyond one.
+        """
+        from scipy.optimize import minimize
+
+        names = list(FIGURES)
+        goals, kept = [names.index(n) for n in minimise], [names.index(n) for n in limits]
+        most = np.array([*limits.values(), -math.log(_SLOW)])
+        kept.append(names.index("settling"))
+        free = np.flatnonzero(self.pid.free)
+
+        def point(x: Array) -> Array:
+            full = start.copy()
+            full[free] = x[:-2]
+            return full
+
+        def rest(x: Array) -> Array:
+            values = self.at(point(x))[0]
+            return np.concatenate([(x[-2] - values[:, goals]).ravel(), (most + x[-1] - values[:, kept]).ravel()])
+
+        def slopes(x: Array) -> Array:
+            rates = self.at(point(x))[1]
+            parts = [-rates[:, g][:, :, free].reshape(-1, free.size) for g in (goals, kept)]
+            ends = [np.tile(e, (p.shape[0], 1)) for e, p in zip(np.eye(2), parts, strict=True)]
+            return np.vstack([np.hstack(pair) for pair in zip(parts, ends, strict=True)])
+
+        values = self.at(start)[0]
+        first = [float(values[:, goals].max()), max(float((values[:, kept] - most).max()), 0.0)]
+        answer = minimize(
+            lambda x: x[-2] + _PENALTY * x[-1], np.array([*start[free], *first]),
+            jac=lambda _: np.array([*np.zeros(free.size), 1.0, _PENALTY]), method="SLSQP",
+            bounds=[*bounds[free].tolist(), (None, None), (0.0, None)],
+            constraints={"type": "ineq", "fun": rest, "jac": slopes}, callback=lambda _: tick(),
+            options={"maxiter": _STEPS, "ftol": 1e-5},
+        )  # fmt: skip
+        found = point(np.clip(answer.x, [*bounds[free, 0], -np.inf, 0.0], [*bounds[free, 1], np.inf, np.inf]))
+        values = self.at(found)[0]
+        return found, float(values[:, goals].max()), max(float((values[:, kept] - most).max()), 0.0)
+
+
+def tune_pid(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return the PID with current feedback that does best on the worst of some plants of one axis.
+
+    Gains that the present loop has not stay absent. EstimationError where no loop meets the limits.
+    """
+    assert rig.loop is not None
+    if not all(isinstance(p.model, OneAxis) for p in plants):
+        raise EstimationError("a PID is tuned for one axis with its coil (model one-axis); the estimate is of another")
+    if rig.loop.law is not None:
+        raise EstimationError(
+            "[loop] is a state-space law, whose structure is no PID. Give a PID in [loop] to start from"
+        )
+    present, pid = rig.loop, Pid.of(rig.loop, plants[0].rate_hz)
+    noise = noise_of(rig.noise, {})[:2]
+    loops = AxisLoops(plants=plants, noise=noise, frequency_hz=plants[0].grid(FREQUENCIES))
+    start = pid.at(present)
+    bounds = bounds_of(rig, pid, start)
+    decays = loops.decays(pid.numbers(start)[0], integrates=bool(pid.signs[1]))[0]
+    search = _Search(
+        loops=loops, pid=pid, reference=goals.reference, decay=max(float(np.min(decays)), 1e-3 * loops.rate_hz / 1e3)
+    )
+    starts = [start, *_placed(plants[0], present, pid, bounds)]
+    done = 0
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        tick("tune", min(done / (_STEPS * (len(starts) + 1)), 0.99))
+
+    limits = {
+        n: math.log(x / goals.reference[n]) - _SLACK * (n not in _worsened(goals)) for n, x in goals.limits.items()
+    }
+    for _ in range(_ROUNDS):
+        found = [search.solve(goals.minimise, limits, x, bounds, advance) for x in starts]
+        best, _, excess = min(found, key=lambda f: f[1] + _PENALTY * f[2])
+        if excess > _MET:
+            raise EstimationError(_refusal(search, goals, limits, starts, bounds, advance))
+        loop = pid.loop(best, present)
+        worst = worst_of([figures_of(p, loop, noise) for p in plants])
+        over = worst.settling / goals.limits.get("settling", math.inf)
+        if over <= 1.0:
+            return loop
+        limits["settling"] -= math.log(over) + _SLACK
+        starts = [best, *starts[:1]]
+    raise EstimationError(_refusal(search, goals, limits, starts, bounds, advance))
+
+
+def _worsened(goals: Goals) -> tuple[str, ...]:
+    """Return the figures whose limit is what the present loop has: it meets them, and need not be left."""
+    return tuple(n for n, x in goals.limits.items() if x == goals.reference[n])
+
+
+def bounds_of(rig: Rig, pid: Pid, start: Array) -> Array:
+    """Return between which logarithms the numbers are searched, (5, 2), as firmware holds them."""
+    bounds = np.column_stack([start - _RANGE, start + _RANGE])
+    bounds[4] = np.log([pid.period / 20.0, 100.0 * pid.period])
+    if rig.daq is None:
+        return bounds
+    from ambid.acquisition.scales import LARGEST_GAIN
+    from ambid.acquisition.settings import FEWEST_STEPS, controller_settings, exact_gains
+
+    unit = replace(rig, loop=Loop(kp=1.0, ki=1.0 / pid.period, kd=pid.period, kc=1.0, delay=0.0))
+    settings = controller_settings(rig)
+    steps = exact_gains(unit, (settings.duty_bias, settings.current_rest, settings.setpoint))
+    for k, name in enumerate(("kp", "ki", "kd", "kc")):
+        held = np.log(np.array([FEWEST_STEPS, LARGEST_GAIN]) / abs(steps[name]))
+        bounds[k] = np.clip(bounds[k], *held)
+    return bounds
+
+
+def _placed(plant: Plant, present: Loop, pid: Pid, bounds: Array) -> list[Array]:
+    """Return further starts: poles placed at multiples of the plant's own rate, with the signs of the present loop."""
+    theta, found = plant.theta, []
+    own = math.sqrt(max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]) / theta["m"])
+    for factor in _PLACED:
+        w = factor * own
+        try:
+            loop = placed_loop(theta, (-5.0 * w, w * (-0.7 + 0.7j), w * (-0.7 - 0.7j), -w / 6.0),
+                               derivative_cutoff_hz=present.derivative_cutoff_hz)  # fmt: skip
+        except ModelError:
+            continue
+        if np.array_equal(Pid.of(loop, plant.rate_hz).signs, pid.signs):
+            found.append(np.clip(pid.at(loop), bounds[:, 0], bounds[:, 1]))
+    return found
+
+
+def _refusal(
+    search: _Search, goals: Goals, limits: Mapping[str, float], starts: Sequence[Array], bounds: Array,
+    tick: Callable[[], None],
+) -> str:  # fmt: skip
+    """Say which limit to move, and how far: the one that has to give way least, the others kept."""
+    ways = []
+    for name in limits:
+        others = {n: x for n, x in limits.items() if n != name}
+        _, least, excess = min(
+            (search.solve((name,), others, x, bounds, tick) for x in starts), key=lambda f: f[1] + _PENALTY * f[2]
+        )
+        if excess <= _MET:
+            ways.append((least - limits[name], name, goals.limits[name] * math.exp(least - limits[name])))
+    asked = ", ".join(said(name, x) for name, x in goals.limits.items())
+    if not ways:
+        return f"no PID meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
+    _, name, least = min(ways)
+    return (
+        f"no PID meets the limits ({asked}) on all plants; with the others kept, {name} can be {said(name, least)} at "
+        f"best. Give --limit {option(name, least)}, or raise another"
+    )
+
+
+def said(name: str, x: float) -> str:
+    """Write a limit for people."""
+    return f"{name} {option(name, x).partition('=')[2]}"
+
+
+def option(name: str, x: float) -> str:
+    """Write a limit as the option ``--limit`` takes it, rounded up."""
+    shown = 20.0 * math.log10(x) if name == "peak" else x
+    digits = 10.0 ** (math.floor(math.log10(shown)) - 2) if shown > 0.0 else 1.0
+    return f"{name}={math.ceil(shown / digits * 1.01) * digits:.4g}{'dB' if name == 'peak' else FIGURES[name]}"
