@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from ambid.estimation.estimate import estimate_from_json as estimate_from_json
     from ambid.job import acquire as acquire
     from ambid.job import compare as compare
+    from ambid.job import design_controller as design_controller
     from ambid.job import design_experiment as design_experiment
     from ambid.job import fit as fit
     from ambid.job import frf as frf

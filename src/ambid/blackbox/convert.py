@@ -83,6 +83,11 @@ def state_space_to_control(A: Array, B: Array, C: Array) -> Any:
     return _control().ss(A, B, C, [[0.0] * B.shape[1]] * C.shape[0])
 
 
+def discrete_to_control(A: Array, B: Array, C: Array, D: Array, dt: float) -> Any:
+    """Return a discrete-time system as a control.StateSpace."""
+    return _control().ss(A, B, C, D, dt)
+
+
 def _control() -> Any:
     try:
         import control

@@ -45,7 +45,7 @@ app.command("acquire", short_help="take a record from a controller, real or emul
 app.command("commission", short_help="go from a controller to tracked parameters, step by step")(commission.command)
 app.command("track", short_help="track parameters through a record, as on-line")(track.command)
 app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
-app.add_typer(design.group, name="design", short_help="design the next experiment on an identified model")
+app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")
 app.command("recover", short_help="recover a recording that was cut off")(recover.command)
 app.command("init", short_help="draft a rig file from a record")(init.command)
 app.command("simulate", short_help="simulate a record from the physics")(simulate.command)

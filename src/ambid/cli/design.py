@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.options import argument, band_of, option, preset_of
+from ambid.cli.options import argument, band_of, option, preset_of, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
+from ambid.errors import AmbidError
 
 group = typer.Typer(rich_markup_mode=None, help="Design what comes next on an identified model.")
 
@@ -79,3 +81,98 @@ def experiment(
         if record is not None:
             outputs.stage(record, lambda path: write_record(one_period(found), path))
     outputs.show(found, strict=strict)
+
+
+@group.command("controller", short_help="design the controller, and verify it on plants around the estimate")
+def controller(
+    estimate: Annotated[Path, argument("ESTIMATE", "What 'ambid identify --json' wrote.")],
+    rig: opt.RigFile = None,
+    out: Annotated[Path | None, option("--out -o RIG", "Write the rig with the new [loop].")] = None,
+    method: Annotated[str, option("--method NAME", "pid: the present structure, tuned.", True)] = "pid",
+    goal: Annotated[
+        list[str] | None,
+        option("--goal FIGURE", "To be small: peak, compliance, noise or settling; repeatable.", "peak and compliance"),
+    ] = None,
+    limit: Annotated[
+        list[str] | None,
+        option("--limit FIGURE=X", "Largest value, such as peak=9.5dB; repeatable.", "what the present loop has"),
+    ] = None,
+    spread: Annotated[
+        list[str] | None,
+        option(
+            "--spread SOURCE=X", "How far plants are drawn, such as delay=0.3; repeatable.", "see the documentation"
+        ),
+    ] = None,
+    plants: Annotated[int, option("--plants N", "Plants that the design is tuned over.", True, min=1)] = 60,
+    judges: Annotated[int, option("--judges N", "Plants that judge the design.", True, min=1)] = 200,
+    seed: Annotated[int, option("--seed N", "Seed of the plants.", True, min=0)] = 0,
+    json: opt.JsonFile = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
+    strict: opt.Strict = False,
+    force: Annotated[bool, switch("--force", "Overwrite an existing rig file.")] = False,
+) -> None:
+    """Design the controller of an identified bearing, and verify it on plants around the estimate.
+
+    Goals are minimised on the worst of many plants; every other figure must not become worse than it is with the rig's
+    [loop], unless a --limit says otherwise.
+    """
+    from ambid.control.design import GOALS
+    from ambid.job import design_controller
+
+    with Outputs(estimate, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
+        outputs.claim(out, "-o", (".toml",), force=force)
+        found = design_controller(
+            estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
+            spread=_sources(spread or ()), plants=plants, judges=judges, seed=seed, tick=show,
+        )  # fmt: skip
+        outputs.give(found, show)
+        if out is not None:
+            from ambid.rig import rig_text
+
+            outputs.stage_text(out, rig_text(found.new_rig, out.parent))
+    outputs.show(found, strict=strict)
+
+
+def _figures(words: Sequence[str]) -> dict[str, float]:
+    """Read ``--limit``: figures with a number and a unit; the peak in dB, all else in SI."""
+    from ambid.control.design import FIGURES
+    from ambid.units import parse_unit
+
+    found = {}
+    for word in words:
+        name, number, unit = _parts(word, "--limit", "peak=9.5dB")
+        if name in FIGURES and name != "peak" and unit:
+            of = parse_unit(unit)
+            if not of.same_kind(parse_unit(FIGURES[name])):
+                raise AmbidError(f"--limit {word}: {name} is in {FIGURES[name]}, not in {unit}. Correct the unit")
+            number = float(of.to_si(number))
+        elif unit not in ("", "dB") or (unit == "dB" and name != "peak"):
+            raise AmbidError(f"--limit {word}: the peak is in dB, not in {unit}. Correct the unit")
+        found[name] = number
+    return found
+
+
+def _sources(words: Sequence[str]) -> dict[str, object]:
+    """Read ``--spread``: sources with a number, or two of them with a colon between."""
+    found: dict[str, object] = {}
+    for word in words:
+        name, _, text = word.partition("=")
+        low, _, high = text.partition(":")
+        try:
+            found[name] = (float(low), float(high)) if high else float(low)
+        except ValueError:
+            raise AmbidError(f"--spread {word} has no number. Give --spread delay=0.3, for example") from None
+    return found
+
+
+def _parts(word: str, option_name: str, example: str) -> tuple[str, float, str]:
+    """Return name, number and unit of a word such as ``noise=0.3V``."""
+    name, _, text = word.partition("=")
+    digits = len(text) - len(text.lstrip("+-.0123456789"))
+    for end in range(len(text), max(digits, 1) - 1, -1):
+        try:
+            return name.strip(), float(text[:end]), text[end:].strip()
+        except ValueError:
+            continue
+    raise AmbidError(f"{option_name} {word} has no number. Give {option_name} {example}, for example")

@@ -11,22 +11,31 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from pathlib import Path
 from types import MappingProxyType
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.blackbox.convert import discrete_to_control
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.drawn import Drawn
-from ambid.control.margins import AxisMargins, AxisSensitivity, Compliance
+from ambid.control.margins import (
+    AxisMargins,
+    AxisSensitivity,
+    Compliance,
+    compliance_by_axis,
+    margins_by_axis,
+    sensitivity_by_axis,
+)
 from ambid.errors import EstimationError, ModelError, nearest
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.progress import Tick, silent
 from ambid.physics.linear_model import discretise
 from ambid.physics.loop import Loop, Noise
-from ambid.rig import Rig
+from ambid.rig import Rig, rig_from_text
 from ambid.simulation.margins import zone_of
 from ambid.simulation.plant import closed_loop_matrix
 
@@ -42,10 +51,12 @@ GOALS = ("peak", "compliance")
 SETTLED = 0.05
 """Part of the largest deflection by a force step, below which it is settled."""
 CIRCLE = 1e-9  # a pole no nearer to the unit circle is stable
+_SPAN = 1e-4  # of the rate: the lowest frequency that is shown
 FREQUENCIES = 320
 """At which many plants are looked at, beside those around their resonances."""
 _LONGEST = 20.0  # time constants of the slowest pole over which a force step is looked at
 _MOST = 2**17  # samples of it
+_SHOWN = 400  # of it that are drawn
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,9 +128,12 @@ def on(loop: Loop, plant: Plant) -> Loop:
     return replace(loop, delay=float(np.max(plant.delays)))
 
 
-def closed_loop_of(plant: Plant, loop: Loop) -> ClosedLoop:
-    """Return the closed loop of a plant and a rig's [loop]."""
-    return ClosedLoop.of(plant, controller_of_loop(loop, plant.model, plant.rate_hz))
+def closed_loop_of(plant: Plant, loop: Loop, frequency_hz: Array | None = None) -> ClosedLoop:
+    """Return the closed loop of a plant and a rig's [loop]; default: at frequencies close where something happens."""
+    controller = controller_of_loop(loop, plant.model, plant.rate_hz)
+    if frequency_hz is None:
+        return ClosedLoop.of(plant, controller)
+    return ClosedLoop(plant=plant, controller=controller, frequency_hz=frequency_hz)
 
 
 def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float, float, str]:
@@ -140,26 +154,38 @@ def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float
     return 1e-6, 0.0, "nothing says how noisy the sensors are: 1 µm rms is taken"
 
 
-def figures_of(plant: Plant, loop: Loop, noise: tuple[float, float], frequency_hz: Array | None = None) -> Figures:
-    """Return what a loop does on a plant, by poles, sampled response and a force step."""
-    held = on(loop, plant)
-    z = closed_loop_matrix(plant.theta, held, plant.rate_hz, of=plant.model)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Examined:
+    """A loop on one plant: its figures, and the moduli of its curves by axis; none where the plant is not held."""
+
+    figures: Figures
+    frequency_hz: Array = field(default_factory=lambda: np.empty(0))
+    sensitivity: Array = field(default_factory=lambda: np.empty((0, 0)))  # (n, n_axes)
+    compliance: Array = field(default_factory=lambda: np.empty((0, 0)))
+
+
+def examine(plant: Plant, loop: Loop, noise: tuple[float, float]) -> Examined:
+    """Say what a loop does on a plant, by its poles, responses around them, and a force step."""
+    z = closed_loop_matrix(plant.theta, on(loop, plant), plant.rate_hz, of=plant.model)
     if not np.isfinite(z).all():
-        return UNSTABLE
+        return Examined(figures=UNSTABLE)
     if loop.law is None and loop.ki == 0.0:  # an integral that nothing feeds
         count = len(plant.model.inputs)
         keep = np.r_[: z.shape[0] - 3 * count, z.shape[0] - 2 * count : z.shape[0]]
         z = z[np.ix_(keep, keep)]
-    largest = float(np.max(np.abs(np.linalg.eigvals(z))))
+    poles = np.linalg.eigvals(z)
+    largest = float(np.max(np.abs(poles)))
     if largest > 1.0 - CIRCLE:
-        return UNSTABLE
+        return Examined(figures=UNSTABLE)
+    f, own = plant.grid(FREQUENCIES), np.abs(np.angle(poles)) * plant.rate_hz / (2.0 * np.pi)
+    of = closed_loop_of(plant, loop, np.union1d(f, own[(own > f[0]) & (own < f[-1])]))
     pole = -math.log(max(largest, 1e-300)) * plant.rate_hz
-    f = plant.grid(FREQUENCIES) if frequency_hz is None else frequency_hz
-    of = ClosedLoop(plant=plant, controller=controller_of_loop(loop, plant.model, plant.rate_hz), frequency_hz=f)
-    return Figures(
-        peak=float(np.max(np.abs(of.of_axes))), compliance=float(np.max(np.abs(of.compliance()))),
-        noise=float(np.max(noise_in_command(of, noise))), settling=settling_of(plant, z, pole)[0], pole=pole,
+    S, G = np.abs(of.of_axes), np.abs(of.compliance)
+    figures = Figures(
+        peak=float(np.max(S)), compliance=float(np.max(G)), noise=float(np.max(noise_in_command(of, noise))),
+        settling=settling_of(plant, z, pole)[0], pole=pole,
     )  # fmt: skip
+    return Examined(figures=figures, frequency_hz=of.frequency_hz, sensitivity=S, compliance=G)
 
 
 def mean_over(frequency_hz: Array, power: Array) -> Array:
@@ -172,7 +198,7 @@ def mean_over(frequency_hz: Array, power: Array) -> Array:
 def noise_in_command(loop: ClosedLoop, noise: tuple[float, float]) -> Array:
     """Return the rms of each command by white noise of the sensors, (n_u,)."""
     sd = np.where(np.isin(np.arange(loop.H.shape[1]), loop.positions), *noise)
-    answer = np.linalg.solve(np.eye(loop.H.shape[2]) + loop.K @ loop.H, loop.K)
+    answer = loop.answers[:, :, -loop.H.shape[1] :]
     return np.asarray(np.sqrt(mean_over(loop.frequency_hz, np.sum(np.abs(answer * sd) ** 2, axis=2))))
 
 
@@ -214,12 +240,14 @@ def worst_of(figures: Sequence[Figures]) -> Figures:
     return Figures(**worst, pole=min(f.pole for f in held))
 
 
-def verify(plants: Sequence[Drawn], loop: Loop, noise: tuple[float, float], tick: Tick = silent) -> tuple[Figures, ...]:
-    """Return the figures of a loop on each plant, in their order."""
+def verify(
+    plants: Sequence[Drawn], loop: Loop, noise: tuple[float, float], tick: Tick = silent
+) -> tuple[Examined, ...]:
+    """Examine a loop on each plant, in their order."""
     found = []
     for k, drawn in enumerate(plants):
         tick("verify", k / len(plants))
-        found.append(figures_of(drawn.plant, loop, noise))
+        found.append(examine(drawn.plant, loop, noise))
     return tuple(found)
 
 
@@ -249,23 +277,15 @@ class WorstPlant:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class LoopCurves:
-    """What is drawn of one loop: of an axis, on the estimate, and between which the drawn plants lie."""
+    """What is drawn of one loop, by axis."""
 
-    sensitivity: Mapping[str, Array]  # modulus, (n,)
+    frequency_hz: Array  # (n,)
+    sensitivity: Mapping[str, Array]  # modulus on the estimate, (n,)
     highest: Mapping[str, Array]  # over the drawn plants
-    compliance: Mapping[str, Array]  # m/N
-    softest: Mapping[str, Array]
+    compliance: Mapping[str, Array]  # modulus on the estimate, m/N
+    softest: Mapping[str, Array]  # over the drawn plants
     time_s: Array  # (n_samples,)
-    step: Mapping[str, Array]  # m, by 1 N
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class DesignCurves:
-    """Curves of both loops."""
-
-    frequency_hz: Array
-    before: LoopCurves
-    after: LoopCurves
+    step: Mapping[str, Array]  # deflection of the estimate by a force step of 1 N, m
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -283,11 +303,14 @@ class Design(Judged):
     goals : Goals
     before, after : Situation
     worst_plant : WorstPlant
+    rate_hz : float
+        Of the controller.
     plants : Mapping[str, object]
         ``tuning`` and ``verification``: how many plants; ``rejected``: draws without physical sense; ``seeds``;
         ``assumed``: what the draws take for granted.
     checks : Mapping[str, Check]
-    curves : DesignCurves
+    curves : Mapping[str, LoopCurves]
+        ``before`` and ``after``.
     warnings : tuple of str
     timing_s : Mapping[str, float]
     rig : Mapping[str, object]
@@ -302,18 +325,86 @@ class Design(Judged):
     before: Situation
     after: Situation
     worst_plant: WorstPlant
+    rate_hz: float
     plants: Mapping[str, object]
     checks: Mapping[str, Check]
-    curves: DesignCurves
+    curves: Mapping[str, LoopCurves]
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
 
+    @property
+    def new_rig(self) -> Rig:
+        """The rig with the new [loop], as ``-o`` writes it."""
+        return rig_from_text(str(self.rig["text"]), Path(str(self.rig["folder"])) / "rig.toml")
 
-def worst_plant(plants: Sequence[Drawn], figures: Sequence[Figures]) -> WorstPlant:
+    @property
+    def loop(self) -> Loop:
+        """The new loop."""
+        found = self.new_rig.loop
+        assert found is not None
+        return found
+
+    def to_control(self) -> Any:
+        """Return the new controller for python-control; needs the extra ``ambid[control]``.
+
+        Returns
+        -------
+        control.StateSpace
+            In discrete time, SI units, from what is fed back (position and current of each axis) to the commands, the
+            sign included; of a PID that of one axis.
+        """
+        law = self.loop.as_law(self.rate_hz)
+        return discrete_to_control(law.A, law.B, law.C, law.D, 1.0 / law.rate_hz)
+
+
+def situation_of(seen: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:
+    """Return what there is to say of a loop; `estimate`: with its covariance."""
+    of = closed_loop_of(estimate, loop)
+    return Situation(
+        loop=loop_entry(loop), figures=seen[0].figures, worst=worst_of([x.figures for x in seen]),
+        unstable=sum(not x.figures.stable for x in seen), sensitivity=sensitivity_by_axis(of),
+        margins=margins_by_axis(of), compliance=compliance_by_axis(of),
+    )  # fmt: skip
+
+
+def curves_of(seen: Sequence[Examined], estimate: Plant, loop: Loop, until_s: float) -> LoopCurves:
+    """Return the curves of a loop on the plants, and its force step up to a time."""
+    f, axes = np.geomspace(_SPAN * estimate.rate_hz, 0.499 * estimate.rate_hz, FREQUENCIES), estimate.axes
+
+    def over(curve: str, plants: Sequence[Examined]) -> Mapping[str, Array]:
+        held = [x for x in plants if x.figures.stable]
+        found = [[np.interp(f, x.frequency_hz, y) for y in getattr(x, curve).T] for x in held]
+        return dict(zip(axes, np.max(found, axis=0), strict=True)) if held else {}
+
+    z = closed_loop_matrix(estimate.theta, on(loop, estimate), estimate.rate_hz, of=estimate.model)
+    n = min(max(int(until_s * estimate.rate_hz), 16), _MOST)
+    x = force_step(estimate, z, n)
+    kept = np.unique(np.geomspace(1, n, _SHOWN).round().astype(int)) - 1
+    return LoopCurves(
+        frequency_hz=f, sensitivity=over("sensitivity", seen[:1]), highest=over("sensitivity", seen),
+        compliance=over("compliance", seen[:1]), softest=over("compliance", seen),
+        time_s=(kept + 1) / estimate.rate_hz, step=dict(zip(axes, x[kept].T, strict=True)),
+    )  # fmt: skip
+
+
+def loop_entry(loop: Loop) -> dict[str, object]:
+    """Return a loop as a result keeps it: JSON numbers only."""
+    if loop.law is not None:
+        return {
+            "kind": "state-space",
+            "rate_hz": loop.law.rate_hz,
+            **{n: getattr(loop.law, n).tolist() for n in "ABCDG"},
+        }
+    cutoff = loop.derivative_cutoff_hz if math.isfinite(loop.derivative_cutoff_hz) else None
+    gains = {name: getattr(loop, name) for name in ("kp", "ki", "kd", "kc")}
+    return {"kind": "pid", **gains, "derivative_cutoff_hz": cutoff, "delay": loop.delay}
+
+
+def worst_plant(plants: Sequence[Drawn], seen: Sequence[Examined]) -> WorstPlant:
     """Return the plant with the highest peak, or the first that is not held."""
-    k = int(np.argmax([f.peak for f in figures]))
-    drawn, peak = plants[k], figures[k].peak
+    k = int(np.argmax([x.figures.peak for x in seen]))
+    drawn, peak = plants[k], seen[k].figures.peak
     return WorstPlant(
         number=drawn.number, words=drawn.words(), changed=drawn.changed, zone=zone_of(peak),
         peak_db=float(20.0 * np.log10(peak)),

@@ -23,7 +23,17 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
-from ambid.control.design import FIGURES, FREQUENCIES, Goals, figures_of, mean_over, noise_of, on, worst_of
+from ambid.control.design import (
+    FIGURES,
+    FREQUENCIES,
+    Goals,
+    closed_loop_of,
+    examine,
+    mean_over,
+    noise_of,
+    on,
+    worst_of,
+)  # fmt: skip
 from ambid.errors import EstimationError, ModelError
 from ambid.estimation.progress import Tick
 from ambid.physics.linear_model import OneAxis
@@ -100,12 +110,11 @@ class AxisLoops:
         """H_x, H_i, G_x and G_x H_i - H_x G_i, each (n_plants, n)."""
         found = []
         for plant in self.plants:
-            x, i = (plant.model.outputs.index(name) for name in ("position", "current"))
-            sampled = plant.sampled(self.frequency_hz)
-            H = sampled.transfer()[:, [x, i], 0]
-            force = replace(sampled.space, B=sampled.space.E[:, :1])
-            G = replace(sampled, space=force, delays=np.zeros(1), held=(False,)).transfer()[:, [x, i], 0]
-            found.append((*H.T, G[:, 0], G[:, 0] * H[:, 1] - H[:, 0] * G[:, 1]))
+            of = plant.model.outputs.index("position"), plant.model.outputs.index("current")
+            loop = closed_loop_of(plant, Loop(), self.frequency_hz)
+            by_forces, by_inputs = loop.pushed
+            (G_x, G_i), (H_x, H_i) = by_forces[:, of, plant.space.E.shape[1]].T, by_inputs[:, of, 0].T
+            found.append((H_x, H_i, G_x, G_x * H_i - H_x * G_i))
         return tuple(np.array(x) for x in zip(*found, strict=True))
 
     @cached_property
@@ -296,7 +305,7 @@ def tune_pid(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loo
         if excess > _MET:
             raise EstimationError(_refusal(search, goals, limits, starts, bounds, advance))
         loop = pid.loop(best, present)
-        worst = worst_of([figures_of(p, loop, noise) for p in plants])
+        worst = worst_of([examine(p, loop, noise).figures for p in plants])
         over = worst.settling / goals.limits.get("settling", math.inf)
         if over <= 1.0:
             return loop

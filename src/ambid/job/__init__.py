@@ -12,6 +12,7 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.job.acquiring import acquire as acquire
     from ambid.job.commissioning import commission as commission
+    from ambid.job.controller_design import design_controller as design_controller
     from ambid.job.data import load_bench as load_bench
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of

@@ -98,7 +98,7 @@ def margins(
                 "margins of an estimate alone take nothing but the rig; --estimate, --reference, --from, --to, --rate, "
                 "--gaps and units are of a record. Omit them, or give a record"
             )
-        known, bench = _given(record, rig)
+        known, bench = given(record, rig)
         bench = replace(bench, open_loop=False)  # so were its records; here its [loop] is closed
     elif estimate is None:
         from ambid.job.identification import identify
@@ -108,7 +108,7 @@ def margins(
         taken: Any = known.used
         used = taken[0] if isinstance(taken, tuple) else taken
     else:
-        known, bench = _given(estimate, rig)
+        known, bench = given(estimate, rig)
         say("read")
         used = load_bench(source, bench, **reading)
     if reference is not None:
@@ -132,7 +132,7 @@ def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
     return replace(bench, channels=(*others, replace(bench.channel(column), name="reference")))
 
 
-def _given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
+def given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
     """Return an estimate that is given, and the rig: its own unless another is given."""
     from ambid.job.results import load, rig_of
 
@@ -140,8 +140,8 @@ def _given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
     known = load(estimate) if isinstance(estimate, str | Path) else estimate
     if not isinstance(known, Estimate | RotorEstimate):
         raise EstimationError(
-            f"{name} is no linear estimate of a bearing or a rotor, and margins are of a linear loop. Give what 'ambid "
-            "identify --json' wrote, without --nonlinear"
+            f"{name} is no linear estimate of a bearing or a rotor, and a loop is judged on a linear plant. Give what "
+            "'ambid identify --json' wrote, without --nonlinear"
         )
     bench = known_rig(rig) if rig is not None else rig_of(known, name)
     if (bench.rotor is None) != isinstance(known, Estimate) or bench.model != known.model:

@@ -516,6 +516,25 @@ def _experiment() -> View:
     )  # fmt: skip
 
 
+def _design() -> View:
+    from ambid.control.design import FIGURES, SCHEMA
+    from ambid.report.design_figures import design_figure
+    from ambid.report.design_text import design_text
+
+    def title(d: Any) -> str:
+        return f"{d.record.get('file') or 'record'}, controller for model {d.model}"
+
+    def table(d: Any) -> Table:
+        found = {"before": d.before, "after": d.after}
+        worst = {f"worst.{name}": [getattr(s.worst, name) for s in found.values()] for name in (*FIGURES, "pole")}
+        return "loop", {"loop": list(found), **_numbers_of([fields_json(s.figures) for s in found.values()]), **worst}
+
+    return View(
+        text=design_text, figure=lambda d, _, width: design_figure(d, title(d), width),
+        document=_fields_of(SCHEMA), table=table, title=title,
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
     "RotorEstimate": _rotor,
     "Estimate": _estimate,
@@ -527,6 +546,7 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Modal": _modal,
     "Margins": _margins,
     "Experiment": _experiment,
+    "Design": _design,
     "Track": _track,
     "Inspection": _inspection,
     "Acquired": _acquired,

@@ -119,6 +119,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
     "ambid.experiment/1": _whole("control.experiment", "Experiment", "design experiment"),
+    "ambid.design/1": _whole("control.design", "Design", "design controller"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),

@@ -1,0 +1,123 @@
+"""The design of a controller as tables for the terminal: both loops, the worst plant, the new [loop]."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ambid.control.design import FIGURES, Design, Situation
+from ambid.control.margins import Opening
+from ambid.report.numbers import sized
+from ambid.report.text import (
+    WIDTH,
+    Paint,
+    check_lines,
+    columns,
+    joined,
+    other_warnings,
+    plain,
+    timing_lines,
+    title_line,
+    warning_lines,
+    wrapped,
+)
+from ambid.simulation.margins import STANDARD, zone_of
+
+_NONE = "–"
+_NAMES = {
+    "peak": "peak of the sensitivity", "compliance": "compliance, largest", "noise": "noise in the command",
+    "settling": "force step settled to 5 %", "pole": "slowest pole",
+}  # fmt: skip
+
+
+def design_text(found: Design, *, width: int = WIDTH, paint: Paint = plain) -> str:
+    """Write a design, below its verdict."""
+    record = found.record
+    samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
+    head = title_line(record.get("file"), f"controller for model {found.model}", samples, rate, found.status, paint)
+    return joined(
+        [
+            [head, *wrapped([_goals(found)], width, "  ")],
+            _figures(found, paint),
+            _margins(found, paint),
+            _plants(found, width, paint),
+            _loop(found, paint),
+            check_lines(found.checks, width=width, paint=paint, above=True),
+            warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
+            timing_lines(found.timing_s, width=width, paint=paint),
+        ]
+    )
+
+
+def said(name: str, x: float) -> str:
+    """Write a figure."""
+    if not np.isfinite(x):
+        return _NONE
+    if name == "peak":
+        return f"{20.0 * np.log10(x):.2f} dB, zone {zone_of(x)}"
+    return sized(x, {**FIGURES, "pole": "1/s"}[name])
+
+
+def _goals(found: Design) -> str:
+    limits = ", ".join(f"{name} up to {said(name, x).partition(',')[0]}" for name, x in found.goals.limits.items())
+    return f"method {found.method}; small: {' and '.join(found.goals.minimise)}; limits on all plants: {limits}"
+
+
+def _figures(found: Design, paint: Paint) -> list[str]:
+    rows: list[tuple[str, ...]] = [("", "before", "after", "worst plant before", "after")]
+    for name, words in _NAMES.items():
+        of = [getattr(x, name) for s in (found.before, found.after) for x in (s.figures, s.worst)]
+        rows.append((words, *(said(name, of[k]) for k in (0, 2, 1, 3))))
+    n = found.plants["verification"]
+    held = [f"{int(str(n)) - s.unstable} of {n}" for s in (found.before, found.after)]
+    rows.append(("plants that are held", "", "", *held))
+    return [paint(f"both loops, on the estimate and on {n} plants around it (zones of {STANDARD})", "strong"),
+            *columns(rows)]  # fmt: skip
+
+
+def _margins(found: Design, paint: Paint) -> list[str]:
+    rows: list[tuple[str, ...]] = [("axis", "opened at", "loop", "gain", "phase", "delay", "disk margin")]
+    for axis in found.after.margins:
+        for place in ("position", "command"):
+            for words, s in (("before", found.before), ("after", found.after)):
+                rows.append((axis, place.replace("command", "input"), words, *_opening(s, axis, place)))
+    return [paint("margins on the estimate, one loop opened", "strong"), *columns(rows)]
+
+
+def _opening(s: Situation, axis: str, place: str) -> Sequence[str]:
+    of: Opening = getattr(s.margins[axis], place)
+    phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
+    disk = _NONE if of.disk is None else f"{_gains(of.disk.gain_down, of.disk.gain_up)}, {of.disk.phase_deg:.0f}°"
+    return _gains(of.gain_down, of.gain_up), phase, _NONE if of.delay_s is None else sized(of.delay_s, "s"), disk
+
+
+def _gains(down: float | None, up: float | None) -> str:
+    return " … ".join("any" if x is None else f"{x:.2g}" for x in (down, up))
+
+
+def _plants(found: Design, width: int, paint: Paint) -> list[str]:
+    worst, of = found.worst_plant, found.plants
+    assumed = of["assumed"]
+    assert isinstance(assumed, list | tuple)
+    peak = f"{worst.peak_db:.2f} dB, zone {worst.zone}" if np.isfinite(worst.peak_db) else "not held"
+    again = f", {of['rejected']} drawn again" if of["rejected"] else ""
+    lines = [
+        f"tuned over {of['tuning']} plants, judged by {of['verification']} others{again}; the worst, draw "
+        f"{worst.number}: {peak}, with {worst.words}",
+        *(str(x) for x in assumed),
+    ]
+    return [paint("plants", "strong"), *wrapped(lines, width, "  ")]
+
+
+def _loop(found: Design, paint: Paint) -> list[str]:
+    loops = found.before.loop, found.after.loop
+    if found.after.loop["kind"] != "pid":
+        A = found.after.loop["A"]
+        assert isinstance(A, list | tuple)
+        return [paint("the new [loop]", "strong"), f"a state-space law of order {len(A)}"]
+    rows: list[tuple[str, ...]] = [("", "before", "after", "")]
+    units = {"kp": "V/m", "ki": "V/(m s)", "kd": "V s/m", "kc": "V/A", "derivative_cutoff_hz": "Hz"}
+    for name, unit in units.items():
+        rows.append((name, *(_NONE if of.get(name) is None else f"{float(str(of[name])):.5g}" for of in loops), unit))
+    return [paint("the new [loop]", "strong"), *columns(rows)]
