@@ -30,6 +30,7 @@ VERBS = {
     "validate": ("validate", "e.json", "r.csv", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),
+    "design controller": ("design", "controller", "e.json", "--rig", "rig.toml", "--out"),
     "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
             "na=1,nb=1,nk=1", "--json"),
     "compare": ("compare", "r.csv", "arx:na=1,nb=1,nk=1", "--input", "voltage", "--output", "current", "--json"),

@@ -102,7 +102,7 @@ def test_eddy_currents_that_are_fast_are_none():
     f = np.geomspace(1.0, 5e3, 50)
     was, now, far = (ClosedLoop(plant=p, controller=controller, frequency_hz=f) for p in (plant, fast, lagged))
     assert np.abs(now.of_axes) == pytest.approx(np.abs(was.of_axes), rel=1e-4)
-    assert np.abs(now.compliance()) == pytest.approx(np.abs(was.compliance()), rel=1e-4)
+    assert np.abs(now.compliance) == pytest.approx(np.abs(was.compliance), rel=1e-4)
     assert np.max(np.abs(far.of_axes)) > 1.002 * np.max(np.abs(was.of_axes))
 
 

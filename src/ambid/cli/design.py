@@ -121,7 +121,7 @@ def controller(
     from ambid.job import design_controller
 
     with Outputs(estimate, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
-        outputs.claim(out, "-o", (".toml",), force=force)
+        outputs.claim(out, "-o", force=force)
         found = design_controller(
             estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
             spread=_sources(spread or ()), plants=plants, judges=judges, seed=seed, tick=show,

@@ -370,9 +370,10 @@ def _refusal(
     if not ways:
         return f"no PID meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
     _, name, least = min(ways)
+    moved = option(name, least)
     return (
-        f"no PID meets the limits ({asked}) on all plants; with the others kept, {name} can be {said(name, least)} at "
-        f"best. Give --limit {option(name, least)}, or raise another"
+        f"no PID meets the limits ({asked}) on all plants; with the others kept, {said(name, least)} is the "
+        f"least. Give --limit {moved}, or raise another"
     )
 
 

@@ -13,6 +13,7 @@ from typing import Any
 from ambid.control.closed import Plant
 from ambid.control.design import (
     GOALS,
+    UNSTABLE,
     Design,
     Goals,
     Method,
@@ -37,7 +38,7 @@ from ambid.job.loop_margins import given
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import Rig
 
-_STEP = 4.0  # settling times over which a force step is drawn
+_STEP = 1.5  # settling times over which a force step is drawn
 
 
 def _pid() -> Method:
@@ -117,16 +118,15 @@ def design_controller(
     say, clock = tick or silent, Clock()
     say("read")
     known, bench = given(estimate, rig)
-    design = _method(method)
+    design, asked, sources = _method(method), _ratios(limits), _spread(spread)
+    Goals.of(goals, asked, UNSTABLE)  # refuses what it does not know, before anything is drawn
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
     for name, x, least in (("plants", plants, 1), ("judges", judges, 1)):
         if x < least:
             raise EstimationError(f"{name} is {x}; it must be at least {least}. Correct it")
     with one_thread():
-        found = _designed(
-            known, bench, design, goals, _ratios(limits), _spread(spread), (plants, judges, seed), say, clock
-        )
+        found = _designed(known, bench, design, goals, asked, sources, (plants, judges, seed), say, clock)
     return replace(found, method=method, timing_s=clock.laps)
 
 

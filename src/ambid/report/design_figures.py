@@ -76,7 +76,7 @@ def _step(axes: Axes, found: Design, axis: str) -> None:
     axes.set_xlabel("time [ms]")
     axes.set_ylabel(f"deflection [{unit}]")
     was, now = (sized(s.figures.settling, "s") for s in (found.before, found.after))
-    head(axes, f"force step of 1 N, settled in {was} → {now}")
+    head(axes, f"1 N settled in {was} → {now}")
 
 
 def _between(axes: Axes, f: Array, mean: Array | None, high: Array | None, color: str, name: str) -> None:

@@ -26,8 +26,8 @@ from ambid.simulation.margins import STANDARD, zone_of
 
 _NONE = "–"
 _NAMES = {
-    "peak": "peak of the sensitivity", "compliance": "compliance, largest", "noise": "noise in the command",
-    "settling": "force step settled to 5 %", "pole": "slowest pole",
+    "peak": "peak of sensitivity", "compliance": "compliance, largest", "noise": "noise in the command",
+    "settling": "force step settled", "pole": "slowest pole",
 }  # fmt: skip
 
 
@@ -55,25 +55,25 @@ def said(name: str, x: float) -> str:
     if not np.isfinite(x):
         return _NONE
     if name == "peak":
-        return f"{20.0 * np.log10(x):.2f} dB, zone {zone_of(x)}"
+        return f"{20.0 * np.log10(x):.2f} dB ({zone_of(x)})"
     return sized(x, {**FIGURES, "pole": "1/s"}[name])
 
 
 def _goals(found: Design) -> str:
-    limits = ", ".join(f"{name} up to {said(name, x).partition(',')[0]}" for name, x in found.goals.limits.items())
+    limits = ", ".join(f"{name} up to {said(name, x).partition(' (')[0]}" for name, x in found.goals.limits.items())
     return f"method {found.method}; small: {' and '.join(found.goals.minimise)}; limits on all plants: {limits}"
 
 
 def _figures(found: Design, paint: Paint) -> list[str]:
-    rows: list[tuple[str, ...]] = [("", "before", "after", "worst plant before", "after")]
+    rows: list[tuple[str, ...]] = [("", "before", "after", "worst before", "worst after")]
     for name, words in _NAMES.items():
         of = [getattr(x, name) for s in (found.before, found.after) for x in (s.figures, s.worst)]
         rows.append((words, *(said(name, of[k]) for k in (0, 2, 1, 3))))
     n = found.plants["verification"]
     held = [f"{int(str(n)) - s.unstable} of {n}" for s in (found.before, found.after)]
     rows.append(("plants that are held", "", "", *held))
-    return [paint(f"both loops, on the estimate and on {n} plants around it (zones of {STANDARD})", "strong"),
-            *columns(rows)]  # fmt: skip
+    head = paint(f"both loops: on the estimate, and the worst of {n} plants around it", "strong")
+    return [head, *columns(rows), f"in brackets: zones of {STANDARD}; check their limits against its text"]
 
 
 def _margins(found: Design, paint: Paint) -> list[str]:
