@@ -30,7 +30,7 @@ _TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage;
 _ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
 _AIM = 0.9  # of that part
 USE = 0.3  # of the way to the trips that an excitation may use
-_VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
+VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
 _NEAR = 0.85  # of the way to a trip: no room left
 
 
@@ -287,6 +287,6 @@ def _used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], u
         up, down = float(volts.max()) - rest, rest - float(volts.min())
         reach = max(up / (high - rest) if high > rest else 1.0, down / (rest - low) if rest > low else 1.0)
         # A voltage that is used as far as it may be counts like a position at the part that is wished.
-        shares["voltage"] = reach * use / _VOLTAGE
+        shares["voltage"] = reach * use / VOLTAGE
     worst = max(shares, key=lambda role: shares[role])
     return worst, shares[worst]

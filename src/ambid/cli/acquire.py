@@ -40,7 +40,8 @@ def command(
         str | None,
         option(
             "--excitation NAME",
-            "Excitation that the controller adds to its output: multisine, schroeder, prbs or steps.",
+            "Excitation that the controller adds to its output: multisine, schroeder, prbs or steps, or a file that "
+            "'ambid design experiment --json' wrote.",
             "none",
         ),
     ] = None,

@@ -42,10 +42,13 @@ def experiment(
     ] = "1%",
     use: Annotated[
         float, option("--use SHARE", "Part of the way to the limits of position and current that may be used.", True)
-    ] = 0.5,
+    ] = 0.3,
     slew: Annotated[float | None, option("--slew V/S", "Largest rate of change of the voltage.", "any")] = None,
     spread: Annotated[
-        float, option("--spread SHARE", "Part of their values within which a rig's free parameters may lie.", True)
+        float,
+        option(
+            "--spread SHARE", "Two relative standard deviations of a rig's free parameters, for the drawn plants.", True
+        ),
     ] = 0.1,
     rate: Annotated[float | None, option("--rate HZ", "Sampling rate in Hz.", "the bench's")] = None,
     loop: Annotated[

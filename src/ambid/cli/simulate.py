@@ -23,7 +23,9 @@ _ENDINGS = (".csv", ".csv.gz", ".h5", ".hdf5")
 def command(
     rig: Annotated[str, argument("RIG|PRESET", "Rig file, or a bench that 'ambid models' lists.")],
     record: Annotated[Path, option("--out -o FILE", "Record to write: .csv, .csv.gz or .h5.")],
-    duration: Annotated[float | None, option("--duration S", "Length in s.", "1, or the scenario's")] = None,
+    duration: Annotated[
+        float | None, option("--duration S", "Length in s.", "1, or the scenario's or experiment's")
+    ] = None,
     rate: Annotated[float | None, option("--rate HZ", "Sampling rate in Hz.", "the preset's, or the rig's")] = None,
     scenario: Annotated[
         str | None,
@@ -36,7 +38,12 @@ def command(
     at: Annotated[float | None, option("--at S", "Start of the scenario, in s.", "the scenario's")] = None,
     size: Annotated[float | None, option("--size X", "Size of the change, e.g. -0.15.", "the scenario's")] = None,
     excitation: Annotated[
-        str | None, option("--excitation NAME", "Excitation, as 'ambid models' lists them.", "multisine")
+        str | None,
+        option(
+            "--excitation NAME",
+            "Excitation, as 'ambid models' lists them, or a file that 'ambid design experiment --json' wrote.",
+            "multisine",
+        ),
     ] = None,
     amplitude: Annotated[
         float | None, option("--amplitude A", "Peak in V (rms for gaussian).", "what half of the limits allows")
@@ -109,7 +116,7 @@ def command(
     with Outputs(source) as outputs, progress("simulate"):
         outputs.claim(record, "-o", _ENDINGS, force=force)
         done, told = simulate_used(
-            preset or Path(rig), duration=1.0 if duration is None else duration, rate_hz=rate,
+            preset or Path(rig), duration=duration, rate_hz=rate,
             excitation=excitation, amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
             axes=None if axes is None else axes.split(","), settle=settle, closed=closed, nonlinear=nonlinear,
             position=position, log_excitation=log_excitation, force=force,

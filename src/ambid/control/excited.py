@@ -17,7 +17,7 @@ from ambid.control.controller import controller_of_loop
 from ambid.control.information import Innovation
 from ambid.control.waves import Limited, Lines
 from ambid.physics.loop import Loop
-from ambid.simulation.plant import excited_loop
+from ambid.simulation.plant import closed_loop_poles, excited_loop
 
 SLEW = ".slew"
 """What follows the name of an input in that of its rate of change."""
@@ -55,12 +55,8 @@ class ExcitedLoop:
 
     @property
     def pole(self) -> float:
-        """Largest modulus of the poles; of a loop that is open, of the plant's."""
-        A = self.Z if self.loop.closed else self.Z[: self.plant.space.A.shape[0], : self.plant.space.A.shape[0]]
-        kept = np.linalg.eigvals(A)
-        if self.loop.closed and self.loop.ki == 0.0:  # an integral without gain
-            kept = np.delete(kept, np.argsort(np.abs(kept - 1.0))[: self.e.shape[1]])
-        return float(np.max(np.abs(kept)))
+        """Largest modulus of the poles."""
+        return float(np.abs(closed_loop_poles(self.plant.theta, self.loop, self.plant.rate_hz, of=self.plant.model)[0]))
 
     def states(self, lines: Lines, period: int, inputs: Lines) -> Complex:
         """Return the states by unit excitation of each line's input, (n_lines, n)."""

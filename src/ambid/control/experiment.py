@@ -22,6 +22,7 @@ from ambid.signals.excitations import schroeder_phases
 SCHEMA = "ambid.experiment/1"
 _CANDIDATES = 3000  # lines from which those of the design are taken
 _HARD = 4  # drawn plants beside the nominal one for which amplitudes and phases are searched
+_SAME_RATE = 1e-6
 _SILENT = 1e-9  # of the largest line
 
 
@@ -35,7 +36,7 @@ class Expected:
     relative_sd: float
     flat_sd: float  # of a flat multisine with Schroeder's phases in the same band, at the same use of the limits
     identifiable: bool
-    seconds: float | None  # of record until the relative sd that is aimed at; None where it never comes
+    seconds: float | None  # of record until the relative sd that is aimed at, a period at least; None: hardly seen
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -59,6 +60,13 @@ class Table:
     amplitude: float  # V at the coil, of an element of 127
     hold: int  # ticks an element
     elements: tuple[int, ...]
+
+    @property
+    def program(self) -> Program:
+        """It as a device takes it."""
+        return Program(
+            kind="table", amplitude=self.amplitude, hold=self.hold, length=len(self.elements), table=self.elements
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -139,6 +147,47 @@ class Experiment(Judged):
         """Length of the record."""
         return self.periods * self.period / self.rate_hz
 
+    def played(self, samples: int, rate_hz: float) -> Array:
+        """Return the excitation of the first input, from the beginning of a period.
+
+        Parameters
+        ----------
+        samples : int
+        rate_hz : float
+            At which it is to be played.
+
+        Returns
+        -------
+        ndarray, shape (samples,), in the unit of the input
+
+        Raises
+        ------
+        EstimationError
+            If it was designed for another rate.
+        """
+        if abs(rate_hz / self.rate_hz - 1.0) > _SAME_RATE:
+            raise EstimationError(
+                f"the experiment is designed for {self.rate_hz:g} Hz, the bench samples at {rate_hz:g} Hz. Design it "
+                "with --rate, or correct the rate"
+            )
+        wave = next(iter(self.excitation.values()))
+        return np.asarray(np.resize(wave, samples))
+
+    @property
+    def program(self) -> Program:
+        """What the controller plays.
+
+        Raises
+        ------
+        EstimationError
+            If it was designed for a rig without ``[daq]``, and has no table.
+        """
+        if self.table is None:
+            raise EstimationError(
+                "the experiment has no table for a controller: its rig has no [daq]. Design it with a rig that has one"
+            )
+        return self.table.program
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Task:
@@ -197,6 +246,11 @@ class Task:
             lines=lines, period=self.period, T=T, low=np.tile(self.low, many), high=np.tile(self.high, many)
         )  # fmt: skip
 
+    def bounded(self, lines: Lines, plants: Sequence[int]) -> Limited:
+        """Return those of the signals that have a limit."""
+        limited = self.limited(lines, plants)
+        return limited.among(np.flatnonzero(np.isfinite(limited.low) | np.isfinite(limited.high)).tolist())
+
     def information(self, lines: Lines, plants: Sequence[int]) -> Information:
         """Return the information of lines, of some of the plants."""
         on, n_u = self.inputs(lines), self.loops[0].e.shape[1]
@@ -223,20 +277,20 @@ class Design:
 def design(task: Task, *, tick: Callable[[], object] = lambda: None) -> Design:
     """Return the lines, amplitudes and phases of least criterion that keep the limits for all plants, from rest too."""
     every = task.candidates()
-    of_all, all_limited = task.information(every, [0]), task.limited(every, [0])
+    of_all, all_limited = task.information(every, [0]), task.bounded(every, [0])
     size = np.minimum(-all_limited.low, all_limited.high)
     cost = 0.5 * np.sum(np.abs(all_limited.T / size) ** 2, axis=1)
     power, gap = power_design(of_all, cost, task.samples)
     tick()
     keep = informed_lines(power, cost, task.n_lines)
-    lines, information, limited = every[keep], of_all.among(keep), task.limited(every[keep], [0])
+    lines, information, limited = every[keep], of_all.among(keep), task.bounded(every[keep], [0])
     starts = [_with_schroeder(spread_power(p)) for p in (power[keep], np.ones(keep.size), np.sqrt(power[keep]))]
     c = joint_design(information, limited, starts, task.samples, tick=tick)
     hard = hardest(task, lines, c)
     if hard:
         plants = [0, *hard]
         c = joint_design(
-            task.information(lines, plants), task.limited(lines, plants), [c], task.samples, tick=tick
+            task.information(lines, plants), task.bounded(lines, plants), [c], task.samples, tick=tick
         )  # fmt: skip
     start, _ = begin_at(task.loops[0], task.limited(lines, [0]), c, task.inputs(lines))
     start -= start % task.hold
@@ -251,7 +305,7 @@ def _with_schroeder(power: Array) -> Complex:
 
 def hardest(task: Task, lines: Lines, c: Complex) -> list[int]:
     """Return the drawn plants whose signals come nearest to their limits."""
-    use = [task.limited(lines, [k]).use(c).max() for k in range(1, len(task.loops))]
+    use = [task.bounded(lines, [k]).use(c).max() for k in range(1, len(task.loops))]
     return [1 + int(k) for k in np.argsort(-np.array(use))[:_HARD]]
 
 
@@ -282,16 +336,7 @@ def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Ta
     counts = max(1, int(np.floor(np.max(np.abs(wave)) / quantum)))
     elements = np.rint(FULL * wave / np.max(np.abs(wave))).astype(int)
     table = Table(amplitude=counts * quantum, hold=task.hold, elements=tuple(elements.tolist()))
-    return table_wave(table, quantum)[:, None], table
-
-
-def table_wave(table: Table, quantum: float) -> Array:
-    """Return one period of what a controller makes of a table, V."""
-    program = Program(
-        kind="table", amplitude=table.amplitude, hold=table.hold, length=len(table.elements), table=table.elements
-    )  # fmt: skip
-    ticks = table.hold * len(table.elements)
-    return np.asarray(quantum * expected(program, ticks, counts=round(table.amplitude / quantum)))
+    return np.asarray(quantum * expected(table.program, task.period, counts=counts))[:, None], table
 
 
 def lines_of(wave: Array) -> tuple[Lines, Complex]:

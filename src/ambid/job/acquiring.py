@@ -17,9 +17,11 @@ from ambid.acquisition.recording import acquire as record_course
 from ambid.acquisition.review import refuse_unstable, review
 from ambid.acquisition.session import Course
 from ambid.acquisition.settings import controller_settings
+from ambid.control.experiment import Experiment
 from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, counted, refuse_given
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
+from ambid.job.results import experiment_of
 from ambid.job.simulation import bench_of_source
 from ambid.physics.presets import Preset
 from ambid.record.sampling import MIN_SAMPLES
@@ -40,7 +42,7 @@ class Request:
     """Settings of a recording."""
 
     seconds: float = 10.0
-    excitation: str | None = None  # None: nothing is played
+    excitation: str | Path | Experiment | None = None  # None: nothing is played
     amplitude: float | None = None  # V; None: found by trials, small first
     band: tuple[float, float] | None = None  # Hz
     mode: Mode | None = None  # None: levitate where the rig has a loop
@@ -55,7 +57,11 @@ class Request:
         check_positive({"--seconds": self.seconds, "--amplitude": self.amplitude})
         if not 0 <= settle_s <= LARGEST:
             raise AmbidError(f"--settle is {settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
-        _check_excitation(port, mode, self.excitation, {"--amplitude": self.amplitude, "--band": self.band})
+        named = {"--amplitude": self.amplitude, "--band": self.band}
+        _check_excitation(port, mode, self.excitation, named)
+        if (experiment := experiment_of(self.excitation)) is not None:
+            refuse_given(named, "--excitation is an experiment, which takes no {}. Omit {}")
+            _ = experiment.program
         return Trial(
             name=str(self.excitation),
             band=self.band,
@@ -76,6 +82,11 @@ class Request:
             )
         if self.excitation is None:
             return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
+        if (experiment := experiment_of(self.excitation)) is not None:
+            experiment.played(0, rate_hz)
+            return Course(
+                mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=experiment.program
+            )  # fmt: skip
         trial = replace(trial, band=band_for(trial, rate_hz))
         known = trial.course(1.0 if self.amplitude is None else self.amplitude, rate_hz)  # refused before all moves
         if self.amplitude is not None:
@@ -102,7 +113,7 @@ def acquire(
     out: str | Path,
     *,
     seconds: float = 10.0,
-    excitation: str | None = None,
+    excitation: str | Path | Experiment | None = None,
     amplitude: float | None = None,
     band: tuple[float, float] | None = None,
     mode: Mode | None = None,
@@ -130,8 +141,9 @@ def acquire(
         Record to write: .h5, .hdf5, .csv or .csv.gz. A journal beside it holds what came so far.
     seconds : float, optional
         Length of the record in s.
-    excitation : {"multisine", "schroeder", "prbs", "steps"}, optional
-        Signal that the controller adds to its output; default none.
+    excitation : {"multisine", "schroeder", "prbs", "steps"}, Path or Experiment, optional
+        Signal that the controller adds to its output; default none. Or what `ambid.design_experiment` designed for a
+        rig with ``[daq]``, or its file.
     amplitude : float, optional
         Peak of the excitation in V; default: found by trials, smallest first.
     band : (float, float), optional
@@ -241,7 +253,7 @@ def opened(
         yield device
 
 
-def _usual_mode(port: str, rig: Rig, excitation: str | None) -> Mode:
+def _usual_mode(port: str, rig: Rig, excitation: object) -> Mode:
     """Choose what a device does where the user does not say."""
     if port.startswith("replay:"):
         return "sample"
@@ -250,7 +262,7 @@ def _usual_mode(port: str, rig: Rig, excitation: str | None) -> Mode:
     return "sample" if excitation is None else "drive"
 
 
-def _check_excitation(port: str, mode: Mode, name: str | None, given: Mapping[str, object]) -> None:
+def _check_excitation(port: str, mode: Mode, name: object, given: Mapping[str, object]) -> None:
     """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
     if name is None:
         refuse_given(given, "{} is for an excitation, and none was named. Give --excitation, or omit it")

@@ -8,12 +8,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.acquisition.amplitude import Room
+from ambid.acquisition.amplitude import USE, VOLTAGE, Room
 from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.scales import TABLE_LENGTH, scale_of
 from ambid.acquisition.settings import controller_settings
 from ambid.arrays import Array
 from ambid.control.closed import Plant
+from ambid.control.drawn import Spread, draw_plants
 from ambid.control.excited import SLEW, ExcitedLoop
 from ambid.control.experiment import (
     Design,
@@ -36,27 +37,27 @@ from ambid.estimation.uncertainty import WEAK
 from ambid.job.data import Clock, known_rig, rig_entry
 from ambid.job.results import load, rig_of
 from ambid.job.simulation import BenchSource, bench_of_source
-from ambid.physics.linear_model import Parameter
+from ambid.physics.loop import Noise
 from ambid.physics.presets import Preset
 from ambid.record import Channel, Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.signals.excitations import schroeder_phases
 from ambid.simulation.rig_bench import Bench
 
-USE = 0.5
-"""Part of the way from rest to the limits of position and current that an experiment uses by default."""
 SPREAD = 0.1
-"""Part of their values within which free parameters of a rig are drawn."""
+"""Part of their values within which free parameters of a rig lie, two standard deviations, for the drawn plants."""
 TARGET = 0.01
 """Relative standard deviation for which the length of the record is told."""
-_VOLTAGE = 0.8  # part of the voltage that is used
 _PLANTS = 40  # drawn
+_SCATTER = Spread(delay=0.0, position=0.0, current=0.0, eddy=0.0, warm_k=(0.0, 0.0), frequency=0.0, damping=0.0)
 _RESERVE = 4.0  # standard deviations of noise that are kept free
 _SECONDS = 10.0
 _PERIODS = 4  # of a record
 _LONGEST = 8192  # samples of a period, unless another is given
 _LINES = 100
 _WHOLE = 0.1  # of a sample, from which identify estimates a fraction of the delay
+_LENGTHS, _LEVELS = np.geomspace(0.1, 100.0, 31), np.geomspace(0.1, 1.0, 11)  # of the record, of its amplitude
+_DIGITS = 6  # of what is drawn
 _KEPT = 1.0 + 1e-6
 
 
@@ -121,11 +122,13 @@ def design_experiment(
     target : float, optional
         Relative standard deviation for which the length of the record is told.
     use : float, optional
-        Part of the way from rest to the limits of position and current that may be used.
+        Part of the way from rest to the limits of position and current that may be used; of a controller's rig to its
+        trips. The bench is not linear, and what is estimated of a linear model moves with the amplitude.
     slew : float, optional
         Largest rate of change of the voltage, V/s.
     spread : float, optional
-        Free parameters of a rig are drawn within this part of their values; priors and estimates bring their own.
+        Two relative standard deviations of free parameters of a rig, for the drawn plants; priors and estimates bring
+        their own.
     rate_hz : float, optional
         Sampling rate; default the bench's.
     closed : bool, optional
@@ -191,9 +194,27 @@ def _given(
             raise AmbidError("--rig is for an estimate; a rig is there already. Omit --rig")
         loop = None if given.loop is None else replace(given.loop, delay=of.loop.delay if of.loop else 0.0)
         of = replace(given, parameters=of.parameters, operating_point=of.operating_point, loop=loop)
+    known = source if isinstance(source, Estimate) else None
+    if of.rotor is not None:
+        raise AmbidError(
+            f"{of.name!r} has a rotor on many axes; an experiment is designed for one axis. Give another bench"
+        )
     if rate_hz is None and of.daq is not None:
         rate_hz = of.daq.rate_hz
-    return source if isinstance(source, Estimate) else None, Bench.of(of, rate_hz, closed)
+    if of.magnet is not None and any(p.value is None for p in of.parameters):
+        at_rest = Bench.of(of, rate_hz, closed, nonlinear=True).parameters
+        filled = tuple(replace(p, value=at_rest[p.name] if p.value is None else p.value) for p in of.parameters)
+        of = replace(of, parameters=filled)
+    return known, Bench.of(of if of.daq is None else _with_steps(of), rate_hz, closed)
+
+
+def _with_steps(rig: Rig) -> Rig:
+    """Return a controller's rig whose noise has the steps of its converters."""
+    full, noise = with_default_daq(rig), rig.noise or Noise()
+    rest = controller_settings(full)
+    counts = {"position": rest.setpoint, "current": rest.current_rest}
+    steps = {f"{role}_resolution": abs(scale_of(full, role).slope(at)) for role, at in counts.items()}
+    return replace(rig, noise=replace(noise, **steps))
 
 
 def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -> Experiment:
@@ -209,13 +230,13 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
         )
     noise = _innovation(known, bench, plant)
     loops, noises, unstable = [loop], [noise], 0
-    for theta in _drawn(known, bench, wanted):
-        other = ExcitedLoop.of(replace(plant, theta=theta), bench.loop)
+    for drawn in _drawn(known, bench, plant, wanted):
+        other = ExcitedLoop.of(drawn, bench.loop)
         if other.pole > _KEPT:
             unstable += 1
             continue
         loops.append(other)
-        noises.append(noise if known is not None else Innovation.of(other.plant, bench.noise))
+        noises.append(noise if known is not None else Innovation.of(drawn, bench.noise))
     low, high = _room(bench, loop, wanted)
     spare = _RESERVE * loop.noise_sd(noise)
     _refuse_full(loop.signals, spare, low, high)
@@ -252,22 +273,18 @@ def _innovation(known: Estimate | None, bench: Bench, plant: Plant) -> Innovatio
     return Innovation(gain=known.noise.gain, covariance=known.noise.innovation_covariance)
 
 
-def _drawn(known: Estimate | None, bench: Bench, wanted: Wanted) -> list[dict[str, float]]:
-    """Return the parameters of drawn plants: of an estimate by its covariance, of a rig by priors and spread."""
-    rng, theta = np.random.default_rng(wanted.seed), dict(bench.linear.parameters)
-    if known is not None:
-        moved = rng.multivariate_normal(np.zeros(len(known.covariance_names)), known.covariance, _PLANTS)
-        return [
-            theta | {n: theta[n] + x for n, x in zip(known.covariance_names, row, strict=True)} for row in moved
-        ]  # fmt: skip
+def _drawn(known: Estimate | None, bench: Bench, plant: Plant, wanted: Wanted) -> list[Plant]:
+    """Return drawn plants: of an estimate by its covariance, of a rig by priors and spread."""
     assert bench.rig is not None
-
-    def one(p: Parameter) -> float:
-        if p.role == "prior":
-            return float(theta[p.name] + (p.sd or 0.0) * rng.standard_normal())
-        return theta[p.name] * (1.0 + (wanted.spread * rng.uniform(-1.0, 1.0) if p.role == "free" else 0.0))
-
-    return [{p.name: one(p) for p in bench.rig.parameters} for _ in range(_PLANTS)]
+    names = tuple(n for n in plant.names if n in plant.theta)
+    if known is not None:
+        names, covariance = known.covariance_names, known.covariance
+    else:
+        half = [abs(plant.theta[n]) * wanted.spread / 2.0 for n in names]
+        covariance = np.diag([bench.rig.parameter(n).sd or x for n, x in zip(names, half, strict=True)]) ** 2
+    around = replace(plant, names=names, covariance=covariance)
+    drawn = draw_plants(around, bench.rig, 1 + _PLANTS, seed=wanted.seed, spread=_SCATTER).plants[1:]
+    return [replace(d.plant, names=plant.names) for d in drawn]
 
 
 def _room(bench: Bench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array]:
@@ -280,7 +297,7 @@ def _room(bench: Bench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array
             most = np.inf if wanted.slew is None else wanted.slew
             ends, share = (-most, most), 1.0
         else:
-            ends, share = (room.voltage, _VOLTAGE) if name == "voltage" else (room.trips[name], wanted.use)
+            ends, share = (room.voltage, VOLTAGE) if name == "voltage" else (room.trips[name], wanted.use)
         rest = 0.0 if name.endswith(SLEW) else point[name]
         low.append(share * (ends[0] - rest))
         high.append(share * (ends[1] - rest))
@@ -353,15 +370,14 @@ def _told(
     flat = flat / max(task.limited(flat_lines, [k]).use(flat).max() for k in range(len(task.loops)))
     of_flat = task.information(flat_lines, [0]).relative_sd(np.abs(flat) ** 2, task.samples)
     relative = information.relative_sd(power, task.samples)
-    lengths = np.geomspace(0.1, 100.0, 31)
-    levels = np.geomspace(0.1, 1.0, 11)
-    by_length = np.array([information.relative_sd(power, x * task.samples) for x in lengths])
-    by_level = np.array([information.relative_sd(power * x**2, task.samples) for x in levels])
+    by_length = np.array([information.relative_sd(power, x * task.samples) for x in _LENGTHS])
+    by_level = np.array([information.relative_sd(power * x**2, task.samples) for x in _LEVELS])
     units = {p.name: p.unit for p in of.parameters}
     expected = {}
     for k, name in enumerate(information.names):
         value = loop.plant.theta.get(name, float(loop.plant.delays[0]))
-        needed = None if relative[k] > 1e6 else float(task.samples / task.rate_hz * (relative[k] / wanted.target) ** 2)
+        aim = task.period * max(1.0, task.periods * (relative[k] / wanted.target) ** 2)
+        needed = float(aim / task.rate_hz) if relative[k] < WEAK else None
         expected[name] = Expected(
             value=value, unit=units.get(name, "1"), sd=float(relative[k] * information.sizes[k]),
             relative_sd=float(relative[k]), flat_sd=float(of_flat[k] * information.sizes[k]),
@@ -379,16 +395,24 @@ def _told(
         )  # fmt: skip
     return Experiment(
         model=of.name, criterion=task.criterion, rate_hz=task.rate_hz, period=task.period, periods=task.periods,
-        frequency_hz=task.frequency_hz(lines), amplitude={of.inputs[0]: np.abs(c)}, phase={of.inputs[0]: np.angle(c)},
+        frequency_hz=task.frequency_hz(found.lines), amplitude={of.inputs[0]: np.abs(found.c)},
+        phase={of.inputs[0]: np.angle(found.c)},
         excitation={of.inputs[0]: wave[:, 0]}, table=table, closed=bench.loop.closed, signals=signals,
         expected=expected, target=wanted.target, gap=found.gap, drawn=len(task.loops) - 1,
         checks=_checks(used, expected, unstable),
         shown=Shown(
-            waves={n: waves[:, k] for k, n in enumerate(loop.signals)}, seconds=lengths * task.samples / task.rate_hz,
-            by_length=dict(zip(information.names, by_length.T, strict=True)), levels=levels,
+            waves={n: rounded(waves[:, k]) for k, n in enumerate(loop.signals)},
+            seconds=_LENGTHS * (task.samples / task.rate_hz),
+            by_length=dict(zip(information.names, by_length.T, strict=True)), levels=_LEVELS,
             by_level=dict(zip(information.names, by_level.T, strict=True)),
         ),
     )  # fmt: skip
+
+
+def rounded(x: Array) -> Array:
+    """Return numbers with as many digits as are drawn, so that a file of them is short."""
+    top = float(np.max(np.abs(x)))
+    return x if top == 0.0 else np.round(x, _DIGITS - 1 - int(np.floor(np.log10(top))))
 
 
 def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dict[str, Check]:

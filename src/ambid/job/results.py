@@ -11,6 +11,7 @@ from typing import Any, Unpack
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_json
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json
+from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
@@ -127,6 +128,21 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),
     "ambid.recovery/1": _whole("acquisition.recorder", "Recorded", "recover"),
 }
+
+
+def experiment_of(excitation: object) -> Experiment | None:
+    """Return the experiment that an excitation is, or the file of one; None for the name of another excitation."""
+    if not isinstance(excitation, (str, Path)):
+        return excitation if isinstance(excitation, Experiment) else None
+    if not str(excitation).lower().endswith(".json"):
+        return None
+    found = load(excitation)
+    if not isinstance(found, Experiment):
+        raise AmbidError(
+            f"--excitation {excitation} is no experiment. Give what 'ambid design experiment --json' wrote, or the "
+            "name of an excitation"
+        )
+    return found
 
 
 def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, nearest
+from ambid.control.experiment import Experiment
+from ambid.errors import AmbidError, nearest, refuse_given
 from ambid.estimation.estimate import Estimate
-from ambid.job.results import read_linear_estimate, rig_of
+from ambid.job.results import experiment_of, read_linear_estimate, rig_of
 from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.record import Channel, Record
@@ -43,9 +44,9 @@ class Excited:
 def simulate(
     source: BenchSource,
     *,
-    duration: float = 1.0,
+    duration: float | None = None,
     rate_hz: float | None = None,
-    excitation: str | None = None,
+    excitation: str | Path | Experiment | None = None,
     amplitude: float | None = None,
     band: tuple[float, float] | None = None,
     periods: int | None = None,
@@ -65,12 +66,12 @@ def simulate(
     source : str, Path, Rig, Preset or Estimate
         A preset by its name; a rig or its file; a linear estimate or its file: its rig, with the estimated values.
     duration : float, optional
-        Length in s.
+        Length in s; default 1, or the experiment's.
     rate_hz : float, optional
         Sampling rate in Hz; default the bench's.
-    excitation : str, optional
+    excitation : str, Path or Experiment, optional
         One of `ambid.signals.EXCITATIONS`, or for a rotor of `ambid.signals.AXES_EXCITATIONS`; default ``multisine``,
-        for a rotor ``zippered``.
+        for a rotor ``zippered``. Or what `ambid.design_experiment` designed, or its file.
     amplitude : float, optional
         Peak in V (rms for ``gaussian``); default: what half of the limits allows.
     band : (float, float), optional
@@ -125,9 +126,9 @@ def simulate(
 def simulate_used(
     source: BenchSource,
     *,
-    duration: float = 1.0,
+    duration: float | None = None,
     rate_hz: float | None = None,
-    excitation: str | None = None,
+    excitation: str | Path | Experiment | None = None,
     amplitude: float | None = None,
     band: tuple[float, float] | None = None,
     periods: int | None = None,
@@ -141,10 +142,21 @@ def simulate_used(
     force: bool = False,
 ) -> tuple[Simulation, Excited]:
     """Return what `simulate` does with what happened, and the excitation."""
-    bench = _bench(source, rate_hz, closed, nonlinear, position)
+    bench, experiment = _bench(source, rate_hz, closed, nonlinear, position), experiment_of(excitation)
+    if duration is None:
+        duration = 1.0 if experiment is None else experiment.seconds
     n = _samples(duration, bench.rate_hz)
     if not force:
         bench.refuse_unstable()
+    if experiment is not None:
+        of_others = {"--amplitude": amplitude, "--band": band, "--periods": periods, "--axes": axes, "--settle": settle}
+        refuse_given(of_others, "--excitation is an experiment, which takes no {}. Omit {}")
+        if isinstance(bench, RotorBench):
+            raise AmbidError("--excitation is an experiment of one axis, the bench a rotor. Give another")
+        wave = experiment.played(n, bench.rate_hz)
+        return _with_excitation(bench.simulate(wave, seed=seed), wave if log_excitation else None), Excited(
+            kind="experiment", peak=float(np.max(np.abs(wave)))
+        )
     if amplitude is None and bench.rig is not None and bench.rig.limits is None:
         raise AmbidError(
             "no amplitude was given, and the rig has no limits to derive one from. Give --amplitude A in V"
@@ -152,7 +164,7 @@ def simulate_used(
     if isinstance(bench, RotorBench):
         if log_excitation:
             raise AmbidError("--log-excitation is for one axis; a rotor's record has <axis>_reference. Omit it")
-        kind, held = excitation or "zippered", 1 if settle is None else settle
+        kind, held = str(excitation or "zippered"), 1 if settle is None else settle
         shape, period = _of_axes(bench, kind, n, periods, axes, band, seed)
         trial = shape[: 2 * period]  # begins at rest: what it needs is no less than later
         peak = bench.largest(trial, seed, _FRACTION) if amplitude is None else amplitude
@@ -161,16 +173,21 @@ def simulate_used(
         return done, Excited(kind=kind, peak=peak, unit=bench.model.units[bench.model.inputs[0]])
     if axes is not None or settle is not None:
         raise AmbidError("--axes and --settle are for a rotor on many axes. Omit them")
-    kind = excitation or "multisine"
+    kind = str(excitation or "multisine")
     shape = _repeat(
         lambda part: make_excitation(kind, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods or 1
     )
     peak = bench.largest(shape, seed, _FRACTION) if amplitude is None else amplitude
     done = bench.simulate(peak * shape, seed=seed)
-    if log_excitation:
-        logged = Channel(name="excitation", unit="V", values=peak * shape)
-        done = replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
-    return done, Excited(kind=kind, peak=peak)
+    return _with_excitation(done, peak * shape if log_excitation else None), Excited(kind=kind, peak=peak)
+
+
+def _with_excitation(done: Simulation, wave: Array | None) -> Simulation:
+    """Add a column of the excitation, where it is to be logged."""
+    if wave is None:
+        return done
+    logged = Channel(name="excitation", unit="V", values=wave)
+    return replace(done, record=replace(done.record, channels=(*done.record.channels, logged)))
 
 
 def _of_axes(
