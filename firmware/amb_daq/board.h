@@ -54,6 +54,8 @@ void board_duty(uint16_t duty);
 
 /* Waits until a pulse width that is ordered now acts at the fixed time after the tick. */
 void board_await_order(void);
+/* There are some 40 us left until then. */
+uint8_t board_order_waits(void);
 /* The order came too late for that, it acts a period later; asked with interrupts off, at once after the order. */
 uint8_t board_order_late(void);
 /* Waits until input 1 or 2 of this tick is in daq.inputs; the law begins when input 0 is there. */

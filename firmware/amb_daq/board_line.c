@@ -50,7 +50,8 @@ ISR(USART_UDRE_vect)
 {
     uint8_t tail = board_tx.tail;
     RING_ORDER();
-    UDR0 = board_tx.data[tail++];
+    UDR0 = board_tx.data[tail];
+    tail = (uint8_t)((tail + 1) & (TX_RING - 1));
     board_tx.tail = tail;
     if (tail == board_tx.head)
         UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);

@@ -291,6 +291,13 @@ void board_await_order(void)
     } while (counts < ORDER_EARLIEST);
 }
 
+uint8_t board_order_waits(void)
+{
+    uint16_t counts;
+    ATOMICALLY { counts = since_tick(); }
+    return counts < ORDER_EARLIEST - 20;
+}
+
 uint8_t board_order_late(void)
 {
     uint16_t counts = since_tick();

@@ -4,6 +4,7 @@
  */
 #include "commands.h"
 
+#include <stddef.h>
 #include <string.h>
 
 #include "daq.h"
@@ -170,6 +171,8 @@ static uint8_t on_gains(struct request *r)
 {
     struct msg_gains wanted = read_gains(r->body);
     uint8_t field = control_refuses(&wanted);
+    if (daq.state == STATE_LEVITATING && (daq.control.law || daq.trial.on))
+        return not_now(r);
     if (field)
         return out_of_range(r, field);
     if (position_outside(wanted.setpoint))
@@ -179,7 +182,48 @@ static uint8_t on_gains(struct request *r)
     if (duty_outside(wanted.duty_bias))
         return out_of_range(r, 9);
     ATOMICALLY { daq.control.gains = wanted; }
+    daq.control.law = NULL; /* idle or sampling */
     daq.ready |= READY_GAINS;
+    return CODE_DONE;
+}
+
+static uint8_t on_law(struct request *r)
+{
+    uint8_t field;
+    if (daq.trial.on || daq.excitation.playing)
+        return not_now(r);
+    field = trial_stage(read_law(r->body, r->n).offset, r->body + LENGTH_LAW, read_law(r->body, r->n).n_words);
+    return field ? out_of_range(r, field) : CODE_DONE;
+}
+
+static uint8_t on_arm(struct request *r)
+{
+    struct msg_arm wanted = read_arm(r->body);
+    uint8_t field;
+    if (!(daq.ready & READY_GAINS))
+        return unready(r);
+    if (daq.trial.on)
+        return not_now(r);
+    field = trial_arm(&wanted);
+    return field ? out_of_range(r, field) : CODE_DONE;
+}
+
+static uint8_t on_settle(struct request *r)
+{
+    uint8_t keep = read_settle(r->body).keep;
+    if (daq.trial.on != TRIAL_RUNS)
+        return not_now(r);
+    if (keep > 1)
+        return out_of_range(r, 2);
+    if (keep)
+        return trial_confirm() ? CODE_DONE : not_now(r);
+    daq.trial.asked = 1; /* the tick does it */
+    return CODE_DONE;
+}
+
+static uint8_t on_ask_law(struct request *r)
+{
+    r->answered = report_law(r->answer, r->body[1]);
     return CODE_DONE;
 }
 
@@ -200,6 +244,8 @@ static uint8_t on_excitation(struct request *r)
     uint8_t field = excitation_refuses(&wanted);
     if (daq.excitation.playing)
         return not_now(r);
+    if (wanted.kind == KIND_TABLE && wanted.length > trial_table())
+        field = 5;
     if (field)
         return out_of_range(r, field);
     excitation_load(&daq.excitation, &wanted);
@@ -214,7 +260,7 @@ static uint8_t on_table(struct request *r)
         return not_now(r);
     if (wanted.n_values == 0 || wanted.n_values > TABLE_MOST)
         return out_of_range(r, 3);
-    if (wanted.offset > (uint16_t)(EXCITATION_TABLE - wanted.n_values))
+    if (wanted.offset > (uint16_t)(trial_table() - wanted.n_values))
         return out_of_range(r, 2);
     for (i = 0; i < wanted.n_values; i++)
         if (table_values(r->body, i) == -128)
@@ -330,6 +376,10 @@ static const struct rule rules[] FLASH = {
     {MSG_PING, LENGTH_PING, ANY, on_ping},
     {MSG_ASK_STATUS, LENGTH_ASK_STATUS, ANY, on_ask_status},
     {MSG_SELF_TEST, LENGTH_SELF_TEST, IN(STATE_IDLE), on_self_test},
+    {MSG_LAW, LENGTH_LAW, IN(STATE_IDLE) | IN(STATE_SAMPLING) | IN(STATE_LEVITATING), on_law},
+    {MSG_ARM, LENGTH_ARM, IN(STATE_IDLE) | IN(STATE_SAMPLING) | IN(STATE_LEVITATING), on_arm},
+    {MSG_SETTLE, LENGTH_SETTLE, IN(STATE_LEVITATING), on_settle},
+    {MSG_ASK_LAW, LENGTH_ASK_LAW, ANY, on_ask_law},
 };
 
 static uint8_t rule_of(uint8_t code, struct rule *rule)
@@ -343,9 +393,11 @@ static uint8_t rule_of(uint8_t code, struct rule *rule)
     return 0;
 }
 
-/* The length must be the message's own; a table's varies. */
+/* The length must be the message's own; those of a table and of a law vary. */
 static uint8_t fits(const struct rule *rule, uint8_t n)
 {
+    if (rule->code == MSG_LAW)
+        return n >= rule->length && !((n - rule->length) & 1);
     return rule->code == MSG_TABLE ? n >= rule->length : n == rule->length;
 }
 
@@ -382,7 +434,7 @@ uint8_t commands_handle(const uint8_t *body, uint8_t n, uint8_t *answer)
         r.answered = write_ack(answer, id, done, r.detail);
     if (code == MSG_IDENTIFY) {
         last.id = 0;
-    } else if (code != MSG_PING && code != MSG_ASK_STATUS) {
+    } else if (code != MSG_PING && code != MSG_ASK_STATUS && code != MSG_ASK_LAW) {
         last.id = id;
         last.code = code;
         last.age = 0;

@@ -7,6 +7,10 @@
 #endif
 #include "control.h"
 
+#include <stddef.h>
+
+#include "multiply.h"
+
 #define DERIVATIVE_LARGEST (1L << 28)
 #define INTEGRAL_LARGEST (1L << 27)
 #define SUM_LARGEST ((1L << 26) - 1)
@@ -31,8 +35,12 @@ uint8_t control_refuses(const struct msg_gains *gains)
 
 void control_reset(struct control *control)
 {
-    control->integral = control->derivative = 0;
-    control->begun = 0;
+    if (control->law) {
+        law_begin(control->law, &control->state, 0);
+    } else {
+        control->loop.integral = control->loop.derivative = 0;
+        control->loop.begun = 0;
+    }
 }
 
 static inline int32_t within(int32_t value, int32_t largest)
@@ -51,58 +59,85 @@ static inline int32_t within(int32_t value, int32_t largest)
 /* gain * factor, which fits 32 bits. */
 static inline int32_t product(int32_t gain, int16_t factor)
 {
-    int16_t upper = (int16_t)((int16_t)(gain >> 16) * factor);
-    uint16_t lower = (uint16_t)gain;
-    HALF(lower);
-    return upper * 65536L + (int32_t)lower * factor;
+    return (int16_t)((int16_t)(gain >> 16) * factor) * 65536L + multiply((uint16_t)gain, factor);
 }
 
 /* value * fraction / 2^16, to the nearest, without a product of 48 bits. */
 static inline int32_t part(int32_t value, uint16_t fraction)
 {
-    int16_t upper = (int16_t)(value >> 16);
     uint16_t lower = (uint16_t)value;
-    HALF(upper);
     HALF(lower);
-    return (int32_t)upper * fraction + (int32_t)(((uint32_t)lower * fraction + 0x8000u) >> 16);
+    return multiply(fraction, (int16_t)(value >> 16)) + (int32_t)(((uint32_t)lower * fraction + 0x8000u) >> 16);
 }
 
 static inline int32_t filtered(struct control *control, uint16_t position)
 {
-    int32_t derivative = part(control->derivative, control->gains.pole);
-    if (control->begun)
-        derivative -= product(control->gains.kd, (int16_t)(position - control->last));
-    control->begun = 1;
-    control->last = position;
-    return control->derivative = within(derivative, DERIVATIVE_LARGEST);
+    struct position_loop *loop = &control->loop;
+    int32_t derivative = part(loop->derivative, control->gains.pole);
+    if (loop->begun)
+        derivative -= product(control->gains.kd, (int16_t)(position - loop->last));
+    loop->begun = 1;
+    loop->last = position;
+    return loop->derivative = within(derivative, DERIVATIVE_LARGEST);
 }
 
 void control_begin(struct control *control, uint16_t position)
 {
+    struct position_loop *loop = &control->loop;
     int16_t error = (int16_t)(control->gains.setpoint - position);
-    control->growth = product(control->gains.ki, error);
-    control->sum = product(control->gains.kp, error) + (control->integral >> 4) + filtered(control, position);
+    if (control->law) {
+        law_position(&control->state, (int16_t)-error);
+        return;
+    }
+    loop->growth = product(control->gains.ki, error);
+    loop->sum = product(control->gains.kp, error) + (loop->integral >> 4) + filtered(control, position);
 }
 
-uint16_t control_end(struct control *control, uint16_t current, int16_t excitation, uint16_t low, uint16_t high)
+static uint16_t loop_end(struct control *control, int16_t current, int16_t offset, uint16_t low, uint16_t high)
 {
-    int32_t sum = control->sum - product(control->gains.kc, (int16_t)(current - control->gains.current_rest));
+    struct position_loop *loop = &control->loop;
+    int32_t sum = loop->sum - product(control->gains.kc, current);
     uint16_t fraction; /* of a count, 2^-16 */
     int16_t whole;     /* counts below or at what is wanted */
     uint8_t growing = 1;
     sum = within(sum, SUM_LARGEST) * 16;
-    whole = (int16_t)((int16_t)(sum >> 16) + (int16_t)control->gains.duty_bias + excitation);
+    whole = (int16_t)((int16_t)(sum >> 16) + offset);
     fraction = (uint16_t)sum;
     if (whole > (int16_t)high || (whole == (int16_t)high && fraction)) {
         whole = (int16_t)high;
-        growing = control->growth <= 0;
+        growing = loop->growth <= 0;
     } else if (whole < (int16_t)low) {
         whole = (int16_t)low;
-        growing = control->growth >= 0;
+        growing = loop->growth >= 0;
     } else if (fraction & 0x8000u) {
         whole++;
     }
     if (growing)
-        control->integral = within(control->integral + control->growth, INTEGRAL_LARGEST);
+        loop->integral = within(loop->integral + loop->growth, INTEGRAL_LARGEST);
     return (uint16_t)whole;
+}
+
+uint16_t control_end(struct control *control, uint16_t current, int16_t excitation, uint16_t low, uint16_t high)
+{
+    int16_t away = (int16_t)(current - control->gains.current_rest);
+    int16_t offset = (int16_t)((int16_t)control->gains.duty_bias + excitation);
+    if (control->law)
+        return law_end(control->law, &control->state, away, offset, low, high);
+    return loop_end(control, away, offset, low, high);
+}
+
+uint8_t control_ahead(struct control *control)
+{
+    return control->law ? law_ahead(control->law, &control->state) : 0;
+}
+
+void control_take(struct control *control, const struct law *law)
+{
+    int32_t carried = control->law ? law_carried(control->law, &control->state) : control->loop.integral >> 4;
+    control->law = law;
+    control_reset(control);
+    if (law)
+        law_begin(law, &control->state, carried);
+    else
+        control->loop.integral = within(carried, INTEGRAL_LARGEST >> 4) * 16;
 }

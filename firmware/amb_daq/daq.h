@@ -11,9 +11,10 @@
 #include "control.h"
 #include "excitation.h"
 #include "protocol.h"
+#include "trial.h"
 
 #define FIRMWARE_MAJOR 1
-#define FIRMWARE_MINOR 0
+#define FIRMWARE_MINOR 1
 
 /* No command goes beyond these. A bench that must never see the full pulse width is compiled with less. */
 #ifndef CAP_DUTY_LOW
@@ -35,6 +36,10 @@
 #define HOST_MS_LEAST 20
 #define HOST_MS_MOST 2000
 #define LIFT_MS_MOST 2000
+/* States that a law may have with ticks of so many periods: each two cost some 80 us of the 50 of a period. */
+#define LAW_MOST(period) ((period) < 9 ? 2 : (period) < 10 ? 4 : LAW_STATES)
+#define CONFIRM_MS_LEAST 20
+#define CONFIRM_MS_MOST 20000
 #define LIFTED_MS 100 /* inside its limits for so long: the rotor is lifted, the position counts from now on */
 
 struct daq {
@@ -59,7 +64,14 @@ struct daq {
 
     volatile uint16_t overruns, dropped, busy_us;
     uint16_t rx_errors, supply_mv, digest;
-    int8_t table[EXCITATION_TABLE];
+    struct trial trial;
+    union {
+        int8_t table[EXCITATION_TABLE];
+        struct {
+            int8_t table_before[EXCITATION_TABLE - LAW_TABLE];
+            struct law coming; /* words of a law that comes; or that runs on trial */
+        };
+    };
 };
 
 extern struct daq daq;

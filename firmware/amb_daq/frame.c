@@ -18,11 +18,12 @@ struct writer {
 static inline void put(struct writer *w, uint8_t byte)
 {
     if (byte) {
-        w->data[w->at++] = byte;
+        w->data[w->at] = byte;
     } else {
-        w->data[w->mark] = (uint8_t)(w->at - w->mark);
-        w->mark = w->at++;
+        w->data[w->mark] = (uint8_t)((w->at - w->mark) & (TX_RING - 1));
+        w->mark = w->at;
     }
+    w->at = (uint8_t)((w->at + 1) & (TX_RING - 1));
 }
 
 uint8_t frame_put(struct tx_ring *ring, const uint8_t *body, uint8_t n, uint8_t reserve)
@@ -33,7 +34,7 @@ uint8_t frame_put(struct tx_ring *ring, const uint8_t *body, uint8_t n, uint8_t 
         return 0;
     w.data = ring->data;
     w.mark = ring->head;
-    w.at = (uint8_t)(w.mark + 1);
+    w.at = (uint8_t)((w.mark + 1) & (TX_RING - 1));
     while (n--) {
         uint8_t byte = *body++;
         crc = crc16_add(crc, byte);
@@ -90,6 +91,6 @@ uint8_t decoder_feed(struct decoder *d, uint8_t byte)
     d->zero = byte != 0xff;
     return 0;
 }
-#if RX_RING & (RX_RING - 1)
-#error "RX_RING must be a power of two"
+#if (RX_RING & (RX_RING - 1)) || (TX_RING & (TX_RING - 1))
+#error "a ring's size must be a power of two"
 #endif

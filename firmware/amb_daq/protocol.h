@@ -23,10 +23,11 @@
 #define MSG_STATUS 0x04 /* to the host: answer to ask_status; with id 0 unasked, every 256 ticks */
 #define MSG_SELF_TEST_RESULT 0x05 /* to the host: answer to self_test */
 #define MSG_FAULT 0x06 /* to the host: sent once, at once, when the safe state is entered */
+#define MSG_LAW_STATUS 0x07 /* to the host: answer to ask_law; with id 0 unasked, when the controller returned to the law before the one on trial */
 #define MSG_IDENTIFY 0x10 /* to the controller: who are you; any state; the number of the last command is forgotten */
 #define MSG_CONFIGURE 0x11 /* to the controller: sampling; idle only; refused where a sample would not fit into the period at 11 us a byte; a new period makes gains invalid */
 #define MSG_LIMITS 0x12 /* to the controller: what the controller holds to, whatever else it is told; idle, sampling or fault. An end of a trip at an end of the converter would never trip: refused, but for one end of the current (a sensor of one sign), and for 0 to 1023 of the position, which says that there is none (no levitation then) */
-#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
+#define MSG_GAINS 0x13 /* to the controller: position loop; idle, sampling or levitating (changed between two ticks), not while a state-space law runs there; it takes the place of such a law; gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
 #define MSG_SETPOINT 0x14 /* to the controller: set point of the position; idle, sampling or levitating; within limits */
 #define MSG_EXCITATION 0x15 /* to the controller: what is added to the pulse width once excite says so; not while it plays */
 #define MSG_TABLE 0x16 /* to the controller: elements of the excitation table; not while it plays */
@@ -37,6 +38,10 @@
 #define MSG_PING 0x1b /* to the controller: the host is there; any state */
 #define MSG_ASK_STATUS 0x1c /* to the controller: answered by status; any state */
 #define MSG_SELF_TEST 0x1d /* to the controller: answered by self_test_result; idle only */
+#define MSG_LAW 0x1e /* to the controller: words of a state-space law that is to be armed; idle, sampling or levitating, not on trial, not while an excitation plays; a loaded excitation by the table is forgotten, as words and the table's last elements share memory. See firmware/amb_daq/law.h */
+#define MSG_ARM 0x1f /* to the controller: the words are whole: run them instead of gains or law, after gains. Idle or sampling: from the next start. Levitating: from the next tick, on trial; what ran before returns where the rotor leaves the bounds, or without settle in time. Detail 1 of range: words that could overflow */
+#define MSG_SETTLE 0x20 /* to the controller: end of the trial; levitating, on trial */
+#define MSG_ASK_LAW 0x21 /* to the controller: answered by law_status; any state */
 
 #define LENGTH_SAMPLE 4
 #define LENGTH_ACK 5
@@ -44,6 +49,7 @@
 #define LENGTH_STATUS 24
 #define LENGTH_SELF_TEST_RESULT 12
 #define LENGTH_FAULT 10
+#define LENGTH_LAW_STATUS 11
 #define LENGTH_IDENTIFY 2
 #define LENGTH_CONFIGURE 5
 #define LENGTH_LIMITS 20
@@ -58,6 +64,10 @@
 #define LENGTH_PING 2
 #define LENGTH_ASK_STATUS 2
 #define LENGTH_SELF_TEST 2
+#define LENGTH_LAW 3
+#define LENGTH_ARM 12
+#define LENGTH_SETTLE 3
+#define LENGTH_ASK_LAW 2
 
 #define STATE_IDLE 0 /* output off, no samples */
 #define STATE_SAMPLING 1 /* output off, samples flow */
@@ -91,6 +101,15 @@
 #define KIND_STEP 1 /* square wave: +amplitude for `hold` ticks, -amplitude for `hold` ticks */
 #define KIND_PRBS 2 /* maximum length sequence of a shift register of `length` bits, one bit each `hold` ticks */
 #define KIND_TABLE 3 /* `length` elements of the table, one each `hold` ticks; element 127 is the amplitude */
+
+#define RUNS_GAINS 0 /* the position loop of message gains */
+#define RUNS_LAW 1 /* a state-space law */
+
+#define BACK_OUT_NONE 0 /* none since the last arm */
+#define BACK_OUT_BOUNDS 1 /* the rotor left the bounds of the trial */
+#define BACK_OUT_UNCONFIRMED 2 /* the host did not confirm in time */
+#define BACK_OUT_ASKED 3 /* the host asked for it */
+#define BACK_OUT_ENDED 4 /* the output went off during the trial */
 
 #define FAILED_PROGRAM 0x01 /* the program memory does not have the digest that it had at reset */
 #define FAILED_SUPPLY 0x02 /* supply voltage outside 4.5 to 5.5 V */
@@ -335,6 +354,38 @@ static inline uint8_t write_fault(uint8_t *p, uint8_t cause, uint32_t tick, uint
     return LENGTH_FAULT;
 }
 
+/* law_status: answer to ask_law; with id 0 unasked, when the controller returned to the law before the one on trial */
+struct msg_law_status {
+    uint8_t id; /* of the command, or 0 */
+    uint8_t running; /* runs */
+    uint8_t trial; /* 1: on trial */
+    uint8_t cause; /* back_out: why the controller last returned to the law before */
+    uint32_t tick; /* of that, since start */
+    uint16_t position; /* then, counts */
+};
+static inline struct msg_law_status read_law_status(const uint8_t *p)
+{
+    struct msg_law_status m;
+    m.id = get_u8(p + 1);
+    m.running = get_u8(p + 2);
+    m.trial = get_u8(p + 3);
+    m.cause = get_u8(p + 4);
+    m.tick = get_u32(p + 5);
+    m.position = get_u16(p + 9);
+    return m;
+}
+static inline uint8_t write_law_status(uint8_t *p, uint8_t id, uint8_t running, uint8_t trial, uint8_t cause, uint32_t tick, uint16_t position)
+{
+    p[0] = MSG_LAW_STATUS;
+    put_u8(p + 1, id);
+    put_u8(p + 2, running);
+    put_u8(p + 3, trial);
+    put_u8(p + 4, cause);
+    put_u32(p + 5, tick);
+    put_u16(p + 9, position);
+    return LENGTH_LAW_STATUS;
+}
+
 /* identify: who are you; any state; the number of the last command is forgotten */
 struct msg_identify {
     uint8_t id; /* number of the command, 1 to 255 */
@@ -419,7 +470,7 @@ static inline uint8_t write_limits(uint8_t *p, uint8_t id, uint16_t position_low
     return LENGTH_LIMITS;
 }
 
-/* gains: position loop; idle, sampling or levitating (changed between two ticks); gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
+/* gains: position loop; idle, sampling or levitating (changed between two ticks), not while a state-space law runs there; it takes the place of such a law; gains are within +-2^19. A change of duty_bias, kp or kc while levitating is not bumpless: the integral is kept, the pulse width jumps. See firmware/amb_daq/control.h */
 struct msg_gains {
     uint8_t id; /* number of the command */
     int32_t kp; /* 2^-12 counts of pulse width per count of position */
@@ -667,6 +718,104 @@ static inline uint8_t write_self_test(uint8_t *p, uint8_t id)
     p[0] = MSG_SELF_TEST;
     put_u8(p + 1, id);
     return LENGTH_SELF_TEST;
+}
+
+/* law: words of a state-space law that is to be armed; idle, sampling or levitating, not on trial, not while an excitation plays; a loaded excitation by the table is forgotten, as words and the table's last elements share memory. See firmware/amb_daq/law.h */
+struct msg_law {
+    uint8_t id; /* number of the command */
+    uint8_t offset; /* of the first word */
+    uint8_t n_words; /* number of elements: n + 256 * shift, d0, d1; then of each of n states: shift, self, other, b0, b1, g, c */
+};
+static inline struct msg_law read_law(const uint8_t *p, uint8_t length)
+{
+    struct msg_law m;
+    m.id = get_u8(p + 1);
+    m.offset = get_u8(p + 2);
+    m.n_words = (uint8_t)((length - LENGTH_LAW) / 2);
+    return m;
+}
+static inline int16_t law_words(const uint8_t *p, uint8_t i)
+{
+    return get_i16(p + LENGTH_LAW + (uint8_t)(2 * i));
+}
+static inline uint8_t write_law(uint8_t *p, uint8_t id, uint8_t offset, const int16_t *words, uint8_t n_words)
+{
+    uint8_t i;
+    p[0] = MSG_LAW;
+    put_u8(p + 1, id);
+    put_u8(p + 2, offset);
+    for (i = 0; i < n_words; i++)
+        put_i16(p + LENGTH_LAW + (uint8_t)(2 * i), words[i]);
+    return (uint8_t)(LENGTH_LAW + 2 * n_words);
+}
+
+/* arm: the words are whole: run them instead of gains or law, after gains. Idle or sampling: from the next start. Levitating: from the next tick, on trial; what ran before returns where the rotor leaves the bounds, or without settle in time. Detail 1 of range: words that could overflow */
+struct msg_arm {
+    uint8_t id; /* number of the command */
+    uint16_t period; /* of a tick for which the law was made, in periods of the pulse width modulation: that of configure, else refused */
+    uint16_t checksum; /* CRC-16/XMODEM of the words 0 to 2 + 7 n, low bytes first */
+    uint16_t position_low; /* bound of the trial, counts: above limits.position_low, below the set point */
+    uint16_t position_high; /* bound of the trial, counts: below limits.position_high, above the set point */
+    uint16_t confirm_ms; /* time for settle, 20 to 20000 ms; 0 in idle or sampling */
+};
+static inline struct msg_arm read_arm(const uint8_t *p)
+{
+    struct msg_arm m;
+    m.id = get_u8(p + 1);
+    m.period = get_u16(p + 2);
+    m.checksum = get_u16(p + 4);
+    m.position_low = get_u16(p + 6);
+    m.position_high = get_u16(p + 8);
+    m.confirm_ms = get_u16(p + 10);
+    return m;
+}
+static inline uint8_t write_arm(uint8_t *p, uint8_t id, uint16_t period, uint16_t checksum, uint16_t position_low, uint16_t position_high, uint16_t confirm_ms)
+{
+    p[0] = MSG_ARM;
+    put_u8(p + 1, id);
+    put_u16(p + 2, period);
+    put_u16(p + 4, checksum);
+    put_u16(p + 6, position_low);
+    put_u16(p + 8, position_high);
+    put_u16(p + 10, confirm_ms);
+    return LENGTH_ARM;
+}
+
+/* settle: end of the trial; levitating, on trial */
+struct msg_settle {
+    uint8_t id; /* number of the command */
+    uint8_t keep; /* 1: the new law stays; 0: what ran before returns */
+};
+static inline struct msg_settle read_settle(const uint8_t *p)
+{
+    struct msg_settle m;
+    m.id = get_u8(p + 1);
+    m.keep = get_u8(p + 2);
+    return m;
+}
+static inline uint8_t write_settle(uint8_t *p, uint8_t id, uint8_t keep)
+{
+    p[0] = MSG_SETTLE;
+    put_u8(p + 1, id);
+    put_u8(p + 2, keep);
+    return LENGTH_SETTLE;
+}
+
+/* ask_law: answered by law_status; any state */
+struct msg_ask_law {
+    uint8_t id; /* number of the command */
+};
+static inline struct msg_ask_law read_ask_law(const uint8_t *p)
+{
+    struct msg_ask_law m;
+    m.id = get_u8(p + 1);
+    return m;
+}
+static inline uint8_t write_ask_law(uint8_t *p, uint8_t id)
+{
+    p[0] = MSG_ASK_LAW;
+    put_u8(p + 1, id);
+    return LENGTH_ASK_LAW;
 }
 
 #endif

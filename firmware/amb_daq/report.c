@@ -46,6 +46,30 @@ static void tell_fault(void)
         daq.fault_untold = 0;
 }
 
+uint8_t report_law(uint8_t *body, uint8_t id)
+{
+    uint32_t tick;
+    uint16_t position;
+    uint8_t running, on, cause;
+    ATOMICALLY
+    {
+        on = daq.trial.on != 0;
+        running = daq.control.law || on ? RUNS_LAW : RUNS_GAINS;
+        cause = daq.trial.cause;
+        tick = daq.trial.tick;
+        position = daq.trial.position;
+    }
+    return write_law_status(body, id, running, on, cause, tick, position);
+}
+
+static void tell_back_out(void)
+{
+    uint8_t body[LENGTH_LAW_STATUS];
+    daq.trial.untold = 0;
+    if (!frame_put(&board_tx, body, report_law(body, 0), 0))
+        daq.trial.untold = 1;
+}
+
 static void tell_sample(const struct sample *sample)
 {
     uint8_t body[LENGTH_SAMPLE + 2 * STREAM_COLUMNS];
@@ -68,6 +92,8 @@ void report_pending(void)
     uint16_t now;
     if (daq.fault_untold)
         tell_fault();
+    if (daq.trial.untold)
+        tell_back_out();
     while ((sample = tick_sample()) != NULL)
         tell_sample(sample);
     now = ticks_256();
@@ -81,5 +107,5 @@ void report_pending(void)
 
 uint8_t report_waits(void)
 {
-    return daq.fault_untold || tick_sample() != NULL;
+    return daq.fault_untold || daq.trial.untold || tick_sample() != NULL;
 }

@@ -17,4 +17,7 @@ uint8_t report_waits(void);
 /* Puts code and fields of the status at `body`; returns how many bytes. */
 uint8_t report_status(uint8_t *body, uint8_t id);
 
+/* The same of the law: which runs, whether on trial, and the last return to the old one. */
+uint8_t report_law(uint8_t *body, uint8_t id);
+
 #endif

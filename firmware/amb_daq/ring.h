@@ -12,7 +12,7 @@
 /* What was read or written before it is, before what comes after it: the compiler may move plain data across an index. */
 #define RING_ORDER() __asm__ volatile("" ::: "memory")
 
-#define TX_RING 256 /* as large as its index: it wraps by itself */
+#define TX_RING 128
 #define RX_RING 128
 
 struct tx_ring {
@@ -27,7 +27,7 @@ struct rx_ring {
 
 static inline uint8_t tx_free(const struct tx_ring *ring)
 {
-    return (uint8_t)(ring->tail - ring->head - 1);
+    return (uint8_t)((ring->tail - ring->head - 1) & (TX_RING - 1));
 }
 
 /* Puts a received byte in; 0: there is no room. */

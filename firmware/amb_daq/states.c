@@ -38,6 +38,7 @@ void daq_output(uint8_t state)
     uint16_t host = in_ticks(daq.limits.host_ms), lift = in_ticks(daq.limits.lift_ms);
     ATOMICALLY
     {
+        trial_back_out(BACK_OUT_ENDED);
         control_reset(&daq.control);
         daq.excitation.playing = 0;
         tick_prepare();
@@ -55,6 +56,7 @@ void daq_stop(void)
     {
         board_output(0);
         board_duty(daq.limits.duty_off);
+        trial_back_out(BACK_OUT_ENDED);
         daq.excitation.playing = 0;
         daq.sampling = 0;
         if (daq.state != STATE_FAULT)

@@ -98,8 +98,11 @@ static uint16_t law(int16_t *excitation)
     uint8_t cause, levitating = daq.state == STATE_LEVITATING;
     uint16_t duty;
     *excitation = prepared;
-    if (levitating)
+    if (levitating) {
+        if (daq.trial.on)
+            trial_tick(daq.inputs[0]);
         control_begin(&daq.control, daq.inputs[0]);
+    }
     board_await_input(1);
     cause = safety_check();
     if (cause) {
@@ -112,7 +115,12 @@ static uint16_t law(int16_t *excitation)
     else
         duty = limited((int16_t)(bias() + *excitation));
     board_send();
+    if (daq.control.law)
+        while (board_order_waits() && control_ahead(&daq.control))
+            ;
     duty = order(duty);
+    while (control_ahead(&daq.control))
+        ;
     tick_prepare();
     return duty;
 }

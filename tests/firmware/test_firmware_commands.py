@@ -248,7 +248,7 @@ def test_identify_forgets_the_last_number(console):
 
 
 def test_malformed_commands_are_answered_and_counted(console):
-    requests = ["command 20ff", "command 7f050000", "command 1b", "command 1b0500", "command 1805", "command 1b00"]
+    requests = ["command 30ff", "command 7f050000", "command 1b", "command 1b0500", "command 1805", "command 1b00"]
     lines = console(requests)
     assert [code(line) for line in lines] == [(UNKNOWN, 0)] * 2 + [(LENGTH, 0)] * 3 + [(RANGE, 1)]
     assert stand(lines[-1]).rx_errors == 5

@@ -12,6 +12,7 @@ struct fake fake;
 uint8_t board_begin(void) { return fake.by_watchdog; }
 void board_output(uint8_t on) { fake.output = on; }
 void board_await_order(void) {}
+uint8_t board_order_waits(void) { return fake.order_waits; }
 uint8_t board_order_late(void) { return fake.order_late; }
 void board_await_input(uint8_t input) { (void)input; }
 

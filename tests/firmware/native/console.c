@@ -43,16 +43,18 @@ static void print_hex(const uint8_t *p, size_t n)
 /* Empties the transmit ring. */
 static void print_sent(void)
 {
-    while (board_tx.tail != board_tx.head)
-        printf("%02x", board_tx.data[board_tx.tail++]);
+    while (board_tx.tail != board_tx.head) {
+        printf("%02x", board_tx.data[board_tx.tail]);
+        board_tx.tail = (uint8_t)((board_tx.tail + 1) & (TX_RING - 1));
+    }
 }
 
-/* encode HEX: the frame of a body, put at all 256 places of the ring in turn. */
+/* encode HEX: the frame of a body, put at all places of the ring in turn. */
 static void encode(const char *rest)
 {
     static uint8_t place;
     size_t n = from_hex(rest);
-    board_tx.head = board_tx.tail = place++;
+    board_tx.head = board_tx.tail = place++ & (TX_RING - 1);
     if (!frame_put(&board_tx, bytes, (uint8_t)n, 0))
         printf("full");
     print_sent();
@@ -87,8 +89,40 @@ static void begin_law(const char *rest)
         v[i] = strtol(end, &end, 10);
     law.gains = (struct msg_gains){1, (int32_t)v[0], (int32_t)v[1], (int32_t)v[2], (uint16_t)v[3],
                                    (int32_t)v[4], (uint16_t)v[5], (uint16_t)v[6], (uint16_t)v[7]};
+    law.law = NULL;
     control_reset(&law);
     printf("%d\n", control_refuses(&law.gains));
+}
+
+/* words WORD ...: takes over with these words from what ran; 1 if they are refused. */
+static void begin_words(const char *rest)
+{
+    static struct law places[2]; /* one may still run */
+    struct law *words = &places[law.law == &places[0]];
+    int16_t *word = (int16_t *)(void *)words;
+    char *end = (char *)rest;
+    memset(words, 0, sizeof *words);
+    for (;;) {
+        const char *begin = end;
+        long w = strtol(begin, &end, 10);
+        if (end == begin || word == (int16_t *)(void *)(words + 1))
+            break;
+        *word++ = (int16_t)w;
+    }
+    if (law_refuses(words)) {
+        printf("1\n");
+        return;
+    }
+    control_take(&law, words);
+    printf("0\n");
+}
+
+/* gains: the gains of `law` take over again. */
+static void back_to_gains(const char *rest)
+{
+    (void)rest;
+    control_take(&law, NULL);
+    printf("\n");
 }
 
 /* steps LOW HIGH, then position current excitation ...: the pulse widths. */
@@ -104,6 +138,8 @@ static void run_law(const char *rest)
         long i = strtol(end, &end, 10), e = strtol(end, &end, 10);
         control_begin(&law, (uint16_t)x);
         printf("%u ", control_end(&law, (uint16_t)i, (int16_t)e, low, high));
+        while (control_ahead(&law))
+            ;
     }
     printf("\n");
 }
@@ -251,7 +287,7 @@ static void reset(const char *rest)
 static const struct {
     const char *name;
     void (*act)(const char *rest);
-} verbs[] = {{"encode", encode}, {"feed", feed}, {"law", begin_law},  {"steps", run_law},  {"play", play}, {"line", on_line},
+} verbs[] = {{"encode", encode}, {"feed", feed}, {"law", begin_law},  {"words", begin_words}, {"gains", back_to_gains}, {"steps", run_law},  {"play", play}, {"line", on_line},
              {"command", command}, {"tick", one_tick}, {"set", set}, {"reset", reset}, {"loop", one_loop}};
 
 int main(void)

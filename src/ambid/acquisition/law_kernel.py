@@ -1,0 +1,56 @@
+"""The controller's state-space law in whole numbers, bit by bit as ``firmware/amb_daq/law.c`` has it; compiled."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.compiled import compiled
+
+Integers = NDArray[np.int64]
+
+HEAD, D0, D1, OF_A_STATE = 0, 1, 2, 3
+"""Places of the words; from the last one seven of each state: shift, self, other, b0, b1, g, c."""
+Y_BITS, E_BITS, SHARE_BITS, SUM_BITS = 5, 3, 14, 12
+"""Binary places of what multiplies of inputs and of what the limits took; of a row with shift 0; of w with shift 0."""
+
+BEGIN = 1 << 13
+"""A state of zero: half a step of what multiplies, so that this is the nearest."""
+
+_STATES, _E, _SUM = 1 << 29, 4095, (1 << 26) - 1
+
+
+@compiled
+def shifted(value: int, shift: int) -> int:
+    """Return value / 2^shift to the nearest, ties up."""
+    return value if shift == 0 else (value + (1 << (shift - 1))) >> shift
+
+
+@compiled
+def limited(value: int, largest: int) -> int:
+    """Return `value` limited to both sides."""
+    return min(max(value, -largest), largest)
+
+
+@compiled
+def law_tick(words: Integers, z: Integers, position: int, current: int, offset: int, low: int, high: int) -> int:
+    """Return the pulse width of a tick, and move the states `z` (n,) on.
+
+    `position`, `current`: from set point and rest, counts; `offset`: bias and excitation.
+    """
+    n, y0, y1 = words[HEAD] & 0xFF, position << Y_BITS, current << Y_BITS
+    total = words[D0] * y0 + words[D1] * y1
+    for i in range(n):
+        total += words[OF_A_STATE + 7 * i + 6] * (z[i] >> SHARE_BITS)
+    wanted = shifted(limited(shifted(total, words[HEAD] >> 8), _SUM), SUM_BITS) + offset
+    duty = min(max(wanted, low), high)
+    e = limited(duty - wanted, _E) << E_BITS
+    for i in range(0, n, 2):
+        last = i + 1 == n
+        first, second = z[i] >> SHARE_BITS, 0 if last else z[i + 1] >> SHARE_BITS
+        for j in range(1 if last else 2):
+            own, other, at = (second, first, OF_A_STATE + 7 * (i + 1)) if j else (first, second, OF_A_STATE + 7 * i)
+            total = words[at + 1] * own + words[at + 2] * other + words[at + 3] * y0 + words[at + 4] * y1
+            moved = z[i + j] + shifted(total + words[at + 5] * e, words[at])
+            z[i + j] = min(max(moved, -_STATES), _STATES - 1)
+    return int(duty)
