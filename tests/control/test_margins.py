@@ -89,6 +89,39 @@ def test_stiffness_and_damping_are_those_of_the_compliance(axis):
     np.testing.assert_allclose(curves.stiffness["x"][high], -mass * (2.0 * np.pi * f[high]) ** 2, rtol=1e-3)
 
 
+def test_noise_that_is_predicted_is_that_of_a_simulation(axis):
+    """rms of voltage and position in a record without excitation: sensors and process through the loop."""
+    rig, _, found = axis
+    quiet = ambid.simulate_rig(rig, np.zeros(40_000), rate_hz=20_000.0, seed=3).record
+    of = found.room["x"].quantities
+    rms = {c.name.split("_")[0]: float(np.std(c.values)) for c in quiet.channels}
+    assert found.noise == "rig"
+    assert of["voltage"].rms == pytest.approx(rms["voltage"], rel=0.02)
+    read = np.hypot(of["position"].rms, rig.noise.position)
+    assert read == pytest.approx(rms["position"], rel=0.25)  # its band is narrow: 2 s hold few periods
+    assert np.hypot(of["voltage"].sensors, of["voltage"].process) == pytest.approx(of["voltage"].rms)
+
+
+def test_a_step_of_force_moves_the_rotor_as_far_as_is_predicted(axis):
+    """The plant with its loop, stepped sample by sample by its matrices."""
+    from ambid.physics.linear_model import discretise, model
+    from ambid.simulation.plant import closed_loop_matrix
+
+    rig, _, found = axis
+    values = {p.name: p.value for p in rig.parameters}
+    z = closed_loop_matrix(values, rig.loop, 20_000.0)
+    d, _ = discretise(model("one-axis").matrices(values), 1.0 / 20_000.0)
+    x, pushed, far = np.zeros(z.shape[0]), np.zeros(z.shape[0]), []
+    pushed[: d.E.shape[0]] = d.E[:, 0]
+    for _ in range(4000):
+        x = z @ x + pushed
+        far.append(d.C[0] @ x[: d.A.shape[0]])
+    room = found.room["x"]
+    assert room.quantities["position"].step == pytest.approx(np.max(np.abs(far)), rel=0.02)
+    at = room.quantities[room.force_limit]
+    assert room.force_step * at.step + 3.0 * at.rms == pytest.approx(at.room)
+
+
 def test_an_open_loop_has_no_margins():
     record = ambid.simulate("thesis", duration=0.3, seed=1)
     with pytest.raises(EstimationError, match="open_loop"):
@@ -105,6 +138,40 @@ def test_a_loop_that_does_not_hold_the_plant_is_another_one(axis):
     rig, record, _ = axis
     with pytest.raises(EstimationError, match="does not hold the estimated plant"):
         ambid.margins(record, replace(rig, loop=replace(rig.loop, kp=0.1 * rig.loop.kp)))
+
+
+@needs_simulator
+def test_vibration_by_unbalance_and_run_out_is_that_of_the_truth():
+    """The loop of the independent simulator at the speed of its record, and what it says of the synchronous motion."""
+    from ambid.control.closed import ClosedLoop
+    from ambid.control.controller import controller_of_loop
+    from ambid.control.room import synchronous
+    from ambid.rotor.balance import Machine
+    from ambid.rotor.likelihood import Point
+    from tests.control.test_closed import plant_of
+    from tests.rotor_benches import truth
+
+    bench = truth.BENCHES["rigid-spin"]
+    plant, loop = plant_of(bench), rig_of(bench).loop
+    at = Point(theta=plant.theta, delays=plant.delays)
+    z = float(rig_of(bench).unbalance[0].z)
+    machine = Machine(model=plant.model, at=at, names=(), covariance=np.zeros((0, 0)), beside={"u": (z,)})
+    closed = ClosedLoop(
+        plant=plant, controller=controller_of_loop(loop, plant.model, bench.rate), frequency_hz=np.array([1.0])
+    )
+    f = np.array([bench.rpm / 60.0])
+    force = bench.unbalance * np.exp(1j * bench.phase_unbalance) * machine.shape("u")[:, None]
+    runout = np.zeros((len(plant.model.outputs), 1), dtype=complex)
+    for k, role in enumerate(plant.model.outputs):
+        if role.endswith("position"):
+            runout[k] = bench.runout * np.exp(1.1j) * (1.0 if "x" in role else -1j)
+    moved = synchronous(closed, machine, f, force, runout)[0, 4:, 0] + runout[:, 0]
+    found = truth.simulate(replace(bench, position_noise=0.0, current_noise=0.0, voltage_noise=0.0, force_noise=0.0,
+                                   amplitude=0.0, period=0.5, periods=2), 1)  # fmt: skip
+    angle = found["angle"]
+    for j, axis in enumerate(truth.AXES):
+        seen = 2.0 * np.mean(found["position"][:, j] * np.exp(-1j * angle))
+        assert moved[plant.model.outputs.index(f"{axis}_position")] == pytest.approx(seen, abs=2e-3 * abs(seen))
 
 
 @needs_simulator

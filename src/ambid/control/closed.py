@@ -140,24 +140,22 @@ class ClosedLoop:
 
         A resonance of the loop between two frequencies turns det(I + K H), however narrow it is.
         """
-        loop = cls(plant=plant, controller=controller, frequency_hz=plant.grid())
+        f = plant.grid()
+        loop = cls(plant=plant, controller=controller, frequency_hz=f)
+        watched = loop._watched()
         for _ in range(_PASSES):
-            f = loop.frequency_hz
-            k = np.flatnonzero(loop._too_far())
-            loop = loop.at(np.union1d(f, (f[k, None] + (f[k + 1] - f[k])[:, None] * _WITHIN).ravel()))
-        return loop
+            k = np.flatnonzero(_too_far(watched, len(plant.axes) + len(plant.model.inputs)))
+            new = (f[k, None] + (f[k + 1] - f[k])[:, None] * _WITHIN).ravel()
+            order = np.argsort(np.concatenate([f, new]))
+            f = np.concatenate([f, new])[order]
+            watched = np.concatenate([watched, loop.at(new)._watched()])[order]
+        return loop.at(f)
 
-    def _too_far(self) -> NDArray[np.bool_]:
-        """Return between which frequencies and the next the loop changes too much, (n - 1,)."""
+    def _watched(self) -> Complex:
+        """Return det(I + K H), the sensitivities, and the sizes that peak, (n, columns)."""
         det = np.linalg.det(np.eye(self.H.shape[2]) + self.K @ self.H)
-        found: NDArray[np.bool_] = np.abs(np.log(det[1:] / det[:-1])) > _TURN
         S = np.hstack([self.of_axes, self.at_commands])
-        L = 1.0 / S - 1.0
-        for of in (np.abs(L) > 1.0, L.imag > 0.0):
-            found |= np.any(of[1:] != of[:-1], axis=1)
-        peaks = np.argmax(np.column_stack([np.abs(S), np.abs(S - 0.5), self.singular, np.abs(self.compliance)]), axis=0)
-        found[np.clip(np.concatenate([peaks - 1, peaks]), 0, found.size - 1)] = True
-        return found
+        return np.column_stack([det, S, np.abs(S), np.abs(S - 0.5), self.singular, np.abs(self.compliance)])
 
     def at(self, frequency_hz: Array) -> ClosedLoop:
         """Return the loop at other frequencies."""
@@ -312,3 +310,15 @@ class ClosedLoop:
         weights = scale * (left @ H[p] @ inner)
         variance += self.controller.variance(self.frequency_hz, seen, weights)
         return float(np.sqrt(max(variance, 0.0)))
+
+
+def _too_far(watched: Complex, n: int) -> NDArray[np.bool_]:
+    """Return between which frequencies and the next a loop changes too much, (n_frequencies - 1,)."""
+    det, S = watched[:, 0], watched[:, 1 : 1 + n]
+    found: NDArray[np.bool_] = np.abs(np.log(det[1:] / det[:-1])) > _TURN
+    L = 1.0 / S - 1.0
+    for of in (np.abs(L) > 1.0, L.imag > 0.0):
+        found |= np.any(of[1:] != of[:-1], axis=1)
+    peaks = np.argmax(watched[:, 1 + n :].real, axis=0)
+    found[np.clip(np.concatenate([peaks - 1, peaks]), 0, found.size - 1)] = True
+    return found

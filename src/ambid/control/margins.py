@@ -12,6 +12,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop
 from ambid.control.measured import MeasuredSensitivity
+from ambid.control.room import Room, Vibration
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.modes import EstimatedNumber
 from ambid.rotor.spectra import smoothed
@@ -146,6 +147,12 @@ class Margins(Judged):
         A lower bound of the disk margin of all position signals at once, from the largest singular value of S - T.
     compliance : Mapping[str, Compliance]
     checks : Mapping[str, Check]
+    room : Mapping[str, Room]
+        By axis: noise in voltage, current and position, and the forces and unbalance that come to a limit.
+    noise : {"rig", "estimate"} or None
+        Whose noise that is; None: it is not known.
+    vibration : Vibration or None
+        By the unbalance and run-out that the rig gives, over the speed.
     curves : Curves
     standard : Mapping[str, object]
         ``edition`` of ISO 14839-3, its ``limits_db`` between the zones, and a ``note`` to check them against its text.
@@ -170,6 +177,9 @@ class Margins(Judged):
     standard: Mapping[str, object] = field(default_factory=lambda: _STANDARD)
     of: Literal["record", "estimate"] = "record"
     disk: Disk | None = None
+    room: Mapping[str, Room] = field(default_factory=lambda: MappingProxyType({}))
+    noise: Literal["rig", "estimate"] | None = None
+    vibration: Vibration | None = None
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))

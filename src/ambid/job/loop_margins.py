@@ -5,14 +5,15 @@ Read -> identify, or take an estimate -> controller -> closed loop -> judge.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Literal, cast
 
 import numpy as np
 
-from ambid.control.closed import Plant
+from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.margins import (
     Disk,
     Margins,
@@ -22,15 +23,20 @@ from ambid.control.margins import (
     margins_by_axis,
     sensitivity_by_axis,
 )
+from ambid.control.room import QUANTITIES, Vibration, role_of, room_by_axis, speeds_of, synchronous
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.closed_loop import Numbers, loop_of, measure, spectra_of
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry
+from ambid.job.rotor import balance_planes
 from ambid.physics.linear_model import model
+from ambid.physics.loop import UNLIMITED
+from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
+from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
 from ambid.simulation.margins import zone_of
 from ambid.simulation.plant import closed_loop_poles
@@ -173,6 +179,9 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     if not estimate.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    noise, whose = _noise(estimate, rig, loop)
+    room = _room(estimate, rig, loop)
+    machine = _machine(estimate, rig)
     return Margins(
         status=estimate.status, model=estimate.model, of="estimate" if bench is None else "record", record=record,
         speed=speed,
@@ -181,6 +190,73 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
         largest_singular={"peak_db": float(20.0 * np.log10(ratio)), "frequency_hz": hz, "zone": zone_of(ratio)},
         margins=margins_by_axis(loop), compliance=compliance_by_axis(loop), checks=checks,
         curves=curves_of(loop, measured), disk=Disk.of(loop.sensitivity, loop.frequency_hz),
+        room=room_by_axis(loop, noise, room, machine), noise=whose,
+        vibration=None if machine is None else _vibration(loop, rig, machine, room),
+    )  # fmt: skip
+
+
+def _noise(
+    estimate: Numbers, rig: Rig, loop: ClosedLoop
+) -> tuple[Mapping[str, float] | None, Literal["rig", "estimate"] | None]:
+    """Return the noise of the loop by the names of the model, and whose it is: the rig's, else the estimate's."""
+    of = loop.plant.model
+    if rig.noise is not None:
+        force, voltage = rig.noise.held_rms(loop.plant.rate_hz)
+        by_kind = {"force": force, "voltage": voltage}
+        for kind in ("position", "current"):
+            step = getattr(rig.noise, f"{kind}_resolution")
+            by_kind[kind] = math.hypot(getattr(rig.noise, kind), step / math.sqrt(12.0))
+        names = (*of.disturbances, *of.outputs)
+        return {n: by_kind[n.split("_")[-1].rstrip("0123456789")] for n in names}, "rig"
+    if isinstance(estimate, RotorEstimate):
+        return estimate.noise, "estimate"
+    if estimate.noise.disturbance_sd or estimate.noise.sensor_sd:
+        return {**estimate.noise.disturbance_sd, **estimate.noise.sensor_sd}, "estimate"
+    return None, None
+
+
+def _room(estimate: Numbers, rig: Rig, loop: ClosedLoop) -> dict[str, float | None]:
+    """Return how far each role stands from its nearer limit; None: it has none."""
+    stands = {**(estimate.operating_point if isinstance(estimate, Estimate) else {}), **rig.operating_point}
+    found: dict[str, float | None] = {}
+    for axis in loop.plant.axes:
+        for quantity in QUANTITIES:
+            role = role_of(loop, axis, quantity)
+            low, high = UNLIMITED if rig.limits is None else getattr(rig.limits, quantity)
+            room = min(high - stands.get(role, 0.0), stands.get(role, 0.0) - low)
+            found[role] = max(room, 0.0) if math.isfinite(room) else None
+    return found
+
+
+def _machine(estimate: Numbers, rig: Rig) -> Machine | None:
+    """Return the rotor with the planes of unbalance of the rig; None of one axis, and without its polar moment."""
+    if not isinstance(estimate, RotorEstimate):
+        return None
+    known = all(p.name in estimate.numbers for p in estimate.plant.at_speed(1.0).parameters)
+    return Machine.of(estimate, balance_planes(estimate, rig)) if known else None
+
+
+def _vibration(loop: ClosedLoop, rig: Rig, machine: Machine, room: Mapping[str, float | None]) -> Vibration | None:
+    """Return the vibration by unbalance and run-out of the rig; None where it gives neither."""
+    of = loop.plant.model
+    assert isinstance(of, RotorModel)
+    known = [u for u in rig.unbalance if u.name in machine.beside]
+    if not known and not rig.runout:
+        return None
+    force = sum((u.value * np.exp(1j * u.phase) * machine.shape(u.name) for u in known), np.zeros(2 + of.n_modes))
+    runout = np.zeros((len(of.outputs), 1), dtype=complex)
+    for r in rig.runout:
+        for j, k in of.sensors:
+            bearing, plane = of.placed[j]
+            if bearing.name == r.name and plane < 2:
+                turned = np.exp(1j * (r.phase - plane * np.pi / 2.0))
+                runout[of.outputs.index(position_role(of.axes[j], k))] = r.value * turned
+    f = speeds_of(loop)
+    moved = synchronous(loop, machine, f, force[:, None], runout)[:, len(of.inputs) :, 0]
+    return Vibration(
+        frequency_hz=f, runout=bool(rig.runout),
+        clearance=min((x for role, x in room.items() if role.endswith("position") and x is not None), default=None),
+        amplitude={of.outputs[k]: np.abs(moved[:, k]) for group in loop.plant.sensors for k in group},
     )  # fmt: skip
 
 

@@ -233,11 +233,11 @@ def _synchronous(
     clearance = None if rig.limits is None else min(abs(x) for x in rig.limits.position)
     read = {b.name: [b.sensor_parameter(k) for k in range(len(b.z_sensors))] for b in estimate.plant.bearings}
     runout = {place: r.value * np.exp(1j * r.phase) for r in rig.runout for place in read[r.name]}
-    machine = Machine.of(estimate, _balance_planes(estimate, rig))
+    machine = Machine.of(estimate, balance_planes(estimate, rig))
     return balance_rotor(machine, turned, runout=runout, clearance=clearance)
 
 
-def _balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, ...]]:
+def balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, ...]]:
     """Return the planes of unbalance that a rig gives: z, and the shape of each mode there.
 
     Shapes are the rig's, else those of its drawing, each turned to the side of the identified mode.

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.control.margins import Margins
+from ambid.control.room import Vibration
 from ambid.report.drawing import BOUND, MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed, sized
 from ambid.simulation.margins import ZONES
@@ -30,7 +33,18 @@ def margins_figure(found: Margins, title: str, width: float) -> Figure:
         widths=(3.0, 2.0),
         by_row=True,
     )
-    return stacked(title, [block], width)
+    blocks, curves = [block], found.curves
+    if curves.stiffness:
+        dynamic = [
+            panel(_signed, curves.frequency_hz, values, name, unit, height=2.2)
+            for values, name, unit in (
+                (curves.stiffness, "dynamic stiffness", "N/m"), (curves.damping, "dynamic damping", "N s/m")
+            )
+        ]  # fmt: skip
+        blocks.append(Block(columns=[[x] for x in dynamic], widths=(1.0, 1.0), shared=False))
+    if found.vibration is not None:
+        blocks.append(Block(columns=[[panel(_vibration, found.vibration, height=2.2)]], shared=False))
+    return stacked(title, blocks, width)
 
 
 def zone_lines(axes: Axes) -> None:
@@ -71,3 +85,33 @@ def _compliance(axes: Axes, found: Margins, axis: str) -> None:
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel(f"compliance [{unit}]")
     head(axes, f"least stiffness {sized(1.0 / of.largest, 'N/m')} at {of.frequency_hz:.3g} Hz")
+
+
+def _signed(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], name: str, unit: str) -> None:
+    """Draw quantities of either sign by axis, in the logarithm beyond their smallest size over the frequencies."""
+    size = np.abs(np.concatenate(list(values.values())))
+    least = float(np.quantile(size, 0.1))
+    scale, unit = prefixed(least, unit)
+    for axis, x in values.items():
+        axes.plot(frequency_hz, x / scale, label=axis if len(values) > 1 else None)
+    axes.set_yscale("symlog", linthresh=least / scale, linscale=2.0)
+    axes.axhline(0.0, color=BOUND, linewidth=0.6)
+    log_axis(axes.xaxis, float(frequency_hz[0]), float(frequency_hz[-1]))
+    axes.set_xlabel("frequency [Hz]")
+    axes.set_ylabel(f"{name} [{unit}]")
+
+
+def _vibration(axes: Axes, found: Vibration) -> None:
+    """Draw the vibration over the speed, and the clearance where it is near."""
+    top = max(float(x.max()) for x in found.amplitude.values())
+    scale, unit = prefixed(top, "m")
+    for role, x in found.amplitude.items():
+        axes.plot(60.0 * found.frequency_hz, x / scale, label=role.replace("_", " "))
+    if found.clearance is not None and found.clearance < 3.0 * top:
+        axes.axhline(found.clearance / scale, color=BOUND, linestyle="--", label="clearance")
+    axes.set_ylim(0.0, None)
+    axes.margins(x=0.0)
+    axes.set_xlabel("speed [1/min]")
+    axes.set_ylabel(f"vibration [{unit}]")
+    clear = "no clearance is given" if found.clearance is None else f"clearance {sized(found.clearance, 'm')}"
+    head(axes, f"unbalance{' and run-out' if found.runout else ''} of the rig; {clear}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ambid.control.margins import AxisSensitivity, Disk, Margins, Opening
+from ambid.control.room import QUANTITIES, Demand
 from ambid.report.numbers import sized
 from ambid.report.text import (
     WIDTH,
@@ -43,6 +44,7 @@ def margins_text(found: Margins, *, width: int = WIDTH, paint: Paint = plain) ->
             _sensitivity(found, paint),
             _openings(found, paint),
             _compliance(found, paint),
+            _room(found, paint),
             check_lines(found.checks, width=width, paint=paint, above=True),
             warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
             timing_lines(found.timing_s, width=width, paint=paint),
@@ -110,3 +112,37 @@ def _compliance(found: Margins, paint: Paint) -> list[str]:
     rows: list[tuple[str, ...]] = [("axis", "least dynamic stiffness", "at")]
     rows += [(axis, sized(1.0 / c.largest, "N/m"), sized(c.frequency_hz, "Hz")) for axis, c in found.compliance.items()]
     return [paint("compliance at the magnets", "strong"), *columns(rows)]
+
+
+def _room(found: Margins, paint: Paint) -> list[str]:
+    """Noise, and what comes to a limit first: a row an axis; nothing where neither noise nor limits are known."""
+    if found.noise is None and all(r.force_step is None for r in found.room.values()):
+        return []
+    rows: list[tuple[str, ...]] = [("axis", *QUANTITIES, "force step", "unbalance")]
+    for axis, r in found.room.items():
+        force = _NONE if r.force_step is None else f"{sized(r.force_step, 'N')}, {r.force_limit}"
+        turned = _NONE if r.unbalance is None else f"{1e6 * r.unbalance:.3g} g mm, {r.unbalance_limit}"
+        cells = (_demand(r.quantities.get(q), unit) for q, unit in QUANTITIES.items())
+        rows.append((axis, *cells, force, turned))
+    whose = "not known" if found.noise is None else f"of the {found.noise}"
+    title = f"noise ({whose}), rms in the room before a limit; what comes to its limit first"
+    lines = [paint(title, "strong"), *columns(rows)]
+    v = found.vibration
+    if v is not None:
+        top, at, role = max(
+            (float(x.max()), float(v.frequency_hz[int(np.argmax(x))]), n) for n, x in v.amplitude.items()
+        )
+        clear = "" if v.clearance is None else f", {100.0 * top / v.clearance:.2g} % of the clearance"
+        lines.append(
+            f"unbalance and run-out of the rig: up to {sized(top, 'm')}{clear} ({role} at {60 * at:.0f} 1/min)"
+        )
+    return lines
+
+
+def _demand(of: Demand | None, unit: str) -> str:
+    if of is None or (of.rms is None and of.room is None):
+        return _NONE
+    if of.room is None:
+        return sized(of.rms or 0.0, unit)
+    share = "" if of.rms is None or not of.room else f"{100.0 * of.rms / of.room:.2g} % of "
+    return f"{share}{sized(of.room, unit)}"
