@@ -50,6 +50,7 @@ sensors in the command, and the time in which a force step is settled."""
 GOALS = ("peak", "compliance")
 SETTLED = 0.05
 """Part of the largest deflection by a force step, below which it is settled."""
+_SAME = 1.005  # of a limit: what is as good as it
 CIRCLE = 1e-9  # a pole no nearer to the unit circle is stable
 _SPAN = 1e-4  # of the rate: the lowest frequency that is shown
 FREQUENCIES = 320
@@ -110,9 +111,18 @@ class Goals:
             limits={**kept, **limits},
         )  # fmt: skip
 
-    def missed(self, worst: Figures, slack: float = 1.0) -> tuple[str, ...]:
-        """Return the limits that figures pass by more than a factor."""
-        return tuple(name for name, x in self.limits.items() if getattr(worst, name) > slack * x)
+    def missed(self, worst: Figures) -> tuple[str, ...]:
+        """Return the limits that figures pass."""
+        return tuple(name for name, x in self.limits.items() if getattr(worst, name) > _SAME * x)
+
+    def closer(self, asked: Goals, worst: Figures) -> Goals | None:
+        """Return what to ask for, where `asked` led to figures that pass these limits; None where they do not."""
+        beyond = {name: getattr(worst, name) / self.limits[name] for name in self.missed(worst)}
+        if not beyond or not all(map(math.isfinite, beyond.values())):
+            return None
+        return replace(
+            asked, limits={n: x / (beyond[n] * _SAME if n in beyond else 1.0) for n, x in asked.limits.items()}
+        )
 
 
 class Method(Protocol):
@@ -413,7 +423,7 @@ def worst_plant(plants: Sequence[Drawn], seen: Sequence[Examined]) -> WorstPlant
 
 def checks_of(goals: Goals, before: Situation, after: Situation, worst: WorstPlant, n: int) -> dict[str, Check]:
     """Judge stability, limits and zone of the new loop over the plants, and whether it is better at all."""
-    missed = goals.missed(after.worst, 1.0 + 1e-6)
+    missed = goals.missed(after.worst)
     held = f"{n - after.unstable} of {n} plants drawn around the estimate are held"
     gains = [getattr(after.worst, g) < getattr(before.worst, g) for g in goals.minimise] or [True]
     return {

@@ -49,8 +49,8 @@ class Spread:
     delay: float = 0.5  # samples by which the delay is longer or shorter at most
     # share of the way to the limits by which the rotor is away from rest at most, and the current from what holds the
     # rotor there
-    position: float = 0.25
-    current: float = 0.25
+    position: float = 0.15
+    current: float = 0.15
     # largest time constant of the eddy currents in samples; where the rig's [magnet] has their pole, over its own
     eddy: float = 0.5
     warm_k: tuple[float, float] = (-10.0, 60.0)  # kelvin by which the coil is colder or warmer than it was

@@ -6,7 +6,7 @@ Read -> plants drawn -> the present loop on them -> design -> as the controller 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ from ambid.control.design import (
     GOALS,
     UNSTABLE,
     Design,
+    Examined,
     Goals,
     Method,
     checks_of,
@@ -27,7 +28,7 @@ from ambid.control.design import (
     worst_of,
     worst_plant,
 )
-from ambid.control.drawn import Spread, draw_plants
+from ambid.control.drawn import Draws, Spread, draw_plants
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -37,7 +38,9 @@ from ambid.job.data import Clock, rig_entry
 from ambid.job.loop_margins import given
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import Rig
+from ambid.rotor.estimate import RotorEstimate
 
+_ROUNDS = 3  # in which the limits are met on the plants that judge too
 _STEP = 1.5  # settling times over which a force step is drawn
 
 
@@ -118,68 +121,114 @@ def design_controller(
     say, clock = tick or silent, Clock()
     say("read")
     known, bench = given(estimate, rig)
-    design, asked, sources = _method(method), _ratios(limits), _spread(spread)
+    asked, sources = _ratios(limits), _spread(spread)
     Goals.of(goals, asked, UNSTABLE)  # refuses what it does not know, before anything is drawn
+    if method not in METHODS:
+        names = f"{', '.join(METHODS)}.{nearest(method, list(METHODS))}"
+        raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
     for name, x, least in (("plants", plants, 1), ("judges", judges, 1)):
         if x < least:
             raise EstimationError(f"{name} is {x}; it must be at least {least}. Correct it")
     with one_thread():
-        found = _designed(known, bench, design, goals, asked, sources, (plants, judges, seed), say, clock)
-    return replace(found, method=method, timing_s=clock.laps)
+        found = _designed(_problem(known, bench, sources, (plants, judges, seed)), method, goals, asked, say, clock)
+    return replace(found, timing_s=clock.laps)
 
 
-def _designed(
-    known: Numbers, bench: Rig, design: Method, goals: Sequence[str], limits: Mapping[str, float], spread: Spread,
-    sizes: tuple[int, int, int], say: Tick, clock: Clock,
-) -> Design:  # fmt: skip
+@dataclass(frozen=True, kw_only=True)
+class _Problem:
+    """What a design is for."""
+
+    known: Numbers
+    bench: Rig  # as it is given
+    rig: Rig  # with the present loop as the controller holds it, and the noise that is taken
+    plant: Plant  # with its covariance
+    noise: tuple[float, float]
+    tuning: Draws
+    judging: Draws
+    seeds: tuple[int, int]
+    assumed: str  # of the noise
+
+    @property
+    def present(self) -> Loop:
+        """The loop as it is."""
+        assert self.rig.loop is not None
+        return self.rig.loop
+
+
+def _problem(known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, int]) -> _Problem:
+    """Return the plants around an estimate, and the present loop on it."""
     plants, judges, seed = sizes
     sd = known.noise.sensor_sd if isinstance(known, Estimate) else known.noise
     position, current, assumed = noise_of(bench.noise, sd)
-    rate = float(str(known.record["rate_hz"]))
-    present = held_by(bench, bench.loop)
-    rig = replace(bench, loop=present, noise=replace(bench.noise or Noise(), position=position, current=current,
-                                                     position_resolution=0.0, current_resolution=0.0))  # fmt: skip
-    plant = at_rate(plant_of(known, rate), bench.daq.rate_hz if bench.daq else rate)
-    noise = (position, current)
-    refuse_unheld(examine(plant, present, noise).figures, "the estimated plant")
+    white = replace(bench.noise or Noise(), position=position, current=current, position_resolution=0.0,
+                    current_resolution=0.0)  # fmt: skip
+    rate, speed = float(str(known.record["rate_hz"])), known.speed if isinstance(known, RotorEstimate) else 0.0
+    plant = at_rate(plant_of(known, rate, speed), bench.daq.rate_hz if bench.daq else rate)
+    rig = replace(bench, loop=held_by(bench, bench.loop), noise=white)
     point = known.operating_point if isinstance(known, Estimate) else None
-    tuning, judging = (draw_plants(plant, rig, n, seed=2 * seed + k, spread=spread, point=point)
-                       for k, n in ((0, plants), (1, judges)))  # fmt: skip
-    before = verify(tuning.plants, present, noise, part_of(say, 0.0, 0.1) or silent)
-    clock.lap("draw")
-    asked = Goals.of(goals, limits, worst_of([x.figures for x in before]))
-    loop = held_by(bench, design([d.plant for d in tuning.plants], rig, asked, say))
-    clock.lap("design")
-    seen = [
-        verify(judging.plants, x, noise, part_of(say, a, a + 0.5) or silent) for x, a in ((present, 0.0), (loop, 0.5))
-    ]
-    was, now = (situation_of(x, plant, of) for x, of in zip(seen, (present, loop), strict=True))
-    worst = worst_plant(judging.plants, seen[1])
-    judged = Goals.of(goals, limits, was.worst)  # what is compared with the present loop, on the same plants
-    checks = checks_of(judged, was, now, worst, judges)
-    if not known.passed:
-        reasons = "; ".join(f"{r.check}: {r.text}" for r in known.verdict.reasons)
-        checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
-    until = _STEP * max(was.figures.settling, now.figures.settling)
-    curves = {name: curves_of(x, plant, of, until)
-              for name, x, of in zip(("before", "after"), seen, (present, loop), strict=True)}  # fmt: skip
-    clock.lap("verify")
-    return Design(
-        status=known.status, model=known.model, method="", record=known.record, goals=judged, before=was, after=now,
-        worst_plant=worst, checks=checks, curves=curves,
-        rig=rig_entry(replace(bench, loop=_kept(loop, bench.loop))), rate_hz=plant.rate_hz,
-        plants={
-            "tuning": plants, "verification": judges, "rejected": tuning.rejected + judging.rejected,
-            "seeds": [2 * seed, 2 * seed + 1], "assumed": [*judging.assumed, assumed],
-        },
+    seeds = 2 * seed, 2 * seed + 1
+    tuning, judging = (
+        draw_plants(plant, rig, n, seed=k, spread=spread, point=point)
+        for k, n in zip(seeds, (plants, judges), strict=True)
+    )
+    return _Problem(
+        known=known, bench=bench, rig=rig, plant=plant, noise=(position, current), tuning=tuning, judging=judging,
+        seeds=seeds, assumed=assumed,
     )  # fmt: skip
 
 
-def _kept(loop: Loop, present: Loop | None) -> Loop:
-    """Return the new loop with the delay that the rig says."""
-    return loop if present is None else replace(loop, delay=present.delay)
+def _designed(
+    problem: _Problem, method: str, goals: Sequence[str], limits: Mapping[str, float], say: Tick, clock: Clock
+) -> Design:
+    of, plants = problem, [d.plant for d in problem.tuning.plants]
+    refuse_unheld(examine(of.plant, of.present, of.noise).figures, "the estimated plant")
+    before = verify(of.tuning.plants, of.present, of.noise, part_of(say, 0.0, 0.3) or silent)
+    first = verify(of.judging.plants, of.present, of.noise, part_of(say, 0.3, 1.0) or silent)
+    clock.lap("draw")
+    asked = Goals.of(goals, limits, worst_of([x.figures for x in before]))
+    judged = Goals.of(goals, limits, worst_of([x.figures for x in first]))  # the present loop on the same plants
+    design = METHODS[method]()
+    for _ in range(_ROUNDS):
+        loop = held_by(of.bench, design(plants, of.rig, asked, say))
+        seen = verify(of.judging.plants, loop, of.noise, say)
+        closer = judged.closer(asked, worst_of([x.figures for x in seen]))
+        if closer is None:
+            break
+        asked = closer
+    clock.lap("design")
+    found = _result(of, method, judged, ((of.present, first), (loop, seen)))
+    clock.lap("verify")
+    return found
+
+
+def _result(
+    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...]
+) -> Design:  # fmt: skip
+    was, now = (situation_of(seen, of.plant, loop) for loop, seen in loops)
+    loop, seen = loops[1]
+    worst = worst_plant(of.judging.plants, seen)
+    checks = checks_of(goals, was, now, worst, len(seen))
+    if not of.known.passed:
+        reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
+        checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    until = _STEP * max(was.figures.settling, now.figures.settling)
+    kept = replace(loop, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
+    return Design(
+        status=of.known.status, model=of.known.model, method=method, record=of.known.record, goals=goals, before=was,
+        after=now, worst_plant=worst, checks=checks, rate_hz=of.plant.rate_hz,
+        curves={
+            name: curves_of(x, of.plant, tried, until)
+            for name, (tried, x) in zip(("before", "after"), loops, strict=True)
+        },
+        rig=rig_entry(replace(of.bench, loop=kept)),
+        plants={
+            "tuning": len(of.tuning.plants), "verification": len(seen),
+            "rejected": of.tuning.rejected + of.judging.rejected, "seeds": list(of.seeds),
+            "assumed": [*of.judging.assumed, of.assumed],
+        },
+    )  # fmt: skip
 
 
 def held_by(rig: Rig, loop: Loop | None) -> Loop:
@@ -197,13 +246,6 @@ def held_by(rig: Rig, loop: Loop | None) -> Loop:
 def at_rate(plant: Plant, rate_hz: float) -> Plant:
     """Return a plant as a controller of another rate sees it: its delay is one in seconds."""
     return replace(plant, rate_hz=rate_hz, delays=plant.delays * (rate_hz / plant.rate_hz))
-
-
-def _method(name: str) -> Method:
-    if name not in METHODS:
-        known = f"{', '.join(METHODS)}.{nearest(name, list(METHODS))}"
-        raise EstimationError(f"method {name!r} of a design is unknown; known: {known} Give one of them")
-    return METHODS[name]()
 
 
 def _ratios(limits: Mapping[str, float] | None) -> dict[str, float]:
