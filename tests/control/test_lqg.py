@@ -8,20 +8,13 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.control.closed import ClosedLoop, Plant
-from ambid.control.controller import controller_of_loop
+from ambid.control.closed import Plant
+from ambid.control.design import Goals, closed_loop_of, examine, noise_of, worst_of
 from ambid.control.drawn import draw_plants
-from ambid.control.lqg import (
-    RESIDUAL,
-    Family,
-    SampledPlant,
-    Weights,
-    command_noise,
-    lqg,
-    score_of,
-    search_lqg,
-)
+from ambid.control.knobs import Family, design_lqg
+from ambid.control.lqg import RESIDUAL, SampledPlant, Weights, lqg
 from ambid.errors import EstimationError, ModelError
+from ambid.estimation.progress import silent
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.rig.preset_rig import rig_of_preset
@@ -127,50 +120,79 @@ def test_states_of_the_filter_see_a_limited_command_and_the_integral_is_tracked_
 
 def test_noise_is_nine_times_lower_and_the_loop_stiffer_than_the_pid_of_the_bench():
     bench, plant = of_preset("rmit-axis")
-    of, family = SampledPlant.of(plant), Family(plants=(plant,))
-    pid = bench.loop.as_law(plant.rate_hz)
+    noise = (bench.noise.position, bench.noise.current)
+    family, of = Family(plants=(plant,), noise=noise), SampledPlant.of(plant)
     law = lqg(plant, weights_of(bench), bench.noise).law
-
-    def compliance(loop):
-        found = controller_of_loop(loop, plant.model, plant.rate_hz)
-        return np.max(np.abs(ClosedLoop(plant=plant, controller=found, frequency_hz=family.frequency_hz).compliance))
-
-    noises = [command_noise(of, x, bench.noise)[0] for x in (pid, law)]
-    assert noises[0] / noises[1] > 8.5
-    assert compliance(Loop(law=law)) < 7e-6 < 10e-6 < compliance(bench.loop)
+    before, after = (family.figures(x) for x in (bench.loop.as_law(plant.rate_hz), law))
+    assert before["noise"] / after["noise"] > 8.5
+    assert after["compliance"] < 7e-6 < 10e-6 < before["compliance"]
     rng, z, x, w = np.random.default_rng(1), np.zeros(law.order), np.zeros(of.A.shape[0]), []
-    for e in rng.standard_normal((20_000, 2)) * of.sensors(bench.noise):  # the same by simulation
+    for e in rng.standard_normal((20_000, 2)) * noise:  # the same by simulation
         y = of.C @ x + e
         w.append(law.C @ z + law.D @ y)
         z, x = law.A @ z + law.B @ y, of.A @ x + of.B @ w[-1]
-    assert np.std(w) == pytest.approx(noises[1], rel=0.05)
+    assert np.std(w) == pytest.approx(after["noise"], rel=0.05)
 
 
-def test_peaks_of_a_family_are_those_of_the_closed_loop():
-    bench, plant = of_preset("rmit")
-    family = Family(plants=(plant,))
-    law = lqg(plant, weights_of(bench), bench.noise).law
-    loop = ClosedLoop(
-        plant=plant, controller=controller_of_loop(Loop(law=law), plant.model, plant.rate_hz),
-        frequency_hz=family.frequency_hz,
-    )  # fmt: skip
-    both = max(np.max(np.abs(loop.of_axes)), np.max(np.abs(loop.at_commands)))
-    assert family.worst(law).peak == pytest.approx(both, rel=1e-6)
-
-
-@pytest.mark.parametrize("name", ["prototype", "unstable-bearing"])
-def test_knobs_hold_all_drawn_plants_in_zone_a(name):
+@pytest.mark.parametrize("name", ["prototype", "rmit"])
+def test_figures_of_a_family_are_those_of_the_closed_loop(name):
     bench, plant = of_preset(name)
-    drawn = tuple(d.plant for d in draw_plants(plant, rig_of_preset(bench), 30, seed=1).plants)
-    family = Family(plants=drawn)
-    found = search_lqg(plant, weights_of(bench), bench.noise, score_of(family, bench.noise, 3.0))
-    assert found is not None
-    worst = family.worst(found.law)
-    assert worst.largest_pole < 1.0
-    assert worst.peak <= 3.0
-    assert search_lqg(plant, weights_of(bench), bench.noise, lambda law: math.inf) is None
-    alone = family.worst(lqg(plant, weights_of(bench), bench.noise).law)
-    assert name != "prototype" or alone.peak > 3.0  # LQG has no margins by itself
+    noise = (bench.noise.position, bench.noise.current)
+    family = Family(plants=(plant, replace(plant, delays=plant.delays + 0.4)), noise=noise)
+    law = lqg(plant, weights_of(bench), bench.noise, effort=0.5).law
+    found, loop = family.figures(law), Loop(law=law)
+    seen = worst_of([examine(p, loop, noise).figures for p in family.plants])
+    for name, least in (("peak", 0.99), ("compliance", 0.99), ("noise", 0.99)):
+        assert least < found[name] / getattr(seen, name) < 1.01
+    assert family.poles(law).max() == pytest.approx(math.exp(-seen.pole / plant.rate_hz), rel=1e-9)
+    commands = closed_loop_of(family.plants[1], loop, family.frequency_hz).at_commands
+    assert family.peaks(law)[1][1] == pytest.approx(np.abs(commands).max(), rel=1e-6)
+
+
+def goals_of(plants, rig, loop, **limits):
+    """Low noise, all else as a loop has it."""
+    worst = worst_of([examine(p, loop, noise_of(rig.noise, {})[:2]).figures for p in plants])
+    return Goals.of(("noise",), limits, worst)
+
+
+@pytest.fixture(scope="module")
+def prototypes():
+    bench, plant = of_preset("prototype")
+    rig = rig_of_preset(bench)
+    return rig, plant, tuple(d.plant for d in draw_plants(plant, rig, 8, seed=1).plants)
+
+
+def test_knobs_keep_the_limits_on_all_drawn_plants(prototypes):
+    rig, plant, drawn = prototypes
+    goals = goals_of(drawn, rig, rig.loop, peak=3.0)
+    loop = design_lqg(drawn, rig, goals, silent)
+    found = worst_of([examine(p, loop, noise_of(rig.noise, {})[:2]).figures for p in drawn])
+    assert not goals.missed(found)
+    assert found.noise < 0.8 * goals.reference["noise"]
+    alone = Family(plants=drawn).figures(lqg(plant, weights_of(ambid.preset("prototype")), rig.noise).law)
+    assert alone["peak"] > 3.0  # LQG has no margins by itself
+    tight = replace(goals, limits={"peak": 1.3, "settling": 9.0})
+    with pytest.raises(EstimationError, match=r"no LQG law meets the limits .*is the least. Give --limit peak="):
+        design_lqg(drawn[:2], rig, tight, silent)
+    with pytest.raises(EstimationError, match=r"gives no \[limits\]"):
+        design_lqg(drawn, replace(rig, limits=None), goals, silent)
+
+
+def test_a_law_is_designed_and_verified_as_a_pid_is(tmp_path):
+    rig = rig_of_preset(ambid.preset("rmit-axis"))
+    known = ambid.identify(ambid.simulate("rmit-axis", duration=0.3, seed=1), rig)
+    found = ambid.design_controller(known, rig, method="lqg", plants=8, judges=8)
+    assert found.after.unstable == 0
+    assert found.after.worst.peak < 0.75 * found.before.worst.peak
+    assert found.after.worst.noise < found.before.worst.noise
+    assert found.loop.law is not None
+    found.save(tmp_path / "design.json")
+    assert "state-space" in (tmp_path / "design.json").read_text()
+    system = found.to_control()
+    f = np.array([10.0, 300.0])
+    np.testing.assert_allclose(
+        [system(np.exp(2j * np.pi * x / found.rate_hz))[0] for x in f], found.loop.law.response(f)[:, 0], rtol=1e-9
+    )
 
 
 def test_what_cannot_be_designed_is_refused():

@@ -91,7 +91,9 @@ def controller(
     estimate: Annotated[Path, argument("ESTIMATE", "What 'ambid identify --json' wrote.")],
     rig: opt.RigFile = None,
     out: Annotated[Path | None, option("--out -o RIG", "Write the rig with the new [loop].")] = None,
-    method: Annotated[str, option("--method NAME", "pid: the present structure, tuned.", True)] = "pid",
+    method: Annotated[
+        str, option("--method NAME", "pid: the present structure, tuned; lqg: a state-space law.", True)
+    ] = "pid",
     goal: Annotated[
         list[str] | None,
         option("--goal FIGURE", "To be small: peak, compliance, noise or settling; repeatable.", "peak and compliance"),

@@ -20,7 +20,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.control.closed import Plant
-from ambid.control.lqg import Family, SampledPlant
+from ambid.control.knobs import Family
+from ambid.control.lqg import SampledPlant
 from ambid.errors import ModelError
 from ambid.physics.law import StateLaw
 
@@ -131,12 +132,13 @@ def fixed_point(law: StateLaw, plant: Plant, counts: Counts, *, word_bits: int =
     d = (int(head[-2]), int(head[-1]))
     realised = _realised(words, shift, d, counts, law.rate_hz)
     family = Family(plants=(plant,))
-    peaks = [family.worst(x).peak for x in (law, realised)]
+    peaks = [float(np.max(family.peaks(x))) for x in (law, realised)]
+    poles = [float(family.poles(x)[0]) for x in (law, realised)]
     noise, states, cycle = _rounding(SampledPlant.of(plant), realised, counts)
     return FixedPointLaw(
         shift=shift, d=d, rows=words, realised=realised, bounds=bound / size,
-        peak_shift_db=20.0 * math.log10(peaks[1] / peaks[0]) if math.isfinite(max(peaks)) else math.inf,
-        largest_pole=family.worst(realised).largest_pole, noise=noise, cycle_of_states=states, cycle=cycle,
+        peak_shift_db=20.0 * math.log10(peaks[1] / peaks[0]) if max(poles) < 1.0 else math.inf, largest_pole=poles[1],
+        noise=noise, cycle_of_states=states, cycle=cycle,
     )  # fmt: skip
 
 

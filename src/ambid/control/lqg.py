@@ -13,19 +13,17 @@ knobs, effort and how strong disturbances are taken, are set by the worst of man
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from ambid.arrays import Array, Complex
-from ambid.control.closed import ClosedLoop, Plant
-from ambid.control.controller import controller_of_loop
+from ambid.arrays import Array
+from ambid.control.closed import Plant
 from ambid.errors import EstimationError, ModelError
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import discretise
-from ambid.physics.loop import Limits, Loop, Noise
+from ambid.physics.loop import Limits, Noise
 from ambid.simulation.plant import fed_back, signals_fed_back
 
 RESIDUAL = 1e-8
@@ -217,114 +215,3 @@ def _filter(
     P, residual = _riccati(A.T, seen.T, driven @ driven.T, np.eye(sd.size))
     M = np.linalg.solve(seen @ P @ seen.T + np.eye(sd.size), seen @ P).T
     return M * (level / sd), residual
-
-
-# --- the knobs, by many plants ---------------------------------------------------------------------------------------
-
-_FREQUENCIES = 200
-_FIRST, _FINEST = 4.0, 1.2  # factors on the knobs between tries
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Worst:
-    """What a law does on the worst of several plants."""
-
-    largest_pole: float
-    peak: float  # of the sensitivity, of any axis, at its position signal or its command
-    plant: int  # the one with the peak, or that is not stable
-
-
-@dataclass(frozen=True, kw_only=True, eq=False)
-class Family:
-    """Plants that one law must hold, the one it is designed for first."""
-
-    plants: tuple[Plant, ...]
-
-    @cached_property
-    def sampled(self) -> tuple[SampledPlant, ...]:
-        """Each over one sample."""
-        return tuple(SampledPlant.of(p) for p in self.plants)
-
-    @cached_property
-    def frequency_hz(self) -> Array:
-        """Where the sensitivity is looked at, close around the resonances of the first plant."""
-        rate, every = self.plants[0].rate_hz, self.plants[0].grid()
-        even = np.geomspace(1e-4 * rate, 0.499 * rate, _FREQUENCIES)
-        fine = np.diff(np.log(every)) < 0.5 * np.log(every[1] / every[0])
-        return np.union1d(even, every[1:][fine])
-
-    @cached_property
-    def responses(self) -> Complex:
-        """From commands to what is fed back, (n_plants, n_frequencies, n_y, n_u)."""
-        rows = signals_fed_back(self.plants[0].model)
-        return np.stack([p.sampled(self.frequency_hz).transfer()[:, rows] for p in self.plants])
-
-    def worst(self, law: StateLaw) -> Worst:
-        """Return the largest pole, and where all are stable the peak of the sensitivity."""
-        poles = np.array([of.largest_pole(law) for of in self.sampled])
-        k = int(np.argmax(poles))
-        if poles[k] >= 1.0:
-            return Worst(largest_pole=float(poles[k]), peak=math.inf, plant=k)
-        H, W = self.responses, law.response(self.frequency_hz)
-        position = self.sampled[0].kinds[0]
-        signals = np.linalg.inv(np.eye(H.shape[2]) - H @ W)[..., position, position]
-        commands = np.linalg.inv(np.eye(H.shape[3]) - W @ H)
-        both = np.concatenate([signals, np.diagonal(commands, axis1=2, axis2=3)], axis=2)
-        peaks = np.max(np.abs(both), axis=(1, 2))
-        return Worst(largest_pole=float(poles[k]), peak=float(np.max(peaks)), plant=int(np.argmax(peaks)))
-
-
-def command_noise(of: SampledPlant, law: StateLaw, noise: Noise) -> Array:
-    """Return the standard deviations of the commands that the sensors' noise makes, (n_inputs,)."""
-    from scipy.linalg import solve_discrete_lyapunov
-
-    sd = np.diag(of.sensors(noise))
-    driven = np.vstack([of.B @ law.D, law.B]) @ sd
-    P = solve_discrete_lyapunov(of.closed(law), driven @ driven.T, method="bilinear")
-    row = np.hstack([law.D @ of.C, law.C])
-    return np.sqrt(np.diag(row @ P @ row.T + law.D @ sd @ sd @ law.D.T))
-
-
-def score_of(family: Family, noise: Noise, peak: float) -> Callable[[StateLaw], float]:
-    """Return a score of laws: ln(noise in the commands · largest compliance) on the first plant.
-
-    Infinite where any plant is unstable or has a larger peak of the sensitivity than `peak`.
-    """
-    plant, rate_hz = family.plants[0], family.plants[0].rate_hz
-
-    def score(law: StateLaw) -> float:
-        if family.worst(law).peak > peak:
-            return math.inf
-        controller = controller_of_loop(Loop(law=law), plant.model, rate_hz)
-        loop = ClosedLoop(plant=plant, controller=controller, frequency_hz=family.frequency_hz)
-        voltage = float(np.max(command_noise(family.sampled[0], law, noise)))
-        return math.log(voltage * float(np.max(np.abs(loop.compliance))))
-
-    return score
-
-
-def search_lqg(plant: Plant, weights: Weights, noise: Noise, score: Callable[[StateLaw], float]) -> Lqg | None:
-    """Return the law of least score over effort and disturbance; None where none has a finite one.
-
-    The knobs are tried on a coarse grid, then around the best by ever smaller steps.
-    """
-    tried: dict[tuple[float, float], tuple[float, Lqg | None]] = {}
-
-    def at(effort: float, disturbance: float) -> float:
-        key = (round(math.log(effort), 6), round(math.log(disturbance), 6))
-        if key not in tried:
-            try:
-                found = lqg(plant, weights, noise, effort=effort, disturbance=disturbance)
-                tried[key] = (score(found.law), found)
-            except EstimationError:  # no law with these knobs
-                tried[key] = (math.inf, None)
-        return tried[key][0]
-
-    step = _FIRST
-    grid = [(step**a, step**b) for a in range(-3, 2) for b in range(-2, 4)]
-    best = min(grid, key=lambda k: at(*k))
-    while (step := math.sqrt(step)) > _FINEST:
-        around = [(best[0] * step**a, best[1] * step**b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-        best = min(around, key=lambda k: at(*k))
-    value, found = min(tried.values(), key=lambda x: x[0])
-    return found if math.isfinite(value) else None

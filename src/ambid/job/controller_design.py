@@ -50,7 +50,13 @@ def _pid() -> Method:
     return tune_pid
 
 
-METHODS: Mapping[str, Callable[[], Method]] = {"pid": _pid}
+def _lqg() -> Method:
+    from ambid.control.knobs import design_lqg
+
+    return design_lqg
+
+
+METHODS: Mapping[str, Callable[[], Method]] = {"pid": _pid, "lqg": _lqg}
 """By the name that ``method`` takes: what designs is imported when it is asked for."""
 
 
@@ -80,8 +86,8 @@ def design_controller(
         The plant, as `ambid.identify` finds it.
     rig : Rig, str or Path, optional
         With the present ``[loop]``; default: that of the estimate.
-    method : {"pid"}
-        "pid": the present structure, tuned.
+    method : {"pid", "lqg"}
+        "pid": the present structure, tuned; "lqg": a state-space law with integral action, its weights tuned.
     goals : sequence of {"peak", "compliance", "noise", "settling"}
         What is to be small: peak of the sensitivity, displacement by a force, noise of the sensors in the command,
         time in which a force step is settled.

@@ -1,0 +1,253 @@
+"""Laws of an optimal method, whose few knobs are set by the worst of many plants.
+
+A method such as LQG promises nothing on another plant than its own (Doyle 1978). So its knobs are searched on a grid
+and then along each of them, for the goals of a design: largest over the plants, with the limits as penalties. Responses
+of the plants are computed once; with y = H w and w = W y,
+
+    S = (I - H W)⁻¹ at the positions,  x/f = G_x + H_x W (I - H W)⁻¹ G_y,  w/n = W (I - H W)⁻¹.
+
+At the commands (I - W H)⁻¹ is limited beside.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.control.closed import Plant
+from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
+from ambid.control.lqg import SampledPlant, Weights, lqg
+from ambid.control.tuning import option, said
+from ambid.errors import EstimationError
+from ambid.estimation.progress import Tick
+from ambid.physics.law import StateLaw
+from ambid.physics.loop import Loop, Noise
+from ambid.rig import Rig
+from ambid.simulation.margins import ZONES
+from ambid.simulation.plant import signals_fed_back
+
+_FREQUENCIES = 150
+_BEYOND = 1e2  # score of a law that passes a limit, before its excess
+_LOST = 1e3  # and of one that does not hold all plants
+_SLACK = 0.03  # by which limits are kept from: other plants judge
+_SETTLED = 3.0  # time constants of the slowest pole that count as settled, until force steps say how many
+_ROUNDS = 4  # of that
+_FIRST, _FINEST = 4.0, 1.15  # factors on the knobs between tries
+
+Knobs = tuple[float, ...]
+Make = Callable[[Knobs], StateLaw]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Family:
+    """Plants that one law must hold, the one it is designed for first."""
+
+    plants: tuple[Plant, ...]
+    noise: tuple[float, float] = (0.0, 0.0)  # of position and current, m and A rms
+
+    @cached_property
+    def sampled(self) -> tuple[SampledPlant, ...]:
+        """Each over one sample."""
+        return tuple(SampledPlant.of(p) for p in self.plants)
+
+    @cached_property
+    def frequency_hz(self) -> Array:
+        """Where the responses are looked at, close around the resonances of the first plant."""
+        return self.plants[0].grid(_FREQUENCIES)
+
+    @cached_property
+    def responses(self) -> tuple[Complex, Complex, Complex, Complex]:
+        """H and G at what is fed back, by commands and forces, then at the magnets, (n_plants, n, ...)."""
+        parts = []
+        for plant in self.plants:
+            by_forces, by_inputs = closed_loop_of(plant, Loop(), self.frequency_hz).pushed
+            rows, n_y, n = signals_fed_back(plant.model), plant.space.C.shape[0], len(plant.axes)
+            forces = by_forces[:, :, plant.space.E.shape[1] :]
+            parts.append((by_inputs[:, rows], forces[:, rows], by_inputs[:, n_y:], forces[:, n_y : n_y + n]))
+        H, G, H_x, G_x = (np.stack(x) for x in zip(*parts, strict=True))
+        return H, G, H_x, G_x
+
+    def poles(self, law: StateLaw) -> Array:
+        """Return the largest modulus of the poles on each plant."""
+        return np.array([of.largest_pole(law) for of in self.sampled])
+
+    def peaks(self, law: StateLaw) -> tuple[Array, Array]:
+        """Return the peak of the sensitivity on each plant, of any axis: at its position signal, at its command."""
+        H, W = self.responses[0], law.response(self.frequency_hz)
+        position = self.sampled[0].kinds[0]
+        signals = np.linalg.inv(np.eye(H.shape[2]) - H @ W)[..., position, position]
+        commands = np.diagonal(np.linalg.inv(np.eye(H.shape[3]) - W @ H), axis1=2, axis2=3)
+        return np.max(np.abs(signals), axis=(1, 2)), np.max(np.abs(commands), axis=(1, 2))
+
+    def figures(self, law: StateLaw) -> dict[str, float]:
+        """Return the worst of each of `FIGURES`, the peak at the commands and the largest pole.
+
+        Settling is that of the slowest pole. The pole is alone where a plant is not held.
+        """
+        largest = float(np.max(self.poles(law)))
+        if largest >= 1.0:
+            return {"pole": largest}
+        H, G, H_x, G_x = self.responses
+        W = law.response(self.frequency_hz)
+        answer = W @ np.linalg.inv(np.eye(H.shape[2]) - H @ W)
+        soft = np.diagonal(G_x + H_x @ (answer @ G), axis1=2, axis2=3)
+        sd = np.zeros(H.shape[2])
+        for rows, x in zip(self.sampled[0].kinds, self.noise, strict=True):
+            sd[rows] = x
+        power = np.sum(np.abs(answer * sd) ** 2, axis=3)
+        noise = np.sqrt(mean_over(self.frequency_hz, np.moveaxis(power, 1, 0)))
+        position, command = self.peaks(law)
+        decay = -math.log(largest) * law.rate_hz
+        return {
+            "peak": float(np.max(position)), "compliance": float(np.max(np.abs(soft))), "noise": float(np.max(noise)),
+            "settling": _SETTLED / decay, "command": float(np.max(command)), "pole": largest,
+        }  # fmt: skip
+
+
+@dataclass(kw_only=True, eq=False)
+class _Tries:
+    """Laws by their knobs, each made and looked at once."""
+
+    make: Make
+    family: Family
+    tick: Callable[[], None]
+
+    def __post_init__(self) -> None:
+        self._known: dict[tuple[float, ...], tuple[StateLaw | None, Mapping[str, float]]] = {}
+
+    def at(self, knobs: Knobs) -> tuple[StateLaw | None, Mapping[str, float]]:
+        """Return the law and its figures; none where the knobs give no law."""
+        key = tuple(round(math.log(x), 6) for x in knobs)
+        if key not in self._known:
+            self.tick()
+            try:
+                law = self.make(knobs)
+                self._known[key] = law, self.family.figures(law)
+            except EstimationError:  # no law with these knobs
+                self._known[key] = None, {"pole": math.inf}
+        return self._known[key]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Score:
+    """How good figures are for goals: small is good; a law that passes a limit is worse than any other."""
+
+    goals: Goals
+    minimise: tuple[str, ...]
+    limits: dict[str, float]
+
+    @classmethod
+    def of(cls, goals: Goals) -> Score:
+        """Return the score of a design's goals; the peak at the commands stays in zone A."""
+        kept = {n: x * math.exp(-_SLACK) for n, x in goals.limits.items()}
+        return cls(goals=goals, minimise=goals.minimise, limits={**kept, "command": ZONES[0][0]})
+
+    def __call__(self, found: Mapping[str, float]) -> float:
+        """Return the score."""
+        if found["pole"] >= 1.0:
+            return _LOST + found["pole"]
+        excess = max((math.log(found[n] / x) for n, x in self.limits.items()), default=-math.inf)
+        goal = max(math.log(found[n] / self.goals.reference[n]) for n in self.minimise)
+        return _BEYOND + excess if excess > 0.0 else goal
+
+    def met(self, found: Mapping[str, float]) -> bool:
+        """Whether no limit is passed."""
+        return self(found) < _BEYOND
+
+
+def _search(tries: _Tries, score: Score, grid: Sequence[Knobs]) -> Knobs:
+    """Return the knobs of least score: the best of a grid, then by smaller and smaller steps.
+
+    The first two knobs change together too, as the border of a limit may run between them.
+    """
+
+    def at(knobs: Knobs) -> float:
+        return score(tries.at(knobs)[1])
+
+    best, step = min(grid, key=at), math.sqrt(_FIRST)
+    while step > _FINEST:
+        around = [tuple(x * step**d for x, d in zip(best, way, strict=True)) for way in _ways(len(best))]
+        nearest = min(around, key=at)
+        if at(nearest) < at(best):
+            best = nearest
+        else:
+            step = math.sqrt(step)
+    return best
+
+
+def _ways(n: int) -> list[tuple[int, ...]]:
+    """Return directions in which `n` knobs change."""
+    pairs = [(a, b, *[0] * (n - 2)) for a in (-1, 0, 1) for b in (-1, 0, 1) if a or b]
+    return [*pairs, *(tuple(side * (j == k) for j in range(n)) for k in range(2, n) for side in (-1, 1))]
+
+
+def design_by_knobs(
+    make: Make, grid: Sequence[Knobs], plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, name: str
+) -> Loop:
+    """Return the loop whose law does best on the worst plant; EstimationError where none meets the limits."""
+    noise, score = noise_of(rig.noise, {})[:2], Score.of(goals)
+    done, most = 0, 6 * len(grid)
+
+    def advance() -> None:
+        nonlocal done
+        done += 1
+        tick("tune", min(done / most, 0.99))
+
+    tries = _Tries(make=make, family=Family(plants=tuple(plants), noise=noise), tick=advance)
+    for _ in range(_ROUNDS):
+        best = _search(tries, score, grid)
+        law, found = tries.at(best)
+        if law is None or not score.met(found):
+            break
+        loop = Loop(law=law, delay=0.0 if rig.loop is None else rig.loop.delay)
+        over = worst_of([examine(p, loop, noise).figures for p in plants]).settling / goals.limits.get(
+            "settling", math.inf
+        )
+        if over <= 1.0:
+            return loop
+        score.limits["settling"] = found["settling"] * math.exp(-_SLACK) / over
+    raise EstimationError(_refusal(tries, score, grid, name))
+
+
+def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> str:
+    """Say which limit to move, and how far: the one that has to give way least, the others kept."""
+    ways, goals = [], score.goals
+    for limit in goals.limits:
+        alone = replace(score, minimise=(limit,), limits={n: x for n, x in score.limits.items() if n != limit})
+        found = tries.at(_search(tries, alone, grid))[1]
+        if alone.met(found) and found[limit] > score.limits[limit]:
+            ways.append((found[limit] / score.limits[limit], limit))
+    asked = ", ".join(said(n, x) for n, x in goals.limits.items())
+    if not ways:
+        return f"no {name} law meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
+    ratio, limit = min(ways)
+    least = ratio * goals.limits[limit]
+    return (
+        f"no {name} law meets the limits ({asked}) on all plants; with the others kept, {said(limit, least)} is the "
+        f"least. Give --limit {option(limit, least)}, or raise another"
+    )
+
+
+def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return an LQG law with integral action for the first of some plants, its knobs set by all of them.
+
+    The knobs: effort, strength of the disturbances, and the time of the integral.
+    """
+    limits, settling = rig.limits, goals.limits.get("settling", goals.reference["settling"])
+    if limits is None:
+        raise EstimationError("the rig gives no [limits]; LQG weighs by them. Give limits.position and limits.voltage")
+    noise = rig.noise or Noise()
+
+    def make(knobs: Knobs) -> StateLaw:
+        effort, disturbance, integral_s = knobs
+        return lqg(plants[0], Weights.of(limits, integral_s), noise, effort=effort, disturbance=disturbance).law
+
+    grid = [
+        (_FIRST**a, _FIRST**b, settling / _SETTLED) for a in range(-3, 2) for b in range(-2, 4)
+    ]  # fmt: skip
+    return design_by_knobs(make, grid, plants, rig, goals, tick, "LQG")
