@@ -191,7 +191,7 @@ def test_the_model_moves_as_the_simulator_does_from_rest(bench, designed):
     record = simulate_rig(silent, wave, rate_hz=designed.rate_hz, seed=0).record
     for name in ("position", "current", "voltage"):
         use = designed.signals[name]
-        reach = use.high - 4.0 * use.noise_sd
+        reach = use.high - use.reserve
         assert np.max(np.abs(record[name].values)) / reach == pytest.approx(use.from_rest, rel=1e-6)
         last = record[name].values[designed.period :]
         assert np.max(np.abs(last - designed.shown.waves[name])) < 0.02 * use.peak

@@ -73,6 +73,10 @@ def command(
             "as the record's angle or speed, or the rig, says",
         ),
     ] = None,
+    experiment: Annotated[
+        Path | None,
+        option("--experiment E.json", "What 'ambid design experiment' promised: compare with the standard deviations."),
+    ] = None,
     second: Annotated[Path | None, option("--validate RECORD2", "Validate the estimate on this second record.")] = None,
     from_s: opt.From = None,
     to_s: opt.To = None,
@@ -105,13 +109,14 @@ def command(
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
-    with Outputs(*records, *kept, rig, second, json=json, plot=plot, report=report) as outputs:
+    with Outputs(*records, *kept, rig, second, experiment, json=json, plot=plot, report=report) as outputs:
         opt.refuse_twice([*records, *kept])
         outputs.claim(export, "--export", EXPORT_ENDINGS)
         if nonlinear:
             if off_below is not None and not isfinite(off_below):
                 raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
             refuse_given({"--speed": speed}, "{} is for rotors with a linear model. Omit {}")
+            refuse_given({"--experiment": experiment}, "{} is for the linear model. Omit {}")
         else:
             refuse_given(
                 {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
@@ -121,7 +126,7 @@ def command(
             estimate: Estimate | NonlinearBearingEstimate | RotorEstimate = (
                 job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
                 if nonlinear
-                else job.identify(list(records), rig, speed_rpm=speed, tick=show, **how)
+                else job.identify(list(records), rig, speed_rpm=speed, experiment=experiment, tick=show, **how)
             )
             stop.torn()
             outputs.give(estimate, show)

@@ -16,13 +16,14 @@ from ambid.control.excited import ExcitedLoop, begin_at, from_rest
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import Limited, Lines, joint_design, spread_power
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check, Judged
+from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.signals.excitations import schroeder_phases
 
 SCHEMA = "ambid.experiment/1"
 _CANDIDATES = 3000  # lines from which those of the design are taken
 _HARD = 4  # drawn plants beside the nominal one for which amplitudes and phases are searched
 _SAME_RATE = 1e-6
+_WORSE = 1.5  # standard deviations over promised ones, from which a record is not the one that was designed
 _SILENT = 1e-9  # of the largest line
 
 
@@ -50,7 +51,7 @@ class SignalUse:
     from_rest: float  # while it sets in
     drawn: float  # the larger of both, of the worst drawn plant
     peak: float  # largest deviation, SI
-    noise_sd: float  # SI; four of them are kept free
+    reserve: float  # what is kept free of the limits for noise, four standard deviations, SI
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -187,6 +188,30 @@ class Experiment(Judged):
                 "the experiment has no table for a controller: its rig has no [daq]. Design it with a rig that has one"
             )
         return self.table.program
+
+
+def reached(experiment: Experiment, estimate: Estimate) -> Check:
+    """Compare the standard deviations of an estimate with what the experiment promised for a record of that length."""
+    seconds = float(str(estimate.record["samples"])) / float(str(estimate.record["rate_hz"]))
+    found, ratio = {p.name: p.sd for p in estimate.parameters if p.sd > 0.0}, dict[str, float]()
+    for name, x in experiment.expected.items():
+        if name in found:
+            curve = np.log(experiment.shown.by_length[name])
+            there = np.exp(np.interp(np.log(seconds), np.log(experiment.shown.seconds), curve))
+            ratio[name] = float(found[name] / (x.sd / x.relative_sd * there))
+    if not ratio:
+        raise EstimationError(
+            f"the experiment was designed for {', '.join(experiment.expected)}, none of which was estimated. Give the "
+            "experiment of this record"
+        )
+    said = ", ".join(f"{name} {x:.2f}" for name, x in ratio.items())
+    good = max(ratio.values()) < _WORSE
+    return Check(
+        passed=good, values=ratio,
+        detail=f"standard deviations over those that the experiment promised: {said}" if good else
+        f"standard deviations are larger than the experiment promised ({said} times): there is more noise than it was "
+        "designed for, or it was not played. Design the next one from this estimate",
+    )  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -109,7 +109,7 @@ def design_experiment(
     rig : Rig, str or Path, optional
         Of an estimate: with other limits, loop or controller than its own.
     seconds : float, optional
-        Length of the record in s; default: as the target needs, 1 to 60 s.
+        Length of the record in s; default 10.
     period : float, optional
         Of the excitation, s; default: a quarter of the record, at most 8192 samples; of a rig with ``[daq]`` what the
         controller's table of 1000 elements holds.
@@ -243,7 +243,7 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
     task = _task(bench, loops, noises, (low + spare, high - spare), wanted, prior_sd)
     say("design")
     found = design(task, tick=lambda: say("design"))
-    return _told(bench, task, found, (low, high, spare / _RESERVE), wanted, unstable)
+    return _told(bench, task, found, (low, high, spare), wanted, unstable)
 
 
 def _plant(known: Estimate | None, bench: Bench) -> tuple[Plant, dict[str, float]]:
@@ -383,7 +383,7 @@ def _told(
             relative_sd=float(relative[k]), flat_sd=float(of_flat[k] * information.sizes[k]),
             identifiable=bool(relative[k] < WEAK), seconds=needed,
         )  # fmt: skip
-    low, high, noise_sd = ends
+    low, high, spare = ends
     waves = task.limited(lines, [0]).waves(c)
     signals = {}
     for k, name in enumerate(loop.signals):
@@ -391,7 +391,7 @@ def _told(
         signals[name] = SignalUse(
             unit="V/s" if name.endswith(SLEW) else of.units[name], low=finite[0], high=finite[1],
             steady=float(used[0, 0, k]), from_rest=float(used[0, 1, k]), drawn=float(used[:, :, k].max()),
-            peak=float(np.max(np.abs(waves[:, k]))), noise_sd=float(noise_sd[k]),
+            peak=float(np.max(np.abs(waves[:, k]))), reserve=float(spare[k]),
         )  # fmt: skip
     return Experiment(
         model=of.name, criterion=task.criterion, rate_hz=task.rate_hz, period=task.period, periods=task.periods,

@@ -24,6 +24,7 @@ from ambid.rig import Rig
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
     from ambid.bearing.multistart import Signals
+    from ambid.control.experiment import Experiment
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
     from ambid.rotor.estimate import RotorEstimate
@@ -35,6 +36,7 @@ def identify(
     *,
     validate: Source | None = None,
     speed_rpm: float | Sequence[float] | None = None,
+    experiment: Experiment | str | Path | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -57,6 +59,9 @@ def identify(
         A second record of the same bench to validate the estimate on.
     speed_rpm : float or sequence of float, optional
         Speed of a rotor in each record, rpm; default: as its channel of angle or speed, or the rig, says.
+    experiment : Experiment, str or Path, optional
+        Of one axis: the designed excitation that was played, or its file; the check ``experiment`` compares the
+        standard deviations with those that it promised.
     from_s, to_s : float, optional
         Part of a record in which the rotor moves, in s; overrides the rig's.
     rate_hz : float, optional
@@ -91,6 +96,7 @@ def identify(
     A table takes the place of the record: ``ambid.identify(record.to_dataframe(), "bench.toml")``.
     """
     bench, sources = known_rig(rig), sources_of(record)
+    planned = None if experiment is None else _planned(experiment, bench)
     reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
     if bench.rotor is not None:
         from ambid.job.rotor import identify_rotor, validated
@@ -107,7 +113,26 @@ def identify(
             f"{len(sources)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
             "operating point to the next. Give --nonlinear for one model of all, or one record"
         )
-    return identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
+    estimate = identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
+    if planned is None:
+        return estimate
+    from ambid.control.experiment import reached
+
+    return replace(estimate, checks={**estimate.checks, "experiment": reached(planned, estimate)})
+
+
+def _planned(experiment: Experiment | str | Path, rig: Rig) -> Experiment:
+    """Return the experiment that is meant."""
+    from ambid.job.results import experiment_of
+
+    if rig.rotor is not None:
+        raise EstimationError("--experiment is of one axis; the rig has a rotor on many. Omit it")
+    found = experiment_of(experiment)
+    if found is None:
+        raise EstimationError(
+            f"--experiment {experiment} is no experiment. Give what 'ambid design experiment --json' wrote"
+        )
+    return found
 
 
 def identify_axis(

@@ -139,7 +139,7 @@ def experiment_of(excitation: object) -> Experiment | None:
     found = load(excitation)
     if not isinstance(found, Experiment):
         raise AmbidError(
-            f"--excitation {excitation} is no experiment. Give what 'ambid design experiment --json' wrote, or the "
+            f"{excitation} is no experiment. Give what 'ambid design experiment --json' wrote, or the "
             "name of an excitation"
         )
     return found

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ambid.control.experiment import Experiment
-from ambid.report.drawing import BOUND, CYCLE, MEASURED, Block, curve, head, log_axis, panel, stacked
+from ambid.report.drawing import BOUND, CYCLE, MEASURED, ORANGE, Block, curve, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed
 
 if TYPE_CHECKING:
@@ -42,6 +42,8 @@ def _wave(axes: Axes, found: Experiment, name: str) -> None:
     curve(axes, np.arange(wave.size) / found.rate_hz, wave / scale, MEASURED, None)
     for end in ends:
         axes.axhline(end / scale, color=BOUND, linestyle=":", label="limit")
+        inside = end - np.copysign(of.reserve, end)
+        axes.axhline(inside / scale, color=ORANGE, linestyle=":", linewidth=0.9, label="limit less noise")
     axes.set_ylabel(f"{name} [{unit}]")
     axes.set_xlabel("time [s]")
     head(axes, f"{name}: {100 * max(of.steady, of.from_rest):.0f} % of the limits, drawn plants {100 * of.drawn:.0f} %",

@@ -14,6 +14,7 @@ from ambid.report.text import (
     plain,
     timing_lines,
     warning_lines,
+    wrapped,
 )
 
 _NONE = "–"
@@ -24,8 +25,8 @@ def experiment_text(found: Experiment, *, width: int = WIDTH, paint: Paint = pla
     """Write a design, below its verdict."""
     return joined(
         [
-            _head(found, paint),
-            _expected(found, paint),
+            _head(found, width, paint),
+            _expected(found, width, paint),
             _signals(found, paint),
             check_lines(found.checks, width=width, paint=paint, above=True),
             warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
@@ -40,10 +41,9 @@ def title_of(found: Experiment) -> str:
     return f"experiment for {_CRITERIA.get(found.criterion, found.criterion)} of model {found.model}, {loop} loop"
 
 
-def _head(found: Experiment, paint: Paint) -> list[str]:
+def _head(found: Experiment, width: int, paint: Paint) -> list[str]:
     first, last = (sized(float(x), "Hz") for x in (found.frequency_hz[0], found.frequency_hz[-1]))
     lines = [
-        paint(title_of(found), "strong"),
         f"{found.frequency_hz.size} lines, {first} to {last}, period {found.period} samples at {found.rate_hz:g} Hz",
         f"record of {sized(found.seconds, 's')}, {found.periods} periods; limits kept for {found.drawn} drawn plants",
     ]
@@ -52,10 +52,10 @@ def _head(found: Experiment, paint: Paint) -> list[str]:
             f"table for the controller: {len(found.table.elements)} elements of {found.table.hold} ticks, "
             f"amplitude {sized(found.table.amplitude, 'V')}"
         )
-    return lines
+    return [paint(title_of(found), "strong"), *wrapped(lines, width)]
 
 
-def _expected(found: Experiment, paint: Paint) -> list[str]:
+def _expected(found: Experiment, width: int, paint: Paint) -> list[str]:
     aim = f"{100.0 * found.target:.3g} % after"
     rows: list[tuple[str, ...]] = [("", "designed for", "relative", "flat", aim)]
     for name, x in found.expected.items():
@@ -65,7 +65,7 @@ def _expected(found: Experiment, paint: Paint) -> list[str]:
     return [
         paint("what the record will show", "strong"),
         *columns(rows),
-        "flat: standard deviation with a flat multisine of the same band and use of the limits",
+        *wrapped(["flat: standard deviation with a flat multisine of the same band and use of the limits"], width),
     ]
 
 
