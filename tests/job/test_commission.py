@@ -94,8 +94,23 @@ def test_what_it_says_has_digits_and_units_for_people(finished):
     assert re.fullmatch(r"current -?[\d.]+ [mu]A, \d+\.\d+ mA rms", said["levitate"][1])
     assert re.fullmatch(r"voltage -?[\d.]+ [mu]?V, \d{3} mV rms", said["levitate"][2])
     m, k_x = said["identify"][:2]
-    assert re.fullmatch(r"m = (29\d|30\d)\.\d ± \d\.\d g \(95 % interval ± [\d.]+ %\)", m)
-    assert re.fullmatch(r"k_x = -6\.\d{3} ± 0\.0\d\d kN/m \(95 % interval ± [\d.]+ %\)", k_x)
+    interval = r" \(95 % interval ± ([\d.]+) %, expected ± ([\d.]+) %\)"
+    for text, value in ((m, r"m = (?:29\d|30\d)\.\d+ ± [\d.]+ g"), (k_x, r"k_x = -6\.\d+ ± 0\.0\d+ kN/m")):
+        told = re.fullmatch(value + interval, text)
+        assert told
+        assert 0.7 < float(told[1]) / float(told[2]) < 1.5  # a record of 4 s, designed on a trial of two
+
+
+def test_what_cannot_be_designed_is_found_by_trials(tmp_path, monkeypatch):
+    def nothing(*_args, **_options):
+        raise EstimationError("the rig has no limits")
+
+    monkeypatch.setattr(room, "design_experiment", nothing)
+    done = ran(tmp_path, SimulatedDevice(prototype()), plan=SHORT)
+    excite = next(s for s in done.steps if s.name == "excite")
+    assert excite.passed
+    assert "no experiment was designed: the rig has no limits" in excite.cautions[0]
+    assert "experiment.json" not in files(tmp_path)
 
 
 def test_what_a_controller_measured_in_itself_is_said_in_words():
@@ -130,7 +145,7 @@ def test_the_report_shows_what_each_step_saw(finished):
         assert f"✓ {k}. {name}" in text
     assert len(done.steps) == len(STEPS)
     seen = {s.name: len(s.pictures) for s in done.steps}
-    assert seen == dict.fromkeys(STEPS, 1) | {"self-test": 0, "record": 2, "validate": 0, "track": 0}
+    assert seen == dict.fromkeys(STEPS, 1) | {"self-test": 0, "excite": 2, "record": 2, "validate": 0, "track": 0}
     assert text.count("data:image/png") > sum(seen.values()) + 4  # those of the estimate and the track too
     assert text.index("verdict: <") < text.index("1. self-test")
     assert "sensitivity peak" in text
@@ -418,7 +433,7 @@ def test_another_bench_when_it_tracks_stops_it_there(tmp_path):
     done = ran(tmp_path, device, plan=replace(SHORT, amplitude_v=1.4))
     assert done.steps[-1].name == "track"
     assert done.steps[-1].reasons
-    assert files(tmp_path) == set(FILES)
+    assert files(tmp_path) == set(FILES) - {"experiment.json"}
 
 
 def followed(**changes):

@@ -27,8 +27,9 @@ from ambid.tracking.blocks import Frame
 
 _FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
 _TRIALS, _FIRST, _GROWTH = 8, 0.02, 4.0  # first: as a part of half the voltage; growth: largest step, down as up
-_ENOUGH, _TOO_MUCH = 0.75, 1.2  # of the part that is wished
-_AIM = 0.9  # of that part
+_ENOUGH = 0.75  # of the part that is wished
+TOO_MUCH, AIM = 1.2, 0.9
+"""Of the part of the room that is wished: what is refused, and what another size aims at."""
 USE = 0.3  # of the way to the trips that an excitation may use
 VOLTAGE = 0.8  # of the voltage is its part; all of it is then too much
 _NEAR = 0.85  # of the way to a trip: no room left
@@ -208,7 +209,7 @@ def find_amplitude(
                 amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons, trials=tuple(tried),
                 last=seen,
             )  # fmt: skip
-        worst, used = _used(seen, room, resting, use)
+        worst, used = room_used(seen, room, resting, use)
         tried.append((size, used))
         findings.append(f"{size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range")
         larger_or_smaller = _next_size(tried, use) if given is None else None
@@ -217,7 +218,7 @@ def find_amplitude(
         size = larger_or_smaller
     return Size(
         amplitude_v=size, used=used, findings=tuple(findings), trials=tuple(tried), last=seen,
-        reasons=_too_much(tried, worst, _TOO_MUCH * use if given is None else _NEAR),
+        reasons=_too_much(tried, worst, TOO_MUCH * use if given is None else _NEAR),
     )  # fmt: skip
 
 
@@ -242,10 +243,10 @@ def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callab
 def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
     """Return the size to try next; None where the last one is good, or another would not be better."""
     size, used = tried[-1]
-    good = _ENOUGH * use <= used <= _TOO_MUCH * use
+    good = _ENOUGH * use <= used <= TOO_MUCH * use
     if good or len(tried) == _TRIALS or (used > use and _at_the_floor(tried)):
         return None
-    wanted = size * (_GROWTH if used <= 0.0 else min(max(_AIM * use / used, 1.0 / _GROWTH), _GROWTH))
+    wanted = size * (_GROWTH if used <= 0.0 else min(max(AIM * use / used, 1.0 / _GROWTH), _GROWTH))
     # Where more is used than in proportion, the good size lies between two that were tried.
     below = max((s for s, part in tried if part <= use), default=0.0)
     above = min((s for s, part in tried if part > use), default=math.inf)
@@ -277,7 +278,7 @@ def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tupl
     return (f"{said} allowed: give a smaller one",)
 
 
-def _used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
+def room_used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
     """Return which quantity uses most of its room, and how much of it."""
     shares = {role: room.used(role, seen[role], resting[role]) for role in room.trips}
     low, high = room.voltage

@@ -131,9 +131,10 @@ def command(
     name, command, passed = last[-1].name, "", done.passed
     if passed:
         volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")
-        given = {"--port": port, "--rig": rig, "--bench": bench, "--excitation": "multisine", "--band": band,
-                 "--amplitude": f"{volts:.6g}", "--track": folder / "estimate.json", "-o": folder / "next.h5",
-                 }  # fmt: skip
+        made = folder / "experiment.json"
+        flat = {"--excitation": "multisine", "--band": band, "--amplitude": f"{volts:.6g}"}
+        given = {"--port": port, "--rig": rig, "--bench": bench, **({"--excitation": made} if made.exists() else flat),
+                 "--track": folder / "estimate.json", "-o": folder / "next.h5"}  # fmt: skip
         command = _line("acquire", given) + (" --force" if force else "")
     elif name == "identify":
         command = _line("identify", {"": folder / "record.h5", "--rig": rig})

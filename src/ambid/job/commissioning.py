@@ -13,35 +13,46 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
-from ambid.acquisition.amplitude import Kept, Room, make_look
-from ambid.acquisition.device import Device, DeviceInfo
+from ambid.acquisition.amplitude import VOLTAGE, Kept, Look, Room, Size, make_look
+from ambid.acquisition.device import Device, DeviceInfo, Program
 from ambid.acquisition.recording import Listeners, acquire
 from ambid.acquisition.review import loop_on, refuse_unstable
 from ambid.acquisition.session import Course
 from ambid.acquisition.view import BenchView
-from ambid.errors import AmbidError
+from ambid.control.experiment import Experiment
+from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Estimate, json_text, plain_json
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Plan, StepName
+from ambid.job.experiment_design import design_experiment
 from ambid.job.identification import identify_axis
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
+from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.report.commission_figures import trace_picture
 from ambid.report.commission_page import Step
 from ambid.rig import Rig, rig_text
+from ambid.rig.load import SELECTED
 from ambid.simulation.margins import LoopMargins
 from ambid.tracking.lines_file import TrackWriter
 
-FILES = ("rig.toml", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl", "commission.json")
+FILES = (
+    "rig.toml", "experiment.json", "record.h5", "second.h5", "estimate.json", "report.html", "track.jsonl",
+    "commission.json",
+)  # fmt: skip
 """What a commissioning leaves in its folder."""
 
 SCHEMA = "ambid.commission/1"
 _LIMIT = 1.5  # acceptable model error of tracking
 _SHOWN = 4000  # samples of a record that its picture shows
+_FIRST = 1 / 3  # of the excitation's part of the room, for the small one that the experiment is designed on
+_LINES = 60  # of the experiment
+_SECOND = 0.8  # amplitude of the second record's excitation, of what its part of the room allows
+_UNITS = {"voltage": "V", "current": "A", "position": "m"}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
@@ -205,6 +216,8 @@ class _Guide:
         self.estimate: Estimate | None = None
         self.track: Track | None = None
         self.done: list[Step] = []
+        self._experiment: Experiment | None = None  # where one was designed
+        self._program: Program | None = None  # that plays it
         self._loops: dict[str, LoopMargins] = {}  # as it was predicted
 
     def found(self) -> Commissioned:
@@ -259,19 +272,62 @@ class _Guide:
             raise Declined("pulses and levitation were not agreed to; the output stayed off. Clear the bench first")
         yield "polarity", lambda: judge.polarity(look, room, self._rig, device)
         yield "levitate", lambda: keep(judge.levitate(look, room, plan, rate_hz))
-        yield "excite", lambda: keep(judge.excite(look, room, plan, rate_hz, found["levitate"]))
+        yield "excite", lambda: keep(self._excite(look, found["levitate"]))
         yield "record", lambda: self._record(amplitude())
         yield "identify", self._identify
         yield "validate", self._validate
         yield "track", lambda: self._track(amplitude())
 
+    def _excite(self, look: Look, hover: Step) -> Step:
+        """Design the excitation on what a small one shows; where that fails, find a flat one by trials."""
+        plan, room, rate_hz = self.plan, self._room, self._device.info.rate_hz
+        if plan.amplitude_v is not None:
+            return judge.excite(look, room, plan, rate_hz, hover)[0]
+        small, size = judge.excite(look, room, replace(plan, use=_FIRST * plan.use), rate_hz, hover)
+        try:
+            if not small.passed:
+                raise EstimationError("; ".join(small.reasons))
+            made = self._design(size)
+        except _Interrupted:
+            raise
+        except AmbidError as failure:
+            step, _ = judge.excite(look, room, plan, rate_hz, hover)
+            return replace(step, cautions=(f"a flat multisine is played, as no experiment was designed: {failure}",))
+        step, self._program = judge.designed(look, room, plan, rate_hz, hover, made)
+        self._experiment = made
+        made.save(self._place / "experiment.json")
+        low, high = room.voltage
+        flat = min(size.amplitude_v * plan.use / size.used, VOLTAGE * (high - low) / 2.0)
+        return replace(
+            step, findings=(*small.findings, *step.findings), pictures=(*small.pictures, *step.pictures),
+            numbers={"amplitude_v": flat, **step.numbers},
+        )  # fmt: skip
+
+    def _design(self, size: Size) -> Experiment:
+        """Design the experiment on the last trial; EstimationError where that shows too little."""
+        channels = [Channel(name=n, unit=unit, values=size.last[n]) for n, unit in _UNITS.items() if n in size.last]
+        seen = Record(rate_hz=self._device.info.rate_hz, channels=tuple(channels), history=(SELECTED,))
+        first = identify_axis(seen, self._rig, tick=self._tick)
+        weak = [p.name for p in first.parameters if not p.identifiable]
+        if first.status != "converged" or weak:
+            raise EstimationError(
+                f"the trial of {size.amplitude_v:.3g} V does not show {', '.join(weak) or 'the plant'}"
+            )
+        plan = self.plan
+        return design_experiment(
+            first, seconds=plan.record_s, band=plan.band_hz, use=plan.use, lines=_LINES, tick=self._tick
+        )  # fmt: skip
+
     def _record(self, amplitude_v: float) -> Step:
         """Take the record, and a second one with another excitation."""
         plan = self.plan
-        first = self._acquire("record", "record.h5", amplitude_v, plan.record_s, 0)
+        first = self._acquire("record", "record.h5", self._course(amplitude_v, plan.record_s, 0), plan.record_s)
         if not first.passed:
             return first
-        second = self._acquire("second record", "second.h5", 0.8 * amplitude_v, plan.second_s, 1)
+        course = plan.trial(self._device.info.rate_hz, plan.second_s, 1).course(
+            _SECOND * amplitude_v, self._device.info.rate_hz
+        )
+        second = self._acquire("second record", "second.h5", course, plan.second_s)
         return replace(
             second,
             findings=(*first.findings, *second.findings),
@@ -280,19 +336,21 @@ class _Guide:
             pictures=(*first.pictures, *second.pictures),
         )
 
-    def _acquire(self, name: str, file: str, amplitude_v: float, seconds: float, seed: int) -> Step:
+    def _acquire(self, name: str, file: str, course: Course, seconds: float) -> Step:
         plant, info, path = model(self._rig.model), self._device.info, self._place / file
         kept = Kept(BenchView(info, self._rig, (*plant.inputs, *plant.outputs)), most=_SHOWN)
         done = acquire(
-            self._device, self._rig, path, self._course(amplitude_v, seconds, seed), taps=[kept],
-            stopped=self._stopped, **self._listeners,
+            self._device, self._rig, path, course, taps=[kept], stopped=self._stopped, **self._listeners,
         )  # fmt: skip
         caption = f"The first {min(seconds, _SHOWN / info.rate_hz):.3g} s; dashed: the controller's trips."
         picture = trace_picture(f"The {name}", caption, kept.roles(), info.rate_hz, self._room.trips)
         return judge.record(name, done, (picture,) if kept.values else ())
 
     def _course(self, amplitude_v: float, seconds: float, seed: int) -> Course:
+        """Return a course that plays the designed excitation, else a multisine."""
         plan, rate_hz = self.plan, self._device.info.rate_hz
+        if self._program is not None:
+            return Course(mode="levitate", seconds=seconds, settle_s=plan.settle_s, program=self._program)
         return plan.trial(rate_hz, seconds, seed).course(amplitude_v, rate_hz)
 
     def _validate(self) -> Step:
@@ -312,7 +370,7 @@ class _Guide:
         write_text(self._place / "estimate.json", self.estimate.dumps())
         found = loop_on(self._rig, self._device.info, self.estimate.values)[0]
         loops = {"identified": found} if found is not None else {}
-        return judge.identification(self.estimate, self.plan, {**loops, **self._loops})
+        return judge.identification(self.estimate, self.plan, {**loops, **self._loops}, self._experiment)
 
     def _track(self, amplitude_v: float) -> Step:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""

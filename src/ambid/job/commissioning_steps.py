@@ -7,18 +7,31 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ambid.acquisition.amplitude import USE, Look, Room, Trial, find_amplitude, moving_band, why_incomplete
-from ambid.acquisition.device import Device
+from ambid.acquisition.amplitude import (
+    AIM,
+    TOO_MUCH,
+    USE,
+    Look,
+    Room,
+    Size,
+    Trial,
+    find_amplitude,
+    moving_band,
+    room_used,
+    why_incomplete,
+)
+from ambid.acquisition.device import Device, Program
 from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
 from ambid.acquisition.recording import Acquired
 from ambid.acquisition.session import Course
 from ambid.arrays import Array
+from ambid.control.experiment import Experiment
 from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
 from ambid.report.commission_figures import (
@@ -265,19 +278,57 @@ def levitate(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
     return Step(name="levitate", findings=findings, reasons=tuple(reasons), numbers=_numbers(shown), pictures=pictures)
 
 
-def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> Step:
+def resting_at(room: Room, hover: Step) -> dict[str, float]:
+    """Return where position and current rest, by the step `levitate`."""
+    return {role: hover.numbers[f"{role}_mean"] for role in room.trips}
+
+
+def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> tuple[Step, Size]:
     """Find the largest excitation that keeps to its part of the room.
 
     `look`: see `make_look`; `room`: limits; `plan`: band, part of the room, perhaps the amplitude
     itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
     `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
     """
-    resting = {role: hover.numbers[f"{role}_mean"] for role in room.trips}
+    resting = resting_at(room, hover)
     trial = plan.trial(rate_hz, plan.longest_trial_s(rate_hz))
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=plan.use, given=plan.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
     picture = trials_picture(found.trials, plan.use, found.last, rate_hz, room.trips)
-    return Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=(picture,))
+    step = Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=(picture,))
+    return step, found
+
+
+def designed(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step, made: Experiment) -> tuple[Step, Program]:
+    """Play a designed excitation as long as a trial, once again with less where it moves more than it should.
+
+    `made`: on what a small excitation showed. Returns the excitation as it is to be played; not passed where the
+    controller tripped, or both used too much.
+    """
+    program, resting = made.program, resting_at(room, hover)
+    findings: list[str] = []
+    for _ in range(2):
+        course = Course(
+            mode="levitate", seconds=plan.longest_trial_s(rate_hz), settle_s=plan.settle_s, program=program
+        )  # fmt: skip
+        report, seen = look(course)
+        reasons = why_incomplete(report, f"the designed excitation of {program.amplitude:.3g} V")
+        if reasons:
+            return Step(name="excite", findings=tuple(findings), reasons=reasons), program
+        worst, used = room_used(seen, room, resting, plan.use)
+        findings.append(
+            f"the designed excitation of {program.amplitude:.3g} V moves {worst} through {100.0 * used:.0f} % of its "
+            f"available range, of {100.0 * plan.use:.0f} %"
+        )
+        if used <= TOO_MUCH * plan.use:
+            break
+        program = replace(program, amplitude=program.amplitude * AIM * plan.use / used)
+    else:
+        reasons = (f"{findings[-1]}, although it was reduced: the model of the first record does not hold",)
+    caption = "As long as a trial; dashed: the controller's trips."
+    picture = trace_picture("The designed excitation", caption, seen, rate_hz, room.trips)
+    numbers = {"designed_v": program.amplitude, "used": used}
+    return Step(name="excite", findings=tuple(findings), reasons=reasons, numbers=numbers, pictures=(picture,)), program
 
 
 def _measured(numbers: Mapping[str, float]) -> str:
@@ -333,12 +384,15 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
     )  # fmt: skip
 
 
-def identification(estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargins]) -> Step:
+def identification(
+    estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargins], experiment: Experiment | None = None
+) -> Step:
     """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
 
     `estimate`: of the record; `plan`: how wide an interval may be; `loops`: margins of the controller on the plant
-    that was identified, and that was expected, by name, the first one first. Returns tests of residuals that
-    fail are cautions, because the standard deviations allow for them; all else stops.
+    that was identified, and that was expected, by name, the first one first; `experiment`: that was played, with what
+    it promised. Returns tests of residuals that fail are cautions, because the standard deviations allow for them; all
+    else stops.
     """
     findings: list[str] = []
     reasons: list[str] = []
@@ -351,7 +405,9 @@ def identification(estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargi
             continue
         half = (p.ci95[1] - p.ci95[0]) / 2.0
         wide = half / abs(p.value) if p.value else math.inf
-        findings.append(f"{p.name} = {quantity(p.value, p.sd, p.unit).text} (95 % interval ± {100 * wide:.2g} %)")
+        promised = None if experiment is None else experiment.expected.get(p.name)
+        told = "" if promised is None else f", expected ± {196.0 * promised.relative_sd:.2g} %"
+        findings.append(f"{p.name} = {quantity(p.value, p.sd, p.unit).text} (95 % interval ± {100 * wide:.2g} %{told})")
         numbers |= {p.name: p.value, f"{p.name}_sd": p.sd}
         if not p.identifiable:
             reasons.append(f"{p.name} is not identifiable from this record: excite more, or fix what is known")
