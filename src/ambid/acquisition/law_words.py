@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.acquisition.law_kernel import D0, D1, HEAD, OF_A_STATE, SHARE_BITS, SUM_BITS, Y_BITS
+from ambid.acquisition.scales import PWM_TOP
 from ambid.arrays import Array, Complex
 from ambid.errors import RigError
-from ambid.physics.law import StateLaw
+from ambid.physics.law import StateLaw, l1_norms
 
 LAW_STATES = 6
 """States that the controller has room for."""
@@ -30,7 +31,7 @@ LARGEST_STATE = 32767
 _WORD = 2**15 - 1
 _IN = 2.0**Y_BITS  # what multiplies of a count of an input, and of one that the limits took
 _LIMITED = 8.0
-_INPUT = 256.0  # counts of both inputs for which a state must have room, whatever their course
+_INPUT = 512.0  # counts of both inputs for which a state must have room, whatever their course
 _CARRIED = 4096.0  # counts of pulse width that an integrator must have room for
 _INTEGRATES = 1e-9  # of its pole's distance from 1
 _WORST_CONDITION = 1e8  # of the way to blocks
@@ -100,7 +101,9 @@ def _fault(words: tuple[int, ...]) -> str | None:
 def law_words(law: StateLaw) -> LawWords:
     """Bring a law of one axis, from counts (position, current) to counts of pulse width, to the controller's words.
 
-    A state has room for any course of both inputs within 256 counts; an integrator for 4096 counts of pulse width.
+    Where G tracks the states back, so that they are stable with the command given, they have room for any course of
+    inputs within 512 counts and any pulse width. Else for such inputs alone; an integrator for 4096 counts of pulse
+    width.
     """
     if law.D.shape != (1, 2):
         raise RigError(
@@ -111,8 +114,12 @@ def law_words(law: StateLaw) -> LawWords:
         raise RigError(
             f"loop.A has {law.order} states; the controller has room for 1 to {LAW_STATES}. Reduce the law's order"
         )
-    if np.abs(np.linalg.eigvals(law.A)).max() > 1.0 + _INTEGRATES:
-        raise RigError("loop.A has a pole outside the unit circle; the states of such a law grow. Design another")
+    tracked = np.abs(np.linalg.eigvals(law.A - law.windup @ law.C)).max() < 1.0
+    if not tracked and np.abs(np.linalg.eigvals(law.A)).max() > 1.0 + _INTEGRATES:
+        raise RigError(
+            "loop.A has a pole outside the unit circle, and loop.G does not track its states back: they grow where the "
+            "command is limited. Give G, so that A - G C is stable, or design another"
+        )
     return rounded(_with_room(_in_blocks(law)))
 
 
@@ -200,18 +207,15 @@ def _scaled(law: StateLaw, by: Array) -> StateLaw:
 
 
 def _peaks(law: StateLaw) -> Array:
-    """Return the largest value of each state for inputs within their counts: sums of sizes of its impulse response."""
-    n = law.order
-    integrates = (np.eye(n) == law.A).all(axis=1)
-    power, total = law.B.copy(), np.zeros(n)
-    for _ in range(_samples(law.A[np.ix_(~integrates, ~integrates)])):
-        total += np.abs(power).sum(axis=1)
-        power = law.A @ power
-    peaks = np.where(integrates, _CARRIED / np.maximum(np.abs(law.C[0]), 1e-300), _INPUT * total)
+    """Return the largest value of each state: with the command v given, z+ = (A - G C) z + (B - G D) y + G v.
+
+    Where that is not stable, that for inputs alone, and of an integrator what pulse width asks of it.
+    """
+    G = law.windup
+    peaks = l1_norms(law.A - G @ law.C, np.hstack([law.B - G @ law.D, G])) @ [_INPUT, _INPUT, PWM_TOP]
+    if not np.all(np.isfinite(peaks)):
+        integrates = (np.eye(law.order) == law.A).all(axis=1)
+        kept = np.flatnonzero(~integrates)
+        peaks = _CARRIED / np.maximum(np.abs(law.C[0]), 1e-300)
+        peaks[kept] = _INPUT * l1_norms(law.A[np.ix_(kept, kept)], law.B[kept]).sum(axis=1)
     return np.where((peaks > 0.0) & np.isfinite(peaks), peaks, 1.0)
-
-
-def _samples(a: Array) -> int:
-    """Return after how many samples an impulse response has died away, at most a quarter of a million."""
-    slowest = float(np.abs(np.linalg.eigvals(a)).max(initial=0.0))
-    return int(20.0 / max(1.0 - slowest, 8e-5)) + 2 * int(a.shape[0])
