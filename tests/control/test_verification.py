@@ -8,6 +8,7 @@ import pytest
 from ambid.control.benches import workbench
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
+from ambid.control.drawn import Spread, draw_plants
 from ambid.control.verification import Trials, checks_of_verifications, verify
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
@@ -93,12 +94,12 @@ def test_the_presets_lift_off_from_both_stops(name):
 def test_what_fails_is_named_with_its_plant():
     plant, rig, loop = given("rmit")  # its stops are nearer to the pole faces than its current lifts it from
     checks = checks_of_verifications([verify(plant, rig, loop, name="draw 17")])
-    assert [name for name, check in checks.items() if not check.passed] == ["lift-off"]
-    assert "lift-off from the lower stop on draw 17" in checks["lift-off"].detail
+    assert [name for name, check in checks.items() if not check.passed] == ["lift_off"]
+    assert "lift-off from the lower stop on draw 17" in checks["lift_off"].detail
     plant, rig, loop = given("unstable-bearing")
     found = verify(plant, rig, replace(loop, kp=0.5 * loop.kp), name="draw 3")
     assert not found.passed
-    assert "on draw 3" in checks_of_verifications([found])["force step"].detail
+    assert "on draw 3" in checks_of_verifications([found])["force_step"].detail
 
 
 def test_limits_act_and_are_counted():
@@ -141,3 +142,14 @@ def _translation(of):
     whole = np.eye(n_x) + inside @ space.B @ (late * K) @ space.C
     x = np.linalg.solve(whole, inside @ push)
     return (magnets[0] @ x[:, : magnets.shape[1], 0].T).T
+
+
+def test_fast_eddy_currents_are_a_delay_and_cost_no_time():
+    plant, rig, loop = given("unstable-bearing")
+    eddies = next(d.plant for d in draw_plants(plant, rig, 20, seed=0, spread=Spread(warm_k=(0, 0))).plants[1:])
+    quick, slow = (replace(eddies, theta={**eddies.theta, "a": x * plant.rate_hz}) for x in (2.0, 1.999))
+    cases = [verify(x, rig, loop).of_kind("impact")[0] for x in (quick, slow)]
+    assert cases[0].peak == pytest.approx(cases[1].peak, rel=5e-3)
+    bench = workbench(replace(eddies, theta={**eddies.theta, "a": 1e12}), rig, loop)
+    assert bench.loop.delay == pytest.approx(eddies.delays[0], abs=1e-6)
+    assert bench.body.eddy_pole == np.inf

@@ -19,7 +19,7 @@ from ambid.control.closed import Plant
 from ambid.control.drawn import GAP_OF_TRAVEL
 from ambid.errors import ModelError, RigError
 from ambid.physics.law_magnet import LawMagnet
-from ambid.physics.linear_model import LinearModel, Parameter
+from ambid.physics.linear_model import LinearModel, OneAxis, Parameter
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.magnet import CoEnergy
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
@@ -101,10 +101,21 @@ def workbench(plant: Plant, rig: Rig, loop: Loop, *, nonlinear: bool = True) -> 
 
     `rig`: its limits, noise, point of rest and magnet are used. ModelError for a plant without a position.
     """
+    plant = _without_fast_eddies(plant)
     loop = replace(loop, delay=float(plant.delays.max(initial=0.0)))
     if not plant.sensors:
         raise ModelError(f"model {plant.model.name!r} has no position, so that nothing levitates. Choose another model")
     return (_Rotor if isinstance(plant.model, RotorModel) else _OneAxis).of(plant, rig, loop, nonlinear)
+
+
+def _without_fast_eddies(plant: Plant) -> Plant:
+    """Return the plant with a delay in place of eddy currents that are gone within half a sample."""
+    pole, of = plant.theta.get("a", 0.0), plant.model
+    if pole < _FAST * plant.rate_hz:
+        return plant
+    slow = replace(of, extras=tuple(x for x in of.extras if x != "a")) if isinstance(of, RotorModel) else OneAxis()
+    theta = {name: x for name, x in plant.theta.items() if name != "a"}
+    return replace(plant, model=slow, theta=theta, delays=plant.delays + plant.rate_hz / pole)
 
 
 def _gap(rig: Rig, farthest: float) -> tuple[float, str]:
@@ -116,6 +127,7 @@ def _gap(rig: Rig, farthest: float) -> tuple[float, str]:
     return gap, f"a gap of {GAP_OF_TRAVEL:g} times the travel inside limits.position, {1e6 * gap:.4g} µm"
 
 
+_FAST = 2.0  # eddy pole over the rate from which it is taken as a delay: small steps cost time
 _INTEGRAL = 1e-6  # distance of an integrator's pole from 1
 _LINEAR = "the magnet is simulated as linear, which says too little of large motions: "
 _BEYOND = "; what lies beyond the neighbourhood of rest is assumed"

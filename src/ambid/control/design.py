@@ -30,6 +30,7 @@ from ambid.control.margins import (
     margins_by_axis,
     sensitivity_by_axis,
 )
+from ambid.control.verification import Verification
 from ambid.errors import EstimationError, ModelError, nearest
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.progress import Tick, silent
@@ -321,6 +322,8 @@ class Design(Judged):
     checks : Mapping[str, Check]
     curves : Mapping[str, LoopCurves]
         ``before`` and ``after``.
+    trials : Mapping[str, tuple of Verification]
+        ``before`` and ``after``: nonlinear simulation on the estimate, then on the worst plants.
     warnings : tuple of str
     timing_s : Mapping[str, float]
     rig : Mapping[str, object]
@@ -339,6 +342,7 @@ class Design(Judged):
     plants: Mapping[str, object]
     checks: Mapping[str, Check]
     curves: Mapping[str, LoopCurves]
+    trials: Mapping[str, tuple[Verification, ...]] = field(default_factory=lambda: MappingProxyType({}))
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
@@ -409,6 +413,18 @@ def loop_entry(loop: Loop) -> dict[str, object]:
     cutoff = loop.derivative_cutoff_hz if math.isfinite(loop.derivative_cutoff_hz) else None
     gains = {name: getattr(loop, name) for name in ("kp", "ki", "kd", "kc")}
     return {"kind": "pid", **gains, "derivative_cutoff_hz": cutoff, "delay": loop.delay}
+
+
+def hardest(plants: Sequence[Drawn], seen: Sequence[Examined]) -> dict[str, Plant]:
+    """Return the estimate, and the plant with the highest peak; of one axis also the softest and the slowest one."""
+    figures, of = [x.figures for x in seen], ("peak", "compliance", "settling")
+    worst = {
+        int(np.argmax([getattr(f, name) for f in figures])) for name in of[: 1 if len(plants[0].plant.axes) > 1 else 3]
+    }
+    return {
+        "the estimate": plants[0].plant,
+        **{f"draw {plants[k].number}": plants[k].plant for k in sorted(worst - {0})},
+    }
 
 
 def worst_plant(plants: Sequence[Drawn], seen: Sequence[Examined]) -> WorstPlant:

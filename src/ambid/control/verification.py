@@ -7,8 +7,8 @@ two loops can be compared number by number. Orbits are judged by ISO 14839-2, wh
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -20,6 +20,7 @@ from ambid.control.benches import Answer, Workbench, integrates, slowest_pole, w
 from ambid.control.closed import Plant
 from ambid.errors import ModelError
 from ambid.estimation.estimate import Check
+from ambid.estimation.progress import Tick, silent
 from ambid.physics.loop import Loop
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig.rig import Rig
@@ -50,8 +51,10 @@ _RPM = 30.0 / math.pi
 class Trials:
     """How hard a loop is tried; what is None follows from the plant and the rig."""
 
-    force: float | None = None  # of the step, N; default a tenth of what the limits let the axis hold
-    impulse: float | None = None  # of the impact, N s; default all that the axis can hold, for half a millisecond
+    # N, of the step, of all axes or of each; default a tenth of what the limits let the axis hold
+    force: float | tuple[float, ...] | None = None
+    # N s, of the impact; default all that the axis can hold, for half a millisecond
+    impulse: float | tuple[float, ...] | None = None
     # kg m; default that of the rig, else balance quality G 2.5 (ISO 21940-11) at the highest speed
     unbalance: float | None = None
     speed: float | None = None  # highest, rad/s; default the rotor's own, else 15 000 rpm
@@ -95,7 +98,7 @@ class Verification:
     """What a loop did on one plant."""
 
     plant: str  # which one
-    clearance: float  # way from rest to the nearer stop, m; infinite where the rig gives no stop
+    clearance: float | None  # way from rest to the nearer stop, m; None where the rig gives no stop
     cases: tuple[Case, ...]
     assumed: tuple[str, ...] = ()  # what the simulation takes for granted
 
@@ -122,8 +125,30 @@ def verify(
     cases = [*trying.lift_off(), *trying.force_steps(), *trying.impacts(), *trying.unbalance()]
     cases += [*trying.noise(), *trying.limit_cycle]
     return Verification(
-        plant=name, clearance=trying.clearance, cases=tuple(cases), assumed=(*bench.assumed, trying.assumed)
+        plant=name,
+        clearance=trying.clearance if math.isfinite(trying.clearance) else None,
+        cases=tuple(cases),
+        assumed=(*bench.assumed, trying.assumed),
     )
+
+
+def verify_all(
+    plants: Mapping[str, Plant], rig: Rig, loop: Loop, *, trials: Trials | None = None, nonlinear: bool = True,
+    seed: int = 0, tick: Tick = silent,
+) -> tuple[Verification, ...]:  # fmt: skip
+    """Try a loop on plants by name, the estimate first: all are pushed and turned as the estimate is."""
+    todo, found = trials or Trials(), list[Verification]()
+    for k, (name, plant) in enumerate(plants.items()):
+        tick("nonlinear simulation", k / len(plants))
+        if not k:
+            first = _Trying(bench=workbench(plant, rig, loop, nonlinear=nonlinear), trials=todo, seed=seed)
+            todo = replace(
+                todo, force=tuple(first.sizes(todo.force, _STEP)),
+                impulse=tuple(first.sizes(todo.impulse, _IMPACT_S)), speed=first.speed,
+                unbalance=first.moment if "m" in plant.theta else None,
+            )  # fmt: skip
+        found.append(verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed))
+    return tuple(found)
 
 
 def checks_of_verifications(found: Sequence[Verification]) -> dict[str, Check]:
@@ -135,7 +160,7 @@ def checks_of_verifications(found: Sequence[Verification]) -> dict[str, Check]:
         if not cases:
             continue
         v, worst = max(cases, key=lambda x: _share(x[1], x[0]))
-        checks[kind] = Check(
+        checks[kind.replace(" ", "_").replace("-", "_")] = Check(
             passed=not failed, values={"cases": float(len(cases)), "failed": float(len(failed))},
             detail="; ".join(failed[:3]) + (f"; and {len(failed) - 3} more" if len(failed) > 3 else "") if failed else
             f"{worst.name} on {v.plant}: {worst.detail}",
@@ -144,7 +169,7 @@ def checks_of_verifications(found: Sequence[Verification]) -> dict[str, Check]:
 
 
 def _share(case: Case, of: Verification) -> float:
-    return math.inf if case.peak is None else case.peak / of.clearance if math.isfinite(of.clearance) else case.peak
+    return math.inf if case.peak is None else case.peak / (of.clearance or 1.0)
 
 
 def _length(x: float) -> str:
@@ -195,8 +220,12 @@ class _Trying:
 
     @property
     def moment(self) -> float:
-        own = self.bench.moment or self.bench.plant.theta["m"] * GRADE / self.speed
-        return own if self.trials.unbalance is None else self.trials.unbalance
+        return self.own_moment if self.trials.unbalance is None else self.trials.unbalance
+
+    @property
+    def own_moment(self) -> float:
+        """Unbalance unless told otherwise, kg m."""
+        return self.bench.moment or self.bench.plant.theta["m"] * GRADE / self.speed
 
     @property
     def assumed(self) -> str:
@@ -204,7 +233,7 @@ class _Trying:
         if "m" not in self.bench.plant.theta:
             return "the model has no mass: no unbalance is tried"
         whose = "as the rig says" if self.bench.moment else f"G {1e3 * GRADE:g} of ISO 21940-11 there"
-        if self.trials.unbalance is not None:
+        if self.moment != self.own_moment:
             whose = "as asked for"
         planes = " in the planes of the bearings" if self.many else ""
         return f"an unbalance of {1e6 * self.moment:.3g} g mm{planes} at up to {self.speed * _RPM:.0f} rpm, {whose}"
@@ -246,7 +275,7 @@ class _Trying:
     def traced(self, answer: Answer, axis: int) -> Trace:
         """Return the trace of an axis over time."""
         n = answer.position.shape[0]
-        kept = np.unique(np.linspace(0, n - 1, min(_POINTS, n)).round().astype(int))
+        kept = np.unique(((n - 1) * np.linspace(0.0, 1.0, _POINTS) ** 2).round().astype(int))  # closer at first
         kept = np.union1d(kept, np.argmax(np.abs(answer.position[:, axis])))
         coil = min(axis, answer.current.shape[1] - 1)
         return Trace(
@@ -316,7 +345,7 @@ class _Trying:
         """Push each axis with a force that stays."""
         return [
             self._pushed("force step", j, size, np.ones(self.samples), "N")
-            for j, size in enumerate(self._sizes(self.trials.force, _STEP))
+            for j, size in enumerate(self.sizes(self.trials.force, _STEP))
         ]
 
     def impacts(self) -> list[Case]:
@@ -325,11 +354,11 @@ class _Trying:
         shape[0] = self.rate_hz
         return [
             self._pushed("impact", j, size, shape, "N s")
-            for j, size in enumerate(self._sizes(self.trials.impulse, _IMPACT_S))
+            for j, size in enumerate(self.sizes(self.trials.impulse, _IMPACT_S))
         ]
 
-    def _sizes(self, given: float | None, share: float) -> list[float]:
-        room = share * self.bench.room if given is None else np.full(len(self.axes), given)
+    def sizes(self, given: float | tuple[float, ...] | None, share: float) -> list[float]:
+        room = share * self.bench.room if given is None else np.broadcast_to(given, len(self.axes))
         return [float(x) for x in room]
 
     def _pushed(self, kind: str, j: int, size: float, shape: Array, unit: str) -> Case:
@@ -444,6 +473,7 @@ class _Trying:
 
     def noise(self) -> list[Case]:
         """Leave the loop alone with its noise."""
+        of = self.bench.plant.model
         n = min(max(round(0.5 * self.rate_hz), 2000), _LONGEST[self.many])
         try:
             answer = self.bench.respond(n, seed=self.seed)
@@ -455,7 +485,7 @@ class _Trying:
         axis = int(np.argmax(np.std(answer.position, axis=0)))
         return [
             self.case("noise", "noise", answer, said, trace=self.traced(answer, axis), steady=rms[0],
-                      rms=rms, passed=not contact)
+                      unit=of.units[of.inputs[0]], rms=rms, passed=not contact)
         ]  # fmt: skip
 
     @cached_property

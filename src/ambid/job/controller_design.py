@@ -21,6 +21,7 @@ from ambid.control.design import (
     checks_of,
     curves_of,
     examine,
+    hardest,
     noise_of,
     refuse_unheld,
     situation_of,
@@ -29,6 +30,7 @@ from ambid.control.design import (
     worst_plant,
 )
 from ambid.control.drawn import Draws, Spread, draw_plants
+from ambid.control.verification import checks_of_verifications, verify_all
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -204,18 +206,24 @@ def _designed(
             break
         asked = closer
     clock.lap("design")
-    found = _result(of, method, judged, ((of.present, first), (loop, seen)))
+    found = _result(of, method, judged, ((of.present, first), (loop, seen)), say)
     clock.lap("verify")
     return found
 
 
 def _result(
-    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...]
-) -> Design:  # fmt: skip
+    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...], say: Tick
+) -> Design:
     was, now = (situation_of(seen, of.plant, loop) for loop, seen in loops)
     loop, seen = loops[1]
     worst = worst_plant(of.judging.plants, seen)
-    checks = checks_of(goals, was, now, worst, len(seen))
+    bench = replace(of.bench, noise=of.bench.noise or of.rig.noise)  # with its resolutions
+    tried = hardest(of.judging.plants, seen)
+    trials = {
+        name: verify_all(tried, bench, x, tick=part_of(say, a, a + 0.5) or silent)
+        for name, (x, _), a in zip(("before", "after"), loops, (0.0, 0.5), strict=True)
+    }
+    checks = {**checks_of(goals, was, now, worst, len(seen)), **checks_of_verifications(trials["after"])}
     if not of.known.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
@@ -223,10 +231,10 @@ def _result(
     kept = replace(loop, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
     return Design(
         status=of.known.status, model=of.known.model, method=method, record=of.known.record, goals=goals, before=was,
-        after=now, worst_plant=worst, checks=checks, rate_hz=of.plant.rate_hz,
+        after=now, worst_plant=worst, checks=checks, rate_hz=of.plant.rate_hz, trials=trials,
         curves={
-            name: curves_of(x, of.plant, tried, until)
-            for name, (tried, x) in zip(("before", "after"), loops, strict=True)
+            name: curves_of(x, of.plant, loop, until)
+            for name, (loop, x) in zip(("before", "after"), loops, strict=True)
         },
         rig=rig_entry(replace(of.bench, loop=kept)),
         plants={

@@ -11,6 +11,7 @@ from ambid.control.design import Design
 from ambid.report.drawing import MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
 from ambid.report.margins_figures import zone_lines
 from ambid.report.numbers import prefixed, sized
+from ambid.report.verification import verification_block
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -25,7 +26,10 @@ def design_figure(found: Design, title: str, width: float) -> Figure:
     """Draw both loops, a row of panels an axis."""
     axes = list(found.after.sensitivity)
     columns = [[panel(draw, found, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
-    return stacked(title, [Block(columns=columns, widths=(4.0, 3.0, 3.0), by_row=True, shared=False)], width)
+    blocks = [Block(columns=columns, widths=(4.0, 3.0, 3.0), by_row=True, shared=False)]
+    if found.trials:
+        blocks.append(verification_block(found.trials["before"][0], found.trials["after"][0]))
+    return stacked(title, blocks, width)
 
 
 def _sensitivity(axes: Axes, found: Design, axis: str) -> None:

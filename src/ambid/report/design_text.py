@@ -22,6 +22,7 @@ from ambid.report.text import (
     warning_lines,
     wrapped,
 )
+from ambid.report.verification import verification_lines
 from ambid.simulation.margins import STANDARD, zone_of
 
 _NONE = "–"
@@ -41,6 +42,7 @@ def design_text(found: Design, *, width: int = WIDTH, paint: Paint = plain) -> s
             [head, *wrapped([_goals(found)], width, "  ")],
             _figures(found, paint),
             _margins(found, paint),
+            _simulated(found, width, paint),
             _plants(found, width, paint),
             _loop(found, paint),
             check_lines(found.checks, width=width, paint=paint, above=True),
@@ -94,6 +96,12 @@ def _opening(s: Situation, axis: str, place: str) -> Sequence[str]:
 
 def _gains(down: float | None, up: float | None) -> str:
     return " … ".join("any" if x is None else f"{x:.2g}" for x in (down, up))
+
+
+def _simulated(found: Design, width: int, paint: Paint) -> list[str]:
+    if not found.trials:
+        return []
+    return verification_lines((found.trials["before"], found.trials["after"]), width=width, paint=paint)
 
 
 def _plants(found: Design, width: int, paint: Paint) -> list[str]:
