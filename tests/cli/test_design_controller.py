@@ -90,3 +90,15 @@ def test_a_rig_that_exists_is_kept(made, ambid, designed):
     assert "new.toml exists" in done.err
     assert (made / "new.toml").read_text() == before
     assert designed.loop is not None
+
+
+def test_both_loops_are_tried_on_the_nonlinear_simulator(designed):
+    before, after = designed.trials["before"], designed.trials["after"]
+    assert [v.plant for v in before] == [v.plant for v in after]
+    assert before[0].plant == "the estimate"
+    assert len(before) > 1
+    pushed = [[v.of_kind("force step")[0] for v in found] for found in (before, after)]
+    assert len({case.size for cases in pushed for case in cases}) == 1  # the same force on all plants
+    assert all(b.peak < a.peak for a, b in zip(*pushed, strict=True))
+    assert designed.checks["lift_off"].passed
+    assert "force step of" in designed.summary()
