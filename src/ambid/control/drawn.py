@@ -7,7 +7,7 @@ damped. Draw 0 is the estimate itself.
 
 Without the numbers of a magnet the law is that of two opposed ones: k_i = 4 k' i0/s0² cos alpha and -k_x = 4 k' i0²/s0³
 cos alpha give i0/s0 = -k_x/k_i and, without leakage, L = -k_i²/k_x, so that the gap s0 alone has to be assumed: twice
-the travel inside the limits, as retainer bearings stand at half of the gap.
+the travel inside the limits, as touch-down bearings stand at half of the gap.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ COPPER = 0.0039
 """Rise of the resistance of copper over its value at 20 °C, 1/K."""
 
 GAP_OF_TRAVEL = 2.0
-"""Air gap over the travel to the retainer bearing, where no gap is given."""
+"""Air gap over the travel to the touch-down bearing, where no gap is given."""
 
 _NARROW = 0.3  # relative standard deviation up to which a number is drawn in its logarithm
 _TRIES = 100  # of one draw
