@@ -12,6 +12,7 @@ import numpy as np
 from ambid.acquisition.device import Program
 from ambid.acquisition.program import FULL, expected
 from ambid.arrays import Array, Complex
+from ambid.control.closed import Plant
 from ambid.control.excited import ExcitedLoop, begin_at, from_rest
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import Limited, Lines, joint_design, spread_power
@@ -21,6 +22,7 @@ from ambid.signals.excitations import schroeder_phases
 
 SCHEMA = "ambid.experiment/1"
 _CANDIDATES = 3000  # lines from which those of the design are taken
+_FROM_REST = 12  # drawn plants that are simulated from rest
 _HARD = 4  # drawn plants beside the nominal one for which amplitudes and phases are searched
 _SAME_RATE = 1e-6
 _WORSE = 1.5  # standard deviations over promised ones, from which a record is not the one that was designed
@@ -219,7 +221,7 @@ class Task:
     """What an experiment is designed for."""
 
     loops: Sequence[ExcitedLoop]  # the nominal plant's, then those of drawn plants
-    noises: Sequence[Innovation]  # of each
+    noise: Callable[[Plant], Innovation]  # of a plant
     low: Array  # (n_signals,), limits of what the excitation moves, noise taken off; -inf: none
     high: Array
     period: int
@@ -285,8 +287,8 @@ class Task:
             of = self.loops[k]
             driven.append(of.states(lines, self.period, on) @ of.rows[n_y:].T + np.eye(n_u)[on])
         return Information.of(
-            [self.loops[k].plant for k in plants], [self.noises[k] for k in plants], self.frequency_hz(lines), driven,
-            prior_sd=self.prior_sd, criterion=self.criterion,
+            [self.loops[k].plant for k in plants], [self.noise(self.loops[k].plant) for k in plants],
+            self.frequency_hz(lines), driven, prior_sd=self.prior_sd, criterion=self.criterion,
         )  # fmt: skip
 
 
@@ -335,13 +337,15 @@ def hardest(task: Task, lines: Lines, c: Complex) -> list[int]:
 
 
 def uses(task: Task, lines: Lines, c: Complex) -> Array:
-    """Return the largest part of each signal's way to its limits, (n_plants, 2, n_signals): steady, and from rest."""
-    on = task.inputs(lines)
-    found = []
-    for k, of in enumerate(task.loops):
-        limited = task.limited(lines, [k])
-        found.append([limited.use(c), from_rest(of, limited, c, on, 0)])
-    return np.array(found)
+    """Return the largest part of each signal's way to its limits, (n_plants, 2, n_signals): steady, and from rest.
+
+    From rest are the plant itself and those drawn ones that use most in steady state.
+    """
+    steady = np.array([task.limited(lines, [k]).use(c) for k in range(len(task.loops))])
+    found = np.repeat(steady[:, None], 2, axis=1)
+    for k in {0, *np.argsort(-steady.max(axis=1))[:_FROM_REST].tolist()}:
+        found[k, 1] = from_rest(task.loops[k], task.limited(lines, [k]), c, task.inputs(lines), 0)
+    return found
 
 
 def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Table | None]:

@@ -80,17 +80,16 @@ def joint_design(
     *, tick: Callable[[], object] = lambda: None,
 ) -> Complex:  # fmt: skip
     """Return amplitudes and phases with the least criterion at a largest use of 1, (n_lines,)."""
-    best, least = starts[0], np.inf
-    for start in starts:
-        c = start
-        for p, steps in zip(_NORMS, _STEPS, strict=True):
-            c = _search(information, limited, c, samples, p, steps)
-            tick()
-        c = c / np.max(limited.use(c))
-        found = information.judge(information.total(np.abs(c) ** 2, samples))[0]
-        if found < least:
-            best, least = c, found
-    return best
+
+    def judged(c: Complex) -> float:
+        return information.judge(information.total(np.abs(c / np.max(limited.use(c))) ** 2, samples))[0]
+
+    tried = list(starts)
+    for p, steps in zip(_NORMS, _STEPS, strict=True):
+        tried = [_search(information, limited, c, samples, p, steps) for c in tried]
+        tried = [min(tried, key=judged)]  # the best start alone goes on
+        tick()
+    return tried[0] / np.max(limited.use(tried[0]))
 
 
 def _search(

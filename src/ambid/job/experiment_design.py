@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -48,7 +48,7 @@ SPREAD = 0.1
 """Part of their values within which free parameters of a rig lie, two standard deviations, for the drawn plants."""
 TARGET = 0.01
 """Relative standard deviation for which the length of the record is told."""
-_PLANTS = 40  # drawn
+_PLANTS = 200  # drawn
 _SCATTER = Spread(delay=0.0, position=0.0, current=0.0, eddy=0.0, warm_k=(0.0, 0.0), frequency=0.0, damping=0.0)
 _RESERVE = 4.0  # standard deviations of noise that are kept free
 _SECONDS = 10.0
@@ -229,18 +229,15 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
             "limits. Give [loop] in the rig"
         )
     noise = _innovation(known, bench, plant)
-    loops, noises, unstable = [loop], [noise], 0
-    for drawn in _drawn(known, bench, plant, wanted):
-        other = ExcitedLoop.of(drawn, bench.loop)
-        if other.pole > _KEPT:
-            unstable += 1
-            continue
-        loops.append(other)
-        noises.append(noise if known is not None else Innovation.of(drawn, bench.noise))
+    drawn = [ExcitedLoop.of(x, bench.loop) for x in _drawn(known, bench, plant, wanted)]
+    loops = [loop, *(x for x in drawn if x.pole <= _KEPT)]
+    unstable = 1 + len(drawn) - len(loops)
     low, high = _room(bench, loop, wanted)
     spare = _RESERVE * loop.noise_sd(noise)
     _refuse_full(loop.signals, spare, low, high)
-    task = _task(bench, loops, noises, (low + spare, high - spare), wanted, prior_sd)
+    task = _task(
+        bench, loops, lambda of: _innovation(known, bench, of), (low + spare, high - spare), wanted, prior_sd
+    )  # fmt: skip
     say("design")
     found = design(task, tick=lambda: say("design"))
     return _told(bench, task, found, (low, high, spare), wanted, unstable)
@@ -321,8 +318,8 @@ def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array
 
 
 def _task(
-    bench: Bench, loops: list[ExcitedLoop], noises: list[Innovation], ends: tuple[Array, Array], wanted: Wanted,
-    prior_sd: dict[str, float],
+    bench: Bench, loops: list[ExcitedLoop], noise: Callable[[Plant], Innovation], ends: tuple[Array, Array],
+    wanted: Wanted, prior_sd: dict[str, float],
 ) -> Task:  # fmt: skip
     """Return the task: period, lines and length beside plants and limits."""
     rate, names = bench.rate_hz, loops[0].plant.names
@@ -344,7 +341,7 @@ def _task(
     band = wanted.band or (rate / period, rate / 5.0)
     periods = max(1, round(seconds * rate / period))
     return Task(
-        loops=loops, noises=noises, low=ends[0], high=ends[1], period=period, periods=periods,
+        loops=loops, noise=noise, low=ends[0], high=ends[1], period=period, periods=periods,
         band_hz=(band[0], min(band[1], 0.4 * rate / hold)), n_lines=wanted.lines, criterion=wanted.criterion,
         prior_sd=prior_sd, hold=hold,
     )  # fmt: skip
