@@ -211,6 +211,7 @@ def design_by_knobs(
         if over <= 1.0:
             return loop
         score.limits["settling"] = found["settling"] * math.exp(-_SLACK) / over
+        grid = [*grid, best]
     raise EstimationError(_refusal(tries, score, grid, name))
 
 
@@ -248,6 +249,9 @@ def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> L
         return lqg(plants[0], Weights.of(limits, integral_s), noise, effort=effort, disturbance=disturbance).law
 
     grid = [
-        (_FIRST**a, _FIRST**b, settling / _SETTLED) for a in range(-3, 2) for b in range(-2, 4)
-    ]  # fmt: skip
+        (_FIRST**a, _FIRST**b, settling / (c * _SETTLED))
+        for a in range(-2, 2)
+        for b in range(-2, 3)
+        for c in (1.0, 1.5)
+    ]
     return design_by_knobs(make, grid, plants, rig, goals, tick, "LQG")
