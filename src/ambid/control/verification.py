@@ -70,6 +70,12 @@ class Trace:
     current: Array
     command: Array
 
+    def __post_init__(self) -> None:
+        for name in ("at", "position", "current", "command"):  # four digits are more than a figure shows
+            x = getattr(self, name)
+            size = float(np.abs(x).max(initial=0.0))
+            object.__setattr__(self, name, np.round(x, 4 - math.floor(math.log10(size))) if size else x)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Case:
@@ -136,7 +142,7 @@ def verify_all(
     plants: Mapping[str, Plant], rig: Rig, loop: Loop, *, trials: Trials | None = None, nonlinear: bool = True,
     seed: int = 0, tick: Tick = silent,
 ) -> tuple[Verification, ...]:  # fmt: skip
-    """Try a loop on plants by name, the estimate first: all are pushed and turned as the estimate is."""
+    """Try a loop on plants by name, the estimate first: all are pushed as it is, and only its traces are kept."""
     todo, found = trials or Trials(), list[Verification]()
     for k, (name, plant) in enumerate(plants.items()):
         tick("nonlinear simulation", k / len(plants))
@@ -147,7 +153,8 @@ def verify_all(
                 impulse=tuple(first.sizes(todo.impulse, _IMPACT_S)), speed=first.speed,
                 unbalance=first.moment if "m" in plant.theta else None,
             )  # fmt: skip
-        found.append(verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed))
+        of = verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed)
+        found.append(of if not k else replace(of, cases=tuple(replace(case, trace=None) for case in of.cases)))
     return tuple(found)
 
 
