@@ -32,6 +32,7 @@ static void listen(void)
         return;
     while (n == 0 && most-- && rx_waiting(&board_rx)) {
         n = decoder_feed(&decoder, rx_take(&board_rx));
+        board_receive();
         if (n == FRAME_DAMAGED) {
             daq_count(&daq.rx_errors);
             n = 0;

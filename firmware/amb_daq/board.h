@@ -82,6 +82,8 @@ uint8_t board_pwm_sound(void);    /* period, read back compare value and pin are
 
 /* Bytes that were lost or had no stop bit, since reset. */
 uint16_t board_rx_lost(void);
+/* There is room in board_rx again. */
+void board_receive(void);
 /* Sends what was put into board_tx. */
 void board_send(void);
 /* Keeps the watchdog quiet if the timer's interrupts went on since the last call; without it, ENABLE is low after 12 ms,

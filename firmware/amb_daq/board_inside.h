@@ -23,6 +23,7 @@ void board_feed(void);        /* the watchdog */
 void board_note_hung(void);   /* for the program that runs after the reset */
 uint8_t board_was_hung(void); /* 1 if the last reset was the watchdog's; asked once */
 void board_begin_line(void);
+uint8_t board_deaf(void);       /* received bytes are left to be lost until board_receive */
 void board_send_later(void); /* sends nothing more until board_send; interrupts are off */
 
 #endif

@@ -26,7 +26,8 @@ void board_begin_line(void)
 }
 
 /* A byte without stop bit is not passed on. One that overran the hardware is gone, the one that is read is sound.
- * With the line full this runs each 10 us: what must be done for a sound byte is done in few registers. */
+ * With the line full this runs each 10 us: what must be done for a sound byte is done in few registers. Where there is no
+ * room it runs no more until there is (board_receive): bytes that would be lost all the same must not keep the law waiting. */
 ISR(USART_RX_vect)
 {
     uint8_t status = UCSR0A, byte = UDR0;
@@ -42,8 +43,10 @@ ISR(USART_RX_vect)
     }
     BOARD_FLAGS |= SOUND_BYTE;
     BOARD_FLAGS |= BYTE_CAME;
-    if (!rx_put(&board_rx, byte))
+    if (!rx_put(&board_rx, byte)) {
         lost++;
+        UCSR0B &= (uint8_t)~_BV(RXCIE0);
+    }
 }
 
 ISR(USART_UDRE_vect)
@@ -54,12 +57,22 @@ ISR(USART_UDRE_vect)
     tail = (uint8_t)((tail + 1) & (TX_RING - 1));
     board_tx.tail = tail;
     if (tail == board_tx.head)
-        UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
+        UCSR0B &= (uint8_t)~_BV(UDRIE0);
 }
 
 void board_send_later(void)
 {
-    UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0);
+    UCSR0B &= (uint8_t)~_BV(UDRIE0);
+}
+
+void board_receive(void)
+{
+    ATOMICALLY { UCSR0B |= _BV(RXCIE0); }
+}
+
+uint8_t board_deaf(void)
+{
+    return !(UCSR0B & _BV(RXCIE0));
 }
 
 void board_send(void)
@@ -67,7 +80,7 @@ void board_send(void)
     ATOMICALLY
     {
         if (board_tx.head != board_tx.tail)
-            UCSR0B = _BV(RXCIE0) | _BV(RXEN0) | _BV(TXEN0) | _BV(UDRIE0);
+            UCSR0B |= _BV(UDRIE0);
     }
 }
 

@@ -210,7 +210,7 @@ static inline uint8_t line_broken(void)
 static inline void watch_lines(void)
 {
     uint8_t pins = PIND;
-    if ((pins & _BV(PIND0)) || (BOARD_FLAGS & BYTE_CAME))
+    if ((pins & _BV(PIND0)) || (BOARD_FLAGS & BYTE_CAME) || board_deaf())
         low_readings = 0;
     else if (low_readings < 255)
         low_readings++;

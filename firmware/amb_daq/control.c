@@ -126,9 +126,18 @@ uint16_t control_end(struct control *control, uint16_t current, int16_t excitati
     return loop_end(control, away, offset, low, high);
 }
 
+void control_watch(struct control *control, uint16_t current, uint16_t off, uint8_t last)
+{
+    control_end(control, current, 0, off, off);
+    while (law_ahead(&control->state))
+        ;
+    if (last)
+        law_settled(control->law, &control->state);
+}
+
 uint8_t control_ahead(struct control *control)
 {
-    return control->law ? law_ahead(control->law, &control->state) : 0;
+    return control->law ? law_ahead(&control->state) : 0;
 }
 
 void control_take(struct control *control, const struct law *law)

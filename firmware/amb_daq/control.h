@@ -54,6 +54,10 @@ void control_reset(struct control *control);
 void control_begin(struct control *control, uint16_t position);
 uint16_t control_end(struct control *control, uint16_t current, int16_t excitation, uint16_t low, uint16_t high);
 
+/* In place of control_end, before a law's output goes on: the pulse width is `off`, whatever it wants; `last`: the output goes
+ * on with the next tick. */
+void control_watch(struct control *control, uint16_t current, uint16_t off, uint8_t last);
+
 /* What is left of the tick's work, some 35 us with each call; 0: nothing. All must be done before the next tick. */
 uint8_t control_ahead(struct control *control);
 

@@ -36,8 +36,9 @@
 #define HOST_MS_LEAST 20
 #define HOST_MS_MOST 2000
 #define LIFT_MS_MOST 2000
-/* States that a law may have with ticks of so many periods: each two cost some 80 us of the 50 of a period. */
-#define LAW_MOST(period) ((period) < 9 ? 2 : (period) < 10 ? 4 : LAW_STATES)
+/* States that a law may have with ticks of so many periods: that many are done in time while noise fills the line. */
+#define LAW_MOST(period) ((period) < 9 ? 3 : (period) < 10 ? 4 : LAW_STATES)
+#define WATCH_MS 100 /* a law that begins with the output: else its filters would take the way to where the rotor lies for a step */
 #define CONFIRM_MS_LEAST 20
 #define CONFIRM_MS_MOST 20000
 #define LIFTED_MS 100 /* inside its limits for so long: the rotor is lifted, the position counts from now on */
@@ -55,6 +56,7 @@ struct daq {
     volatile uint32_t ticks; /* since start; the tick being worked on is the one before */
     volatile uint16_t silent_ticks, host_ticks;
     volatile uint16_t lift_ticks; /* left in which out_of_gap does not count */
+    uint16_t watching; /* ticks left in which a law only watches, with the output still off */
     uint16_t inside; /* periods of the pulse width for which the position was inside its limits during the lift */
     uint16_t inputs[BOARD_ANALOG];
 

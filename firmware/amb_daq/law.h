@@ -44,7 +44,9 @@ struct law_state {
     int32_t z[LAW_STATES];
     int32_t next;      /* C z of the next tick */
     int16_t y0, y1, e; /* of this one: 32 y, 32 y, 8 e */
-    uint8_t row;       /* the next one to be moved on */
+    uint8_t left;      /* that are to be moved on, from the one at `at`, with the words from `words` on */
+    int32_t *at;
+    const int16_t *words;
 };
 
 /* 1: it could overflow, or is no law. */
@@ -61,7 +63,10 @@ int32_t law_carried(const struct law *law, const struct law_state *state);
 static inline void law_position(struct law_state *state, int16_t y) { state->y0 = (int16_t)(y * 32); }
 uint16_t law_end(const struct law *law, struct law_state *state, int16_t current, int16_t offset, uint16_t low, uint16_t high);
 
+/* The output goes on with the next tick: pure integrators begin at zero. */
+void law_settled(const struct law *law, struct law_state *state);
+
 /* Then the states move on, a block with each call. Returns 0 once all have. */
-uint8_t law_ahead(const struct law *law, struct law_state *state);
+uint8_t law_ahead(struct law_state *state);
 
 #endif

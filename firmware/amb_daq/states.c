@@ -36,9 +36,13 @@ static uint16_t in_ticks(uint16_t ms)
 void daq_output(uint8_t state)
 {
     uint16_t host = in_ticks(daq.limits.host_ms), lift = in_ticks(daq.limits.lift_ms);
+    uint16_t watching = state == STATE_LEVITATING ? in_ticks(WATCH_MS) : 0;
     ATOMICALLY
     {
         trial_back_out(BACK_OUT_ENDED);
+        daq.watching = daq.control.law ? watching : 0;
+        if (lift)
+            lift = (uint16_t)(lift + daq.watching);
         control_reset(&daq.control);
         daq.excitation.playing = 0;
         tick_prepare();

@@ -110,14 +110,21 @@ static uint16_t law(int16_t *excitation)
         *excitation = 0;
         return daq.limits.duty_off;
     }
+    if (daq.watching) {
+        control_watch(&daq.control, daq.inputs[1], daq.limits.duty_off, --daq.watching == 0);
+        board_send();
+        *excitation = 0;
+        return daq.limits.duty_off;
+    }
     if (levitating)
         duty = control_end(&daq.control, daq.inputs[1], *excitation, daq.limits.duty_low, daq.limits.duty_high);
     else
         duty = limited((int16_t)(bias() + *excitation));
-    board_send();
-    if (daq.control.law)
+    if (daq.control.law) /* its states move on, while the order waits and then: bytes to the host wait for them */
         while (board_order_waits() && control_ahead(&daq.control))
             ;
+    else
+        board_send();
     duty = order(duty);
     while (control_ahead(&daq.control))
         ;

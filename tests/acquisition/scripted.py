@@ -47,6 +47,14 @@ class ScriptedDevice:
         self.told.append(f"start {mode}")
         self.state, self.ended = {"sample": "sampling", "drive": "driving"}.get(mode, "levitating"), False
 
+    def arm(self, trial):
+        """No law is tried."""
+        raise NotImplementedError
+
+    def confirm(self):
+        """No law is tried."""
+        raise NotImplementedError
+
     def excite(self, program):
         self.told.append(f"excite at {self.next}")
         self.playing, self.ordered = program is not None, self.next

@@ -138,6 +138,12 @@ class Host:
         self.ask("configure", **(wanted | ({} if period is None else {"period": period})))
         self.ask("limits", **self.settings.fields("limits"))
         self.ask("gains", **self.settings.fields("gains"))
+        law = self.settings.law
+        if law is not None:
+            for at in range(0, len(law.words), 24):
+                self.ask("law", offset=at, values=law.words[at : at + 24])
+            one = {"period": self.settings.period, "checksum": law.checksum}
+            self.ask("arm", **one, position_low=0, position_high=0, confirm_ms=0)
 
     def start(self, mode=_LEVITATE):
         self.heard = Heard()

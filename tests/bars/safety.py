@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.acquisition.law_words import WATCH_MS
 from ambid.acquisition.protocol.table import table
 from tests.bars.host import Host, tick_times, trajectory
 
@@ -145,7 +146,9 @@ def _judged(kind, host, folder, acked, unanswered, wrong):
         wrong.append("it did not levitate")
     delay, unclear = edges[0] - happened, False
     if kind in SILENT:
-        last = tick_times(rows, edges[1])[host.heard.ticks[acked]]
+        # ENABLE rises with the tick after tick 0, or after a law has watched.
+        watched = 0 if host.settings.law is None else round(1e-3 * WATCH_MS * host.settings.rate_hz)
+        last = tick_times(rows, edges[1])[host.heard.ticks[acked] - watched]
         delay = edges[0] - last - 1e-3 * HOST_MS
         unclear = unanswered and delay > 2e-3
     return Trip(kind=kind, moment_s=happened - edges[1], delay_s=delay, unclear=unclear, wrong=tuple(wrong))

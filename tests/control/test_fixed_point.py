@@ -6,8 +6,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquisition.law_kernel import BEGIN, law_tick
-from ambid.acquisition.law_words import LawWords
+from ambid.acquisition.law_kernel import law_tick
+from ambid.acquisition.law_words import BEGIN, LawWords
 from ambid.control.fixed_point import Counts, fixed_point
 from ambid.control.knobs import Family
 from ambid.control.lqg import SampledPlant, lqg

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ambid.acquisition.law_kernel import BEGIN, law_tick
-from ambid.acquisition.law_words import LAW_ROW, LawWords, law_words
+from ambid.acquisition.law_kernel import law_tick
+from ambid.acquisition.law_words import BEGIN, LAW_ROW, LawWords, law_words
 from ambid.errors import RigError
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Loop

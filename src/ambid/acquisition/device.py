@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal, Protocol, Self
 
+from ambid.acquisition.law_words import LawWords
 from ambid.errors import DeviceError
 from ambid.tracking.blocks import Frame
 
@@ -62,10 +63,22 @@ class Program:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LawTrial:
+    """A law that a controller is to try while it levitates; `acquisition.settings.law_trial` makes one from a rig."""
+
+    law: LawWords
+    low: int  # bounds of the position, counts: outside, the controller returns to what ran before
+    high: int
+    confirm_ms: int = 3000  # after so long without `Device.confirm` too
+    seconds: float = 1.0  # for which it is watched before that
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceEvent:
     """Something that a device told beside its samples, or that stands among them in a recording."""
 
-    # ``fault`` (with its safe state), ``state`` (another change of state), ``lost`` (samples that never came),
+    # ``fault`` (with its safe state), ``state`` (another change of state), ``law`` (an armed one was
+    # given up), ``lost`` (samples that never came),
     # ``damaged`` (frames whose check value was wrong), ``link`` (the line); in a recording ``excitation``, ``note`` too
     kind: str
     what: str  # for a fault the cause (enum ``cause``), for a state its name; else one line for a person
@@ -160,6 +173,19 @@ class Device(Protocol):
         ----------
         program : Program
         """
+        ...
+
+    def arm(self, trial: LawTrial) -> None:
+        """Let another law levitate on trial, from the next tick on; levitating. A return to the old one is an event.
+
+        Parameters
+        ----------
+        trial : LawTrial
+        """
+        ...
+
+    def confirm(self) -> None:
+        """Keep the law on trial."""
         ...
 
     def read(self, timeout_s: float) -> Frame | None:

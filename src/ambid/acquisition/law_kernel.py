@@ -5,17 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.acquisition.law_words import BEGIN, D0, D1, E_BITS, HEAD, OF_A_STATE, SHARE_BITS, SUM_BITS, Y_BITS
 from ambid.compiled import compiled
 
 Integers = NDArray[np.int64]
-
-HEAD, D0, D1, OF_A_STATE = 0, 1, 2, 3
-"""Places of the words; from the last one seven of each state: shift, self, other, b0, b1, g, c."""
-Y_BITS, E_BITS, SHARE_BITS, SUM_BITS = 5, 3, 14, 12
-"""Binary places of what multiplies of inputs and of what the limits took; of a row with shift 0; of w with shift 0."""
-
-BEGIN = 1 << 13
-"""A state of zero: half a step of what multiplies, so that this is the nearest."""
 
 _STATES, _E, _SUM = 1 << 29, 4095, (1 << 26) - 1
 
@@ -54,3 +47,12 @@ def law_tick(words: Integers, z: Integers, position: int, current: int, offset: 
             moved = z[i + j] + shifted(total + words[at + 5] * e, words[at])
             z[i + j] = min(max(moved, -_STATES), _STATES - 1)
     return int(duty)
+
+
+@compiled
+def watch(words: Integers, z: Integers, position: int, current: int, bias: int, off: int, last: bool) -> None:
+    """Move the states on while the pulse width is still `off`; with the last such tick integrators begin at zero."""
+    law_tick(words, z, position, current, bias, off, off)
+    for i in range(z.size if last else 0):
+        if words[OF_A_STATE + 7 * i + 1] == 0 and words[OF_A_STATE + 7 * i + 2] == 0:
+            z[i] = BEGIN

@@ -14,7 +14,6 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.law_kernel import D0, D1, HEAD, OF_A_STATE, SHARE_BITS, SUM_BITS, Y_BITS
 from ambid.acquisition.scales import PWM_TOP
 from ambid.arrays import Array, Complex
 from ambid.errors import RigError
@@ -24,13 +23,20 @@ LAW_STATES = 6
 """States that the controller has room for."""
 LAW_ROW = 49151
 """Sum of the sizes of a row's words at most: no sum of products can then overflow."""
+HEAD, D0, D1, OF_A_STATE = 0, 1, 2, 3
+"""Places of the words; from the last one seven of each state: shift, self, other, b0, b1, g, c."""
+Y_BITS, E_BITS, SHARE_BITS, SUM_BITS = 5, 3, 14, 12
+"""Binary places of what multiplies of inputs and of what the limits took; of a row with shift 0; of w with shift 0."""
+BEGIN = 1 << 13
+"""A state of zero: half a step of what multiplies, so that this is the nearest."""
+WATCH_MS = 100
+"""For which a law only watches before its output goes on, ms: else its filters would see a step to the rotor's stop."""
 LARGEST_SHIFT = 15
 LARGEST_STATE = 32767
 """Full scale of what multiplies of a state."""
 
 _WORD = 2**15 - 1
-_IN = 2.0**Y_BITS  # what multiplies of a count of an input, and of one that the limits took
-_LIMITED = 8.0
+_IN, _LIMITED = 2.0**Y_BITS, 2.0**E_BITS
 _INPUT = 512.0  # counts of both inputs for which a state must have room, whatever their course
 _CARRIED = 4096.0  # counts of pulse width that an integrator must have room for
 _INTEGRATES = 1e-9  # of its pole's distance from 1

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ambid.acquisition.device import Device, DeviceEvent, Mode, Program
+from ambid.acquisition.device import Device, DeviceEvent, LawTrial, Mode, Program
 from ambid.acquisition.program import period_ticks
 from ambid.errors import DeviceError
 from ambid.tracking.blocks import Block, Frame
@@ -46,6 +46,7 @@ class Course:
     # excitation. It begins one period, at most a second, before the part that is passed on: what is passed on is
     # periodic from its first sample.
     program: Program | None = None
+    trial: LawTrial | None = None  # another law, tried and confirmed after the settling
     # pass on all of it, the settling too; `seconds` then count from the excitation's first sample on
     transient: bool = False
 
@@ -90,6 +91,8 @@ def run(
             device.load(course.program)
         device.start(course.mode)
         made.settle(stopped, told=course.transient)
+        if made.going and course.trial is not None:
+            made.arm(course.trial, stopped)
         if made.going and course.program is not None:
             device.excite(course.program)
             made.lead_in(course.program, told=course.transient)
@@ -141,6 +144,22 @@ class _Run:
                 self._extend(block, None)
                 self._pass_on(frame, block)
             if block.first + len(block.values) >= settled:
+                return
+
+    def arm(self, trial: LawTrial, stopped: Callable[[], bool]) -> None:
+        """Try another law, unseen, and keep it unless the controller does not."""
+        until: int | None = None
+        self._device.arm(trial)
+        for frame in self._frames(stopped):
+            if back := next((e for e in self.report.events if e.kind == "law"), None):
+                raise DeviceError(
+                    f"{self._device.info.port}: the controller returned to the loop that it ran before: {back.what} "
+                    f"(sample {back.sample}). It kept levitating; nothing was recorded. Design the law again, or widen "
+                    "its bounds"
+                )
+            until = until or frame.block.first + round(trial.seconds * self._rate_hz)
+            if frame.block.first >= until:
+                self._device.confirm()
                 return
 
     def listen(self, stopped: Callable[[], bool]) -> None:

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ambid.acquisition.device import Column
+from ambid.acquisition.device import Column, LawTrial
+from ambid.acquisition.law_words import LawWords, law_words
 from ambid.acquisition.protocol.table import table
 from ambid.acquisition.scales import (
     ADC_TOP,
@@ -34,7 +35,8 @@ from ambid.acquisition.scales import (
     who,
 )
 from ambid.arrays import Array
-from ambid.errors import DeviceError, RigError
+from ambid.errors import DeviceError, ModelError, RigError
+from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Loop
 from ambid.rig.rig import Daq, Rig
@@ -71,6 +73,7 @@ class ControllerSettings:
     setpoint: int = 0  # rest, counts
     current_rest: int = 0
     duty_bias: int = 0
+    law: LawWords | None = None  # what runs instead of the gains, which are then 0; messages ``law`` and ``arm``
 
     @property
     def rate_hz(self) -> float:
@@ -84,8 +87,8 @@ class ControllerSettings:
 
     @property
     def closed(self) -> bool:
-        """True where any gain acts: without one there is nothing to levitate with."""
-        return any((self.kp, self.ki, self.kd, self.kc))
+        """True where a law or any gain acts: without one there is nothing to levitate with."""
+        return self.law is not None or any((self.kp, self.ki, self.kd, self.kc))
 
     def fields(self, message: str) -> dict[str, int]:
         """Return the fields of the message ``configure``, ``limits`` or ``gains``, without its number."""
@@ -126,10 +129,30 @@ def controller_settings(rig: Rig) -> ControllerSettings:
         setpoint=setpoint,
         current_rest=current_rest,
         duty_bias=bias,
+        law=_law(rig, (bias, current_rest, setpoint)),
         **_gains(rig, (bias, current_rest, setpoint)),
     )
     _check_line(rig, daq, settings)
     return settings
+
+
+def law_trial(rig: Rig, new: Rig) -> LawTrial:
+    """Return another rig's loop as a law to be tried by the controller of a rig that levitates.
+
+    `rig`: with ``[daq]`` and calibrations; `new`: whose ``[loop]`` is tried, gains as a law of two states. The
+    bounds are half way from the set point to the trips.
+    """
+    if new.loop is None or not new.loop.closed:
+        raise RigError(f"{who(new)} has no [loop] with a gain; there is nothing to arm. Give it one")
+    old = controller_settings(rig)
+    law = new.loop.as_law(old.rate_hz)
+    settings = controller_settings(replace(rig, loop=replace(new.loop.opened(), law=law)))
+    assert settings.law is not None
+    return LawTrial(
+        law=settings.law,
+        low=(old.setpoint + old.position_low) // 2,
+        high=(old.setpoint + old.position_high + 1) // 2,
+    )
 
 
 def realised(settings: ControllerSettings, rig: Rig) -> Loop:
@@ -141,6 +164,9 @@ def realised(settings: ControllerSettings, rig: Rig) -> Loop:
     voltage = scale_of(rig, "voltage").slope(settings.duty_bias)
     current = scale_of(rig, "current").slope(settings.current_rest)
     position = scale_of(rig, "position").slope(settings.setpoint) if has_position(rig) else math.inf
+    if settings.law is not None:
+        law = _in_units(settings.law.law(settings.rate_hz), (1.0 / position, 1.0 / current), voltage)
+        return Loop(law=law, delay=LAG_S * settings.rate_hz)
     period, pole = 1.0 / settings.rate_hz, settings.pole / 2.0**POLE_BITS
     tau = period * pole / (1.0 - pole)
     per_count = voltage / position / 2.0**GAIN_BITS
@@ -211,10 +237,34 @@ def exact_gains(rig: Rig, rest: tuple[int, int, int]) -> dict[str, float]:
     }
 
 
+def _law(rig: Rig, rest: tuple[int, int, int]) -> LawWords | None:
+    """Return the words of the loop's state-space law, by the slopes of the calibrations at rest."""
+    if rig.loop is None or rig.loop.law is None or not has_position(rig):
+        return None
+    assert rig.daq is not None
+    law = rig.loop.law
+    if law.D.shape == (1, 1):  # no current is fed back
+        law = replace(law, B=np.pad(law.B, ((0, 0), (0, 1))), D=np.pad(law.D, ((0, 0), (0, 1))))
+    volts, amperes, metres = (
+        scale_of(rig, r).slope(at) for r, at in zip(("voltage", "current", "position"), rest, strict=True)
+    )
+    try:
+        law.check(1, 2, PWM_HZ / _period(rig, rig.daq))
+        return law_words(_in_units(law, (metres, amperes), 1.0 / volts))
+    except (ModelError, RigError) as failure:
+        raise RigError(f"{who(rig)}: {failure}") from None
+
+
+def _in_units(law: StateLaw, inputs: tuple[float, float], output: float) -> StateLaw:
+    """Return a law whose signals are first multiplied by `inputs`, and its command last by `output`."""
+    law = law.scaled(inputs)
+    return replace(law, C=law.C * output, D=law.D * output, G=law.windup / output)
+
+
 def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:
     """Return the loop's gains in fixed point."""
     loop = rig.loop
-    if loop is None or not loop.closed or not has_position(rig):
+    if loop is None or loop.law is not None or not loop.closed or not has_position(rig):
         return {}
     assert rig.daq is not None
     period, tau = 1.0 / rig.daq.rate_hz, loop.filter_s

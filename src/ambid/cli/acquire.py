@@ -60,6 +60,14 @@ def command(
     settle: Annotated[
         float | None, option("--settle S", "Time after the start that is not recorded, in s.", "1 when levitating")
     ] = None,
+    arm: Annotated[
+        Path | None,
+        option(
+            "--arm RIG",
+            "Rig file whose [loop] the controller tries once it levitates, and keeps: the record is made with it. It"
+            " returns to the loop before where the rotor moves more than half way to a trip.",
+        ),
+    ] = None,
     bench: opt.BenchName = None,
     pace: opt.Pace = "fastest",
     seed: opt.Seed = 0,
@@ -92,16 +100,16 @@ def command(
     between = opt.band_of(band)
     replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
     start_file = None if track in (None, "auto") else Path(str(track))
-    outputs = Outputs(rig, start_file, replayed, json=None if track else json, plot=plot, report=report)
+    outputs = Outputs(rig, start_file, replayed, arm, json=None if track else json, plot=plot, report=report)
     outputs.claim(record, "-o", _ENDINGS, force=force)
     outputs.claim(json_path(json) if track else None, "--json")
     known, stop, behind = load_rig(rig), Stop(), None if bench is None else opt.preset_of(bench) or bench
     settings: dict[str, Any] = {
         "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
-        "settle": settle, "seed": seed, "stopped": stop.wished,
+        "settle": settle, "seed": seed, "stopped": stop.wished, "arm": None if arm is None else load_rig(arm),
     }  # fmt: skip
     wanted, start, before = Request(**settings), start_of_track(track), _changed(record)
-    job = Recording(known, port, record, wanted.trial(port, known).settle_s, stop, force=force)
+    job = Recording(wanted.measured(known), port, record, wanted.trial(port, known).settle_s, stop, force=force)
     if (record.exists() or record.is_symlink()) and not force:
         raise AmbidError(f"-o {record} already exists. Choose another name, or give --force")
     try:

@@ -16,7 +16,7 @@ from ambid.acquisition.recording import Acquired, Progress
 from ambid.acquisition.recording import acquire as record_course
 from ambid.acquisition.review import refuse_unstable, review
 from ambid.acquisition.session import Course
-from ambid.acquisition.settings import controller_settings
+from ambid.acquisition.settings import controller_settings, law_trial
 from ambid.control.experiment import Experiment
 from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, counted, refuse_given
 from ambid.estimation.progress import Tick, silent
@@ -48,6 +48,7 @@ class Request:
     mode: Mode | None = None  # None: levitate where the rig has a loop
     settle: float | None = None  # s; None: 1 to levitate
     seed: int = 0
+    arm: Rig | None = None  # whose loop is tried and kept once the rig's own levitates
     stopped: Callable[[], bool] = field(default=lambda: False)
 
     def trial(self, port: str, rig: Rig) -> Trial:
@@ -70,6 +71,10 @@ class Request:
             seconds=self.seconds,
             seed=self.seed,
         )
+
+    def measured(self, rig: Rig) -> Rig:
+        """Return the rig with the loop that the record is made with."""
+        return rig if self.arm is None else replace(rig, loop=self.arm.loop)
 
     def course(self, device: Device, rig: Rig, trial: Trial, *, note: Note, tick: Tick) -> Course:
         """Say what the device is to do; find the amplitude of its excitation where none is given."""
@@ -121,6 +126,7 @@ def acquire(
     bench: str | Path | Rig | Preset | None = None,
     pace: Literal["fastest", "real-time"] = "fastest",
     seed: int = 0,
+    arm: Rig | str | Path | None = None,
     force: bool = False,
     stopped: Callable[[], bool] = lambda: False,
     on_note: Note = _mute,
@@ -159,6 +165,9 @@ def acquire(
         Speed of an emulated, simulated or replayed device.
     seed : int, optional
         Seed of excitation and simulated noise.
+    arm : Rig, str or Path, optional
+        Whose ``[loop]`` the controller is to try, once it levitates by that of `rig`, and to keep: the record is made
+        with it. Where the rotor moves more than half way to a trip meanwhile, the controller returns to what it ran.
     force : bool, optional
         Overwrite an existing record, and close a loop that is predicted unstable.
     stopped : callable, optional
@@ -185,14 +194,21 @@ def acquire(
     known, path = known_rig(rig), Path(out)
     wanted = Request(
         seconds=seconds, excitation=excitation, amplitude=amplitude, band=band, mode=mode, settle=settle, seed=seed,
-        stopped=stopped,
+        stopped=stopped, arm=None if arm is None else known_rig(arm),
     )  # fmt: skip
     wanted.trial(port, known)
     if (path.exists() or path.is_symlink()) and not force:
         raise AmbidError(f"-o {path} already exists. Choose another name, or give --force")
     with ready(port, known, wanted, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
         return record_course(
-            device, known, path, course, force=force, on_progress=on_progress, on_trouble=on_trouble, stopped=stopped
+            device,
+            wanted.measured(known),
+            path,
+            course,
+            force=force,
+            on_progress=on_progress,
+            on_trouble=on_trouble,
+            stopped=stopped,
         )
 
 
@@ -211,8 +227,15 @@ def ready(
     """Open a device, say what it is to do, and close it; arguments as those of `acquire`."""
     trial, say = wanted.trial(port, rig), tick or silent
     closes = trial.mode == "levitate" and not force
+    if wanted.arm is not None and trial.mode != "levitate":
+        raise AmbidError(f"--arm tries a loop while the rotor levitates, and the mode is {trial.mode}. Omit --arm")
     with opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note) as device:
         course = wanted.course(device, rig, trial, note=note, tick=say)
+        if wanted.arm is not None:
+            complete = with_default_daq(rig) if port in ("emulated", "simulated") else rig
+            course = replace(course, trial=law_trial(complete, wanted.arm))
+            if closes:
+                refuse_unstable(wanted.measured(rig), device.info)
         say("record")
         yield device, course
 

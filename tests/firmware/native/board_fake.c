@@ -40,5 +40,6 @@ uint8_t board_memory_sound(void) { return 1; }
 uint8_t board_pwm_sound(void) { return !fake.pwm_broken; }
 uint16_t board_rx_lost(void) { return 0; }
 void board_send(void) {}
+void board_receive(void) {}
 uint16_t board_alive(void) { return 0; }
 void board_sleep(uint8_t (*pending)(void)) { (void)pending; }

@@ -10,6 +10,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from ambid.acquisition.law_kernel import law_tick, watch
 from ambid.arrays import Array
 from ambid.compiled import compiled
 from ambid.simulation.kernels import Linear, Nonlinear, advance_plant
@@ -30,8 +31,8 @@ N_SETTINGS = 24
 
 # Places in `memory`.
 STATE, CAUSE, INTEGRAL, DERIVATIVE, LAST, FRESH, TICK, FAULT_TICK, LIFTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
-PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY, INSIDE = 9, 10, 11, 12, 13, 14, 15
-N_MEMORY = 16
+PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY, INSIDE, WATCHING = 9, 10, 11, 12, 13, 14, 15, 16
+N_MEMORY = 17
 
 _ONE = 1 << 12  # a count in the law's fixed point
 _TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
@@ -96,12 +97,16 @@ def within(value: int, largest: int) -> int:
 
 
 @compiled
-def ordered(position: int, current: int, excitation: int, settings: Integers, memory: Integers) -> int:
+def ordered(
+    position: int, current: int, excitation: int, settings: Integers, memory: Integers, words: Integers, z: Integers
+) -> int:
     """Return the pulse width that the law orders, in counts: the firmware's fixed point, number by number."""
     low, high = settings[DUTY_LOW], settings[DUTY_HIGH]
     if memory[STATE] == DRIVING:
         return int(min(max(settings[BIAS] + excitation, low), high))
     error = settings[SETPOINT] - position
+    if z.size:
+        return law_tick(words, z, -error, current - settings[REST], settings[BIAS] + excitation, low, high)
     growth = settings[KI] * error
     derivative = (memory[DERIVATIVE] * settings[POLE] + 0x8000) >> 16
     if memory[FRESH] == 0:
@@ -144,6 +149,8 @@ def tick_on(
     settings: Integers,
     memory: Integers,
     table: Integers,
+    words: Integers,
+    z: Integers,
     x: Array,
     line: Array,
     roles: tuple[int, int],
@@ -158,7 +165,8 @@ def tick_on(
 
     `noise` (n, 2 + n_disturbances) are standard normal numbers, `noise_size` what they are multiplied with: position,
     current, disturbances. `maps` are x and y of position to counts, current to counts, pulse width to volts. `roles`
-    are the states of position and current (-1: none). `line` (whole delay + 2,) are the newest voltages.
+    are the states of position and current (-1: none). `words` and `z` are a law and its states, empty for gains.
+    `line` (whole delay + 2,) are the newest voltages.
 
     Filled: counts (n, 6): position, current, pulse width, excitation, set point, state. Returns the first tick whose
     state is not finite, -1 for none.
@@ -181,9 +189,16 @@ def tick_on(
             memory[PLAYING] = 0
         on = memory[STATE] == DRIVING or memory[STATE] == LEVITATING
         excitation, duty = 0, settings[DUTY_OFF]
-        if on:
+        if on and memory[WATCHING]:
+            on = False
+            memory[WATCHING] -= 1
+            watch(
+                words, z, position - settings[SETPOINT], current - settings[REST], settings[BIAS], duty,
+                memory[WATCHING] == 0,
+            )  # fmt: skip
+        elif on:
             excitation = played(settings, memory, table)
-            duty = ordered(position, current, excitation, settings, memory)
+            duty = ordered(position, current, excitation, settings, memory, words, z)
         memory[DUTY] = duty
         counts[k, 0], counts[k, 1], counts[k, 2], counts[k, 3] = position, current, duty, excitation
         counts[k, 4], counts[k, 5] = settings[SETPOINT], memory[STATE]

@@ -319,7 +319,7 @@ class Controller:
 
     def _heard(self, what: Message) -> None:
         waiting = self._waiting.get(what.fields.get("id", 0))
-        if what.name in ("status", "fault"):
+        if what.name in ("status", "fault", "law_status"):
             self._told(what)
         if waiting is not None and what.name in ("ack", _ANSWERS.get(waiting.name, "ack")):
             with self._news:

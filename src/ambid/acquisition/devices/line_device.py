@@ -18,6 +18,7 @@ from ambid.acquisition.device import (
     Counters,
     DeviceEvent,
     DeviceInfo,
+    LawTrial,
     Mode,
     Program,
     SelfTest,
@@ -27,6 +28,7 @@ from ambid.acquisition.device import (
 from ambid.acquisition.devices.controller import Controller
 from ambid.acquisition.devices.frames import FrameQueue
 from ambid.acquisition.devices.port import Port, open_port
+from ambid.acquisition.law_words import LawWords
 from ambid.acquisition.program import counts_of
 from ambid.acquisition.protocol.codec import Message
 from ambid.acquisition.protocol.samples import SampleCounters, SampleDecoder, Samples
@@ -39,6 +41,7 @@ from ambid.tracking.blocks import Block, Frame
 
 _NONE: Mapping[str, int] = MappingProxyType({})
 _TABLE_PART = 48  # elements in one message
+_LAW_PART = 24  # words in one message
 _TOLD = ("overruns", "dropped", "rx_errors", "rx_lost", "busy_us", "supply_mv")  # of a status
 _WINDOW_S = 0.25  # at first; doubled whenever the windows are full
 _WINDOWS = 512
@@ -247,7 +250,11 @@ class SampleStream:
         with self._lock:
             if not self.live:
                 return
-            if what.name == "fault":
+            if what.name == "law_status":
+                if what["id"] == 0:
+                    about = next(e.about for e in table().enums["back_out"] if e.value == what["cause"])
+                    self._events.append(DeviceEvent(kind="law", sample=self._base + what["tick"], what=about))
+            elif what.name == "fault":
                 self._fault(what["cause"], what["tick"])
             elif _state_of(what["state"]) == "fault":
                 self._fault(what["cause"], what["fault_tick"])
@@ -426,6 +433,15 @@ class LineDevice(ABC):
         self._ask("excitation", fields)
         self._loaded = program
 
+    def arm(self, trial: LawTrial) -> None:
+        """As `Device.arm`."""
+        bounds = {"position_low": trial.low, "position_high": trial.high, "confirm_ms": trial.confirm_ms}
+        self._send_law(self._ready(), trial.law, bounds)
+
+    def confirm(self) -> None:
+        """As `Device.confirm`."""
+        self._ask("settle", {"keep": 1})
+
     def read(self, timeout_s: float) -> Frame | None:
         """As `Device.read`."""
         frame = None
@@ -515,11 +531,20 @@ class LineDevice(ABC):
             self._stream.tell(DeviceEvent(kind="link", sample=None, what=told))
         for name in ("configure", "limits", "gains"):
             controller.ask(name, self._settings.fields(name))
+        if self._settings.law is not None:
+            self._send_law(controller, self._settings.law, {"position_low": 0, "position_high": 0, "confirm_ms": 0})
         controller.pace(self._settings.rate_hz)
         # What came before is not of this session.
         line = controller.counters
         self._before = (line.damaged + controller.odd, line.discarded_bytes)
         self._stream.live = True
+
+    def _send_law(self, controller: Controller, law: LawWords, trial: Mapping[str, int]) -> None:
+        """Send the words, and arm them: from the next start on, or on trial."""
+        for at in range(0, len(law.words), _LAW_PART):
+            controller.ask("law", {"offset": at}, values=law.words[at : at + _LAW_PART])
+        self._loaded = None  # words and the table's end share memory
+        controller.ask("arm", {"period": self._settings.period, "checksum": law.checksum, **trial})
 
     def _counted(self, c: Controller) -> Counters:
         line, kept, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()

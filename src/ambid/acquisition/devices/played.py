@@ -18,6 +18,7 @@ from ambid.acquisition.device import (
     Counters,
     DeviceEvent,
     DeviceInfo,
+    LawTrial,
     Mode,
     Program,
     SelfTest,
@@ -145,6 +146,14 @@ class PlayedDevice(ABC):
 
     def load(self, program: Program) -> None:  # noqa: B027 - there is no line on which it would take time
         """As `Device.load`."""
+
+    def arm(self, trial: LawTrial) -> None:  # noqa: ARG002 - a contract
+        """As `Device.arm`: refused, as only the firmware keeps an old law."""
+        self._refuse("arm", "only the firmware tries a law. Arm it on 'emulated' or a serial port")
+
+    def confirm(self) -> None:
+        """As `Device.confirm`."""
+        self._refuse("confirm", "no law is on trial. Omit it")
 
     def read(self, timeout_s: float) -> Frame | None:
         """As `Device.read`."""

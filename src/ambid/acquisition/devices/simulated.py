@@ -16,6 +16,7 @@ from ambid.acquisition.default_daq import is_made_up, with_default_daq
 from ambid.acquisition.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquisition.devices.benches import bench_of, instruments
 from ambid.acquisition.devices.played import Pace, PlayedDevice
+from ambid.acquisition.law_words import BEGIN, WATCH_MS
 from ambid.acquisition.program import counts_of
 from ambid.acquisition.protocol.table import table
 from ambid.acquisition.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates
@@ -91,6 +92,9 @@ class SimulatedDevice(PlayedDevice):
         self._maps = _maps_of(self._instruments)
         self._numbers = _numbers_of(self._settings)
         self._table = np.zeros(TABLE_LENGTH, dtype=np.int64)
+        law = self._settings.law
+        self._words = np.array(law.words if law else (), dtype=np.int64)
+        self._z = np.full(law.order if law else 0, BEGIN, dtype=np.int64)
         self._memory = np.zeros(k.N_MEMORY, dtype=np.int64)
         self._x, self._room_x = self._plant.centre.copy(), np.empty(self._plant.centre.size)
         self._line = np.zeros(whole + 2)
@@ -116,7 +120,11 @@ class SimulatedDevice(PlayedDevice):
             memory[k.TICK] = 0
         memory[k.STATE] = table().value("state", {"sample": "sampling", "drive": "driving"}.get(mode, "levitating"))
         memory[k.CAUSE] = memory[k.INTEGRAL] = memory[k.DERIVATIVE] = memory[k.PLAYING] = 0
-        memory[k.FRESH], memory[k.LIFTED], memory[k.INSIDE] = 1, memory[k.TICK], 0
+        self._z[:] = BEGIN
+        law = mode == "levitate" and self._settings.law is not None
+        memory[k.WATCHING] = math.ceil(WATCH_MS * 1e-3 * self._rate) if law else 0
+        lifts = memory[k.TICK] + (memory[k.WATCHING] if self._settings.lift_ms else 0)
+        memory[k.FRESH], memory[k.LIFTED], memory[k.INSIDE] = 1, lifts, 0
 
     def _rest(self) -> None:
         """Let time pass with the output off, unseen."""
@@ -188,6 +196,8 @@ class SimulatedDevice(PlayedDevice):
             self._numbers,
             self._memory,
             self._table,
+            self._words,
+            self._z,
             self._x,
             self._line,
             plant.roles,
