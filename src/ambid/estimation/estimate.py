@@ -535,6 +535,8 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     fit : Mapping[str, OutputFit]
         By output role.
     checks : Mapping[str, Check]
+    sensitivity : Mapping[str, Any]
+        Peak of the sensitivity of axis ``x``, where a loop is known or a reference is logged.
     validation : Mapping[str, object] or None
         Results on a second record.
     warnings : tuple of str
@@ -562,6 +564,7 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     operating_point: Mapping[str, float]
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
+    sensitivity: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
     validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))

@@ -4,22 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import Controller, controller_of_loop, identify_controller
-from ambid.control.margins import MISFIT
+from ambid.control.margins import MISFIT, sensitivity_by_axis
 from ambid.control.measured import MeasuredSensitivity, measured_locally, measured_sensitivity
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate
+from ambid.estimation.estimate import Estimate, plain_json
 from ambid.physics.linear_model import LinearModel, model
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import Between, PeriodSpectra, find_excitation, period_spectra, references_of
-from ambid.simulation.plant import fed_back
+from ambid.simulation.plant import closed_loop_poles, fed_back
 
 _NO_FEEDBACK = 1e-4  # share of an input below which nothing is fed back
 _IMPLIED = 0.03  # part of its largest line below which an excitation that follows from [loop] is rounding
@@ -38,6 +39,40 @@ def loop_of(
     """
     plant = plant_of(estimate, rate_hz, speed)
     return ClosedLoop.of(plant, controller_of(plant, rig, spectra))
+
+
+def loop_and_peaks(
+    estimate: Numbers, rig: Rig, bench: Record, spectra: PeriodSpectra | None, speed: float = 0.0
+) -> tuple[ClosedLoop | None, Mapping[str, Any], tuple[str, ...]]:
+    """Return the closed loop of a record, the peaks of its sensitivity, warnings; None: its controller is not known.
+
+    `spectra`: of the record, where they are there already.
+    """
+    of = estimate.plant if isinstance(estimate, RotorEstimate) else model(estimate.model)
+    if not any(role in bench for role in references_of(of)) and (rig.loop is None or rig.open_loop):
+        return None, {}, ()
+    seen = spectra_of(bench, of, speed) if spectra is None else spectra
+    try:
+        loop = loop_of(estimate, rig, bench.rate_hz, seen, speed)
+        refuse_unstable(loop, rig)
+    except EstimationError as error:
+        return None, {}, (f"no sensitivity: {error}",) if seen is not None and seen.R is not None else ()
+    return loop, plain_json(sensitivity_by_axis(loop, measure(loop, bench, seen))), ()
+
+
+def refuse_unstable(loop: ClosedLoop, rig: Rig) -> None:
+    """Refuse a [loop] that would not hold the estimated plant: it is not the one of the record."""
+    if loop.controller.source != "rig":
+        return
+    assert rig.loop is not None
+    plant = loop.plant
+    late = replace(rig.loop, delay=float(np.max(plant.delays)))
+    pole = float(np.abs(closed_loop_poles(plant.theta, late, plant.rate_hz, of=plant.model)[0]))
+    if pole > 1.0 + 1e-6:
+        raise EstimationError(
+            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the loop of a "
+            "levitated rotor does: it is another controller. Correct [loop], or log the excitation as reference"
+        )
 
 
 def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:

@@ -44,6 +44,7 @@ from ambid.report.commission_figures import (
 )
 from ambid.report.commission_page import Step
 from ambid.report.device_text import acquired_text
+from ambid.report.estimate_text import sensitivity_lines
 from ambid.report.numbers import quantity, sized
 from ambid.rig import Rig
 from ambid.simulation.margins import LoopMargins
@@ -421,6 +422,7 @@ def identification(
             (cautions if name in _RESIDUAL else reasons).append(f"{name}: {check.detail}")
     for loop in list(loops.values())[:1]:
         (findings if loop.stable and loop.zone != "D" else cautions).append(f"the loop on this plant: {loop.words()}")
+    findings += sensitivity_lines(estimate.sensitivity)
     return Step(
         name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
         pictures=(margins_picture(loops),) if loops else (),

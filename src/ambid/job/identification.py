@@ -145,6 +145,7 @@ def identify_axis(
 ) -> Estimate:
     """Identify one axis, as `identify` does."""
     from ambid.bearing.linear import greybox
+    from ambid.job.closed_loop import loop_and_peaks
 
     say, clock = tick or silent, Clock()
     bench, plant = load_bench(record, rig, **reading), rig.plant
@@ -163,6 +164,8 @@ def identify_axis(
     say("check")
     with one_thread():
         estimate = judge(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
+        _, sensitivity, said = loop_and_peaks(estimate, rig, bench, None)
+        estimate = replace(estimate, sensitivity=sensitivity, warnings=(*estimate.warnings, *said))
     clock.lap("checks")
     if validate is not None:
         from ambid.validation.second_record import validation

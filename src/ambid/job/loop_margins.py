@@ -13,7 +13,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.closed import ClosedLoop
 from ambid.control.margins import (
     Disk,
     Margins,
@@ -24,11 +24,11 @@ from ambid.control.margins import (
     sensitivity_by_axis,
 )
 from ambid.control.room import QUANTITIES, Vibration, role_of, room_by_axis, speeds_of, synchronous
-from ambid.errors import EstimationError
+from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
-from ambid.job.closed_loop import Numbers, loop_of, measure, spectra_of
+from ambid.job.closed_loop import Numbers, loop_of, measure, refuse_unstable, spectra_of
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry
 from ambid.job.rotor import balance_planes
 from ambid.physics.linear_model import model
@@ -39,7 +39,6 @@ from ambid.rig import Rig
 from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
 from ambid.simulation.margins import zone_of
-from ambid.simulation.plant import closed_loop_poles
 
 
 def margins(
@@ -127,6 +126,26 @@ def margins(
     return replace(found, timing_s=clock.laps, rig=rig_entry(bench))
 
 
+def margins_beside(estimate: Numbers, used: Any) -> Margins | None:
+    """Return the margins of an estimate's loop for its page; None where they cannot be said.
+
+    `used`: the record it was made from, of a rotor one or several; None: the margins of the model.
+    """
+    from ambid.job.results import rig_of
+
+    if not estimate.sensitivity:
+        return None
+    taken = used if isinstance(used, tuple) else (used,)
+    k = 0
+    if isinstance(estimate, RotorEstimate) and len(taken) == len(estimate.records):
+        k = max(range(len(taken)), key=lambda m: abs(float(str(estimate.records[m]["speed"]))))
+    try:
+        with one_thread():
+            return _margins(estimate, rig_of(estimate, "the estimate"), taken[k])
+    except AmbidError:
+        return None
+
+
 def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
     """Return a record of one axis whose excitation is a column of its own."""
     if rig.rotor is not None:
@@ -168,8 +187,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     spectra = None if clean is None else spectra_of(clean, plant, speed)
     record = estimate.record if bench is None else origin(bench)
     loop = loop_of(estimate, rig, float(str(record["rate_hz"])), spectra, speed)
-    if loop.controller.source == "rig":
-        _refuse_unstable(loop.plant, rig)
+    refuse_unstable(loop, rig)
     measured = measure(loop, clean, spectra)
     found, of = sensitivity_by_axis(loop, measured), loop.controller
     top = int(np.argmax(loop.singular))
@@ -258,15 +276,3 @@ def _vibration(loop: ClosedLoop, rig: Rig, machine: Machine, room: Mapping[str, 
         clearance=min((x for role, x in room.items() if role.endswith("position") and x is not None), default=None),
         amplitude={of.outputs[k]: np.abs(moved[:, k]) for group in loop.plant.sensors for k in group},
     )  # fmt: skip
-
-
-def _refuse_unstable(plant: Plant, rig: Rig) -> None:
-    """Refuse a [loop] that would not hold the estimated plant: it is not the one of the record."""
-    assert rig.loop is not None
-    loop = replace(rig.loop, delay=float(np.max(plant.delays)))
-    pole = float(np.abs(closed_loop_poles(plant.theta, loop, plant.rate_hz, of=plant.model)[0]))
-    if pole > 1.0 + 1e-6:
-        raise EstimationError(
-            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the loop of a "
-            "levitated rotor does: it is another controller. Correct [loop], or log the excitation as reference"
-        )

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import html
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -73,8 +73,26 @@ def page(result: Result, record: Any = None) -> str:
         drawn = Section(title="Figures", figure=lambda width: known.figure(result, used, width))
         made = Page(title=title, sections=[said, drawn])
     else:
-        made = known.page(result, used)
+        made = _with_loop(result, used, known.page(result, used))
     return page_html(made, result.verdict, made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"))
+
+
+def _with_loop(result: Any, used: Any, made: Page) -> Page:
+    """Return a page of an estimate with the margins of its loop, where that is known."""
+    if not getattr(result, "sensitivity", None):
+        return made
+    from ambid.job.loop_margins import margins_beside
+    from ambid.report.page import Section
+
+    found = margins_beside(result, used)
+    if found is None:
+        return made
+    known = _margins()
+    section = Section(
+        title="Margins of the loop", text=known.text(found, width=WIDTH, paint=plain),
+        figure=lambda width: known.figure(found, None, width),
+    )  # fmt: skip
+    return replace(made, sections=[*made.sections[:-1], section, *made.sections[-1:]])
 
 
 def document(result: Result) -> str:

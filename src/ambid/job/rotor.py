@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Check, plain_json
+from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, origin, rig_entry
@@ -49,6 +49,7 @@ def identify_rotor(
     with bearings; `speed_rpm`: of each record; `reading`: how files are read. EstimationError where nothing can be
     identified.
     """
+    from ambid.job.closed_loop import loop_and_peaks
     from ambid.rotor.conclusion import conclude
     from ambid.rotor.synchronous import separate
 
@@ -83,7 +84,7 @@ def identify_rotor(
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
-        loop, sensitivity, said = _loop(estimate, rig, clean[fastest], found.seen[fastest])
+        loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], found.seen[fastest], estimate.speed)
         synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
     clock.lap("checks")
     return replace(
@@ -193,21 +194,6 @@ def _delays(rig: Rig) -> list[float | None]:
     assert rig.rotor is not None
     given = [rig.channel(role).delay for role in rig.rotor.inputs]
     return [None if d == "auto" else float(d) for d in given]
-
-
-def _loop(
-    estimate: RotorEstimate, rig: Rig, bench: Record, spectra: PeriodSpectra | None
-) -> tuple[ClosedLoop | None, Mapping[str, Any], tuple[str, ...]]:
-    """Return the closed loop of a record, the peaks of its sensitivity, warnings; None: its controller is not known."""
-    from ambid.control.margins import sensitivity_by_axis
-    from ambid.job.closed_loop import loop_of, measure, spectra_of
-
-    seen = spectra_of(bench, estimate.plant, estimate.speed) if spectra is None else spectra
-    try:
-        loop = loop_of(estimate, rig, bench.rate_hz, seen, estimate.speed)
-    except EstimationError as error:
-        return None, {}, (f"no sensitivity: {error}",) if seen is not None and seen.R is not None else ()
-    return loop, plain_json(sensitivity_by_axis(loop, measure(loop, bench, seen))), ()
 
 
 def _synchronous(

@@ -19,6 +19,7 @@ from ambid.report.estimate_text import (
     names_words,
     output_rows,
     seconds_of,
+    sensitivity_lines,
     validation_rows,
 )
 from ambid.report.figures import BearingEvidence, Evidence
@@ -88,7 +89,7 @@ def estimate_page(evidence: Evidence | BearingEvidence) -> Page:
             folded=True,
         ),
         *([] if isinstance(e, Estimate) else [_curves(e)]),
-        Section(title="Delay and fit", paragraphs=delay_lines(e), tables=[output_rows(e)]),
+        Section(title="Delay and fit", paragraphs=_said(e), tables=[output_rows(e)]),
         Section(title="Checks", tables=[check_table(e.checks)]),
         *([] if e.validation is None else [second_section(e.validation)]),
         *(
@@ -116,6 +117,10 @@ def _parameters(e: Any) -> Section:
         rows.append((name, (meaning[name], ""), *more, (words, style)))
     note = f"{_SIGNS} Standard deviations are from the {_SOURCES[e.covariance_method]}."
     return Section(title="Parameters", tables=[rows], note=note)
+
+
+def _said(e: Any) -> list[str]:
+    return [*delay_lines(e), *sensitivity_lines(getattr(e, "sensitivity", {}))]
 
 
 def _curves(e: Any) -> Section:

@@ -28,6 +28,7 @@ from ambid.report.text import (
     other_warnings,
     parameter_lines,
     plain,
+    pure,
     status_words,
     timing_lines,
     title_line,
@@ -58,6 +59,7 @@ def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = p
             curves,
             delay_lines(estimate),
             columns(output_rows(estimate)),
+            sensitivity_lines(getattr(estimate, "sensitivity", {})),
             check_lines(estimate.checks, width=width, paint=paint, above=True),
             [] if validation is None else validation_lines(validation, width=width, paint=paint),
             [] if curves else warnings,
@@ -161,6 +163,17 @@ def output_rows(estimate: AnyEstimate) -> list[tuple[str, ...]]:
             cells += ["held", ""] if f is None else [f"{f.one_step:.4f}", f"{sized(f.innovation_sd, unit)} rms"]
         rows.append((name, *cells))
     return rows
+
+
+def sensitivity_lines(sensitivity: Mapping[str, Any]) -> list[str]:
+    """Say the peak of the sensitivity of one axis, predicted and measured; nothing where it is not known."""
+    lines = []
+    for s in sensitivity.values():
+        peak, seen = s["peak_db"], s["measured_peak_db"]
+        measured = "" if seen is None else f"; measured {seen:.2f} dB at {sized(s['measured_frequency_hz'], 'Hz')}"
+        at = f"{pure(peak['value'], peak['sd'] or 0.0)} dB at {sized(s['frequency_hz'], 'Hz')}"
+        lines.append(f"sensitivity of the loop: {at}, zone {s['zone']} of ISO 14839-3{measured}")
+    return lines
 
 
 def validation_lines(validation: Mapping[str, Any], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
