@@ -226,7 +226,24 @@ def test_a_noisy_measured_sensitivity_has_no_peak():
     assert noisy.peak is None
     ratio = np.ones(200)
     ratio[50], sd = 2.0, np.full(200, 0.01)
-    assert MeasuredSensitivity(frequency_hz=f, ratio=ratio, sd=sd).peak == (2.0, f[50])
+    assert MeasuredSensitivity(frequency_hz=f, ratio=ratio, sd=sd).peak == pytest.approx((2.0, f[50], 0.01))
+
+
+def test_a_measured_peak_is_that_of_many_lines():
+    """A broad peak with 2 % noise on each line: its top is known better than a line, and its interval covers."""
+    from ambid.control.measured import MeasuredSensitivity
+
+    rng, f = np.random.default_rng(2), np.linspace(10.0, 60.0, 80)
+    exact, errors, missed = 2.0 - 1.5 * np.log(f / 30.0) ** 2, [], []
+    for _ in range(200):
+        noisy = exact + 0.04 * rng.standard_normal(f.size)
+        peak = MeasuredSensitivity(frequency_hz=f, ratio=noisy, sd=np.full(f.size, 0.04)).peak
+        assert peak is not None
+        errors.append(peak[0] - 2.0)
+        missed.append(abs(peak[0] - 2.0) > 1.96 * peak[2])
+    assert np.sqrt(np.mean(np.square(errors))) < 0.025
+    assert abs(np.mean(errors)) < 0.01
+    assert np.mean(missed) < 0.15
 
 
 def test_the_command_writes_text_json_figure_and_page(axis, tmp_path, monkeypatch, capsys):

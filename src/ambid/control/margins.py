@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array, Complex
-from ambid.control.closed import ClosedLoop
+from ambid.control.closed import DECIBEL, ClosedLoop
 from ambid.control.measured import MeasuredSensitivity
 from ambid.control.room import Room, Vibration
 from ambid.estimation.estimate import Check, Judged
@@ -43,6 +43,7 @@ class AxisSensitivity:
     zone: str  # of ISO 14839-3
     measured_peak_db: float | None  # from the record alone, at its excited lines; None where it has no excitation
     measured_frequency_hz: float | None = None
+    measured_sd_db: float | None = None
     # where T = 1 - S last falls through 1/sqrt(2): up to there the rotor follows its set point; None: it never does
     bandwidth_hz: float | None = None
 
@@ -196,7 +197,9 @@ def sensitivity_by_axis(
         found[axis] = AxisSensitivity(
             peak_db=EstimatedNumber.of(peak.decibel, peak.sd_db, size=1.0), frequency_hz=peak.frequency_hz,
             zone=zone_of(peak.ratio), measured_peak_db=None if top is None else float(20.0 * np.log10(top[0])),
-            measured_frequency_hz=None if top is None else top[1], bandwidth_hz=_bandwidth(loop.frequency_hz, S),
+            measured_frequency_hz=None if top is None else top[1],
+            measured_sd_db=None if top is None else DECIBEL * top[2] / top[0],
+            bandwidth_hz=_bandwidth(loop.frequency_hz, S),
         )  # fmt: skip
     return found
 

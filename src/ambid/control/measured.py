@@ -19,6 +19,9 @@ _SILENT = 1e-3  # of the largest line, below which a reference has no power
 _COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
 _LINES_PER_UNKNOWN = 3
 _BOUND = 3.0  # standard deviations
+_LEAST = 3  # lines on either side of a peak, to which a parabola is fitted first
+_NEAR = 1.6  # factor on the frequency
+_LIKELY = 1.0  # standard deviations of the mean square of what a parabola leaves
 _SEEN = 0.1  # relative standard deviation of a peak that the record shows
 
 
@@ -31,14 +34,40 @@ class MeasuredSensitivity:
     sd: Array
 
     @property
-    def peak(self) -> tuple[float, float] | None:
-        """Ratio and frequency in Hz of the line that surely stands highest; None where noise hides all of them.
+    def peak(self) -> tuple[float, float, float] | None:
+        """Ratio, frequency in Hz and standard deviation of the peak; None where noise hides it.
 
-        The largest ratio of many noisy lines is that of the largest noise; the largest lower bound is not.
+        It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
+        noise, the largest lower bound is not. Around it a parabola over the logarithm of the frequency is fitted to as
+        many lines as it explains within their scatter, at most those up to a factor of `_NEAR` away.
         """
-        sd = np.sqrt(smoothed(self.sd[:, None] ** 2)[:, 0])
+        f, sd = self.frequency_hz, np.sqrt(smoothed(self.sd[:, None] ** 2)[:, 0])
         k = int(np.argmax(self.ratio - _BOUND * sd))
-        return (float(self.ratio[k]), float(self.frequency_hz[k])) if sd[k] <= _SEEN * self.ratio[k] else None
+        found = (float(self.ratio[k]), float(f[k]), float(sd[k]))
+        half = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k)))
+        while sd[k] > 0.0 and half >= _LEAST:
+            near = slice(max(k - half, 0), k + half + 1)
+            fit = _parabola(np.log(f[near] / f[k]), self.ratio[near], sd[near])
+            if fit is not None:
+                found = (fit[0], float(f[k] * np.exp(fit[1])), fit[2])
+                break
+            half = int(0.7 * half)
+        return found if sd[k] <= _SEEN * self.ratio[k] else None
+
+
+def _parabola(x: Array, y: Array, sd: Array) -> tuple[float, float, float] | None:
+    """Return height, place and standard deviation of the top of a parabola; None where it does not fit, or has none."""
+    level, freedom = float(np.sqrt(np.mean(sd**2))), x.size - 3
+    rows = np.vander(x, 3, increasing=True) / level
+    c, *_ = np.linalg.lstsq(rows, y / level, rcond=None)
+    misfit = float(np.sum((rows @ c - y / level) ** 2)) / freedom
+    if misfit > 1.0 + _LIKELY * np.sqrt(2.0 / freedom):
+        return None
+    ends = [float(x[0]), float(x[-1])]
+    top = -c[1] / (2.0 * c[2]) if c[2] < 0.0 else ends[int(np.argmax(np.polyval(c[::-1], ends)))]
+    at = np.vander([min(max(top, ends[0]), ends[1])], 3, increasing=True)[0]
+    spread = max(misfit, 1.0) * (at @ np.linalg.pinv(rows.T @ rows) @ at)
+    return float(at @ c), float(at[1]), float(np.sqrt(spread))
 
 
 def measured_sensitivity(

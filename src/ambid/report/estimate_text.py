@@ -170,7 +170,10 @@ def sensitivity_lines(sensitivity: Mapping[str, Any]) -> list[str]:
     lines = []
     for s in sensitivity.values():
         peak, seen = s["peak_db"], s["measured_peak_db"]
-        measured = "" if seen is None else f"; measured {seen:.2f} dB at {sized(s['measured_frequency_hz'], 'Hz')}"
+        spread = s.get("measured_sd_db") or 0.0
+        measured = (
+            "" if seen is None else f"; measured {pure(seen, spread)} dB at {sized(s['measured_frequency_hz'], 'Hz')}"
+        )
         at = f"{pure(peak['value'], peak['sd'] or 0.0)} dB at {sized(s['frequency_hz'], 'Hz')}"
         lines.append(f"sensitivity of the loop: {at}, zone {s['zone']} of ISO 14839-3{measured}")
     return lines

@@ -83,7 +83,7 @@ def _sensitivity(found: Margins, paint: Paint) -> list[str]:
 def _measured(s: AxisSensitivity) -> str:
     if s.measured_peak_db is None or s.measured_frequency_hz is None:
         return _NONE
-    return f"{s.measured_peak_db:.2f} dB at {sized(s.measured_frequency_hz, 'Hz')}"
+    return f"{pure(s.measured_peak_db, s.measured_sd_db or 0.0)} dB at {sized(s.measured_frequency_hz, 'Hz')}"
 
 
 def _openings(found: Margins, paint: Paint) -> list[str]:
