@@ -27,7 +27,8 @@ def made(tmp_path_factory):
 @pytest.fixture(scope="module")
 def designed(made):
     """The files of a design, and its result."""
-    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html")
+    words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html",
+             "--export", made / "law.c")  # fmt: skip
     assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0
     return package.load(made / "d.json")
 

@@ -114,6 +114,10 @@ def controller(
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
+    export: Annotated[
+        Path | None,
+        option("--export FILE", "Write the law for other programs: .mat, .py (python-control) or .c (C source)."),
+    ] = None,
     strict: opt.Strict = False,
     force: Annotated[bool, switch("--force", "Overwrite an existing rig file.")] = False,
 ) -> None:
@@ -124,9 +128,11 @@ def controller(
     """
     from ambid.control.design import GOALS
     from ambid.job import design_controller
+    from ambid.job.files import LAW_ENDINGS
 
     with Outputs(estimate, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
         outputs.claim(out, "-o", force=force)
+        outputs.claim(export, "--export", LAW_ENDINGS)
         found = design_controller(
             estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
             spread=_sources(spread or ()), plants=plants, judges=judges, seed=seed, tick=show,
@@ -136,6 +142,8 @@ def controller(
             from ambid.rig import rig_text
 
             outputs.stage_text(out, rig_text(found.new_rig, out.parent))
+        if export is not None:
+            outputs.stage(export, found.export)
     outputs.show(found, strict=strict)
 
 

@@ -34,11 +34,12 @@ from ambid.control.verification import Verification
 from ambid.errors import EstimationError, ModelError, nearest
 from ambid.estimation.estimate import Check, Judged
 from ambid.estimation.progress import Tick, silent
-from ambid.physics.linear_model import discretise
+from ambid.physics.law import StateLaw, beside
+from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import Rig, rig_from_text
 from ambid.simulation.margins import zone_of
-from ambid.simulation.plant import closed_loop_matrix
+from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
 
 SCHEMA = "ambid.design/1"
 FIGURES: Mapping[str, str] = MappingProxyType(
@@ -366,10 +367,40 @@ class Design(Judged):
         -------
         control.StateSpace
             In discrete time, SI units, from what is fed back (position and current of each axis) to the commands, the
-            sign included; of a PID that of one axis.
+            sign included.
         """
-        law = self.loop.as_law(self.rate_hz)
+        law = self.law
         return discrete_to_control(law.A, law.B, law.C, law.D, 1.0 / law.rate_hz)
+
+    @property
+    def law(self) -> StateLaw:
+        """The new loop as a law of all axes."""
+        of = self._model
+        axes, pairs = len(of.inputs), fed_back(of)
+        if self.loop.law is not None:
+            return self.loop.law
+        return beside([self.loop.as_law(self.rate_hz, current=bool(pairs[j, 1] >= 0)) for j in range(axes)])
+
+    @property
+    def _model(self) -> LinearModel:
+        rotor = self.new_rig.rotor
+        return model(self.model) if rotor is None else rotor
+
+    def export(self, path: str | Path) -> None:
+        """Write the new controller for another program, SI units, the sign included.
+
+        Parameters
+        ----------
+        path : str or Path
+            Ending in ``.mat``: A, B, C, D, G and the rate. In ``.py``: a script that makes it an object of
+            python-control. In ``.c``: C source in double precision that needs nothing else. A file that exists is
+            replaced.
+        """
+        from ambid.control.law_files import write_law
+
+        of = self._model
+        signals = [of.outputs[k] for k in signals_fed_back(of)]
+        write_law(self.law, path, self.new_rig.name, signals, of.inputs)
 
 
 def situation_of(seen: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:

@@ -16,8 +16,10 @@ PAGE_ENDINGS = (".html", ".htm")
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
 EXPORT_ENDINGS = (".mat", ".py")
+LAW_ENDINGS = (*EXPORT_ENDINGS, ".c")
 _BEGINNINGS = {
     FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<",), EXPORT_ENDINGS: (b"MATLAB 5.0", b'"""'),
+    LAW_ENDINGS: (b"MATLAB 5.0", b'"""The law of ', b"/* The law of "),
 }  # fmt: skip
 _STREAMED = ("--json",)  # options that take - for standard output
 
