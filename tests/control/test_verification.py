@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.control.benches import workbench
+from ambid.control.benches import Answer, workbench
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.drawn import Spread, draw_plants
-from ambid.control.verification import Trials, checks_of_verifications, verify
+from ambid.control.verification import Trials, _Trying, checks_of_verifications, verify
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
 from ambid.rig.preset_rig import rig_of_preset
@@ -153,3 +153,19 @@ def test_fast_eddy_currents_are_a_delay_and_cost_no_time():
     bench = workbench(replace(eddies, theta={**eddies.theta, "a": 1e12}), rig, loop)
     assert bench.loop.delay == pytest.approx(eddies.delays[0], abs=1e-6)
     assert bench.body.eddy_pole == np.inf
+
+
+def test_what_a_rotor_does_on_its_stop_is_no_contact_and_coming_back_is():
+    plant, rig, loop = given("unstable-bearing")
+    bench = workbench(plant, rig, loop)
+    trying = _Trying(bench=bench, trials=Trials(), seed=0)
+    stop, fall = bench.stops[0], np.exp(-np.arange(4000) / 200.0)
+    fall[:30] = 1.0
+    fall[10:12] = 0.998  # it chatters
+    shaken = fall.copy()
+    shaken[300] = -1.0  # at the other stop
+    for course, passed in ((fall, True), (shaken, False)):
+        position = (stop * course)[:, None]
+        case = trying.lifted("lift-off", Answer(position, position, position, 0, 0), stop, np.ones(1))
+        assert case.passed is passed
+        assert case.contact is not passed

@@ -36,7 +36,7 @@ ORBIT = 0.4
 _STEP = 0.1  # force step over what an axis can hold
 _IMPACT_S = 0.5e-3  # for which an impact has all that an axis can hold
 _SETTLED = 0.02  # of the peak
-_LIFTED = 0.05  # of the way from the stop
+_LIFTED = 0.05  # of the way from the stop: away from it, and at rest
 _AT_STOP = 1e-3  # of the clearance: nearer is contact
 _CYCLE = 0.05  # largest limit cycle over the clearance
 _LONGEST = {True: 12_000, False: 60_000}  # samples of a case, of a rotor and of one axis
@@ -262,7 +262,7 @@ class _Trying:
         } | more
         told = [said]
         if found["contact"]:
-            told.append("it touches a stop")
+            told.append("it touches a stop again" if kind == KINDS[0] else "it touches a stop")
         if answer.limited:
             told.append(f"the command is limited in {100.0 * answer.limited / n:.2g} % of the samples")
         if answer.over:
@@ -323,15 +323,14 @@ class _Trying:
             except ModelError as problem:
                 found.append(self.broken("lift-off", name, problem))
                 continue
-            found.append(self._lifted(name, answer, stop, lying))
+            found.append(self.lifted(name, answer, stop, lying))
         return found
 
-    def _lifted(self, name: str, answer: Answer, stop: float, lying: Array) -> Case:
-        touching = self.touching(answer.position)
-        away = ~(touching & (lying > 0.0)).any(axis=1)
-        left = int(np.argmax(away)) if away.any() else None
+    def lifted(self, name: str, answer: Answer, stop: float, lying: Array) -> Case:
+        away = (np.abs(answer.position[:, lying > 0.0]) < (1.0 - _LIFTED) * abs(stop)).all(axis=1)
+        left = int(np.argmax(away)) if away.any() else None  # what it does before, on the stop, is no contact
         settling = self.settled(answer.position, max(_LIFTED * abs(stop), self.resolution))
-        again = left is not None and bool(touching[left:].any())
+        again = left is not None and bool(self.touching(answer.position)[left:].any())
         beyond = float((-np.sign(stop) * answer.position[:, lying > 0.0]).max())
         said = (
             "the rotor stays on the stop" if left is None else
