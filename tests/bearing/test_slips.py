@@ -13,9 +13,12 @@ from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError
 from ambid.job import identify, simulate
 from ambid.physics.linear_model import Parameter, model
+from ambid.physics.loop import Noise
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import default_rig
+from ambid.signals import excitation
+from ambid.simulation import simulate_preset
 from tests.bearing.benches import parameters, run
 from tests.conventions.sources import ROOT
 
@@ -297,6 +300,19 @@ def test_the_lag_of_a_sound_record_is_within_what_is_said():
     assert len(off) > 20
     assert 0.6 < np.sqrt(np.mean(np.square(off))) < 1.4
     assert not any(lag.shown for lag in found)
+
+
+def test_motion_of_one_resonance_is_not_taken_for_a_lag():
+    """Half of its period later the current explains as much with the other sign; the least lag is the one."""
+    rate = 10_000.0
+    flat = np.tile(excitation("schroeder", 5000, rate, amplitude=0.1, band=(2.0, 2000.0)), 4)
+    u = flat + 0.05 * np.sin(2.0 * np.pi * 638.0 * np.arange(flat.size) / rate)
+    noise = Noise(position=1e-5, current=1.5e-3)
+    for seed in range(6):
+        record = simulate_preset(preset("thesis"), u, seed=seed, closed=False, noise=noise).record
+        v, x, i = (record[role].values for role in ("voltage", "position", "current"))
+        found = lag_of(Signals(u=v[:, None], y=np.column_stack([x, i]), rate_hz=rate))
+        assert abs(found.samples) < 0.5
 
 
 def test_swapped_columns_are_not_taken_for_a_lag():

@@ -23,6 +23,7 @@ _FEWEST = 20  # lines
 _SHARE = 0.7  # of the acceleration that has to be explained before a lag is one
 _SURE = 4.0  # standard deviations
 _LEAST = 0.5  # samples: a smaller lag moves parameters by a percent at most
+_ALIKE = 48.0  # over the lines: rise of what is left over that is no more than chance, 4 sd, of lines joined in threes
 _STEPS = 3
 _REACH = 8  # lines whose products count, less and less: twice the width of the window's main lobe
 _JOINED, _HELD = 3, 0.9  # lines that are left out together, and the most that they may be said to hold of themselves
@@ -121,23 +122,28 @@ def _rows(
 
 
 def _coarse(target: Spectrum, stiffness: Spectrum, current: Spectrum, turn: Array) -> tuple[float, int]:
-    """The whole lag at which most is explained, and how much."""
+    """The whole lag at which most is explained, and how much; of several that explain as much the smallest.
+
+    Where one resonance has most of the motion, half of its period later the current explains as much with the other
+    sign.
+    """
     aside, goal = _real(stiffness), _real(target)
     if not (np.any(goal) and np.any(aside) and np.any(current)):
         return 0.0, 0
     aside = aside / float(np.linalg.norm(aside))
     power, goal = float(goal @ goal), goal - aside * float(aside @ goal)
-    best, at = -1.0, 0
+    shares = np.empty(2 * _FARTHEST + 1)
     moved, step = current * np.exp(1j * turn * _FARTHEST), np.exp(-1j * turn)
-    for samples in range(-_FARTHEST, _FARTHEST + 1):
+    for k in range(shares.size):
         row = _real(moved)
         row = row - aside * float(aside @ row)
         gain = float(row @ goal) ** 2 / float(row @ row)
-        share = 1.0 - (float(goal @ goal) - gain) / power
-        if share > best:
-            best, at = share, samples
+        shares[k] = 1.0 - (float(goal @ goal) - gain) / power
         moved = moved * step
-    return best, at
+    alike = (1.0 - shares.max()) * (1.0 + _ALIKE / turn.size)
+    near = np.flatnonzero(1.0 - shares <= alike) - _FARTHEST
+    at = int(near[np.argmin(np.abs(near))])
+    return float(shares[at + _FARTHEST]), at
 
 
 def _sd(terms: Array, left: Array) -> float:
