@@ -241,8 +241,8 @@ def test_a_measured_peak_is_that_of_many_lines():
         assert peak is not None
         errors.append(peak[0] - 2.0)
         missed.append(abs(peak[0] - 2.0) > 1.96 * peak[2])
-    assert np.sqrt(np.mean(np.square(errors))) < 0.025
-    assert abs(np.mean(errors)) < 0.01
+    assert np.sqrt(np.mean(np.square(errors))) < 0.75 * 0.04
+    assert abs(np.mean(errors)) < 0.5 * np.std(errors)
     assert np.mean(missed) < 0.15
 
 

@@ -20,7 +20,7 @@ _COUPLED = 1e-6  # share of its own term below which another axis' term in the c
 _LINES_PER_UNKNOWN = 3
 _BOUND = 3.0  # standard deviations
 _LEAST = 3  # lines on either side of a peak, to which a parabola is fitted first
-_NEAR = 1.6  # factor on the frequency
+_NEAR = 1.2  # factor on the frequency; over wider stretches a peak is no parabola
 _LIKELY = 1.0  # standard deviations of the mean square of what a parabola leaves
 _SEEN = 0.1  # relative standard deviation of a peak that the record shows
 
@@ -39,12 +39,12 @@ class MeasuredSensitivity:
 
         It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
         noise, the largest lower bound is not. Around it a parabola over the logarithm of the frequency is fitted to as
-        many lines as it explains within their scatter, at most those up to a factor of `_NEAR` away.
+        many lines as it explains within their scatter, at most those up to a factor of `_NEAR` away, or the nearest.
         """
         f, sd = self.frequency_hz, np.sqrt(smoothed(self.sd[:, None] ** 2)[:, 0])
         k = int(np.argmax(self.ratio - _BOUND * sd))
         found = (float(self.ratio[k]), float(f[k]), float(sd[k]))
-        half = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k)))
+        half = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k), initial=_LEAST))
         while sd[k] > 0.0 and half >= _LEAST:
             near = slice(max(k - half, 0), k + half + 1)
             fit = _parabola(np.log(f[near] / f[k]), self.ratio[near], sd[near])
