@@ -52,7 +52,8 @@ sensors in the command, and the time in which a force step is settled."""
 GOALS = ("peak", "compliance")
 SETTLED = 0.05
 """Part of the largest deflection by a force step, below which it is settled."""
-_SAME = 1.005  # of a limit: what is as good as it
+SAME = 1.005
+"""Of a limit: what is as good as it."""
 CIRCLE = 1e-9  # a pole no nearer to the unit circle is stable
 _SPAN = 1e-4  # of the rate: the lowest frequency that is shown
 FREQUENCIES = 320
@@ -115,7 +116,7 @@ class Goals:
 
     def missed(self, worst: Figures) -> tuple[str, ...]:
         """Return the limits that figures pass."""
-        return tuple(name for name, x in self.limits.items() if getattr(worst, name) > _SAME * x)
+        return tuple(name for name, x in self.limits.items() if getattr(worst, name) > SAME * x)
 
     def closer(self, asked: Goals, worst: Figures) -> Goals | None:
         """Return what to ask for, where `asked` led to figures that pass these limits; None where they do not."""
@@ -123,7 +124,7 @@ class Goals:
         if not beyond or not all(map(math.isfinite, beyond.values())):
             return None
         return replace(
-            asked, limits={n: x / (beyond[n] * _SAME if n in beyond else 1.0) for n, x in asked.limits.items()}
+            asked, limits={n: x / (beyond[n] * SAME if n in beyond else 1.0) for n, x in asked.limits.items()}
         )
 
 
