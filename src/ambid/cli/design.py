@@ -92,7 +92,7 @@ def controller(
     rig: opt.RigFile = None,
     out: Annotated[Path | None, option("--out -o RIG", "Write the rig with the new [loop].")] = None,
     method: Annotated[
-        str, option("--method NAME", "pid: the present structure, tuned; lqg: a state-space law.", True)
+        str, option("--method NAME", "pid: the present structure, tuned; lqg or hinf: a state-space law.", True)
     ] = "pid",
     goal: Annotated[
         list[str] | None,

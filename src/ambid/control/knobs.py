@@ -21,6 +21,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
+from ambid.control.hinf import hinf
 from ambid.control.lqg import SampledPlant, Weights, lqg
 from ambid.control.tuning import option, said
 from ambid.errors import EstimationError
@@ -41,6 +42,7 @@ _FIRST, _FINEST = 4.0, 1.15  # factors on the knobs between tries
 
 Knobs = tuple[float, ...]
 Make = Callable[[Knobs], StateLaw]
+LawOf = Callable[[Plant, Weights, Noise, float, float], StateLaw]
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -234,24 +236,37 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> s
     )
 
 
-def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-    """Return an LQG law with integral action for the first of some plants, its knobs set by all of them.
+def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of: LawOf, name: str) -> Loop:
+    """Return the law of a method for the first of some plants, its knobs set by all of them.
 
     The knobs: effort, strength of the disturbances, and the time of the integral.
     """
     limits, settling = rig.limits, goals.limits.get("settling", goals.reference["settling"])
     if limits is None:
-        raise EstimationError("the rig gives no [limits]; LQG weighs by them. Give limits.position and limits.voltage")
+        raise EstimationError(
+            f"the rig gives no [limits]; {name} weighs by them. Give limits.position and limits.voltage"
+        )
     noise = rig.noise or Noise()
-
-    def make(knobs: Knobs) -> StateLaw:
-        effort, disturbance, integral_s = knobs
-        return lqg(plants[0], Weights.of(limits, integral_s), noise, effort=effort, disturbance=disturbance).law
-
     grid = [
         (_FIRST**a, _FIRST**b, settling / (c * _SETTLED))
         for a in range(-2, 2)
         for b in range(-2, 3)
         for c in (1.0, 1.5)
     ]
-    return design_by_knobs(make, grid, plants, rig, goals, tick, "LQG")
+    return design_by_knobs(
+        lambda k: law_of(plants[0], Weights.of(limits, k[2]), noise, k[0], k[1]), grid, plants, rig, goals, tick, name
+    )
+
+
+def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return the loop of `ambid.control.lqg`."""
+    return _design(
+        plants, rig, goals, tick, lambda p, w, n, e, d: lqg(p, w, n, effort=e, disturbance=d).law, "LQG"
+    )  # fmt: skip
+
+
+def design_hinf(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+    """Return the loop of `ambid.control.hinf`."""
+    return _design(
+        plants, rig, goals, tick, lambda p, w, n, e, d: hinf(p, w, n, effort=e, disturbance=d)[0], "H-infinity"
+    )  # fmt: skip

@@ -128,8 +128,8 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     trusts the sensors, small the model. EstimationError where the equations have no good solution.
     """
     of = SampledPlant.of(plant)
-    scale = _scales(of, weights)
-    A, B, E, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.E / scale[:, None], of.C * scale
+    scale = scales_of(of, weights)
+    A, B, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.C * scale
     n, (position, current) = A.shape[0], of.kinds
     if position.size == 0:
         raise EstimationError(f"model {plant.model.name!r} has no position to hold. Give one with a position")
@@ -140,7 +140,7 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     wide_B, R = np.vstack([B, np.zeros((axes, B.shape[1]))]) * weights.command, effort**2 * np.eye(B.shape[1])
     P, first = _riccati(wide, wide_B, Q, R)
     K = weights.command * np.linalg.solve(R + wide_B.T @ P @ wide_B, wide_B.T @ P @ wide)
-    M, second = _filter(of, A, B, E, C, weights, noise, disturbance)
+    M, second = _filter(of, A, C, scale, weights, noise, disturbance)
     kept = np.eye(n) - M @ C
     moved, direct = A - B @ K[:, :n], -K[:, :n] @ M
     total = K[:, n:]
@@ -168,7 +168,7 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     )  # fmt: skip
 
 
-def _scales(of: SampledPlant, weights: Weights) -> Array:
+def scales_of(of: SampledPlant, weights: Weights) -> Array:
     """Return sizes of the states, powers of two, that make the rows of plant, inputs and outputs alike (Osborne)."""
     from scipy.linalg import matrix_balance
 
@@ -198,18 +198,25 @@ def _riccati(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, float]:
     return P, float(np.max(np.abs(left)) / max(float(np.max(np.abs(t))) for t in terms))
 
 
-def _filter(
-    of: SampledPlant, A: Array, B: Array, E: Array, C: Array, weights: Weights, noise: Noise, disturbance: float
-) -> tuple[Array, float]:
-    """Return the gain M of the stationary filter, and the residual of its equation, outputs counted in their noise."""
+def filter_noise(of: SampledPlant, weights: Weights, noise: Noise, disturbance: float) -> tuple[Array, Array]:
+    """Return what disturbances of unit size do to the states in a sample, and the sizes of the sensors' noise."""
     force, voltage = noise.held_rms(of.plant.rate_hz)
     size = [force if name.rsplit("_", 1)[-1] == "force" else voltage for name in of.plant.model.disturbances]
-    driven = np.hstack([E * np.array(size), B * (_ROUNDED * weights.command)]) * disturbance
+    driven = np.hstack([of.E * np.array(size), of.B * (_ROUNDED * weights.command)]) * disturbance
     sd = of.sensors(noise)
     for rows, largest in zip(of.kinds, (weights.position, weights.current), strict=True):
         sd[rows] = np.maximum(sd[rows], _HIDDEN * (largest if math.isfinite(largest) else 0.0))
     if not np.all(sd > 0.0):
         raise ModelError("noise.current is not given; the filter of LQG weighs by it. Give noise.current")
+    return driven, sd
+
+
+def _filter(
+    of: SampledPlant, A: Array, C: Array, scale: Array, weights: Weights, noise: Noise, disturbance: float
+) -> tuple[Array, float]:
+    """Return the gain M of the stationary filter, and the residual of its equation, outputs counted in their noise."""
+    driven, sd = filter_noise(of, weights, noise, disturbance)
+    driven = driven / scale[:, None]
     level = float(np.max(np.abs(driven)))
     seen, driven = C / sd[:, None] * level, driven / level
     P, residual = _riccati(A.T, seen.T, driven @ driven.T, np.eye(sd.size))

@@ -58,7 +58,13 @@ def _lqg() -> Method:
     return design_lqg
 
 
-METHODS: Mapping[str, Callable[[], Method]] = {"pid": _pid, "lqg": _lqg}
+def _hinf() -> Method:
+    from ambid.control.knobs import design_hinf
+
+    return design_hinf
+
+
+METHODS: Mapping[str, Callable[[], Method]] = {"pid": _pid, "lqg": _lqg, "hinf": _hinf}
 """By the name that ``method`` takes: what designs is imported when it is asked for."""
 
 
@@ -88,8 +94,9 @@ def design_controller(
         The plant, as `ambid.identify` finds it.
     rig : Rig, str or Path, optional
         With the present ``[loop]``; default: that of the estimate.
-    method : {"pid", "lqg"}
-        "pid": the present structure, tuned; "lqg": a state-space law with integral action, its weights tuned.
+    method : {"pid", "lqg", "hinf"}
+        "pid": the present structure, tuned; "lqg" and "hinf": a state-space law with integral action by the
+        mean or the worst of noise and disturbances, its weights tuned.
     goals : sequence of {"peak", "compliance", "noise", "settling"}
         What is to be small: peak of the sensitivity, displacement by a force, noise of the sensors in the command,
         time in which a force step is settled.
