@@ -19,7 +19,7 @@ def made(tmp_path_factory):
     rig, design = folder / "rig.toml", folder / "d.json"
     for words in (
         ("init", "--preset", "prototype", "-o", rig),
-        ("design", "experiment", rig, *LENGTH, "--json", design, "-o", folder / "d.csv", "--plot", folder / "d.png",
+        ("design", "experiment", rig, *LENGTH, "--json", design, "-o", folder / "d.csv",
          "--report", folder / "d.html", "--slew", "3e4"),
         ("simulate", rig, "--rate", "2000", "--excitation", design, "--nonlinear", "--log-excitation",
          "-o", folder / "r.csv"),

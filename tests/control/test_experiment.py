@@ -15,10 +15,11 @@ from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.likelihood import weight_of
 from ambid.estimation.predictor import PredictorProblem, scales_for
 from ambid.estimation.sensitivity import linearise
-from ambid.physics.linear_model import model
+from ambid.physics.linear_model import Parameter, model
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
+from ambid.rig.rig import RecordSettings, RigChannel
 from ambid.simulation import simulate_rig
 
 BENCH = preset("prototype")
@@ -204,6 +205,21 @@ def test_it_is_read_back(designed, tmp_path):
     assert again.signals == designed.signals
     assert np.array_equal(again.excitation["voltage"], designed.excitation["voltage"])
     assert again.summary() == designed.summary()
+
+
+def test_a_coil_alone_is_designed_for_in_open_loop():
+    values = {"R": 1.25, "L": 0.06}
+    of = model("coil")
+    rig = replace(
+        ambid.default_rig(), model="coil",
+        channels=tuple(RigChannel(role=x, column=x) for x in (*of.inputs, *of.outputs)),
+        parameters=tuple(Parameter(name=p.name, unit=p.unit, value=values[p.name]) for p in of.parameters),
+        noise=Noise(current=1e-3), limits=Limits(voltage=(-10.0, 10.0), current=(-1.0, 1.0)),
+        record=RecordSettings(rate_hz=2000.0), open_loop=True,
+    )  # fmt: skip
+    found = ambid.design_experiment(rig, seconds=1.0, lines=10)
+    estimate = ambid.identify(ambid.simulate(rig, excitation=found, seed=2), rig, experiment=found)
+    assert estimate.checks["experiment"].values == pytest.approx({"R": 1.0, "L": 1.0}, abs=0.15)
 
 
 def test_what_cannot_be_designed_is_refused(bench):

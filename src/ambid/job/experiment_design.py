@@ -229,12 +229,13 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
             "limits. Give [loop] in the rig"
         )
     noise = _innovation(known, bench, plant)
-    drawn = [ExcitedLoop.of(x, bench.loop) for x in _drawn(known, bench, plant, wanted)]
-    loops = [loop, *(x for x in drawn if x.pole <= _KEPT)]
-    unstable = 1 + len(drawn) - len(loops)
     low, high = _room(bench, loop, wanted)
     spare = _RESERVE * loop.noise_sd(noise)
     _refuse_full(loop.signals, spare, low, high)
+    _refuse_criterion(wanted.criterion, plant.names)
+    drawn = [ExcitedLoop.of(x, bench.loop) for x in _drawn(known, bench, plant, wanted)]
+    loops = [loop, *(x for x in drawn if x.pole <= _KEPT)]
+    unstable = 1 + len(drawn) - len(loops)
     task = _task(
         bench, loops, lambda of: _innovation(known, bench, of), (low + spare, high - spare), wanted, prior_sd
     )  # fmt: skip
@@ -294,7 +295,8 @@ def _room(bench: Bench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array
             most = np.inf if wanted.slew is None else wanted.slew
             ends, share = (-most, most), 1.0
         else:
-            ends, share = (room.voltage, VOLTAGE) if name == "voltage" else (room.trips[name], wanted.use)
+            trip = bench.rig.trip("current" if name == "current" else "position")
+            ends, share = (room.voltage, VOLTAGE) if name == "voltage" else (trip, wanted.use)
         rest = 0.0 if name.endswith(SLEW) else point[name]
         low.append(share * (ends[0] - rest))
         high.append(share * (ends[1] - rest))
@@ -317,12 +319,21 @@ def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array
         )
 
 
+def _refuse_criterion(criterion: str, names: tuple[str, ...]) -> None:
+    """Refuse the name of what is not estimated."""
+    if criterion not in ("all", "worst", *(n for n in names if not n.endswith(".delay"))):
+        raise AmbidError(
+            f"--criterion {criterion!r}; it must be all, worst or an estimated parameter: {', '.join(names)}."
+            f"{nearest(criterion, list(names))} Correct it"
+        )
+
+
 def _task(
     bench: Bench, loops: list[ExcitedLoop], noise: Callable[[Plant], Innovation], ends: tuple[Array, Array],
     wanted: Wanted, prior_sd: dict[str, float],
 ) -> Task:  # fmt: skip
     """Return the task: period, lines and length beside plants and limits."""
-    rate, names = bench.rate_hz, loops[0].plant.names
+    rate = bench.rate_hz
     assert bench.rig is not None
     seconds = wanted.seconds or _SECONDS
     hold, period = 1, min(round(seconds * rate / _PERIODS), _LONGEST)
@@ -333,11 +344,6 @@ def _task(
             period = TABLE_LENGTH if wanted.band is None else int(np.ceil(rate / wanted.band[0] - 1e-9))
         hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
         period -= period % hold
-    if wanted.criterion not in ("all", "worst", *(n for n in names if not n.endswith(".delay"))):
-        raise AmbidError(
-            f"--criterion {wanted.criterion!r}; it must be all, worst or an estimated parameter: {', '.join(names)}."
-            f"{nearest(wanted.criterion, list(names))} Correct it"
-        )
     band = wanted.band or (rate / period, rate / 5.0)
     periods = max(1, round(seconds * rate / period))
     return Task(
@@ -386,8 +392,9 @@ def _told(
     for k, name in enumerate(loop.signals):
         finite = [float(x) if np.isfinite(x) else None for x in (low[k], high[k])]
         signals[name] = SignalUse(
-            unit="V/s" if name.endswith(SLEW) else of.units[name], low=finite[0], high=finite[1],
-            steady=float(used[0, 0, k]), from_rest=float(used[0, 1, k]), drawn=float(used[:, :, k].max()),
+            unit=f"{of.units[of.inputs[0]]}/s" if name.endswith(SLEW) else of.units[name],
+            low=finite[0], high=finite[1], steady=float(used[0, 0, k]),
+            from_rest=float(used[0, 1, k]), drawn=float(used[:, :, k].max()),
             peak=float(np.max(np.abs(waves[:, k]))), reserve=float(spare[k]),
         )  # fmt: skip
     return Experiment(
@@ -423,8 +430,8 @@ def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dic
         ),
         "loop": Check(
             passed=unstable == 0, values={"unstable": float(unstable)},
-            detail="the loop holds all drawn plants" if not unstable else
-            f"the loop does not hold {unstable} of {_PLANTS} drawn plants; the limits are kept for the others alone. "
+            detail="all drawn plants are stable, in their loop if there is one" if not unstable else
+            f"{unstable} of {_PLANTS} drawn plants are unstable in this loop; limits are kept for the others alone. "
             "Know the plant better (--spread, priors, an estimate)",
         ),
         "identifiable": Check(
