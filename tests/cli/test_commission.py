@@ -4,11 +4,13 @@ import json
 import os
 import shlex
 import signal
+from functools import partial
 
 import pytest
 
+from ambid import job
 from ambid.acquisition.device import DeviceInfo
-from ambid.job.commissioning import FILES
+from ambid.job.commissioning import FILES, REDESIGNED
 from tests.firmware.conftest import avr_gcc, bench_program, firmware_elf, native_cc
 from tests.job.benches import COIL, PROTOTYPE_FILE, Spoiled, prototype
 
@@ -72,9 +74,18 @@ def test_a_good_bench_ends_with_0_and_a_line_that_runs_next(commission, ambid):
 
 
 @pytest.mark.usefixtures("bench_program", "firmware_elf")
-def test_the_firmware_on_the_emulated_bench_is_commissioned(commission):
-    done = commission(*QUICK, port="emulated")
+def test_the_firmware_on_the_emulated_bench_is_commissioned_and_its_loop_made_better(commission, monkeypatch):
+    few = partial(job.design_controller, plants=12, judges=12)  # what a design is worth its own tests say
+    monkeypatch.setattr("ambid.job.commissioning.design_controller", few)
+    done = commission(*QUICK, "--redesign", port="emulated")
     assert done.code == 0, done.out + done.err
+    assert set(REDESIGNED) < files()
+    steps = {s["name"]: s for s in told()["steps"]}
+    load = steps["load"]["numbers"]
+    assert load["peak_after_db"] < load["peak_before_db"] - 0.5
+    assert load["measured_after_db"] < load["measured_before_db"]
+    assert load["voltage_sd_after"] < 1.1 * load["voltage_sd_before"]
+    assert "--rig out/redesigned.toml" in done.out.splitlines()[-1]
     assert told()["device"]["kind"] == "emulated"
     truth = {"m": 0.3, "k_i": 20.1, "R": 6.0, "L": 0.0803}
     with open("out/estimate.json", encoding="utf-8") as file:

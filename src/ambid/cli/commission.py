@@ -45,6 +45,9 @@ def command(
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
+    redesign: Annotated[
+        bool, switch("--redesign", "Design a better loop, load it on trial, and measure again.")
+    ] = False,
     force: Annotated[bool, switch("--force", "Go on with a loop that is predicted unstable.")] = False,
     yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
 ) -> None:
@@ -56,7 +59,7 @@ def command(
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
-    from ambid.job.commissioning_steps import STEPS, Plan
+    from ambid.job.commissioning_steps import Plan
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
@@ -72,6 +75,7 @@ def command(
         band_hz=opt.band_of(band),
         widest=widest,
         seed=seed,
+        redesign=redesign,
     )
     known, paint, stop = load_rig(rig), painter(), Stop()
     _check_port(port, yes=yes)
@@ -79,13 +83,15 @@ def command(
     if folder.exists():
         check_folder(folder)
     last: list[Step] = []
+    begun: list[StepName] = []
     behind = None if bench is None else opt.preset_of(bench) or bench
     opening = opened(port, known, bench=behind, pace=pace, seed=seed, closes=not force, note=say_note)
     with watching() as watch, signals(stop.take), opening as device:
         new = _make(folder)
 
         def begin(name: StepName) -> None:
-            watch.show(name, STEPS.index(name) / len(STEPS), "")
+            begun.append(name)
+            watch.show(name, plan.steps.index(name) / len(plan.steps), "")
 
         def show(now: Progress) -> None:
             watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
@@ -93,7 +99,7 @@ def command(
         def tell(step: Step) -> None:
             last.append(step)
             watch.clear()
-            typer.echo(step_text(step, f"{len(last)}/{len(STEPS)}", paint=paint), err=json == "-")
+            typer.echo(step_text(step, f"{len(last)}/{len(plan.steps)}", paint=paint), err=json == "-")
 
         def agreed(name: StepName) -> bool:
             del name
@@ -107,7 +113,7 @@ def command(
 
         def alive(stage: str, done: float | None = None, /) -> None:
             del done
-            watch.show("identify", STEPS.index("identify") / len(STEPS), stage)
+            watch.show(begun[-1], plan.steps.index(begun[-1]) / len(plan.steps), stage)
 
         try:
             done = commission(
@@ -133,12 +139,16 @@ def command(
         volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")
         made = folder / "experiment.json"
         flat = {"--excitation": "multisine", "--band": band, "--amplitude": f"{volts:.6g}"}
-        given = {"--port": port, "--rig": rig, "--bench": bench, **({"--excitation": made} if made.exists() else flat),
-                 "--track": folder / "estimate.json", "-o": folder / "next.h5"}  # fmt: skip
+        better = folder / "redesigned.toml"
+        given = {
+            "--port": port, "--rig": better if better.exists() else rig, "--bench": bench,
+            **({"--excitation": made} if made.exists() else flat), "--track": folder / "estimate.json",
+            "-o": folder / "next.h5",
+        }  # fmt: skip
         command = _line("acquire", given) + (" --force" if force else "")
     elif name == "identify":
         command = _line("identify", {"": folder / "record.h5", "--rig": rig})
-    typer.echo(next_text(passed, name, len(last), len(STEPS), str(folder), command=command), err=json == "-")
+    typer.echo(next_text(passed, name, len(last), len(plan.steps), str(folder), command=command), err=json == "-")
     end(failed=not passed)
 
 

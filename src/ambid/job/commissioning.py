@@ -6,6 +6,7 @@ to there stays in the folder.
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -14,11 +15,14 @@ from pathlib import Path
 from typing import Unpack
 
 from ambid.acquisition.amplitude import VOLTAGE, Kept, Look, Room, Size, make_look
+from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.device import Device, DeviceInfo, Program
 from ambid.acquisition.recording import Listeners, acquire
 from ambid.acquisition.review import loop_on, refuse_unstable
 from ambid.acquisition.session import Course
+from ambid.acquisition.settings import law_trial
 from ambid.acquisition.view import BenchView
+from ambid.control.design import Design
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Estimate, json_text, plain_json
@@ -26,8 +30,10 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Plan, StepName
+from ambid.job.controller_design import design_controller
 from ambid.job.experiment_design import design_experiment
 from ambid.job.identification import identify_axis
+from ambid.job.loop_margins import margins
 from ambid.job.presentation import page
 from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
@@ -45,12 +51,15 @@ FILES = (
     "commission.json",
 )  # fmt: skip
 """What a commissioning leaves in its folder."""
+REDESIGNED = ("design.json", "redesigned.toml", "redesigned.h5")
+"""What it leaves beside them where a better loop was designed."""
 
 SCHEMA = "ambid.commission/1"
 _LIMIT = 1.5  # acceptable model error of tracking
 _SHOWN = 4000  # samples of a record that its picture shows
 _FIRST = 1 / 3  # of the excitation's part of the room, for the small one that the experiment is designed on
 _LINES = 60  # of the experiment
+_RMS = 4.0  # peak over rms of noise
 _SECOND = 0.8  # amplitude of the second record's excitation, of what its part of the room allows
 _UNITS = {"voltage": "V", "current": "A", "position": "m"}
 
@@ -218,13 +227,14 @@ class _Guide:
         self.done: list[Step] = []
         self._experiment: Experiment | None = None  # where one was designed
         self._program: Program | None = None  # that plays it
+        self._design: Design | None = None  # of a better loop, where one was found
         self._loops: dict[str, LoopMargins] = {}  # as it was predicted
 
     def found(self) -> Commissioned:
         """Return what came of it so far."""
         return Commissioned(
             steps=tuple(self.done), estimate=self.estimate, track=self.track, folder=self._place, rig=self._rig,
-            device=self._device.info, plan=self.plan,
+            device=self._device.info, plan=self.plan, names=self.plan.steps,
         )  # fmt: skip
 
     def predict(self, *, force: bool) -> None:
@@ -242,6 +252,11 @@ class _Guide:
             raise AmbidError(f"{self._device.info.port} is a record that is replayed: it cannot be commissioned")
         if self._rig.loop is None or not self._rig.loop.closed or self._rig.open_loop:
             raise AmbidError("the rig has no [loop] with a gain: there is nothing to levitate with. Give [loop]")
+        if plan.redesign and self._device.info.kind == "simulated":
+            raise AmbidError(
+                f"{self._device.info.port} is simulated; only the firmware tries another loop. Take --port emulated "
+                "or a bench, or omit --redesign"
+            )
         for what, seconds in (
             ("a trial of the amplitude", plan.longest_trial_s(rate_hz)),
             ("the record", plan.record_s),
@@ -276,6 +291,9 @@ class _Guide:
         yield "record", lambda: self._record(amplitude())
         yield "identify", self._identify
         yield "validate", self._validate
+        if plan.redesign:
+            yield "redesign", self._redesign
+            yield "load", lambda: self._load(look, found["levitate"], amplitude())
         yield "track", lambda: self._track(amplitude())
 
     def _excite(self, look: Look, hover: Step) -> Step:
@@ -287,7 +305,7 @@ class _Guide:
         try:
             if not small.passed:
                 raise EstimationError("; ".join(small.reasons))
-            made = self._design(size)
+            made = self._experiment_on(size)
         except _Interrupted:
             raise
         except AmbidError as failure:
@@ -297,13 +315,18 @@ class _Guide:
         self._experiment = made
         made.save(self._place / "experiment.json")
         low, high = room.voltage
-        flat = min(size.amplitude_v * plan.use / size.used, VOLTAGE * (high - low) / 2.0)
+        noise = _RMS * max(  # of the room, which the small excitation used too
+            hover.numbers[f"{role}_sd"] / min(abs(end - hover.numbers[f"{role}_mean"]) for end in ends)
+            for role, ends in room.trips.items()
+        )
+        own = math.sqrt(max(size.used**2 - noise**2, (size.used / 3.0) ** 2))
+        flat = min(size.amplitude_v * plan.use / own, VOLTAGE * (high - low) / 2.0)
         return replace(
             step, findings=(*small.findings, *step.findings), pictures=(*small.pictures, *step.pictures),
             numbers={"amplitude_v": flat, **step.numbers},
         )  # fmt: skip
 
-    def _design(self, size: Size) -> Experiment:
+    def _experiment_on(self, size: Size) -> Experiment:
         """Design the experiment on the last trial; EstimationError where that shows too little."""
         channels = [Channel(name=n, unit=unit, values=size.last[n]) for n, unit in _UNITS.items() if n in size.last]
         seen = Record(rate_hz=self._device.info.rate_hz, channels=tuple(channels), history=(SELECTED,))
@@ -313,9 +336,12 @@ class _Guide:
             raise EstimationError(
                 f"the trial of {size.amplitude_v:.3g} V does not show {', '.join(weak) or 'the plant'}"
             )
+        return self._experiment_for(first, self.plan.record_s)
+
+    def _experiment_for(self, estimate: Estimate, seconds: float, rig: Rig | None = None) -> Experiment:
         plan = self.plan
         return design_experiment(
-            first, seconds=plan.record_s, band=plan.band_hz, use=plan.use, lines=_LINES, tick=self._tick
+            estimate, rig, seconds=seconds, band=plan.band_hz, use=plan.use, lines=_LINES, tick=self._tick
         )  # fmt: skip
 
     def _record(self, amplitude_v: float) -> Step:
@@ -372,6 +398,44 @@ class _Guide:
         loops = {"identified": found} if found is not None else {}
         return judge.identification(self.estimate, self.plan, {**loops, **self._loops}, self._experiment)
 
+    def _redesign(self) -> Step:
+        """Design a better loop on what was identified; where none is found the present one stays."""
+        assert self.estimate is not None
+        try:
+            design = design_controller(self.estimate, self._rig, tick=self._tick)
+        except EstimationError as failure:
+            return Step(name="redesign", cautions=(f"the present loop stays: {failure}",))
+        design.save(self._place / "design.json")
+        step = judge.redesign(design)
+        if step.numbers["better"]:
+            self._design = design
+            write_text(self._place / "redesigned.toml", rig_text(design.new_rig, self._place))
+        return step
+
+    def _load(self, look: Look, hover: Step, amplitude_v: float) -> Step:
+        """Let the controller try the new loop, record and hover with it, and measure both loops."""
+        if self._design is None:
+            return Step(name="load", findings=("the present loop stays",))
+        plan, rate_hz, kind = self.plan, self._device.info.rate_hz, self._device.info.kind
+        rig = replace(self._rig, loop=self._design.loop)
+        assert self.estimate is not None
+        try:
+            made = self._experiment_for(self.estimate, plan.second_s, rig)
+            course = Course(mode="levitate", seconds=plan.second_s, settle_s=plan.settle_s, program=made.program)
+        except EstimationError:
+            course = plan.trial(rate_hz, plan.second_s, 3).course(amplitude_v, rate_hz)
+        present = with_default_daq(self._rig) if kind in ("emulated", "simulated") else self._rig
+        course = replace(course, trial=law_trial(present, rig))
+        done = acquire(
+            self._device, rig, self._place / "redesigned.h5", course, stopped=self._stopped, **self._listeners
+        )  # fmt: skip
+        after = judge.levitate(look, self._room, plan, rate_hz)
+        loops = {
+            words: margins(self._place / file, of, estimate=self.estimate, tick=self._tick)
+            for words, file, of in (("before", "record.h5", self._rig), ("after", "redesigned.h5", rig))
+        }
+        return judge.load(done, after, hover, loops)
+
     def _track(self, amplitude_v: float) -> Step:
         """Let the tracker follow the running bench, excited as for the record, from what was identified."""
         course = self._course(amplitude_v, self.plan.track_s, 2)
@@ -396,7 +460,7 @@ def check_folder(folder: str | Path) -> None:
         raise AmbidError(f"{place} is no folder; commissioning leaves {len(FILES)} files in one. Make it first")
     if not os.access(place, os.W_OK):
         raise AmbidError(f"folder {place} may not be written. Choose another folder")
-    there = [name for name in FILES if (place / name).exists()]
+    there = [name for name in (*FILES, *REDESIGNED) if (place / name).exists()]
     there += sorted(path.name for path in place.glob("*.journal"))
     if there:
         raise AmbidError(f"{place} holds {', '.join(there)} of an earlier commissioning. Take an empty folder")

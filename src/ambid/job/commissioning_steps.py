@@ -31,28 +31,37 @@ from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
 from ambid.acquisition.recording import Acquired
 from ambid.acquisition.session import Course
 from ambid.arrays import Array
+from ambid.control.design import FIGURES, Design
 from ambid.control.experiment import Experiment
+from ambid.control.margins import Margins
 from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
 from ambid.report.commission_figures import (
     Picture,
+    design_picture,
     margins_picture,
+    measured_picture,
     pulses_picture,
     rest_picture,
     trace_picture,
     trials_picture,
 )
 from ambid.report.commission_page import Step
+from ambid.report.design_text import NAMES, said
 from ambid.report.device_text import acquired_text
 from ambid.report.estimate_text import sensitivity_lines
 from ambid.report.numbers import quantity, sized
 from ambid.rig import Rig
 from ambid.simulation.margins import LoopMargins
 
-StepName = Literal["self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "track"]
+StepName = Literal[
+    "self-test", "rest", "polarity", "levitate", "excite", "record", "identify", "validate", "redesign", "load", "track"
+]
 
-STEPS: tuple[StepName, ...] = get_args(StepName)
-"""In their order."""
+REDESIGN: tuple[StepName, ...] = ("redesign", "load")
+"""Those that a commissioning does only where a better loop is wished."""
+STEPS: tuple[StepName, ...] = tuple(name for name in get_args(StepName) if name not in REDESIGN)
+"""The others, in their order."""
 
 _EXCITATION = "multisine"
 _PERIODS = 4.0  # of the lowest line in a trial
@@ -86,6 +95,12 @@ class Plan:
     # largest half width of a 95 % interval, relative to the value, of a parameter that counts as found
     widest: float = 0.10
     seed: int = 0  # of the excitation
+    redesign: bool = False  # whether a better loop is designed, loaded and measured
+
+    @property
+    def steps(self) -> tuple[StepName, ...]:
+        """The steps that are done, in their order."""
+        return get_args(StepName) if self.redesign else STEPS
 
     def band(self, rate_hz: float) -> tuple[float, float]:
         """Return the band of the excitation in Hz.
@@ -426,6 +441,47 @@ def identification(
     return Step(
         name="identify", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), numbers=numbers,
         pictures=(margins_picture(loops),) if loops else (),
+    )  # fmt: skip
+
+
+def redesign(design: Design) -> Step:
+    """Judge a designed controller by its verification; one that is not better leaves the present one in place.
+
+    `design`: on what was identified. Returns always passed; `numbers` hold ``better``, 1 or 0.
+    """
+    of = [(name, getattr(design.before.worst, name), getattr(design.after.worst, name)) for name in FIGURES]
+    findings = [f"{NAMES[name]} {said(name, was)} → {said(name, now)}, predicted worst" for name, was, now in of]
+    stays = [f"the present loop stays: {r.check}: {r.text}" for r in design.verdict.reasons if not design.passed]
+    numbers = {"better": float(not stays), "peak": design.after.figures.peak, "peak_before": design.before.figures.peak}
+    return Step(
+        name="redesign", findings=tuple(findings), cautions=tuple(stays), numbers=numbers,
+        pictures=(design_picture(design),),
+    )  # fmt: skip
+
+
+def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]) -> Step:
+    """Judge the new loop by what was measured with it.
+
+    `done`: the record with it; `hover`, `before`: hovering with it, and with the loop before; `loops`: margins by
+    record, the loop before first. Returns not passed where the controller did not keep it, or it does not levitate.
+    """
+    kept = record("record with the new loop", done)
+    findings, numbers = list(kept.findings), dict[str, float]()
+    for (name, of), when in zip(loops.items(), ("before", "after"), strict=True):
+        s = of.sensitivity["x"]
+        seen = "" if s.measured_peak_db is None else f", measured {s.measured_peak_db:.2f} dB"
+        findings.append(f"{name}: peak of the sensitivity {s.peak_db.value:.2f} dB{seen}, zone {s.zone}")
+        numbers |= {f"peak_{when}_db": s.peak_db.value}
+        numbers |= {} if s.measured_peak_db is None else {f"measured_{when}_db": s.measured_peak_db}
+    for role, unit in _UNITS.items() if hover.passed else ():
+        was, now = (x.numbers[f"{role}_sd"] for x in (before, hover))
+        findings.append(f"{role} while hovering {sized(was, unit)} → {sized(now, unit)} rms")
+        numbers |= {f"{role}_sd_before": was, f"{role}_sd_after": now}
+    worse = numbers["peak_after_db"] > numbers["peak_before_db"]
+    cautions = ("the new loop has a higher peak of the sensitivity than the one before; load rig.toml again",) * worse
+    return Step(
+        name="load", findings=tuple(findings), reasons=(*kept.reasons, *hover.reasons),
+        cautions=(*kept.cautions, *cautions), numbers=numbers, pictures=(measured_picture(loops), *hover.pictures),
     )  # fmt: skip
 
 

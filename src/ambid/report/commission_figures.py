@@ -11,8 +11,11 @@ import numpy as np
 
 from ambid.acquisition.polarity import Pulse
 from ambid.arrays import Array
+from ambid.control.design import Design
+from ambid.control.margins import Margins
+from ambid.report.design_figures import loops_block
 from ambid.report.drawing import BAND, BOUND, MEASURED, ORANGE, PREDICTED, Block, curve, head, log_axis, panel
-from ambid.report.margins_figures import zone_lines
+from ambid.report.margins_figures import sensitivity_panel, zone_lines
 from ambid.report.numbers import prefixed, sized
 from ambid.signals.spectra import power_spectrum
 from ambid.simulation.margins import ZONES, LoopMargins
@@ -109,6 +112,22 @@ def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
             shared=False,
         ),
     )
+
+
+def design_picture(found: Design) -> Picture:
+    """Both loops of a redesign, as predicted."""
+    caption = "On the estimate, and shaded up to the worst of the plants around it; the step is of 1 N."
+    return Picture(title="The loop before and after", caption=caption, block=loops_block(found))
+
+
+def measured_picture(loops: Mapping[str, Margins]) -> Picture:
+    """Sensitivity of loops by name, by plant and controller, and as measured."""
+    caption = "Lines: by the plant and the controller; dots: as the records show it. Zones of ISO 14839-3."
+    panels = [[panel(sensitivity_panel, of, "x", height=2.6)] for of in loops.values()]
+    return Picture(
+        title=f"Measured: {', '.join(loops)}", caption=caption,
+        block=Block(columns=panels, widths=(1.0,) * len(panels), shared=False),
+    )  # fmt: skip
 
 
 _NONE: Array = np.empty(0)

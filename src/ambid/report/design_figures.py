@@ -24,12 +24,17 @@ _SHALLOW = 1e-4  # of the largest compliance: the lowest that is drawn
 
 def design_figure(found: Design, title: str, width: float) -> Figure:
     """Draw both loops, a row of panels an axis."""
-    axes = list(found.after.sensitivity)
-    columns = [[panel(draw, found, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
-    blocks = [Block(columns=columns, widths=(4.0, 3.0, 3.0), by_row=True, shared=False)]
+    blocks = [loops_block(found)]
     if found.trials:
         blocks.append(verification_block(found.trials["before"][0], found.trials["after"][0]))
     return stacked(title, blocks, width)
+
+
+def loops_block(found: Design) -> Block:
+    """Return panels of both loops: sensitivity, compliance and force step."""
+    axes = list(found.after.sensitivity)
+    columns = [[panel(draw, found, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
+    return Block(columns=columns, widths=(4.0, 3.0, 3.0), by_row=True, shared=False)
 
 
 def _sensitivity(axes: Axes, found: Design, axis: str) -> None:

@@ -26,7 +26,7 @@ from ambid.report.verification import verification_lines
 from ambid.simulation.margins import STANDARD, zone_of
 
 _NONE = "–"
-_NAMES = {
+NAMES = {
     "peak": "peak of sensitivity", "compliance": "compliance, largest", "noise": "noise in the command",
     "settling": "force step settled", "pole": "slowest pole",
 }  # fmt: skip
@@ -68,7 +68,7 @@ def _goals(found: Design) -> str:
 
 def _figures(found: Design, paint: Paint) -> list[str]:
     rows: list[tuple[str, ...]] = [("", "before", "after", "worst before", "worst after")]
-    for name, words in _NAMES.items():
+    for name, words in NAMES.items():
         of = [getattr(x, name) for s in (found.before, found.after) for x in (s.figures, s.worst)]
         rows.append((words, *(said(name, of[k]) for k in (0, 2, 1, 3))))
     n = found.plants["verification"]

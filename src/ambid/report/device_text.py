@@ -34,6 +34,10 @@ _NEXT = {
         "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
         "what changed between the two"
     ),
+    "load": (
+        "the controller kept levitating with the loop before; look at {folder}/design.json, or commission without "
+        "--redesign"
+    ),
     "track": "look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when",
 }
 """What to do after a step that was not good enough."""

@@ -27,7 +27,7 @@ def margins_figure(found: Margins, title: str, width: float) -> Figure:
     axes = list(found.sensitivity)
     block = Block(
         columns=[
-            [panel(_sensitivity, found, axis, height=2.2) for axis in axes],
+            [panel(sensitivity_panel, found, axis, height=2.2) for axis in axes],
             [panel(_compliance, found, axis, height=2.2) for axis in axes],
         ],
         widths=(3.0, 2.0),
@@ -58,7 +58,8 @@ def zone_lines(axes: Axes) -> None:
         )  # fmt: skip
 
 
-def _sensitivity(axes: Axes, found: Margins, axis: str) -> None:
+def sensitivity_panel(axes: Axes, found: Margins, axis: str) -> None:
+    """Draw the sensitivity of an axis, predicted and measured, within the zones."""
     curves, s = found.curves, found.sensitivity[axis]
     measured = curves.measured.get(axis)
     if measured is not None:
