@@ -501,8 +501,7 @@ def _lag(pole: float, dt: float, x: Array, *, hold: bool) -> Array:
     else:
         new = (1 - (1 - alpha) / z) / pole
         old = (1 - alpha) / pole - new
-    out = lfilter([new, old], [1.0, -alpha], x)
-    return np.asarray(out - new * x[0] * alpha ** np.arange(x.size))
+    return np.asarray(lfilter([new, old], [1.0, -alpha], x, zi=[-new * x[0]])[0])
 
 
 def spread(electric: Equation, mechanic: Equation, clean: Array) -> tuple[Array, dict[str, float]]:
