@@ -7,6 +7,7 @@ recursion (Burg 1967): stable by construction, all orders at once, no normal equ
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -39,21 +40,22 @@ def autoregression(residual: Array, highest: int) -> Autoregression:
     `residual`: (n_samples,).
     """
     n = residual.size
-    forward, backward = residual.copy(), residual.copy()
-    d, power = np.ones(1), float(residual @ residual) / n
-    best, lowest = Autoregression(D=d, variance=power), n * np.log(power + 1e-300)
-    for order in range(1, min(highest, n // 4) + 1):
+    forward = backward = residual
+    most, power = min(highest, n // 4), float(residual @ residual) / n
+    d = np.eye(1, most + 1)[0]
+    best, lowest = Autoregression(D=d[:1].copy(), variance=power), n * math.log(power + 1e-300)
+    for order in range(1, most + 1):
         f, b = forward[1:], backward[:-1]
         size = float(f @ f + b @ b)
         if size <= 0 or power <= 0:
             break
         k = -2.0 * float(f @ b) / size
         forward, backward = f + k * b, b + k * f
-        d = np.append(d, 0.0) + k * np.append(d, 0.0)[::-1]
+        d[: order + 1] += k * d[order::-1]
         power *= 1 - k * k
-        criterion = n * np.log(power + 1e-300) + 2 * order * n / max(n - order - 1, 1)
+        criterion = n * math.log(power + 1e-300) + 2 * order * n / max(n - order - 1, 1)
         if criterion < lowest:
-            best, lowest = Autoregression(D=d, variance=power), criterion
+            best, lowest = Autoregression(D=d[: order + 1].copy(), variance=power), criterion
     return best
 
 
