@@ -52,5 +52,9 @@ class Preset:
     plant: NonlinearPlant | None = None  # the nonlinear plant whose linearisation `parameters` is, where there is one
     operating_point: OperatingPoint = field(default_factory=OperatingPoint)  # where the bench rests: m, A, V
     # gains of sensors and amplifiers with their units, where the source gives them
-    instruments: Mapping[str, tuple[float, str]] = field(default_factory=lambda: MappingProxyType({}))
+    instruments: Mapping[str, tuple[float, str]] = field(default_factory=dict)
     rotor: RotorBody | None = None  # of a rotor on many axes; loop, limits and noise are those of every axis
+
+    def __post_init__(self) -> None:
+        for name in ("parameters", "sources", "instruments"):  # nobody changes what a name stands for
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))

@@ -5,8 +5,6 @@ What a source prints is given with its source; everything else is chosen, and `P
 
 from __future__ import annotations
 
-from types import MappingProxyType
-
 from ambid.errors import ModelError, nearest
 from ambid.physics.loop import Limits, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
@@ -21,23 +19,21 @@ def _thesis() -> Preset:
     return Preset(
         name="thesis",
         summary="the thesis's simulation rig: stable, poles -0.0076 and -10.5 +- 4017j rad/s",
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         loop=placed_loop(parameters, (-400 + 3990j, -400 - 3990j, -40, -10), derivative_cutoff_hz=3000.0, delay=0.0),
         usually_closed=False,
         noise=Noise(position=5e-7, current=1e-4),
         limits=Limits(voltage=(-24.0, 24.0), current=(-2.0, 2.0), position=(-0.01, 0.01)),
         rate_hz=10_000.0,
-        sources=MappingProxyType(
-            {
-                "m": table,
-                "k_x": table,
-                "k_i": table,
-                "L": f"{table}, printed 5.96e-2 mH; (4.10) needs 59.6 mH",
-                "R": f"{table}, printed 1.8 ohm; (4.10) needs 1.25 ohm",
-                "c": "thesis eq. 4.8: none",
-                "loop, noise, limits, rate_hz": "chosen; travel of 20 mm as in thesis ch. 5",
-            }
-        ),
+        sources={
+            "m": table,
+            "k_x": table,
+            "k_i": table,
+            "L": f"{table}, printed 5.96e-2 mH; (4.10) needs 59.6 mH",
+            "R": f"{table}, printed 1.8 ohm; (4.10) needs 1.25 ohm",
+            "c": "thesis eq. 4.8: none",
+            "loop, noise, limits, rate_hz": "chosen; travel of 20 mm as in thesis ch. 5",
+        },
     )
 
 
@@ -48,23 +44,21 @@ def _unstable_bearing() -> Preset:
     return Preset(
         name="unstable-bearing",
         summary="differential bearing: 138 turns, 470.3 mm2, bias 1 A, gap 0.432 mm; k_i 55.7 N/A, k_x -1.29e5 N/m",
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         plant=plant,
         loop=placed_loop(parameters, (-600, -120 + 120j, -120 - 120j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
         usually_closed=True,
         noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=2e-3, force=1.0, voltage=0.05),
         limits=Limits(voltage=(-48.0, 48.0), current=(-1.0, 1.0), position=(-0.2e-3, 0.2e-3)),
         rate_hz=20_000.0,
-        sources=MappingProxyType(
-            {
-                "turns, area, bias, gap, half_angle": "given for this bench; k_i and k_x follow (theory.md sec. 1)",
-                "L": "follows from the geometry (24.07 mH) and a chosen leakage of 2 mH, both coils",
-                "m": "chosen",
-                "R": "chosen, both coils",
-                "limits.current": "the bias: neither coil reverses",
-                "loop, noise, limits, rate_hz": "chosen",
-            }
-        ),
+        sources={
+            "turns, area, bias, gap, half_angle": "given for this bench; k_i and k_x follow (theory.md sec. 1)",
+            "L": "follows from the geometry (24.07 mH) and a chosen leakage of 2 mH, both coils",
+            "m": "chosen",
+            "R": "chosen, both coils",
+            "limits.current": "the bias: neither coil reverses",
+            "loop, noise, limits, rate_hz": "chosen",
+        },
     )
 
 
@@ -74,26 +68,24 @@ def _rmit_axis() -> Preset:
     return Preset(
         name="rmit-axis",
         summary="one axis of the RMIT bearing: 61 N/A, -150 000 N/m, air gap 0.35 mm",
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         loop=placed_loop(parameters, (-800, -180 + 180j, -180 - 180j, -20), derivative_cutoff_hz=1500.0, delay=1.0),
         usually_closed=True,
         noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.5, voltage=0.05),
         limits=Limits(voltage=(-60.0, 60.0), current=(-2.0, 2.0), position=(-350e-6, 350e-6)),
         rate_hz=20_000.0,
-        sources=MappingProxyType(
-            {
-                "k_i": f"{source}, eq. 1.6",
-                "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
-                "limits.position": source,
-                "position_sensor": source,
-                "amplifier": source,
-                "m": "chosen",
-                "R": "chosen",
-                "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
-                "loop, noise, voltage and current limits, rate_hz": "chosen",
-            }
-        ),
-        instruments=MappingProxyType({"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")}),
+        sources={
+            "k_i": f"{source}, eq. 1.6",
+            "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
+            "limits.position": source,
+            "position_sensor": source,
+            "amplifier": source,
+            "m": "chosen",
+            "R": "chosen",
+            "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
+            "loop, noise, voltage and current limits, rate_hz": "chosen",
+        },
+        instruments={"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")},
     )
 
 
@@ -105,7 +97,7 @@ def _levitated_ball() -> Preset:
     return Preset(
         name="levitated-ball",
         summary="a ball under one magnet: position is the gap, rest at 10 mm and 0.95 A",
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         plant=plant,
         operating_point=plant.equilibrium(gap),
         loop=placed_loop(parameters, (-150, -40 + 30j, -40 - 30j, -2), derivative_cutoff_hz=400.0, delay=1.0),
@@ -113,13 +105,11 @@ def _levitated_ball() -> Preset:
         noise=Noise.held(rate_hz=2000.0, position=2e-6, current=1e-3, force=2e-3, voltage=0.02),
         limits=Limits(voltage=(0.0, 12.0), current=(0.0, 2.5), position=(0.002, 0.020)),
         rate_hz=2000.0,
-        sources=MappingProxyType(
-            {
-                "k_i, k_x": "gravity balance at the chosen rest point: k_i = -2 m g/i0, k_x = -2 m g/x0",
-                "m, R, leakage, rest point": "chosen",
-                "loop, noise, limits, rate_hz": "chosen",
-            }
-        ),
+        sources={
+            "k_i, k_x": "gravity balance at the chosen rest point: k_i = -2 m g/i0, k_x = -2 m g/x0",
+            "m, R, leakage, rest point": "chosen",
+            "loop, noise, limits, rate_hz": "chosen",
+        },
     )
 
 
@@ -132,7 +122,7 @@ def _prototype() -> Preset:
     return Preset(
         name="prototype",
         summary="table-top bearing on an Arduino Uno: 12 V bridge, 10 bits, 2 kHz; k_i 20.1 N/A, k_x -6702 N/m",
-        parameters=MappingProxyType(parameters),
+        parameters=parameters,
         plant=plant,
         loop=placed_loop(parameters, (-320, -80 + 80j, -80 - 80j, -16), derivative_cutoff_hz=300.0, delay=0.35),
         usually_closed=True,
@@ -146,25 +136,21 @@ def _prototype() -> Preset:
         ),
         limits=Limits(voltage=(-11.4, 11.4), current=(-1.0, 1.0), position=(-1e-3, 1e-3)),
         rate_hz=rate_hz,
-        sources=MappingProxyType(
-            {
-                "supply": "12 V battery, thesis ch. 5; a full bridge is chosen, so that the coil sees both signs",
-                "position_resolution, current_resolution": "10 bits over 2.5 mm and 2.5 A, chosen",
-                "voltage_resolution": "800 counts of pulse width over +-12 V",
-                "turns, area, bias, gap, leakage, m, R": "chosen",
-                "limits.voltage": "pulse width of 2.5 to 97.5 %: a bridge with a charge pump needs its pause",
-                "limits.current": "the bias: neither coil reverses",
-                "loop.delay": "the controller's 175 us (firmware/amb_daq/README.md)",
-                "loop, noise, limits.position, rate_hz": "chosen",
-            }
-        ),
-        instruments=MappingProxyType(
-            {
-                "position_sensor": (5.0 / 2.5e-3, "V/m"),
-                "current_sensor": (5.0 / 2.5, "V/A"),
-                "pulse_width": (volts / counts, "V"),
-            }
-        ),
+        sources={
+            "supply": "12 V battery, thesis ch. 5; a full bridge is chosen, so that the coil sees both signs",
+            "position_resolution, current_resolution": "10 bits over 2.5 mm and 2.5 A, chosen",
+            "voltage_resolution": "800 counts of pulse width over +-12 V",
+            "turns, area, bias, gap, leakage, m, R": "chosen",
+            "limits.voltage": "pulse width of 2.5 to 97.5 %: a bridge with a charge pump needs its pause",
+            "limits.current": "the bias: neither coil reverses",
+            "loop.delay": "the controller's 175 us (firmware/amb_daq/README.md)",
+            "loop, noise, limits.position, rate_hz": "chosen",
+        },
+        instruments={
+            "position_sensor": (5.0 / 2.5e-3, "V/m"),
+            "current_sensor": (5.0 / 2.5, "V/A"),
+            "pulse_width": (volts / counts, "V"),
+        },
     )
 
 

@@ -29,10 +29,6 @@ def _of_pair(axes: tuple[str, ...], magnet: DifferentialPair, resistance: float)
     return {f"{axis}.{name}": value for axis in axes for name, value in numbers.items()}
 
 
-def _sources(**more: str) -> Mapping[str, str]:
-    return MappingProxyType({**more, _CHOSEN: "chosen"})
-
-
 def _utrc() -> Preset:
     axes = ("ax", "ay", "bx", "by")
     magnet = DifferentialPair(turns=100, area=600e-6, bias=2.0, gap=0.5e-3, half_angle=0.392, leakage=2e-3)
@@ -53,7 +49,7 @@ def _utrc() -> Preset:
         name="utrc",
         summary="the UTRC facility: flexible rotor at 15 000 rpm above its first bending mode, four axes, eddy pole",
         model="rotor",
-        parameters=MappingProxyType({**_of_pair(axes, magnet, 1.2), **sensors, "a": 2.0 * math.pi * 1200.0}),
+        parameters={**_of_pair(axes, magnet, 1.2), **sensors, "a": 2.0 * math.pi * 1200.0},
         rotor=RotorBody(
             model=model, shaft=shaft, gap=magnet.gap, sigma=0.01,
             unbalance=(Turning(name="disc", value=8e-6, phase=0.7, z=0.40),),
@@ -64,16 +60,15 @@ def _utrc() -> Preset:
         noise=Noise.held(rate_hz=20_000.0, position=0.2e-6, current=3e-3, force=0.5, voltage=0.05),
         limits=Limits(voltage=(-200.0, 200.0), current=(-2.0, 2.0), position=(-0.25e-3, 0.25e-3)),
         rate_hz=20_000.0,
-        sources=_sources(
-            **{
+        sources={
                 "speed": "thesis sec. 1.3: 15 000 rpm, above the first bending critical speed",
                 "modes": "thesis sec. 1.3: three bending modes, damping 1 %; the shaft is chosen",
                 "a": "thesis eq. 1.4; its value is chosen",
                 "loop.kc": "the amplifier of thesis eq. 1.5, K H = kc with H = 1; its value is chosen",
                 "sensor_pole": "thesis sec. 1.3: sensors as low-pass filters; the value is chosen",
                 "magnets, planes, unbalance, runout": "chosen",
-            }
-        ),
+                _CHOSEN: "chosen",
+            },
     )  # fmt: skip
 
 
@@ -86,7 +81,7 @@ def _rmit() -> Preset:
         name="rmit",
         summary="the RMIT rotor on four axes: 61 N/A, -150 000 N/m, air gap 0.35 mm",
         model="rotor",
-        parameters=MappingProxyType({**rigid, **{f"{axis}.{name}": x for axis in axes for name, x in numbers.items()}}),
+        parameters={**rigid, **{f"{axis}.{name}": x for axis in axes for name, x in numbers.items()}},
         rotor=RotorBody(
             model=RotorModel(bearings=(_radial("L", axes[:2], 0.07, 0.04), _radial("R", axes[2:], 0.33, 0.36))),
             gap=0.40e-3,
@@ -96,18 +91,17 @@ def _rmit() -> Preset:
         noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.5, voltage=0.05),
         limits=Limits(voltage=(-60.0, 60.0), current=(-0.9, 0.9), position=(-350e-6, 350e-6)),
         rate_hz=20_000.0,
-        sources=_sources(
-            **{
-                "k_i": f"{source}, eq. 1.6",
-                "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
-                "limits.position": f"{source}: clearance of the actuators",
-                "position_sensor, amplifier": source,
-                "m, Id, planes, R": "chosen",
-                "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
-                "gap": "chosen: the clearance and 0.05 mm of iron and cover",
-            }
-        ),
-        instruments=MappingProxyType({"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")}),
+        sources={
+            "k_i": f"{source}, eq. 1.6",
+            "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
+            "limits.position": f"{source}: clearance of the actuators",
+            "position_sensor, amplifier": source,
+            "m, Id, planes, R": "chosen",
+            "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
+            "gap": "chosen: the clearance and 0.05 mm of iron and cover",
+            _CHOSEN: "chosen",
+        },
+        instruments={"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")},
     )
 
 
@@ -130,7 +124,7 @@ def _camb() -> Preset:
         name="camb",
         summary="conical bearings: two claw stators of four pole pairs; five axes, the axial one by the cone angle",
         model="rotor",
-        parameters=MappingProxyType({**rigid, **numbers}),
+        parameters={**rigid, **numbers},
         rotor=RotorBody(
             model=RotorModel(
                 bearings=(
@@ -147,14 +141,13 @@ def _camb() -> Preset:
         noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.3, voltage=0.05),
         limits=Limits(voltage=(-60.0, 60.0), current=(-1.4, 1.4), position=(-0.2e-3, 0.2e-3)),
         rate_hz=20_000.0,
-        sources=_sources(
-            **{
+        sources={
                 "force law": "thesis eq. 1.9",
                 "pole pairs, differential drive": "thesis sec. 1.5: eight teeth in four pairs a stator",
                 "turns, area, bias, gap, cone angle": "chosen",
                 "m, Id, Ip, planes, R, leakage, speed, unbalance": "chosen",
-            }
-        ),
+                _CHOSEN: "chosen",
+            },
     )  # fmt: skip
 
 
@@ -172,7 +165,7 @@ def _central_mass() -> Preset:
         name="central-mass",
         summary="the thesis's proposal: two bearings, a central mass between them; two bending modes, 3000 rpm",
         model="rotor",
-        parameters=MappingProxyType(_of_pair(axes, magnet, 1.0)),
+        parameters=_of_pair(axes, magnet, 1.0),
         rotor=RotorBody(
             model=RotorModel(
                 bearings=(_radial("A", axes[:2], 0.075, 0.100), _radial("B", axes[2:], 0.525, 0.500)),
@@ -186,12 +179,11 @@ def _central_mass() -> Preset:
         noise=Noise.held(rate_hz=20_000.0, position=0.2e-6, current=2e-3, force=0.3, voltage=0.05),
         limits=Limits(voltage=(-100.0, 100.0), current=(-1.5, 1.5), position=(-0.2e-3, 0.2e-3)),
         rate_hz=20_000.0,
-        sources=_sources(
-            **{
+        sources={
                 "two bearings, central mass": "thesis ch. 6, fig. 6.1",
                 "shaft, mass, magnets, planes, speed, unbalance": "chosen; the thesis prints none",
-            }
-        ),
+                _CHOSEN: "chosen",
+            },
     )  # fmt: skip
 
 
@@ -203,7 +195,7 @@ def _spindle() -> Preset:
         name="spindle",
         summary="a rigid spindle on five axes at 30 000 rpm",
         model="rotor",
-        parameters=MappingProxyType({**rigid, **_of_pair(axes, magnet, 0.8)}),
+        parameters={**rigid, **_of_pair(axes, magnet, 0.8)},
         rotor=RotorBody(
             model=RotorModel(
                 bearings=(
@@ -220,7 +212,7 @@ def _spindle() -> Preset:
         noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=2e-3, force=0.2, voltage=0.05),
         limits=Limits(voltage=(-80.0, 80.0), current=(-2.0, 2.0), position=(-0.2e-3, 0.2e-3)),
         rate_hz=20_000.0,
-        sources=_sources(numbers="chosen"),
+        sources={"numbers": "chosen", _CHOSEN: "chosen"},
     )  # fmt: skip
 
 
