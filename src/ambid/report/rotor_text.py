@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 
-from ambid.errors import counted
 from ambid.estimation.estimate import Delay, EstimatedParameter
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.physics.shaft import Shaft
@@ -19,6 +18,7 @@ from ambid.report.text import (
     check_lines,
     columns,
     joined,
+    late,
     other_warnings,
     parameter_lines,
     plain,
@@ -138,12 +138,7 @@ def _cell(p: EstimatedParameter | None) -> str:
 
 
 def _late(d: Delay | None, rate_hz: float) -> str:
-    if d is None:
-        return ""
-    total = d.samples + d.fraction
-    count = f"{total:.3g}" if d.sd is None else pure(total, d.sd)
-    time = f" ({sized(total / rate_hz, 's')})" if total else ""
-    return f"{counted(count, 'sample')}{time}{', given' if d.how == 'given' else ''}"
+    return "" if d is None else f"{late(d, rate_hz)}{', given' if d.how == 'given' else ''}"
 
 
 def _fit(e: RotorEstimate, role: str) -> str:

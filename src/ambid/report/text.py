@@ -160,11 +160,15 @@ def word_for_all(found: Verdict) -> str:
 
 
 def delay_line(what: str, d: Delay, rate_hz: float) -> str:
-    """Say by how much an input is delayed."""
+    """Say by how much an input is delayed, and how that is known."""
+    return f"delay of {what}: {late(d, rate_hz)}, {d.how}"
+
+
+def late(d: Delay, rate_hz: float) -> str:
+    """Write a delay in samples and seconds."""
     total = d.samples + d.fraction
     count = f"{total:.3g}" if d.sd is None else pure(total, d.sd)
-    time = f" ({sized(total / rate_hz, 's')})" if total else ""
-    return f"delay of {what}: {counted(count, 'sample')}{time}, {d.how}"
+    return counted(count, "sample") + (f" ({sized(total / rate_hz, 's')})" if total else "")
 
 
 def pure(value: float, sd: float) -> str:

@@ -22,7 +22,7 @@ from typing import Any, Literal
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
-from ambid.tracking.blocks import Block, Frame, Rejection, RejectionKind, Stretch
+from ambid.tracking.blocks import Block, Frame, Passed, Rejection, RejectionKind, Stretch
 from ambid.tracking.guard import StreamGuard
 from ambid.tracking.replay import paced
 from ambid.tracking.ring import BlockRing
@@ -303,16 +303,16 @@ class _Pump:
         self._statistics.late += frame.arrived_s < self._done
         self.blocks += 1
         self._arrivals.append(frame.arrived_s)
-        for passed in self._guard.take(frame.block):
+        self._deliver(self._guard.take(frame.block), self._guard.n_waiting)
+        self._working += self._done - began
+
+    def _deliver(self, found: Iterable[Passed], waiting: int) -> None:
+        """Hand on what the guard lets pass, and count the latency of blocks that are done with."""
+        for passed in found:
             if isinstance(passed, Stretch):
                 self._consume(passed)
             elif self._reject is not None:
                 self._reject(passed)
-        self._count(self._guard.n_waiting)
-        self._working += self._done - began
-
-    def _count(self, waiting: int) -> None:
-        """Count the latency of blocks that are done with."""
         self._done = time.perf_counter()
         while len(self._arrivals) > waiting:
             self._statistics.add(self._done - self._arrivals.popleft())
@@ -348,12 +348,7 @@ class _Pump:
 
     def finish(self) -> None:
         """Deliver what waits in the guard."""
-        for passed in self._guard.flush():
-            if isinstance(passed, Stretch):
-                self._consume(passed)
-            elif self._reject is not None:
-                self._reject(passed)
-        self._count(0)
+        self._deliver(self._guard.flush(), 0)
 
     def report(self, *, interrupted: bool) -> StreamReport:
         guard = self._guard
