@@ -30,6 +30,7 @@ NORMAL_95 = 1.959963984540054
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE, NARROW = 11.0, 4.6  # inches: a page, and the screen of a telephone
+_DPI = 130  # of a PNG
 _WHOLE = 9.0  # inches from which verdict and convention stand on one line
 PIXELS = 800  # stretches of which a long curve shows the extremes, about one for each column of pixels
 _LETTERS = 13.7  # of a legend on an inch
@@ -178,10 +179,16 @@ def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = No
     kind : str, optional
         Format, where the name does not tell it.
     """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
     # no date inside: equal estimates give equal files
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     ending = kind or Path(str(target)).suffix.lower().removeprefix(".")
-    figure.savefig(target, dpi=130, format=ending, metadata=dates.get(ending))
+    if ending == "png":  # `savefig` would draw everything twice
+        figure.set_dpi(_DPI)
+        FigureCanvasAgg(figure).print_png(target)  # type: ignore[no-untyped-call]
+    else:
+        figure.savefig(target, dpi=_DPI, format=ending, metadata=dates.get(ending))
 
 
 def curve(
