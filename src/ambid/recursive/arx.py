@@ -298,17 +298,14 @@ class DelayLines:
 
 
 def columns_of(
-    na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool, output: int = 0
+    na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool
 ) -> tuple[list[tuple[int, int, int]], list[str]]:
-    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs.
-
-    `output`: channel that stands for the output.
-    """
+    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs."""
     if na < 0 or len(nb) != len(nk) or any(n < 0 for n in (*nb, *nk)) or na + sum(nb) == 0:
         raise EstimationError(
             f"na={na}, nb={list(nb)}, nk={list(nk)}: orders must be at least 0, and not all 0. Correct them"
         )
-    columns, names = [(output, lag, -1) for lag in range(1, na + 1)], [f"a{lag}" for lag in range(1, na + 1)]
+    columns, names = [(0, lag, -1) for lag in range(1, na + 1)], [f"a{lag}" for lag in range(1, na + 1)]
     for i, (order, delay) in enumerate(zip(nb, nk, strict=True), start=1):
         for lag in range(delay, delay + order):
             columns.append((i, lag, 1))

@@ -86,16 +86,15 @@ def campbell_panel(
     drawn: Campbell | None = None,
     sd: Array | None = None,
     speeds: Sequence[float] = (),
-    bearings: str = "without bearings",
 ) -> Panel:
     """Draw whirl frequencies over speed: identified lines, with 95 % bands from `sd`; those of a drawing dashed, grey
     where both are drawn.
 
     `sd`: standard deviations of the identified frequencies in rad/s, (n_speeds, n_lines); `speeds`: at which records
-    were taken, rad/s; `bearings`: those that the lines are for. Where a line meets the speed itself (1x), a critical
+    were taken, rad/s. Where a line meets the speed itself (1x), a critical
     speed is marked.
     """
-    return panel(_campbell, identified, drawn, sd, speeds, bearings, height=4.2)
+    return panel(_campbell, identified, drawn, sd, speeds, height=4.2)
 
 
 def _hertz(drawn: FreeRotor, k: int | None) -> float:
@@ -223,7 +222,6 @@ def _campbell(
     drawn: Campbell | None,
     sd: Array | None,
     speeds: Sequence[float],
-    bearings: str,
 ) -> None:
     """Frequencies in Hz over speed in 1/min."""
     given = [x for x in (identified, drawn) if x is not None]
@@ -244,7 +242,7 @@ def _campbell(
     axes.set_ylabel("frequency of whirl [Hz]")
     many = "speed" if len(criticals) == 1 else "speeds"
     said = f"critical {many} {', '.join(criticals)} 1/min" if criticals else "no critical speed up to here"
-    head(axes, f"{said}, {bearings}")
+    head(axes, f"{said}, without bearings")
 
 
 def _lines(axes: Axes, which: Campbell, sd: Array | None, style: Mapping[str, Any]) -> None:

@@ -491,19 +491,15 @@ def folds(data: IOData, count: int = FOLDS) -> tuple[Fold, ...]:
     return tuple(out)
 
 
-def held_out_error(
-    parts: Sequence[Fold], fitted: Callable[[IOData], BlackBoxFit], *, tick: Callable[[], None] | None = None
-) -> float:
+def held_out_error(parts: Sequence[Fold], fitted: Callable[[IOData], BlackBoxFit]) -> float:
     """Return the root mean squared error on parts that a fit has not seen, relative to the outputs.
 
-    `fitted`: makes a fit from data; `tick`: called before each fit. Returns 1 is as bad as the mean; over all outputs,
+    `fitted`: makes a fit from data. Returns 1 is as bad as the mean; over all outputs,
     each relative to its own variance. One-step errors; for an output-error model simulation errors. Infinite where a
     model cannot be run.
     """
     total, weight = 0.0, 0
     for fold in parts:
-        if tick is not None:
-            tick()
         fit = fitted(fold.fitted)
         found = errors_elsewhere(fit, fold.judged)
         e = found.one_step if found.claims_noise else found.simulation
