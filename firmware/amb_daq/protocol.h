@@ -259,7 +259,7 @@ struct msg_status {
     uint16_t overruns; /* ticks that came too early, and pulse widths that acted a period later than they should, since reset */
     uint16_t dropped; /* frames that found no room in the transmit buffer, since reset */
     uint16_t rx_errors; /* received frames of wrong CRC, length or code, since reset */
-    uint16_t rx_lost; /* received bytes that were lost or had no stop bit, since reset */
+    uint16_t rx_lost; /* received bytes that were lost or had no stop bit, since reset; a run of them that found no room counts once or more */
     uint16_t busy_us; /* longest work of one tick since start, microseconds */
     uint16_t supply_mv; /* supply voltage by the internal reference, mV; 0: not measured yet */
 };

@@ -1,11 +1,19 @@
 """State-space laws in the firmware's own binary on the emulated bench: bit by bit, in time, and back to the old one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from ambid.acquisition.law_kernel import law_tick, watch
 from ambid.acquisition.law_words import BEGIN, WATCH_MS, law_words
+from ambid.control.lqg import lqg
+from ambid.errors import AmbidError
+from ambid.job.acquiring import acquire
 from ambid.physics.law import StateLaw
+from ambid.physics.loop import Loop
+from tests.bars.host import prototype
+from tests.control.test_lqg import of_preset, weights_of
 from tests.firmware.controller_host import Host
 from tests.firmware.native.console import LEVITATING, LIMITS
 from tests.firmware.test_firmware_emulated import BENCH, PLANT, gains_for
@@ -126,3 +134,45 @@ def test_confirmed_it_stays_and_unconfirmed_it_goes(host, keep, cause):
     after = [s.values[2] for s in one.samples[1200:1400]]
     assert abs(np.mean(after) - np.mean(before)) < 15  # no jump of what holds the rotor
     assert np.abs(np.array([s.values[0] for s in one.samples[600:]]) - 512).max() < 20
+
+
+@pytest.fixture
+def record_of(bench_program, firmware_elf, tmp_path):
+    """Record 6 s of the prototype with a loop, lifted off by it or armed; returns what was sampled."""
+
+    def run(law, *, armed):
+        rig = prototype()
+        new = replace(rig, loop=Loop(law=law, delay=rig.loop.delay))
+        options = {"seconds": 6.0, "excitation": "multisine", "amplitude": 0.6}
+        first, arm = (rig, new) if armed else (new, None)
+        done = acquire("emulated", first, tmp_path / "run.csv", arm=arm, **options)
+        assert done.run.fault is None
+        columns = done.record.to_dataframe()
+        return [columns[c].to_numpy() for n in ("position", "current", "duty", "excitation") for c in columns if n in c]
+
+    return run
+
+
+@pytest.mark.parametrize("armed", [False, True], ids=["lifted off", "armed"])
+def test_lqg_in_fixed_point_is_that_in_floating_point(record_of, armed):
+    """Peak of the sensitivity within 0.1 dB on the emulated bench."""
+    bench, plant = of_preset("prototype")
+    law = lqg(plant, weights_of(bench), bench.noise).law
+    x, i, u, e = (np.fft.rfft(v - v.mean()) for v in record_of(law, armed=armed))
+    lines = np.abs(e) > 0.2 * np.abs(e).max()
+    x, i, u, e = x[lines], i[lines], u[lines], e[lines]
+    f = np.fft.rfftfreq(int(6.0 * RATE), 1.0 / RATE)[lines]
+    w = law.response(f)[:, 0, :] * np.array([2.44140625e-6, 2.44140625e-3]) / 0.03
+    loop = (w[:, 0] * x + w[:, 1] * i) / u
+    words, floating = u / e, 1.0 / (1.0 - loop)
+    peaks = [20.0 * np.log10(np.abs(s).max()) for s in (words, floating)]
+    assert peaks[0] > 3.0
+    assert abs(peaks[0] - peaks[1]) < 0.1
+
+
+def test_a_loop_that_does_not_hold_is_given_up_and_said(bench_program, firmware_elf, tmp_path):
+    rig = prototype()
+    weak = replace(rig, loop=replace(rig.loop, kp=0.2 * rig.loop.kp, ki=0.0, kd=0.0))
+    with pytest.raises(AmbidError, match="returned to the loop that it ran before: the rotor left the bounds"):
+        acquire("emulated", rig, tmp_path / "run.csv", seconds=1.0, arm=weak, force=True)
+    assert not (tmp_path / "run.csv").exists()

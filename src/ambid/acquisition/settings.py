@@ -45,6 +45,7 @@ GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
 """Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
 
 FEWEST_STEPS = 3  # of a gain: coarser than that it is another gain
+_FAST_LAWS = ((9, 3), (10, 4))  # ticks of fewer periods, and the states that a law may have there
 _FRAME_BYTES = 8  # of a sample on the wire beside its values: code, tick, state, CRC, COBS, end
 STREAM = ("position", "current", "third", "voltage", "excitation", "reference")
 """Roles of what a sample may carry, in the order of the bits of the stream mask and of a block's columns."""
@@ -248,8 +249,16 @@ def _law(rig: Rig, rest: tuple[int, int, int]) -> LawWords | None:
     volts, amperes, metres = (
         scale_of(rig, r).slope(at) for r, at in zip(("voltage", "current", "position"), rest, strict=True)
     )
+    period = _period(rig, rig.daq)
+    most = next((n for below, n in _FAST_LAWS if period < below), law.order)
+    if law.order > most:
+        raise RigError(
+            f"{who(rig)}: loop.A has {law.order} states; at {PWM_HZ / period:.5g} Hz the controller has time for"
+            f" {most}."
+            " Lower daq.rate_hz and design the law for it, or reduce the law's order"
+        )
     try:
-        law.check(1, 2, PWM_HZ / _period(rig, rig.daq))
+        law.check(1, 2, PWM_HZ / period)
         return law_words(_in_units(law, (metres, amperes), 1.0 / volts))
     except (ModelError, RigError) as failure:
         raise RigError(f"{who(rig)}: {failure}") from None
