@@ -18,11 +18,13 @@ from functools import cached_property
 
 import numpy as np
 
+from ambid.acquisition.law_words import LAW_STATES
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
 from ambid.control.hinf import hinf
 from ambid.control.lqg import SampledPlant, Weights, lqg
+from ambid.control.reduction import reduced
 from ambid.control.tuning import option, said
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick
@@ -253,9 +255,18 @@ def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of:
         for b in range(-2, 3)
         for c in (1.0, 1.5)
     ]
-    return design_by_knobs(
-        lambda k: law_of(plants[0], Weights.of(limits, k[2]), noise, k[0], k[1]), grid, plants, rig, goals, tick, name
-    )
+
+    def make(knobs: Knobs) -> StateLaw:
+        weights = Weights.of(limits, knobs[2])
+        law = law_of(plants[0], weights, noise, knobs[0], knobs[1])
+        if rig.daq is None or law.order <= LAW_STATES:
+            return law
+        each = [weights.position, weights.current if math.isfinite(weights.current) else 1.0]
+        axes = law.D.shape[0]
+        sizes = np.tile(each[: law.D.shape[1] // axes], axes)
+        return reduced(law, LAW_STATES, sizes, weights.command)[0]  # what the controller has room for
+
+    return design_by_knobs(make, grid, plants, rig, goals, tick, name)
 
 
 def design_lqg(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
