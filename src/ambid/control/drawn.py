@@ -80,11 +80,12 @@ class Drawn:
 
     def words(self) -> str:
         """Say what was changed, on one line."""
-        said = []
-        for name, x in self.changed.items():
-            kind = name.rsplit(".", 1)[-1]
-            if kind in _WORDS:
-                said.append(_WORDS[kind].format(x if kind not in ("position", "eddy_s") else 1e6 * x))
+        said, by_axis = [], sorted(self.changed.items(), key=lambda item: -abs(item[1]))
+        for kind, words in _WORDS.items():
+            found = [(name, x) for name, x in by_axis if name.rsplit(".", 1)[-1] == kind]
+            for name, x in found[:1]:  # of a rotor the axis that is changed most
+                axis = f"axis {name.partition('.')[0]}: " if "." in name else ""
+                said.append(axis + words.format(x if kind not in ("position", "eddy_s") else 1e6 * x))
         sizes = sorted(
             ((n, x) for n, x in self.changed.items() if n.rsplit(".", 1)[-1] not in _WORDS), key=lambda x: -abs(x[1])
         )
