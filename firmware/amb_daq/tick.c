@@ -123,9 +123,9 @@ static uint16_t law(int16_t *excitation)
     if (daq.control.law) /* its states move on, while the order waits and then: bytes to the host wait for them */
         while (board_order_waits() && control_ahead(&daq.control))
             ;
-    else
-        board_send();
     duty = order(duty);
+    if (!daq.control.law)
+        board_send(); /* at a fixed time: the line's bytes then never come when the next tick holds its inputs */
     while (control_ahead(&daq.control))
         ;
     tick_prepare();
