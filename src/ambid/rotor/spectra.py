@@ -26,6 +26,7 @@ _TRANSIENT = 5.0  # standard deviations by which a first period may differ from 
 _LEAST_PERIODS = 2
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
 _FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
+_LEAST_LINES = 20  # that are excited
 _MOST_LINES = 1200
 _MOST_WINDOWS = 4000  # in which noise is looked at
 _LINES_PER_UNKNOWN = 3
@@ -233,10 +234,11 @@ def period_spectra(record: Record, model: LinearModel, found: Excitation, speed:
         R[:, [named.index(role) for role in logged]] = spectra(logged).mean(axis=0)
     within = slice(1, (n + 1) // 2)
     clean = (R if logged else U.mean(axis=0))[None, within]
-    lines = excited_lines(clean, None if logged else np.var(U, axis=0, ddof=1)[within].sum(axis=1) / found.count)[0] + 1
+    scatter = None if logged else np.var(U, axis=0, ddof=1)[within].sum(axis=1) / found.count
+    lines = excited_lines(clean, scatter, least=_LEAST_LINES)[0] + 1
     frequency: Array = np.asarray(lines * (rate / n), dtype=np.float64)
     near = beside_harmonics(frequency, speed / (2.0 * np.pi), rate / n)
-    if np.count_nonzero(~near) < 20:
+    if np.count_nonzero(~near) < _LEAST_LINES:
         raise EstimationError(
             f"the excitation of the record has {lines.size} lines, {np.count_nonzero(near)} of them beside harmonics "
             "of the speed; a rotor needs 20 others. Excite more lines: a multisine with whole periods"
@@ -277,7 +279,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     seen[:_FIRST_LINE] = False
     seen &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
     lines = np.flatnonzero(seen)
-    if lines.size < 20:
+    if lines.size < _LEAST_LINES:
         raise EstimationError(
             f"the record shows motion above its noise at {lines.size} lines; a rotor needs 20. Excite more, and more "
             "frequencies, or record longer"

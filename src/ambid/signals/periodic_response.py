@@ -71,11 +71,11 @@ def find_period(x: Array) -> int:
     return int(low[np.argmax(d[low] <= 2.0 * deepest + 1e-3)])
 
 
-def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
+def excited_lines(mean: Complex, noise: Array | None, *, least: int = 1) -> tuple[Lines, bool]:
     """Return the excited lines of spectra `mean` (n_experiments, n_lines, n_channels), and whether a gap shows them.
 
-    The lines are those over the largest gap in the sorted amplitudes, of 12 dB at least; without such a gap all that
-    are within 60 dB of the largest and 10 dB over their own noise power `noise` (n_lines,).
+    The lines are those over the largest gap in the sorted amplitudes, of 12 dB at least, below the `least` largest;
+    without such a gap all that are within 60 dB of the largest and 10 dB over their own noise power `noise` (n_lines,).
     """
     power = np.sum(np.abs(mean) ** 2, axis=(0, 2))
     if not np.any(power > 0):
@@ -84,6 +84,7 @@ def excited_lines(mean: Complex, noise: Array | None) -> tuple[Lines, bool]:
     order = np.argsort(level)[::-1]
     high = int(np.sum(power > power.max() * _LARGEST_GAP_FROM**2))
     falls = level[order[:-1]] - level[order[1:]]
+    falls[: least - 1] = 0.0  # of a designed excitation some lines are far larger than the others
     last = int(np.argmax(falls[:high])) if falls.size else 0
     clear = bool(falls.size and falls[:high].max() > np.log(10.0**1.2))
     lines = np.sort(order[: last + 1]) if clear else np.sort(order[:high])
