@@ -24,11 +24,12 @@ from ambid.control.experiment import (
     SignalUse,
     Task,
     design,
+    hardest,
     lines_of,
     played,
     uses,
 )
-from ambid.control.information import Innovation
+from ambid.control.information import Information, Innovation
 from ambid.errors import AmbidError, check_positive, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -360,10 +361,9 @@ def _told(
 ) -> Experiment:
     """Play the design, and say what it uses and what a record of it will show."""
     assert bench.rig is not None
-    loop, of = task.loops[0], task.loops[0].plant.model
-    full = with_default_daq(bench.rig)
-    quantum = None
+    loop, of, quantum = task.loops[0], task.loops[0].plant.model, None
     if bench.rig.daq is not None:
+        full = with_default_daq(bench.rig)
         quantum = abs(scale_of(full, "voltage").slope(controller_settings(full).duty_bias))
     for _ in range(_ROUNDINGS):
         wave, table = played(found, task, quantum)
@@ -372,51 +372,65 @@ def _told(
         if table is None or quantum is None or used.max() <= _FULL:
             break
         found = replace(found, c=found.c / (used.max() + quantum / table.amplitude))  # a step less at least
-    information = task.information(lines, [0])
-    power = np.abs(c) ** 2
-    flat_lines = task.candidates()
-    flat = np.exp(1j * schroeder_phases(np.ones(flat_lines.size)))
-    flat = flat / max(task.limited(flat_lines, [k]).use(flat).max() for k in range(len(task.loops)))
-    of_flat = task.information(flat_lines, [0]).relative_sd(np.abs(flat) ** 2, task.samples)
-    relative = information.relative_sd(power, task.samples)
+    information, power = task.information(lines, [0]), np.abs(c) ** 2
+    expected = _expected(task, information, power, _flat_sd(task, found), wanted.target)
+    waves = dict(zip(loop.signals, task.limited(lines, [0]).waves(c).T, strict=True))
     by_length = np.array([information.relative_sd(power, x * task.samples) for x in _LENGTHS])
     by_level = np.array([information.relative_sd(power * x**2, task.samples) for x in _LEVELS])
-    units = {p.name: p.unit for p in of.parameters}
-    expected = {}
-    for k, name in enumerate(information.names):
-        value = loop.plant.theta.get(name, float(loop.plant.delays[0]))
-        aim = task.period * max(1.0, task.periods * (relative[k] / wanted.target) ** 2)
-        needed = float(aim / task.rate_hz) if relative[k] < WEAK else None
-        expected[name] = Expected(
-            value=value, unit=units.get(name, "1"), sd=float(relative[k] * information.sizes[k]),
-            relative_sd=float(relative[k]), flat_sd=float(of_flat[k] * information.sizes[k]),
-            identifiable=bool(relative[k] < WEAK), seconds=needed,
-        )  # fmt: skip
-    low, high, spare = ends
-    waves = task.limited(lines, [0]).waves(c)
-    signals = {}
-    for k, name in enumerate(loop.signals):
-        finite = [float(x) if np.isfinite(x) else None for x in (low[k], high[k])]
-        signals[name] = SignalUse(
-            unit=f"{of.units[of.inputs[0]]}/s" if name.endswith(SLEW) else of.units[name],
-            low=finite[0], high=finite[1], steady=float(used[0, 0, k]),
-            from_rest=float(used[0, 1, k]), drawn=float(used[:, :, k].max()),
-            peak=float(np.max(np.abs(waves[:, k]))), reserve=float(spare[k]),
-        )  # fmt: skip
     return Experiment(
         model=of.name, criterion=task.criterion, rate_hz=task.rate_hz, period=task.period, periods=task.periods,
         frequency_hz=task.frequency_hz(found.lines), amplitude={of.inputs[0]: np.abs(found.c)},
-        phase={of.inputs[0]: np.angle(found.c)},
-        excitation={of.inputs[0]: wave[:, 0]}, table=table, closed=bench.loop.closed, signals=signals,
-        expected=expected, target=wanted.target, gap=found.gap, drawn=len(task.loops) - 1,
-        checks=_checks(used, expected, unstable),
+        phase={of.inputs[0]: np.angle(found.c)}, excitation={of.inputs[0]: wave[:, 0]}, table=table,
+        closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
+        gap=found.gap, drawn=len(task.loops) - 1, checks=_checks(used, expected, unstable),
         shown=Shown(
-            waves={n: rounded(waves[:, k]) for k, n in enumerate(loop.signals)},
+            waves={name: rounded(x) for name, x in waves.items()},
             seconds=_LENGTHS * (task.samples / task.rate_hz),
             by_length=dict(zip(information.names, by_length.T, strict=True)), levels=_LEVELS,
             by_level=dict(zip(information.names, by_level.T, strict=True)),
         ),
     )  # fmt: skip
+
+
+def _flat_sd(task: Task, found: Design) -> Array:
+    """Return the relative standard deviations of a flat multisine with Schroeder's phases at the same use, (n,)."""
+    lines = task.candidates()
+    flat = np.exp(1j * schroeder_phases(np.ones(lines.size)))
+    plants = [0, *hardest(task, found.lines, found.c)]
+    flat = flat / float(np.max(task.limited(lines, plants).use(flat)))
+    return task.information(lines, [0]).relative_sd(np.abs(flat) ** 2, task.samples)
+
+
+def _expected(task: Task, known: Information, power: Array, flat: Array, target: float) -> dict[str, Expected]:
+    """Return what a record will show, by parameter."""
+    plant, relative = task.loops[0].plant, known.relative_sd(power, task.samples)
+    units, found = {p.name: p.unit for p in plant.model.parameters}, {}
+    for k, name in enumerate(known.names):
+        aim = task.period * max(1.0, task.periods * (relative[k] / target) ** 2)
+        seen = bool(relative[k] < WEAK)
+        found[name] = Expected(
+            value=plant.theta.get(name, float(plant.delays[0])), unit=units.get(name, "1"),
+            sd=float(relative[k] * known.sizes[k]), relative_sd=float(relative[k]),
+            flat_sd=float(flat[k] * known.sizes[k]), identifiable=seen,
+            seconds=float(aim / task.rate_hz) if seen else None,
+        )  # fmt: skip
+    return found
+
+
+def _signals(
+    loop: ExcitedLoop, ends: tuple[Array, Array, Array], used: Array, waves: Mapping[str, Array]
+) -> dict[str, SignalUse]:
+    """Return what the excitation moves, by signal."""
+    of, found = loop.plant.model, {}
+    low, high, spare = ends
+    for k, (name, wave) in enumerate(waves.items()):
+        finite = [float(x) if np.isfinite(x) else None for x in (low[k], high[k])]
+        found[name] = SignalUse(
+            unit=f"{of.units[of.inputs[0]]}/s" if name.endswith(SLEW) else of.units[name],
+            low=finite[0], high=finite[1], steady=float(used[0, 0, k]), from_rest=float(used[0, 1, k]),
+            drawn=float(used[:, :, k].max()), peak=float(np.max(np.abs(wave))), reserve=float(spare[k]),
+        )  # fmt: skip
+    return found
 
 
 def rounded(x: Array) -> Array:
