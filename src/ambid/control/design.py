@@ -60,6 +60,7 @@ FREQUENCIES = 320
 """At which many plants are looked at, beside those around their resonances."""
 _LONGEST = 20.0  # time constants of the slowest pole over which a force step is looked at
 _MOST = 2**17  # samples of it
+_ENOUGH = 2048  # of them that tell when it is settled
 _SHOWN = 400  # of it that are drawn
 
 
@@ -215,33 +216,36 @@ def noise_in_command(loop: ClosedLoop, noise: tuple[float, float]) -> Array:
     return np.asarray(np.sqrt(mean_over(loop.frequency_hz, np.sum(np.abs(answer * sd) ** 2, axis=2))))
 
 
-def force_step(plant: Plant, z: Array, n: int) -> Array:
+def force_step(plant: Plant, z: Array, n: int, doublings: int = 0) -> Array:
     """Return the positions of the axes after a step of 1 N on each, one at a time, (n, n_axes), m.
 
-    `z`: matrix of the closed loop. Samples by doubling: x[k + m] = z^m x[k] + x[m].
+    `z`: matrix of the closed loop. Samples by doubling: x[k + m] = z^m x[k] + x[m]; of each 2^`doublings` the last.
     """
     whole = float(np.max(plant.delays))
     d, _ = discretise(plant.space, 1.0 / plant.rate_hz, fraction=whole - math.floor(whole))
     axes, first = len(plant.axes), [group[0] for group in plant.sensors]
     pushed = np.zeros((z.shape[0], axes))
     pushed[: d.A.shape[0]] = d.E[:, :axes]
-    states = pushed[None]
     power = z
-    while states.shape[0] < n:
-        more = np.einsum("ij,kjl->kil", power, states) + states[-1]
-        states, power = np.concatenate([states, more]), power @ power
-    found = np.einsum("ij,kjl->kil", d.C[first], states[:n, : d.A.shape[0]])
-    return np.asarray(np.einsum("kii->ki", found))
+    for _ in range(doublings):
+        pushed, power = power @ pushed + pushed, power @ power
+    states = pushed[:, None]  # (n_states, n, n_axes)
+    while states.shape[1] < n:
+        more = (power @ states.reshape(z.shape[0], -1)).reshape(states.shape) + states[:, -1:]
+        states, power = np.concatenate([states, more], axis=1), power @ power
+    return np.asarray(np.einsum("ij,jki->ki", d.C[first], states[: d.A.shape[0], :n]))
 
 
 def settling_of(plant: Plant, z: Array, pole: float) -> tuple[float, Array, Array]:
     """Return when the deflection by a force step last leaves `SETTLED` of its largest; times in s, and deflections."""
     n = int(min(max(_LONGEST / pole * plant.rate_hz, 64.0), _MOST))
-    x = force_step(plant, z, n)
+    doublings = max(int(math.log2(n / _ENOUGH)), 0)
+    n, every = n >> doublings, 2**doublings
+    x = force_step(plant, z, n, doublings)
     final = x[-1]
     off = np.abs(x - final)
     last = [int(np.flatnonzero(o > SETTLED * max(o.max(), 1e-300))[-1]) + 2 if o.max() else 0 for o in off.T]
-    return max(last) / plant.rate_hz, np.arange(1, n + 1) / plant.rate_hz, x
+    return every * max(last) / plant.rate_hz, every * np.arange(1, n + 1) / plant.rate_hz, x
 
 
 def worst_of(figures: Sequence[Figures]) -> Figures:

@@ -38,6 +38,7 @@ GAP_OF_TRAVEL = 2.0
 _NARROW = 0.3  # relative standard deviation up to which a number is drawn in its logarithm
 _TRIES = 100  # of one draw
 _STEPS = 6  # of Newton's method; the force is nearly a square of the current
+_GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # whose multiples are spread evenly
 _TOLD = 3  # numbers that `Drawn.words` names
 
 
@@ -75,7 +76,7 @@ class Drawn:
     plant: Plant  # without covariance
     number: int  # of the draw; 0 is the estimate
     # "position" (m) from rest and "current" (A) from what holds the rotor there, "delay" (samples), "eddy_s" (s),
-    # "warm_k" (K), and the relative change of every number of the model by its name; of a rotor by axis
+    # "warm_k" (K), "speed" (rad/s), relative change of every number of the model by its name; of a rotor by axis
     changed: Mapping[str, float]
 
     def words(self) -> str:
@@ -85,7 +86,7 @@ class Drawn:
             found = [(name, x) for name, x in by_axis if name.rsplit(".", 1)[-1] == kind]
             for name, x in found[:1]:  # of a rotor the axis that is changed most
                 axis = f"axis {name.partition('.')[0]}: " if "." in name else ""
-                said.append(axis + words.format(x if kind not in ("position", "eddy_s") else 1e6 * x))
+                said.append(axis + words.format(x * _SHOWN.get(kind, 1.0)))
         sizes = sorted(
             ((n, x) for n, x in self.changed.items() if n.rsplit(".", 1)[-1] not in _WORDS), key=lambda x: -abs(x[1])
         )
@@ -95,8 +96,9 @@ class Drawn:
 
 _WORDS = {
     "position": "rotor {:+.3g} µm from rest", "current": "current {:+.2g} A", "delay": "delay {:+.2f} samples",
-    "eddy_s": "eddy currents {:.3g} µs", "warm_k": "coil {:+.0f} K",
+    "eddy_s": "eddy currents {:.3g} µs", "warm_k": "coil {:+.0f} K", "speed": "{:.0f} rpm",
 }  # fmt: skip
+_SHOWN = {"position": 1e6, "eddy_s": 1e6, "speed": 30.0 / math.pi}  # over SI
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -138,6 +140,29 @@ def draw_plants(
 
 
 _NONE: Mapping[str, float] = MappingProxyType({})
+
+
+def over_speeds(draws: Draws, speeds: Interval) -> Draws:
+    """Return the plants of a rotor at speeds in rad/s between two: the estimate at its own, two draws at the ends.
+
+    EstimationError where the estimate does not know what a turning rotor does.
+    """
+    found = list(draws.plants[:1])
+    for k, drawn in enumerate(draws.plants[1:]):
+        share = k if k < 2 else (k * _GOLDEN) % 1.0
+        speed, of = speeds[1] - share * (speeds[1] - speeds[0]), drawn.plant.model
+        assert isinstance(of, RotorModel)
+        turned = of.at_speed(speed)
+        missing = [p.name for p in turned.parameters if p.name not in drawn.plant.theta]
+        if missing:
+            raise EstimationError(
+                f"the estimate does not know {', '.join(missing)}, which a turning rotor has. Identify it with a "
+                "record at speed too, or design for no speed"
+            )
+        found.append(replace(
+            drawn, plant=replace(drawn.plant, model=turned), changed={"speed": speed, **drawn.changed}
+        ))  # fmt: skip
+    return replace(draws, plants=tuple(found))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

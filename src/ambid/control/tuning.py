@@ -1,8 +1,8 @@
-"""The PID of `ambid.physics.loop.Loop` tuned over many plants of one axis at once.
+"""The PID of `ambid.physics.loop.Loop` tuned over many plants at once; of rotors also one a bearing or by motion.
 
-Its five numbers kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) + q (1 - 1/z)/(1 -
-p/z) and, each alone, in the matrix of the closed loop: the responses H of the plants are computed once, and slopes are
-exact. With x, i by a voltage (H) and by a force (G), D = 1 + kc H_i + K H_x:
+Of one axis its five numbers kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) +
+q (1 - 1/z)/(1 - p/z) and, each alone, in the matrix of the closed loop: the responses H of the plants are computed
+once, and slopes are exact. With x, i by a voltage (H) and by a force (G), D = 1 + kc H_i + K H_x:
 
     S = (1 + kc H_i)/D,   x/f = (G_x + kc (G_x H_i - H_x G_i))/D,   u/n = (K, kc)/D.
 
@@ -37,10 +37,13 @@ from ambid.control.design import (
     on,
     worst_of,
 )  # fmt: skip
+from ambid.control.gain_sets import GainSets, Pid, form_of
+from ambid.control.rotor_loops import RotorLoops
 from ambid.errors import EstimationError, ModelError
 from ambid.estimation.progress import Tick
 from ambid.physics.linear_model import OneAxis
 from ambid.physics.loop import Loop, placed_loop
+from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.simulation.plant import closed_loop_matrix
 
@@ -53,47 +56,9 @@ _MET = 2e-3  # excess in logarithms that counts as none
 _SLACK = 0.01  # by which limits are kept from, in logarithms: other plants judge
 _ROUNDS = 5  # of corrections by the force steps
 _WAYS = 10  # loops that are tried between the present one and the best
+_AWAY = math.log(2.0)  # of the frequencies of a filter from those of its mode
+_DAMPING = (0.02, 2.0)  # of zeros and poles of a filter
 _PLACED = (0.6, 1.0, 1.6)  # over the plant's own rate, where poles are placed to start from
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pid:
-    """What may change in a loop: its numbers as `AxisLoops` takes them, with the signs of the present ones."""
-
-    signs: Array  # (4,): of kp, ki, kd, kc; 0 where the present loop has none, and keeps none
-    period: float
-
-    @classmethod
-    def of(cls, loop: Loop, rate_hz: float) -> Pid:
-        """Return the structure of a loop."""
-        return cls(signs=np.sign([loop.kp, loop.ki, loop.kd, loop.kc]), period=1.0 / rate_hz)
-
-    @property
-    def free(self) -> Array:
-        """Which of the five numbers are searched."""
-        return np.append(self.signs != 0.0, self.signs[2] != 0.0)
-
-    def at(self, loop: Loop) -> Array:
-        """Return the logarithms of |kp|, |ki| T, |q|, |kc| and tau; of a loop without filter, a tau of T/10."""
-        T = self.period
-        tau = max(loop.filter_s, T / 10.0)
-        sizes = np.abs([loop.kp, loop.ki * T, loop.kd / (loop.filter_s + T), loop.kc, tau])
-        return np.asarray(np.log(np.where(sizes > 0.0, sizes, 1.0)))
-
-    def numbers(self, at: Array) -> tuple[Array, Array]:
-        """Return kp, ki T, q, kc and p, and their slopes by the logarithms."""
-        tau, T = math.exp(at[4]), self.period
-        v = np.append(self.signs * np.exp(at[:4]), tau / (tau + T) if self.signs[2] else 0.0)
-        return v, np.append(v[:4], tau * T / (tau + T) ** 2 if self.signs[2] else 0.0)
-
-    def loop(self, at: Array, present: Loop) -> Loop:
-        """Return the loop."""
-        v, _ = self.numbers(at)
-        tau = math.exp(at[4])
-        return replace(
-            present, kp=float(v[0]), ki=float(v[1] / self.period), kd=float(v[2] * (tau + self.period)),
-            kc=float(v[3]), derivative_cutoff_hz=1.0 / (2.0 * math.pi * tau) if self.signs[2] else math.inf,
-        )  # fmt: skip
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -200,8 +165,8 @@ class AxisLoops:
 class _Search:
     """One problem: what is minimised and limited, over plants; evaluated once for each point."""
 
-    loops: AxisLoops
-    pid: Pid
+    loops: AxisLoops | RotorLoops
+    pid: Pid | GainSets
     reference: Mapping[str, float]
     decay: float  # 1/s, of the present loop, by which settling is judged
 
@@ -271,74 +236,177 @@ class _Search:
         return found, float(values[:, goals].max()), max(float((values[:, kept] - most).max()), 0.0)
 
 
-def tune_pid(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
-    """Return the PID with current feedback that does best on the worst of some plants of one axis.
+def tune_pid(
+    plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, *, form: str = "axes", filters: int = 0
+) -> Loop:
+    """Return the PID with current feedback that does best on the worst of some plants.
 
-    Gains that the present loop has not stay absent. EstimationError where no loop meets the limits.
+    Gains that the present loop has not stay absent. `form`: of a rotor which axes share gains, of
+    `ambid.control.gain_sets.FORMS`; `filters`: around so many of its lowest bending modes. EstimationError where no
+    loop meets the limits.
     """
     assert rig.loop is not None
-    if not all(isinstance(p.model, OneAxis) for p in plants):
-        raise EstimationError("a PID is tuned for one axis with its coil (model one-axis); the estimate is of another")
     if rig.loop.law is not None:
         raise EstimationError(
             "[loop] is a state-space law, whose structure is no PID. Give a PID in [loop] to start from"
         )
-    present, pid = rig.loop, Pid.of(rig.loop, plants[0].rate_hz)
-    noise = noise_of(rig.noise, {})[:2]
-    loops = AxisLoops(plants=plants, noise=noise, frequency_hz=plants[0].grid(FREQUENCIES))
-    start = pid.at(present)
-    bounds = bounds_of(rig, pid, start)
-    decays = loops.decays(pid.numbers(start)[0], integrates=bool(pid.signs[1]))[0]
-    search = _Search(
-        loops=loops, pid=pid, reference=goals.reference, decay=max(float(np.min(decays)), 1e-3 * loops.rate_hz / 1e3)
-    )
-    starts = [start, *_placed(plants[0], present, pid, bounds)]
-    done = 0
+    of = _Rotors if isinstance(plants[0].model, RotorModel) else _OneAxis
+    return _tuned(of.of(plants, rig, form, filters), goals, tick)
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _OneAxis:
+    """What is tuned: plants of one axis, all of which are looked at all the time."""
+
+    plants: Sequence[Plant]
+    present: Loop
+    noise: tuple[float, float]
+    pid: Pid
+    bounds: Array
+
+    @classmethod
+    def of(cls, plants: Sequence[Plant], rig: Rig, form: str, filters: int) -> _OneAxis:
+        """Return the problem of a rig."""
+        if not all(isinstance(p.model, OneAxis) for p in plants):
+            raise EstimationError(
+                "a PID is tuned for one axis with its coil (model one-axis) or a rotor; the estimate is of another"
+            )
+        if form != "axes" or filters:
+            raise EstimationError("forms and filters of gains are of a rotor; the estimate is of one axis. Omit them")
+        assert rig.loop is not None
+        pid = Pid.of(rig.loop, plants[0].rate_hz)
+        return cls(
+            plants=plants, present=rig.loop, noise=noise_of(rig.noise, {})[:2], pid=pid,
+            bounds=bounds_of(rig, pid, pid.at(rig.loop)),
+        )  # fmt: skip
+
+    def starts(self) -> list[Array]:
+        """Return where searches start, the present loop first."""
+        return [self.pid.at(self.present), *_placed(self.plants[0], self.present, self.pid, self.bounds)]
+
+    def looked_at(self, figures: Sequence[Figures], before: Sequence[int]) -> list[int]:  # noqa: ARG002
+        """Return which plants to look at, by the figures of a loop on all of them."""
+        return list(range(len(self.plants)))
+
+    def loops(self, which: Sequence[int], at: Array) -> AxisLoops:  # noqa: ARG002
+        """Return some plants in their loop."""
+        return AxisLoops(
+            plants=[self.plants[k] for k in which], noise=self.noise, frequency_hz=self.plants[0].grid(FREQUENCIES)
+        )
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Rotors:
+    """What is tuned: rotors, of which those are looked at that were the worst of all in any figure."""
+
+    plants: Sequence[Plant]
+    present: Loop
+    noise: tuple[float, float]
+    pid: GainSets
+    around: tuple[float, ...]  # frequencies of filters, rad/s
+    bounds: Array
+
+    @classmethod
+    def of(cls, plants: Sequence[Plant], rig: Rig, form: str, filters: int) -> _Rotors:
+        """Return the problem of a rig."""
+        assert rig.loop is not None
+        first = plants[0]
+        own = sorted(x for name, x in first.theta.items() if name.startswith("mode") and name.endswith(".omega"))
+        if filters > len(own):
+            raise EstimationError(
+                f"{filters} filters are asked for, and the estimate has {len(own)} bending modes. Ask for no more than "
+                "modes"
+            )
+        around = tuple(own[:filters])
+        pid = GainSets.of(rig.loop, first.model, first.rate_hz, form_of(first.model, first.theta, form), filters)
+        one = pid.pid.at(rig.loop)
+        gains = np.tile(bounds_of(rig, pid.pid, one), (len(pid.form.names), 1))
+        near = [[[math.log(w) - _AWAY, math.log(w) + _AWAY]] * 2 + [list(np.log(_DAMPING))] * 2 for w in around]
+        return cls(
+            plants=plants, present=rig.loop, noise=noise_of(rig.noise, {})[:2], pid=pid, around=around,
+            bounds=np.vstack([gains, *near]),
+        )  # fmt: skip
+
+    def starts(self) -> list[Array]:
+        """Return where searches start: the present loop."""
+        return [self.pid.at(self.present, self.around)]
+
+    def looked_at(self, figures: Sequence[Figures], before: Sequence[int]) -> list[int]:
+        """Return the plants of before and those that are now the worst, by much, in any figure."""
+        found = list(before) or [0]
+        for name in FIGURES:
+            sizes = np.array([getattr(f, name) for f in figures])
+            k = int(np.argmax(sizes))
+            if not before or sizes[k] > (1.0 + _SLACK) * sizes[found].max():
+                found.append(k)
+        return list(dict.fromkeys(found))
+
+    def loops(self, which: Sequence[int], at: Array) -> RotorLoops:
+        """Return some plants in their loop."""
+        return RotorLoops(plants=[self.plants[k] for k in which], noise=self.noise, sets=self.pid, around=at)
+
+
+def _tuned(of: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
+    """Return the best loop: on some plants, until it does as well on all."""
+    starts, done = of.starts(), 0
 
     def advance() -> None:
         nonlocal done
         done += 1
-        tick("tune", min(done / (_STEPS * (len(starts) + 1)), 0.99))
+        tick("tune", 1.0 - 1.0 / (1.0 + done / (_STEPS * len(starts))))
+
+    def figures_of(loop: Loop) -> list[Figures]:
+        return [examine(p, loop, of.noise).figures for p in of.plants]
 
     limits = {
         n: math.log(x / goals.reference[n]) - _SLACK * (n not in _worsened(goals)) for n, x in goals.limits.items()
     }
-    best = start
+    which = of.looked_at([] if isinstance(of, _OneAxis) else figures_of(of.present), [])
+    first = best = starts[0]
     for k in range(_ROUNDS):
-        found = [search.solve(goals.minimise, limits, x, bounds, advance) for x in starts]
+        loops = of.loops(which, starts[0])
+        decays = loops.decays(of.pid.numbers(first)[0], integrates=bool(of.pid.signs[1]))[0]
+        search = _Search(
+            loops=loops, pid=of.pid, reference=goals.reference,
+            decay=max(float(np.min(decays)), 1e-3 * loops.rate_hz / 1e3),
+        )  # fmt: skip
+        found = [search.solve(goals.minimise, limits, x, of.bounds, advance) for x in starts]
         point, _, excess = min(found, key=lambda f: f[1] + _PENALTY * f[2])
+        if excess > _MET and not k:  # or the search stood still: what is far inside a limit is a better start
+            ways = _ways(search, limits, starts, of.bounds, advance)
+            inside = [search.solve(goals.minimise, limits, x, of.bounds, advance) for gap, _, x in ways if gap <= 0.0]
+            point, _, excess = min(inside, key=lambda f: f[1] + _PENALTY * f[2], default=(point, 0.0, excess))
+            if excess > _MET:
+                raise EstimationError(_refusal(goals, ways))
         if excess > _MET:
-            if not k:
-                raise EstimationError(_refusal(search, goals, limits, starts, bounds, advance))
             break
-        best, loop = point, pid.loop(point, present)
-        settling = _worst(plants, loop, noise).settling
-        over = settling / goals.limits.get("settling", math.inf)
-        if over <= SAME:
+        best, loop = point, of.pid.loop(point, of.present)
+        figures = figures_of(loop)
+        over, more = _worst(figures).settling / goals.limits.get("settling", math.inf), of.looked_at(figures, which)
+        if over <= SAME and more == which:
             return loop
-        limits["settling"] -= 1.5 * math.log(over) + _SLACK
-        starts = [best, *starts[:1]]
-    return _between(pid, present, (start, best), plants, noise, goals)
+        if over > SAME and math.isfinite(over):
+            limits["settling"] -= 1.5 * math.log(over) + _SLACK
+        which, starts = more, [best, *starts[:1]]
+    return _between(of, (first, best), figures_of, goals)
 
 
-def _worst(plants: Sequence[Plant], loop: Loop, noise: tuple[float, float]) -> Figures:
+def _worst(figures: Sequence[Figures]) -> Figures:
     """Return the worst of each figure over plants; without stability everywhere those of none."""
-    figures = [examine(p, loop, noise).figures for p in plants]
     return worst_of(figures) if all(f.stable for f in figures) else UNSTABLE
 
 
 def _between(
-    pid: Pid, present: Loop, ends: tuple[Array, Array], plants: Sequence[Plant], noise: tuple[float, float],
-    goals: Goals,
-) -> Loop:  # fmt: skip
-    """Return the loop farthest from the present one towards the best whose force steps settle within the limit.
+    of: _OneAxis | _Rotors, ends: tuple[Array, Array], figures_of: Callable[[Loop], Sequence[Figures]], goals: Goals
+) -> Loop:
+    """Return the loop farthest from the present one towards the best that meets the limits on all plants.
 
-    The slowest pole says little of them where it takes no part.
+    The slowest pole says little of force steps where it takes no part.
     """
     worst = UNSTABLE
-    for share in np.linspace(0.9, 0.0, _WAYS):
-        loop = pid.loop(ends[0] + share * (ends[1] - ends[0]), present) if share else present
-        worst = _worst(plants, loop, noise)
+    for share in np.linspace(1.0, 0.0, _WAYS + 1):
+        loop = of.pid.loop(ends[0] + share * (ends[1] - ends[0]), of.present) if share else of.present
+        worst = _worst(figures_of(loop))
         if not goals.missed(worst):
             return loop
     asked = ", ".join(said(name, x) for name, x in goals.limits.items())
@@ -388,23 +456,31 @@ def _placed(plant: Plant, present: Loop, pid: Pid, bounds: Array) -> list[Array]
     return found
 
 
-def _refusal(
-    search: _Search, goals: Goals, limits: Mapping[str, float], starts: Sequence[Array], bounds: Array,
-    tick: Callable[[], None],
-) -> str:  # fmt: skip
-    """Say which limit to move, and how far: the one that has to give way least, the others kept."""
+_Way = tuple[float, str, Array]
+
+
+def _ways(
+    search: _Search, limits: Mapping[str, float], starts: Sequence[Array], bounds: Array, tick: Callable[[], None]
+) -> list[_Way]:
+    """Return how far each limit has to give way where the others are kept, in logarithms, its name, and where."""
     ways = []
     for name in limits:
         others = {n: x for n, x in limits.items() if n != name}
-        _, least, excess = min(
+        point, least, excess = min(
             (search.solve((name,), others, x, bounds, tick) for x in starts), key=lambda f: f[1] + _PENALTY * f[2]
         )
         if excess <= _MET:
-            ways.append((least - limits[name], name, goals.limits[name] * math.exp(least - limits[name])))
+            ways.append((least - limits[name], name, point))
+    return ways
+
+
+def _refusal(goals: Goals, ways: Sequence[_Way]) -> str:
+    """Say which limit to move, and how far: the one that has to give way least, the others kept."""
     asked = ", ".join(said(name, x) for name, x in goals.limits.items())
     if not ways:
         return f"no PID meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
-    _, name, least = min(ways)
+    gap, name, _ = min(ways, key=lambda w: w[0])
+    least = goals.limits[name] * math.exp(gap)
     moved = option(name, least)
     return (
         f"no PID meets the limits ({asked}) on all plants; with the others kept, {said(name, least)} is the "

@@ -74,6 +74,11 @@ class StateLaw:
         """Return the law that sees its signals multiplied by `gains`, (n_y,)."""
         return replace(self, B=self.B * np.asarray(gains), D=self.D * np.asarray(gains))
 
+    def through(self, rows: Array, columns: Array) -> StateLaw:
+        """Return the law that sees `rows` y, (n_seen, n_y), and commands `columns` w, (n_u, n_given)."""
+        given = np.linalg.pinv(columns)
+        return replace(self, B=self.B @ rows, C=columns @ self.C, D=columns @ self.D @ rows, G=self.windup @ given)
+
     def check(self, n_inputs: int, n_fed_back: int, rate_hz: float) -> None:
         """Refuse a plant or a rate that the law is not for."""
         if self.D.shape != (n_inputs, n_fed_back):
