@@ -108,6 +108,13 @@ def controller(
             "--spread SOURCE=X", "How far plants are drawn, such as delay=0.3; repeatable.", "see the documentation"
         ),
     ] = None,
+    form: Annotated[
+        str, option("--form NAME", "Gains of a rotor's PID: axes (one set), bearings, or tilt (and parallel).", True)
+    ] = "axes",
+    filters: Annotated[int, option("--filters N", "Filters around a rotor's lowest bending modes.", True, min=0)] = 0,
+    speeds: Annotated[
+        str | None, option("--speeds LO:HI", "Of a rotor in rpm.", "from rest to the speed of rig or estimate")
+    ] = None,
     plants: Annotated[int, option("--plants N", "Plants that the design is tuned over.", True, min=1)] = 60,
     judges: Annotated[int, option("--judges N", "Plants that judge the design.", True, min=1)] = 200,
     seed: Annotated[int, option("--seed N", "Seed of the plants.", True, min=0)] = 0,
@@ -135,7 +142,8 @@ def controller(
         outputs.claim(export, "--export", LAW_ENDINGS)
         found = design_controller(
             estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
-            spread=_sources(spread or ()), plants=plants, judges=judges, seed=seed, tick=show,
+            spread=_sources(spread or ()), form=form, filters=filters,
+            speeds_rpm=None if speeds is None else _pair(speeds), plants=plants, judges=judges, seed=seed, tick=show,
         )  # fmt: skip
         outputs.give(found, show)
         if out is not None:
@@ -145,6 +153,15 @@ def controller(
         if export is not None:
             outputs.stage(export, found.export)
     outputs.show(found, strict=strict)
+
+
+def _pair(text: str) -> tuple[float, float]:
+    """Read ``--speeds``."""
+    low, _, high = text.partition(":")
+    try:
+        return float(low), float(high)
+    except ValueError:
+        raise AmbidError(f"--speeds is {text!r}; give two speeds in rpm with a colon between, such as 0:6000") from None
 
 
 def _figures(words: Sequence[str]) -> dict[str, float]:

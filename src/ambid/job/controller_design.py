@@ -5,8 +5,10 @@ Read -> plants drawn -> the present loop on them -> design -> as the controller 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,7 +31,8 @@ from ambid.control.design import (
     worst_of,
     worst_plant,
 )
-from ambid.control.drawn import Draws, Spread, draw_plants
+from ambid.control.drawn import Draws, Spread, draw_plants, over_speeds
+from ambid.control.gain_sets import FORMS
 from ambid.control.verification import checks_of_verifications, verify_all
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
@@ -38,7 +41,7 @@ from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
 from ambid.job.data import Clock, rig_entry
 from ambid.job.loop_margins import given
-from ambid.physics.loop import Loop, Noise
+from ambid.physics.loop import Interval, Loop, Noise
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 
@@ -64,7 +67,7 @@ def _hinf() -> Method:
     return design_hinf
 
 
-METHODS: Mapping[str, Callable[[], Method]] = {"pid": _pid, "lqg": _lqg, "hinf": _hinf}
+METHODS: Mapping[str, Callable[[], Callable[..., Loop]]] = {"pid": _pid, "lqg": _lqg, "hinf": _hinf}
 """By the name that ``method`` takes: what designs is imported when it is asked for."""
 
 
@@ -76,6 +79,9 @@ def design_controller(
     goals: Sequence[str] = GOALS,
     limits: Mapping[str, float] | None = None,
     spread: Mapping[str, Any] | None = None,
+    form: str = "axes",
+    filters: int = 0,
+    speeds_rpm: tuple[float, float] | None = None,
     plants: int = 60,
     judges: int = 200,
     seed: int = 0,
@@ -104,6 +110,12 @@ def design_controller(
         Largest values by the same names, in dB, m/N, V rms and s; default: what the present loop has.
     spread : Mapping[str, float], optional
         How far plants are drawn, by the names of `ambid.control.drawn.Spread`; 0 switches a source off.
+    form : {"axes", "bearings", "tilt"}
+        Gains of a rotor's PID: the same on all axes, a set a bearing, or sets for parallel and tilting motion.
+    filters : int
+        Around so many of a rotor's lowest bending modes the PID has a filter each, a notch or a phase lead.
+    speeds_rpm : (float, float), optional
+        Of a rotor, between which the plants turn; default: from rest to the speed of rig or estimate.
     plants, judges : int
         How many plants the design is tuned over, and how many judge it.
     seed : int
@@ -146,8 +158,11 @@ def design_controller(
     for name, x, least in (("plants", plants, 1), ("judges", judges, 1)):
         if x < least:
             raise EstimationError(f"{name} is {x}; it must be at least {least}. Correct it")
+    design = _method(method, form, filters)
+    speeds = _speeds(known, bench, speeds_rpm)
     with one_thread():
-        found = _designed(_problem(known, bench, sources, (plants, judges, seed)), method, goals, asked, say, clock)
+        problem = _problem(known, bench, sources, (plants, judges, seed), speeds)
+        found = _designed(problem, method, design, goals, asked, say, clock)
     return replace(found, timing_s=clock.laps)
 
 
@@ -172,7 +187,38 @@ class _Problem:
         return self.rig.loop
 
 
-def _problem(known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, int]) -> _Problem:
+def _method(name: str, form: str, filters: int) -> Method:
+    """Return a method with the form of a PID's gains; refuse these of another method."""
+    if name != "pid":
+        if form != "axes" or filters:
+            raise EstimationError(f"form and filters are of a PID, not of {name}. Omit them, or give method pid")
+        return METHODS[name]()
+    if form not in FORMS:
+        raise EstimationError(
+            f"form {form!r} of gains is unknown: {', '.join(FORMS)}.{nearest(form, list(FORMS))} Give one of them"
+        )
+    if filters < 0:
+        raise EstimationError(f"filters is {filters}; it must be zero or positive. Correct it")
+    return partial(METHODS[name](), form=form, filters=filters)
+
+
+def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> Interval | None:
+    """Return between which speeds in rad/s the plants turn; None where nothing turns."""
+    if given is not None:
+        if not isinstance(known, RotorEstimate):
+            raise EstimationError("speeds are of a rotor on many axes; the estimate is of one axis. Omit them")
+        if not (0.0 <= given[0] <= given[1] and math.isfinite(given[1])):
+            raise EstimationError(f"speeds are {given} rpm; they are zero or positive, the lower first. Correct them")
+        return given[0] * math.pi / 30.0, given[1] * math.pi / 30.0
+    if not isinstance(known, RotorEstimate) or bench.rotor is None:
+        return None
+    top = max(abs(bench.rotor.speed), abs(known.speed))
+    return (0.0, top) if top else None
+
+
+def _problem(
+    known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, int], speeds: Interval | None
+) -> _Problem:
     """Return the plants around an estimate, and the present loop on it."""
     plants, judges, seed = sizes
     sd = known.noise.sensor_sd if isinstance(known, Estimate) else known.noise
@@ -188,6 +234,8 @@ def _problem(known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, 
         draw_plants(plant, rig, n, seed=k, spread=spread, point=point)
         for k, n in zip(seeds, (plants, judges), strict=True)
     )
+    if speeds is not None:
+        tuning, judging = over_speeds(tuning, speeds), over_speeds(judging, speeds)
     return _Problem(
         known=known, bench=bench, rig=rig, plant=plant, noise=(position, current), tuning=tuning, judging=judging,
         seeds=seeds, assumed=assumed,
@@ -195,8 +243,9 @@ def _problem(known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, 
 
 
 def _designed(
-    problem: _Problem, method: str, goals: Sequence[str], limits: Mapping[str, float], say: Tick, clock: Clock
-) -> Design:
+    problem: _Problem, method: str, design: Method, goals: Sequence[str], limits: Mapping[str, float], say: Tick,
+    clock: Clock,
+) -> Design:  # fmt: skip
     of, plants = problem, [d.plant for d in problem.tuning.plants]
     refuse_unheld(examine(of.plant, of.present, of.noise).figures, "the estimated plant")
     before = verify(of.tuning.plants, of.present, of.noise, part_of(say, 0.0, 0.3) or silent)
@@ -204,7 +253,6 @@ def _designed(
     clock.lap("draw")
     asked = Goals.of(goals, limits, worst_of([x.figures for x in before]))
     judged = Goals.of(goals, limits, worst_of([x.figures for x in first]))  # the present loop on the same plants
-    design = METHODS[method]()
     for _ in range(_ROUNDS):
         loop = held_by(of.bench, design(plants, of.rig, asked, say))
         seen = verify(of.judging.plants, loop, of.noise, say)

@@ -1,0 +1,104 @@
+"""Gains of rotors: forms that are the same law, exact slopes, and a tuned loop that holds other plants and speeds."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.control.closed import Plant
+from ambid.control.controller import controller_of_loop
+from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
+from ambid.control.drawn import draw_plants, over_speeds
+from ambid.control.gain_sets import FORMS, GainSets, form_of
+from ambid.control.rotor_loops import RotorLoops
+from ambid.control.tuning import tune_pid
+from ambid.errors import EstimationError
+from ambid.estimation.progress import silent
+from ambid.physics.loop import Loop
+from ambid.rig.preset_rig import rig_of_preset
+from ambid.simulation.rotor_bench import RotorBench
+
+
+def bench_of(name):
+    rig = rig_of_preset(ambid.preset(name))
+    of = RotorBench.of(rig, None, True)
+    n = len(of.model.inputs)
+    return rig, Plant(
+        model=of.model, theta=of.plant.parameters, delays=np.full(n, rig.loop.delay), rate_hz=of.rate_hz
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def turning():
+    return bench_of("camb")
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize("filters", [0, 1])
+def test_equal_gains_are_the_decentralised_loop_in_every_form(turning, form, filters):
+    rig, plant = turning
+    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, plant.theta, form), filters)
+    law = sets.law(sets.at(rig.loop, (2500.0,) * filters))
+    f = np.geomspace(0.5, 0.49 * plant.rate_hz, 40)
+    same, found = (controller_of_loop(x, plant.model, plant.rate_hz).response(f)[0] for x in (rig.loop, Loop(law=law)))
+    np.testing.assert_allclose(found, same, atol=1e-12 * np.abs(same).max())
+
+
+def test_parallel_gains_push_without_tilting(turning):
+    _, plant = turning
+    form = form_of(plant.model, {**plant.theta, "z_cg": 0.08}, "tilt")
+    assert form.names == ("parallel", "tilt", "axial")
+    np.testing.assert_allclose(sum(form.share(k) for k in range(3)), np.eye(5), atol=1e-14)
+    levers = np.array([plant.theta[f"{b.name}.z"] - 0.08 for b, plane in plant.model.placed if plane == 0])
+    push = form.transform[0][[j for j, (_, plane) in enumerate(plant.model.placed) if plane == 0]]
+    assert push @ levers == pytest.approx(0.0, abs=1e-15)
+
+
+def test_slopes_of_rotors_are_exact(turning):
+    rig, plant = turning
+    plants = [d.plant for d in draw_plants(plant, rig, 2, seed=3).plants]
+    sets = GainSets.of(rig.loop, plant.model, plant.rate_hz, form_of(plant.model, plant.theta, "tilt"), 1)
+    at = sets.at(rig.loop, (2500.0,))
+    loops = RotorLoops(plants=plants, noise=noise_of(rig.noise, {})[:2], sets=sets, around=at)
+    at = at + 0.05 * np.sin(np.arange(at.size))
+    (figures, slopes), (decays, falls) = loops.figures(at), loops.decays(at, integrates=True)
+    for plant_of, found, decay in zip(plants, figures, decays, strict=True):
+        alone = examine(plant_of, sets.loop(at, rig.loop), loops.noise).figures
+        np.testing.assert_allclose(np.exp(found), [alone.peak, alone.compliance, alone.noise], rtol=0.03)
+        assert decay <= alone.pole * 1.001
+    for j in range(0, at.size, 3):
+        step = 1e-6 * np.eye(at.size)[j]
+        (high, fast), (low, slow) = (
+            (loops.figures(at + s)[0], loops.decays(at + s, integrates=True)[0]) for s in (step, -step)
+        )
+        np.testing.assert_allclose(slopes[..., j], (high - low) / 2e-6, atol=1e-6 * np.abs(slopes).max())
+        np.testing.assert_allclose(falls[:, j], (fast - slow) / 2e-6, atol=1e-3 * np.abs(falls).max())
+
+
+def test_a_tuned_rotor_is_better_on_other_plants_and_speeds(turning):
+    rig, plant = turning
+    noise, speeds = noise_of(rig.noise, {})[:2], (0.0, plant.model.speed)
+    tuning, judging = (over_speeds(draw_plants(plant, rig, n, seed=k), speeds) for k, n in ((0, 6), (1, 5)))
+    plants = [d.plant for d in tuning.plants]
+    assert [p.model.speed for p in plants[:3]] == [speeds[1], speeds[1], 0.0]
+    before = worst_of([examine(p, rig.loop, noise).figures for p in plants])
+    loop = tune_pid(plants, rig, Goals.of(GOALS, {}, before), silent, form="tilt")
+    found = [[examine(d.plant, x, noise).figures for d in judging.plants] for x in (rig.loop, loop)]
+    assert all(f.stable for f in found[1])
+    was, now = map(worst_of, found)
+    assert now.peak < 0.8 * was.peak
+    assert now.compliance < was.compliance
+    assert now.noise < 1.02 * was.noise
+
+
+def test_what_an_estimate_does_not_show_is_refused():
+    rig, plant = bench_of("rmit")
+    draws = draw_plants(plant, rig, 2, seed=0)
+    with pytest.raises(EstimationError, match="does not know Ip"):
+        over_speeds(draws, (0.0, 500.0))
+    with pytest.raises(EstimationError, match="has 0 bending modes"):
+        tune_pid([plant], rig, Goals.of(GOALS, {}, examine(plant, rig.loop, (1e-7, 0.0)).figures), silent, filters=1)
+    one = replace(plant.model, bearings=plant.model.bearings[:1])
+    with pytest.raises(EstimationError, match="tilting takes two bearings"):
+        form_of(one, plant.theta, "tilt")
