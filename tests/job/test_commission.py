@@ -15,7 +15,7 @@ from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, EstimationError, ModelError
 from ambid.job import commissioning as room
 from ambid.job import commissioning_steps as judge
-from ambid.job.commissioning import FILES, Declined, check_folder, commission
+from ambid.job.commissioning import FILES, REDESIGNED, Declined, check_folder, commission
 from ambid.job.commissioning_steps import STEPS, Plan, tracking
 from ambid.job.commissioning_steps import record as judged_record
 from ambid.record import read_record
@@ -111,6 +111,28 @@ def test_what_cannot_be_designed_is_found_by_trials(tmp_path, monkeypatch):
     assert excite.passed
     assert "no experiment was designed: the rig has no limits" in excite.cautions[0]
     assert "experiment.json" not in files(tmp_path)
+
+
+@pytest.mark.usefixtures("bench_program", "firmware_elf")
+def test_where_no_better_loop_is_found_the_present_one_stays(tmp_path, monkeypatch):
+    def nothing(*_args, **_options):
+        raise EstimationError("no loop keeps the noise. Raise the limit noise")
+
+    monkeypatch.setattr(room, "design_controller", nothing)
+    plan = replace(SHORT, amplitude_v=1.4, redesign=True)
+    with EmulatedDevice(prototype()) as device:
+        done = commission(device, prototype(), tmp_path, plan=plan)
+    assert [s.name for s in done.steps] == list(plan.steps)
+    assert done.passed
+    step = next(s for s in done.steps if s.name == "redesign")
+    assert step.cautions == ("the present loop stays: no loop keeps the noise. Raise the limit noise",)
+    assert not files(tmp_path) & set(REDESIGNED)
+
+
+def test_a_loop_is_tried_by_the_firmware_alone(tmp_path):
+    with SimulatedDevice(prototype()) as device, pytest.raises(AmbidError, match="omit --redesign"):
+        commission(device, prototype(), tmp_path, plan=replace(SHORT, redesign=True))
+    assert not files(tmp_path)
 
 
 def test_what_a_controller_measured_in_itself_is_said_in_words():

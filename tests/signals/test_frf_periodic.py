@@ -6,6 +6,7 @@ from scipy.signal import lfilter
 
 from ambid.errors import EstimationError
 from ambid.signals import find_period, frf_periodic, multisine
+from ambid.signals.periodic_response import excited_lines
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, one_period, response, steady
 
 N = 512
@@ -201,3 +202,15 @@ def test_remedies_name_the_options_of_the_command():
     flat = {"inputs": ["coil"], "outputs": ["gap"], "period": N}
     with pytest.raises(EstimationError, match="output 'gap' is constant"):
         frf_periodic(x, np.ones(N), 1.0, **flat)
+
+
+def test_a_line_far_above_the_others_does_not_hide_them():
+    """A designed excitation has lines 13 dB below its largest; noise is 40 dB below them."""
+    size = np.full(60, 1e-5)
+    size[3:40:2] = 0.2
+    size[7] = 1.0
+    mean = np.sqrt(size)[None, :, None] * (1.0 + 0j)
+    assert excited_lines(mean, np.full(60, 1e-5), least=10)[0].tolist() == list(range(3, 40, 2))
+    mean[0, 7] = 10.0
+    assert excited_lines(mean, np.full(60, 1e-5))[0].tolist() == [7]  # as a stepped sine with harmonics
+    assert excited_lines(mean, np.full(60, 1e-5), least=10)[0].tolist() == list(range(3, 40, 2))
