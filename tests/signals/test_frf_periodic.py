@@ -205,12 +205,11 @@ def test_remedies_name_the_options_of_the_command():
 
 
 def test_a_line_far_above_the_others_does_not_hide_them():
-    """A designed excitation has lines 13 dB below its largest; noise is 40 dB below them."""
-    size = np.full(60, 1e-5)
-    size[3:40:2] = 0.2
-    size[7] = 1.0
-    mean = np.sqrt(size)[None, :, None] * (1.0 + 0j)
-    assert excited_lines(mean, np.full(60, 1e-5), least=10)[0].tolist() == list(range(3, 40, 2))
-    mean[0, 7] = 10.0
-    assert excited_lines(mean, np.full(60, 1e-5))[0].tolist() == [7]  # as a stepped sine with harmonics
-    assert excited_lines(mean, np.full(60, 1e-5), least=10)[0].tolist() == list(range(3, 40, 2))
+    """A designed excitation may have one line 13 dB above the next; what lies 13 dB below all of them is noise."""
+    lines = list(range(3, 40, 2))
+    power = np.full(60, 0.01)
+    power[lines] = 0.2
+    power[7] = 8.0
+    mean, noise = np.sqrt(power)[None, :, None] + 0j, np.full(60, 1e-4)
+    assert excited_lines(mean, noise)[0].tolist() == [7]  # as of a sine with harmonics
+    assert excited_lines(mean, noise, least=10)[0].tolist() == lines
