@@ -57,12 +57,13 @@ def results(record, tmp_path_factory):
         "track": track_of(seconds=2.0, every_s=0.05),
         "inspection": inspect(record),
         "acquisition": acquired,
+        "experiment": ambid.design_experiment("prototype", seconds=1.0, lines=10),
     }
 
 
 KINDS = (
     "estimate", "bearing", "fit", "nonlinear fit", "validation", "validation of a fit", "response", "comparison",
-    "track", "inspection", "acquisition",
+    "track", "inspection", "acquisition", "experiment",
 )  # fmt: skip
 
 
