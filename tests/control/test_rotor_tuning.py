@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import ambid
+from ambid.control.benches import workbench
 from ambid.control.closed import Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
@@ -15,7 +16,7 @@ from ambid.control.rotor_loops import RotorLoops
 from ambid.control.tuning import tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
-from ambid.physics.loop import Loop
+from ambid.physics.loop import Limits, Loop
 from ambid.rig.preset_rig import rig_of_preset
 from ambid.simulation.rotor_bench import RotorBench
 
@@ -102,3 +103,13 @@ def test_what_an_estimate_does_not_show_is_refused():
     one = replace(plant.model, bearings=plant.model.bearings[:1])
     with pytest.raises(EstimationError, match="tilting takes two bearings"):
         form_of(one, plant.theta, "tilt")
+
+
+def test_a_rotor_without_a_stop_is_tried_on_linear_magnets():
+    rig, plant = bench_of("rmit")
+    rig = replace(rig, limits=Limits(), magnet=None)
+    found = workbench(plant, rig, rig.loop)
+    assert "neither a gap nor limits.position" in found.assumed[0]
+    load = np.zeros((50, 4))
+    load[:, 0] = 1.0
+    assert np.isfinite(found.respond(50, load=load).position).all()

@@ -290,6 +290,8 @@ class _Rotor(Workbench):
                             *(p for p in (rig.magnet.parameters if rig.magnet else ()) if p.name != "s")),
             )  # fmt: skip
             try:
+                if not math.isfinite(gap):
+                    raise RigError("neither a gap nor limits.position is given")
                 poles = poles_of(replace(rig, magnet=known), model, plant.theta)
                 said = f"the law of the magnets is that of opposed pole pairs with {how}{_BEYOND}"
             except RigError as problem:

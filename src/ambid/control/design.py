@@ -276,6 +276,7 @@ class Situation:
     figures: Figures  # on the estimate
     worst: Figures  # the worst of each over the plants that are held
     unstable: int  # plants that are not held
+    singular: float  # largest singular value of the sensitivity of all axes together on the estimate, as a ratio
     sensitivity: Mapping[str, AxisSensitivity]
     margins: Mapping[str, AxisMargins]
     compliance: Mapping[str, Compliance]
@@ -414,6 +415,7 @@ def situation_of(seen: Sequence[Examined], estimate: Plant, loop: Loop) -> Situa
     return Situation(
         loop=loop_entry(loop), figures=seen[0].figures, worst=worst_of([x.figures for x in seen]),
         unstable=sum(not x.figures.stable for x in seen), sensitivity=sensitivity_by_axis(of),
+        singular=float(np.max(of.singular)),
         margins=margins_by_axis(of), compliance=compliance_by_axis(of),
     )  # fmt: skip
 

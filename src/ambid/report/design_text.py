@@ -71,6 +71,9 @@ def _figures(found: Design, paint: Paint) -> list[str]:
     for name, words in NAMES.items():
         of = [getattr(x, name) for s in (found.before, found.after) for x in (s.figures, s.worst)]
         rows.append((words, *(said(name, of[k]) for k in (0, 2, 1, 3))))
+    if len(found.after.sensitivity) > 1:
+        both = (said("peak", s.singular) for s in (found.before, found.after))
+        rows.append(("largest singular value", *both, "", ""))
     n = found.plants["verification"]
     held = [f"{int(str(n)) - s.unstable} of {n}" for s in (found.before, found.after)]
     rows.append(("plants that are held", "", "", *held))
