@@ -157,7 +157,7 @@ def over_speeds(draws: Draws, speeds: Interval) -> Draws:
         if missing:
             raise EstimationError(
                 f"the estimate does not know {', '.join(missing)}, which a turning rotor has. Identify it with a "
-                "record at speed too, or design for no speed"
+                "record at speed too, or give speeds 0:0"
             )
         found.append(replace(
             drawn, plant=replace(drawn.plant, model=turned), changed={"speed": speed, **drawn.changed}
