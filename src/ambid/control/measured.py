@@ -6,7 +6,8 @@ alone has power gives its column of T at once; where several have, neighbouring 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
@@ -19,55 +20,72 @@ _SILENT = 1e-3  # of the largest line, below which a reference has no power
 _COUPLED = 1e-6  # share of its own term below which another axis' term in the controller is left out
 _LINES_PER_UNKNOWN = 3
 _BOUND = 3.0  # standard deviations
-_LEAST = 3  # lines on either side of a peak, to which a parabola is fitted first
-_NEAR = 1.2  # factor on the frequency; over wider stretches a peak is no parabola
-_LIKELY = 1.0  # standard deviations of the mean square of what a parabola leaves
+_NEAR = 1.2  # factor on the frequency, around a peak
+_HALVES = (6, 4, 3)  # lines on either side of a peak that are fitted, or all that are near; fewer where they do not fit
+_ORDERS = (2, 6)  # of the polynomial, and at most half the lines
+_MISFIT = 4.0  # mean square of what a fit leaves, over the scatter, from which it is none
+_INNER = 0.5  # part of the fitted lines where the top is looked for: towards their ends a polynomial swings
 _SEEN = 0.1  # relative standard deviation of a peak that the record shows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class MeasuredSensitivity:
-    """|S_jj| of one axis at the lines of its reference, and its standard deviation."""
+    """S_jj of one axis at the lines of its reference, and the standard deviation of its modulus."""
 
     frequency_hz: Array  # (n_lines,)
     ratio: Array
     sd: Array
+    phase: Array = field(default_factory=lambda: np.zeros(0))  # rad; none in a file of an earlier version
 
     @property
     def peak(self) -> tuple[float, float, float] | None:
         """Ratio, frequency in Hz and standard deviation of the peak; None where noise hides it.
 
         It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
-        noise, the largest lower bound is not. Around it a parabola over the logarithm of the frequency is fitted to as
-        many lines as it explains within their scatter, at most those up to a factor of `_NEAR` away, or the nearest.
+        noise, the largest lower bound is not. Around it a polynomial is fitted to 1/S, whose poles, those of the plant
+        and the controller, are farther away than the poles of S; the noise of 1/S is circular, and has no bias.
         """
-        f, sd = self.frequency_hz, np.sqrt(smoothed(self.sd[:, None] ** 2)[:, 0])
-        k = int(np.argmax(self.ratio - _BOUND * sd))
-        found = (float(self.ratio[k]), float(f[k]), float(sd[k]))
-        half = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k), initial=_LEAST))
-        while sd[k] > 0.0 and half >= _LEAST:
-            near = slice(max(k - half, 0), k + half + 1)
-            fit = _parabola(np.log(f[near] / f[k]), self.ratio[near], sd[near])
-            if fit is not None:
-                found = (fit[0], float(f[k] * np.exp(fit[1])), fit[2])
+        f, known = self.frequency_hz, self.ratio > 0.0
+        relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=known)
+        noise = np.sqrt(smoothed(relative[:, None] ** 2)[:, 0])
+        k = int(np.argmax(self.ratio * (1.0 - _BOUND * noise)))
+        if noise[k] > _SEEN:
+            return None
+        wide = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k), initial=0))
+        for half in (max(wide, _HALVES[0]), *_HALVES[1:]):
+            near = np.flatnonzero(known[max(k - half, 0) : k + half + 1]) + max(k - half, 0)
+            if noise[k] == 0.0 or not self.phase.size or near.size < 2 * _ORDERS[0]:
                 break
-            half = int(0.7 * half)
-        return found if sd[k] <= _SEEN * self.ratio[k] else None
+            S = self.ratio[near] * np.exp(1j * self.phase[near])
+            top = _top(np.log(f[near] / f[k]), S, noise[near])
+            if top is not None:
+                return top[0], float(f[k] * np.exp(top[1])), top[2]
+        return float(self.ratio[k]), float(f[k]), float(noise[k] * self.ratio[k])
 
 
-def _parabola(x: Array, y: Array, sd: Array) -> tuple[float, float, float] | None:
-    """Return height, place and standard deviation of the top of a parabola; None where it does not fit, or has none."""
-    level, freedom = float(np.sqrt(np.mean(sd**2))), x.size - 3
-    rows = np.vander(x, 3, increasing=True) / level
-    c, *_ = np.linalg.lstsq(rows, y / level, rcond=None)
-    misfit = float(np.sum((rows @ c - y / level) ** 2)) / freedom
-    if misfit > 1.0 + _LIKELY * np.sqrt(2.0 / freedom):
+def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | None:
+    """Return height, place and standard deviation of the top of |S| by a polynomial of 1/S; None where none fits.
+
+    `noise`: relative standard deviation of |S|. The order is Akaike's.
+    """
+    reach, weights = float(np.abs(x).max()), np.abs(S) / noise
+    best: tuple[float, int, Any, Any, float] | None = None
+    for order in range(_ORDERS[0], min(_ORDERS[1], x.size // 2) + 1):
+        Q, R = np.linalg.qr(np.polynomial.chebyshev.chebvander(x / reach, order) * weights[:, None])
+        projected = Q.T @ (weights / S)
+        left = float(np.sum(np.abs(weights / S - Q @ projected) ** 2))
+        score = left + 4.0 * order
+        if best is None or score < best[0]:
+            best = (score, order, np.linalg.solve(R, projected), R, left / (2.0 * (x.size - order - 1)))
+    if best is None or best[4] > _MISFIT:
         return None
-    ends = [float(x[0]), float(x[-1])]
-    top = -c[1] / (2.0 * c[2]) if c[2] < 0.0 else ends[int(np.argmax(np.polyval(c[::-1], ends)))]
-    at = np.vander([min(max(top, ends[0]), ends[1])], 3, increasing=True)[0]
-    spread = max(misfit, 1.0) * (at @ np.linalg.pinv(rows.T @ rows) @ at)
-    return float(at @ c), float(at[1]), float(np.sqrt(spread))
+    _, order, found, R, misfit = best
+    at = np.linspace(max(float(x[0]) / reach, -_INNER), min(float(x[-1]) / reach, _INNER), 1001)
+    rows = np.polynomial.chebyshev.chebvander(at, order)
+    size = np.abs(rows @ found)
+    k = int(np.argmin(size))
+    sd = np.linalg.norm(np.linalg.solve(R.T, rows[k])) * np.sqrt(max(misfit, 1.0))
+    return float(1.0 / size[k]), float(at[k] * reach), float(sd / size[k] ** 2)
 
 
 def measured_sensitivity(
@@ -93,21 +111,31 @@ def measured_sensitivity(
 def _of_axis(
     spectra: PeriodSpectra, loop: ClosedLoop, columns: dict[int, Complex], C: Complex, on: Array, j: int
 ) -> MeasuredSensitivity:
-    """Return the sensitivity of axis `j`; the scatter is that of its own term."""
+    """Return the sensitivity of axis `j`.
+
+    Other axes' terms are interpolated period by period, so that the scatter is that of all terms together; to it comes
+    the error of a straight line between their lines, an eighth of the second difference.
+    """
     at, f = np.flatnonzero(on[:, j]), spectra.frequency_hz
     through = C[at] @ loop.together[:, j]  # (n_lines, n_references): what a disturbance of the axis' sensors orders
     weights = loop.weights[at, j]  # (n_lines, n_p)
     S = 1.0 - np.sum(weights * columns[j], axis=2) * through[:, j]  # (n_periods, n_lines)
+    between = np.zeros(at.size)
     for other, column in columns.items():
         if other == j or np.all(np.abs(through[:, other]) <= _COUPLED * np.abs(through[:, j])):
             continue
-        mean = column.mean(axis=0)
-        near = np.flatnonzero(on[:, other])
-        found = np.stack([np.interp(f[at], f[near], x) for x in mean.T], axis=1)
-        S = S - np.sum(weights * found, axis=1) * through[:, other]
+        known = f[np.flatnonzero(on[:, other])]
+        bend = np.diff(column.mean(axis=0), 2, axis=0) / 8.0
+        terms = [np.stack([np.interp(f[at], known, x) for x in one.T], axis=1) for one in column]
+        S = S - np.sum(weights * np.stack(terms), axis=2) * through[:, other]
+        if len(bend):
+            off = np.stack([np.interp(f[at], known[1:-1], x) for x in bend.T], axis=1)
+            between += np.abs(np.sum(weights * off, axis=1) * through[:, other]) ** 2
     mean = S.mean(axis=0)
-    scatter = np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
-    return MeasuredSensitivity(frequency_hz=f[at], ratio=np.abs(mean), sd=np.sqrt(scatter / 2.0))
+    scatter = between + np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
+    return MeasuredSensitivity(
+        frequency_hz=f[at], ratio=np.abs(mean), sd=np.sqrt(scatter / 2.0), phase=np.angle(mean)
+    )  # fmt: skip
 
 
 def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Complex:
@@ -142,8 +170,8 @@ def measured_locally(response: FrequencyResponse, loop: ClosedLoop) -> tuple[Mea
     found = []
     for j in range(len(loop.plant.sensors)):
         through, weights = C @ loop.together[:, j], loop.weights[:, j]
-        ratio = np.abs(1.0 - np.einsum("kp,kpr,kr->k", weights, response.G, through))
+        S = 1.0 - np.einsum("kp,kpr,kr->k", weights, response.G, through)
         size = np.abs(weights)[:, :, None] * response.sd * np.abs(through)[:, None, :]
         sd = np.sqrt(np.sum(size**2, axis=(1, 2)) / 2.0)
-        found.append(MeasuredSensitivity(frequency_hz=response.frequency_hz, ratio=ratio, sd=sd))
+        found.append(MeasuredSensitivity(frequency_hz=response.frequency_hz, ratio=np.abs(S), sd=sd, phase=np.angle(S)))
     return tuple(found)
