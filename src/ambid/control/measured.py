@@ -113,26 +113,27 @@ def _of_axis(
 ) -> MeasuredSensitivity:
     """Return the sensitivity of axis `j`.
 
-    Other axes' terms are interpolated period by period, so that the scatter is that of all terms together; to it comes
-    the error of a straight line between their lines, an eighth of the second difference.
+    Other axes' terms are interpolated period by period, with the bend between their lines, so that the scatter is that
+    of all terms together.
     """
     at, f = np.flatnonzero(on[:, j]), spectra.frequency_hz
     through = C[at] @ loop.together[:, j]  # (n_lines, n_references): what a disturbance of the axis' sensors orders
     weights = loop.weights[at, j]  # (n_lines, n_p)
     S = 1.0 - np.sum(weights * columns[j], axis=2) * through[:, j]  # (n_periods, n_lines)
-    between = np.zeros(at.size)
     for other, column in columns.items():
         if other == j or np.all(np.abs(through[:, other]) <= _COUPLED * np.abs(through[:, j])):
             continue
         known = f[np.flatnonzero(on[:, other])]
-        bend = np.diff(column.mean(axis=0), 2, axis=0) / 8.0
-        terms = [np.stack([np.interp(f[at], known, x) for x in one.T], axis=1) for one in column]
-        S = S - np.sum(weights * np.stack(terms), axis=2) * through[:, other]
-        if len(bend):
-            off = np.stack([np.interp(f[at], known[1:-1], x) for x in bend.T], axis=1)
-            between += np.abs(np.sum(weights * off, axis=1) * through[:, other]) ** 2
+        place = np.interp(f[at], known, np.arange(known.size))
+        below = np.clip(place.astype(int), 0, max(known.size - 2, 0))
+        t = (place - below)[:, None]
+        found = (1.0 - t) * column[:, below] + t * column[:, np.minimum(below + 1, known.size - 1)]
+        if known.size > 2:
+            bend = np.pad(np.diff(column, 2, axis=1), ((0, 0), (1, 0), (0, 0)), mode="edge")
+            found = found - 0.5 * t * (1.0 - t) * bend[:, below]
+        S = S - np.sum(weights * found, axis=2) * through[:, other]
     mean = S.mean(axis=0)
-    scatter = between + np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
+    scatter = np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
     return MeasuredSensitivity(
         frequency_hz=f[at], ratio=np.abs(mean), sd=np.sqrt(scatter / 2.0), phase=np.angle(mean)
     )  # fmt: skip
