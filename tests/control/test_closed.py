@@ -84,6 +84,30 @@ def test_sensitivity_measured_without_a_model_scatters_about_the_truth():
         assert 0.7 < np.sqrt(np.mean((found.ratio - exact) ** 2)) / np.sqrt(np.mean(found.sd**2)) < 1.4
 
 
+def test_sensitivity_of_a_controller_that_mixes_axes_has_no_bias_between_their_lines():
+    """Position columns mixed: with x = T r of the truth, S = I - T F⁻¹ K of that controller."""
+
+    class Mixed:
+        def response(self, f):
+            K, F = controller.response(f)
+            K = K.copy()
+            K[:, :, :4] = K[:, :, :4] @ (np.eye(4) + 0.3 * np.roll(np.eye(4), 2, axis=0))
+            return K, F
+
+    bench = replace(truth.BENCHES["rigid"], position_noise=0.0, force_noise=0.0, **SHORT)
+    spectra, plant = spectra_of(bench), plant_of(bench)
+    controller = identified(spectra, plant.model)
+    f = spectra.frequency_hz
+    K, F = controller.response(f)
+    T = (np.eye(4) - truth.sensitivity_frf(bench, f)) @ np.linalg.inv(np.linalg.inv(F) @ K[:, :, :4])
+    exact = np.eye(4) - T @ np.linalg.inv(F) @ Mixed().response(f)[0][:, :, :4]
+    mixed = ClosedLoop(plant=plant, controller=Mixed(), frequency_hz=f)
+    for j, found in enumerate(measured_sensitivity(spectra, mixed)):
+        at = np.flatnonzero(np.isin(f, found.frequency_hz) & ((f > 20.0) & (f < 60.0)))
+        left = found.ratio[np.isin(found.frequency_hz, f[at])] - np.abs(exact[at, j, j])
+        assert abs(np.mean(left)) < 4e-3
+
+
 def test_references_that_share_lines_are_told_apart_by_neighbours():
     bench = replace(truth.BENCHES["rigid"], excitation="full", **SHORT)
     spectra, plant = spectra_of(bench), plant_of(bench)
