@@ -71,6 +71,7 @@ def test_the_loop_becomes_an_object_of_python_control(designed):
         (("--goal", "peek"), "figure 'peek' of a design is unknown"),
         (("--limit", "noise=high"), "--limit noise=high has no number"),
         (("--limit", "noise=1m"), "noise is in V, not in m"),
+        (("--limit", "peak=nan"), "limit peak is nan; it must be a finite number"),
         (("--limit", "peak=-3dB"), "no loop is that good"),
         (("--spread", "delay=x"), "--spread delay=x has no number"),
         (("--spread", "dealy=1"), "source 'dealy' of spread is unknown"),

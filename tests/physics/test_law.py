@@ -116,9 +116,13 @@ def test_another_rate_or_plant_is_refused(pair: tuple[Rig, Rig]) -> None:
 
 def test_gains_and_matrices_exclude_each_other(tmp_path: Path) -> None:
     text = rig_text(rig_of_preset(ambid.preset("rmit-axis")), tmp_path)
+    loop = text[text.index("[loop]") : text.index("limits", text.index("[loop]"))]
+    law = '[loop]\nkind = "state-space"\nrate_hz = 1000\nA = [[0.5]]\nB = [[1, 0]]\nC = [[1]]\nD = [[-1, 0]]\n'
     for old, new, match in (
         ('kind = "pid"', 'kind = "pid"\nA = [[1.0]]', "of a state-space law"),
         ('kind = "pid"', 'kind = "state-space"', "has no loop.A"),
+        (loop, law.replace("[[0.5]]", "[[0.5], [1.0, 2.0]]"), "loop.A is no matrix"),
+        (loop, law + "G = [[1.0], [1.0, 2.0]]\n", "loop.G is no matrix"),
     ):
         (tmp_path / "rig.toml").write_text(text.replace(old, new))
         with pytest.raises(RigError, match=match):

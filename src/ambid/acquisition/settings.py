@@ -36,7 +36,6 @@ from ambid.acquisition.scales import (
 )
 from ambid.arrays import Array
 from ambid.errors import DeviceError, ModelError, RigError
-from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Loop
 from ambid.rig.rig import Daq, Rig
@@ -166,7 +165,7 @@ def realised(settings: ControllerSettings, rig: Rig) -> Loop:
     current = scale_of(rig, "current").slope(settings.current_rest)
     position = scale_of(rig, "position").slope(settings.setpoint) if has_position(rig) else math.inf
     if settings.law is not None:
-        law = _in_units(settings.law.law(settings.rate_hz), (1.0 / position, 1.0 / current), voltage)
+        law = settings.law.law(settings.rate_hz).in_units((1.0 / position, 1.0 / current), voltage)
         return Loop(law=law, delay=LAG_S * settings.rate_hz)
     period, pole = 1.0 / settings.rate_hz, settings.pole / 2.0**POLE_BITS
     tau = period * pole / (1.0 - pole)
@@ -259,15 +258,9 @@ def _law(rig: Rig, rest: tuple[int, int, int]) -> LawWords | None:
         )
     try:
         law.check(1, 2, PWM_HZ / period)
-        return law_words(_in_units(law, (metres, amperes), 1.0 / volts))
+        return law_words(law.in_units((metres, amperes), 1.0 / volts))
     except (ModelError, RigError) as failure:
         raise RigError(f"{who(rig)}: {failure}") from None
-
-
-def _in_units(law: StateLaw, inputs: tuple[float, float], output: float) -> StateLaw:
-    """Return a law whose signals are first multiplied by `inputs`, and its command last by `output`."""
-    law = law.scaled(inputs)
-    return replace(law, C=law.C * output, D=law.D * output, G=law.windup / output)
 
 
 def _gains(rig: Rig, rest: tuple[int, int, int]) -> Mapping[str, int]:

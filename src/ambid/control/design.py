@@ -107,6 +107,8 @@ class Goals:
         if not minimise:
             raise ModelError("a design needs a goal. Give at least one of " + ", ".join(FIGURES))
         for name, x in limits.items():
+            if not math.isfinite(x):
+                raise ModelError(f"limit {name} is {x:g}; it must be a finite number. Correct it")
             if not x > (1.0 if name == "peak" else 0.0):
                 raise ModelError(f"limit {name} is {x:g} {FIGURES[name]}; no loop is that good. Raise it")
         kept = {name: getattr(before, name) for name in FIGURES if name not in minimise}

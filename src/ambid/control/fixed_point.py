@@ -10,7 +10,7 @@ command, and by the l1 norms of the closed loop the largest limit cycle (Gevers 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -34,16 +34,11 @@ class Counts:
 
     def of(self, law: StateLaw) -> StateLaw:
         """Return a law in counts."""
-        return _in_units(law, (self.position, self.current), 1.0 / self.command)
+        return law.in_units((self.position, self.current), 1.0 / self.command)
 
     def to_si(self, law: StateLaw) -> StateLaw:
         """Return a law in counts as one in SI."""
-        return _in_units(law, (1.0 / self.position, 1.0 / self.current), self.command)
-
-
-def _in_units(law: StateLaw, inputs: tuple[float, float], output: float) -> StateLaw:
-    seen = law.scaled(inputs)
-    return replace(seen, C=seen.C * output, D=seen.D * output, G=law.windup / output)
+        return law.in_units((1.0 / self.position, 1.0 / self.current), self.command)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -74,6 +74,11 @@ class StateLaw:
         """Return the law that sees its signals multiplied by `gains`, (n_y,)."""
         return replace(self, B=self.B * np.asarray(gains), D=self.D * np.asarray(gains))
 
+    def in_units(self, inputs: Sequence[float], output: float) -> StateLaw:
+        """Return the law whose signals are first multiplied by `inputs`, (n_y,), and its commands last by `output`."""
+        seen = self.scaled(inputs)
+        return replace(seen, C=self.C * output, D=seen.D * output, G=self.windup / output)
+
     def through(self, rows: Array, columns: Array) -> StateLaw:
         """Return the law that sees `rows` y, (n_seen, n_y), and commands `columns` w, (n_u, n_given)."""
         given = np.linalg.pinv(columns)

@@ -13,8 +13,6 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-import numpy as np
-
 from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.law import StateLaw
@@ -310,7 +308,7 @@ def _loop(entry: LoopEntry, where: str) -> Loop:
         what = f"has no loop.{missing[0]}" if missing else f"has loop.{extra[0]}, which is of a PID"
         raise RigError(f'{where}: [loop] of kind "state-space" {what}. Give A, B, C, D and rate_hz alone')
     try:
-        return Loop(delay=entry.delay, law=StateLaw(**matrices, G=np.array(entry.G) if entry.G is not None else None))
+        return Loop(delay=entry.delay, law=StateLaw(**{**matrices, "G": entry.G}))
     except ModelError as failure:
         raise RigError(f"{where}: {failure}") from None
 
