@@ -115,6 +115,9 @@ def controller(
     speeds: Annotated[
         str | None, option("--speeds LO:HI", "Of a rotor in rpm.", "from rest to the speed of rig or estimate")
     ] = None,
+    schedule: Annotated[
+        int, option("--schedule N", "Laws over a rotor's speeds, of which the nearest orders; lqg, hinf.", True, min=1)
+    ] = 1,
     plants: Annotated[int, option("--plants N", "Plants that the design is tuned over.", True, min=1)] = 60,
     judges: Annotated[int, option("--judges N", "Plants that judge the design.", True, min=1)] = 200,
     seed: Annotated[int, option("--seed N", "Seed of the plants.", True, min=0)] = 0,
@@ -143,7 +146,8 @@ def controller(
         found = design_controller(
             estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
             spread=_sources(spread or ()), form=form, filters=filters,
-            speeds_rpm=None if speeds is None else _pair(speeds), plants=plants, judges=judges, seed=seed, tick=show,
+            speeds_rpm=None if speeds is None else _pair(speeds), schedule=schedule, plants=plants, judges=judges,
+            seed=seed, tick=show,
         )  # fmt: skip
         outputs.give(found, show)
         if out is not None:

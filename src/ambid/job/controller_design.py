@@ -12,6 +12,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ambid.control.closed import Plant
 from ambid.control.design import (
     GOALS,
@@ -41,7 +43,9 @@ from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
 from ambid.job.data import Clock, rig_entry
 from ambid.job.loop_margins import given
+from ambid.physics.law import StateLaw
 from ambid.physics.loop import Interval, Loop, Noise
+from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
 
@@ -82,6 +86,7 @@ def design_controller(
     form: str = "axes",
     filters: int = 0,
     speeds_rpm: tuple[float, float] | None = None,
+    schedule: int = 1,
     plants: int = 60,
     judges: int = 200,
     seed: int = 0,
@@ -116,6 +121,8 @@ def design_controller(
         Around so many of a rotor's lowest bending modes the PID has a filter each, a notch or a phase lead.
     speeds_rpm : (float, float), optional
         Of a rotor, between which the plants turn; default: from rest to the speed of rig or estimate.
+    schedule : int
+        Laws over these speeds, of which the nearest orders; of "lqg" and "hinf".
     plants, judges : int
         How many plants the design is tuned over, and how many judge it.
     seed : int
@@ -160,6 +167,10 @@ def design_controller(
             raise EstimationError(f"{name} is {x}; it must be at least {least}. Correct it")
     design = _method(method, form, filters)
     speeds = _speeds(known, bench, speeds_rpm)
+    if schedule > 1:
+        if method == "pid" or speeds is None:
+            raise EstimationError("a schedule is of lqg or hinf on a rotor that turns. Omit it, or give both")
+        design = _scheduled(design, speeds[1], schedule)
     with one_thread():
         problem = _problem(known, bench, sources, (plants, judges, seed), speeds)
         found = _designed(problem, method, design, goals, asked, say, clock)
@@ -200,6 +211,24 @@ def _method(name: str, form: str, filters: int) -> Method:
     if filters < 0:
         raise EstimationError(f"filters is {filters}; it must be zero or positive. Correct it")
     return partial(METHODS[name](), form=form, filters=filters)
+
+
+def _scheduled(design: Method, top: float, n: int) -> Method:
+    """Return the method that makes `n` laws over speeds up to one in rad/s, each on the plants nearest to its own."""
+
+    def method(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick) -> Loop:
+        knots, laws, of = np.linspace(0.0, top, n), list[tuple[float, StateLaw]](), plants[0].model
+        assert isinstance(of, RotorModel)
+        nearest = [int(np.argmin(np.abs(knots - abs(getattr(p.model, "speed", 0.0))))) for p in plants]
+        for k, speed in enumerate(knots.tolist()):
+            own = [p for p, at in zip(plants[1:], nearest[1:], strict=True) if at == k]
+            told = part_of(tick, k / n, (k + 1) / n) or silent
+            found = design([replace(plants[0], model=of.at_speed(speed)), *own], rig, goals, told)
+            assert found.law is not None
+            laws.append((speed, found.law))
+        return replace(found, law=laws[0][1], laws=tuple(laws))
+
+    return method
 
 
 def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> Interval | None:

@@ -12,6 +12,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from ambid.errors import RigError, nearest
+from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.named_bench import Turning
@@ -530,14 +531,17 @@ def _magnet_lines(magnet: RigMagnet) -> list[str]:
     return [*lines, "[magnet.parameters]", *map(_parameter_line, magnet.parameters)] if magnet.parameters else lines
 
 
+def _law_lines(law: StateLaw) -> list[str]:
+    return [f"{name} = {getattr(law, name).tolist()!r}" for name in "ABCDG"]
+
+
 def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
     lines = ["[loop]", f'kind = "{"pid" if loop.law is None else "state-space"}"']
     if loop.law is None:
         numbers: Mapping[str, float] = {"kp": loop.kp, "ki": loop.ki, "kd": loop.kd, "kc": loop.kc}
         lines += [f"{name} = {value!r}" for name, value in numbers.items()]
     else:
-        lines += [f"rate_hz = {loop.law.rate_hz!r}"]
-        lines += [f"{name} = {getattr(loop.law, name).tolist()!r}" for name in "ABCDG"]
+        lines += [f"rate_hz = {loop.law.rate_hz!r}", *_law_lines(loop.law)]
     if math.isfinite(loop.derivative_cutoff_hz):
         lines.append(f"derivative_cutoff_hz = {loop.derivative_cutoff_hz!r}")
     lines.append(f"delay = {loop.delay!r}")
@@ -549,6 +553,8 @@ def _loop_lines(loop: Loop, limits: Limits | None) -> list[str]:
                 raise RigError(f"limits.{role} is ({low}, {high}); a rig file holds both ends or none. Give both")
         inside = ", ".join(f"{role} = [{low!r}, {high!r}]" for role, (low, high) in given.items())
         lines += [f"limits = {{ {inside} }}"] if inside else []
+    for speed, law in loop.laws[1:]:
+        lines += ["", "[[loop.laws]]", f'speed = {{ value = {speed!r}, unit = "rad/s" }}', *_law_lines(law)]
     return lines
 
 

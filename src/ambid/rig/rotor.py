@@ -33,7 +33,7 @@ def rotor_of(file: RigFile, where: str) -> RotorModel:
         raise RigError(f'{where}: [bearings] are given, but the model is {file.model!r}. Set model = "rotor"')
     bearings = tuple(_bearing(name, entry, f"{where}: bearings.{name}") for name, entry in file.bearings.items())
     _apart(bearings, where)
-    speed = _speed(file, where)
+    speed = speed_of(file.speed, where)
     axes = [axis for b in bearings for axis in b.axes]
     drives: list[Drive] = []
     for axis in axes:
@@ -189,16 +189,14 @@ def _si(given: PlaneEntry | QuantityEntry | TurningEntry, si: str, place: str) -
     return unit.to_si(given.value)
 
 
-def _speed(file: RigFile, where: str) -> float:
-    """Return the speed of a rig in rad/s, 0 where it gives none."""
-    if file.speed is None:
+def speed_of(entry: QuantityEntry | None, where: str) -> float:
+    """Return a speed of a rig in rad/s, 0 where it gives none."""
+    if entry is None:
         return 0.0
     try:
-        unit = parse_unit(file.speed.unit)
+        unit = parse_unit(entry.unit)
     except UnitError as error:
         raise RigError(f"{where}: speed.unit: {error}") from None
     if unit.si not in _SPEEDS:
-        raise RigError(
-            f"{where}: speed is in [{file.speed.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit"
-        )
-    return unit.to_si(file.speed.value) * _SPEEDS[unit.si]
+        raise RigError(f"{where}: speed is in [{entry.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit")
+    return unit.to_si(entry.value) * _SPEEDS[unit.si]

@@ -79,6 +79,17 @@ class LimitsEntry(_Entry):
     position: Interval | None = None
 
 
+class LawEntry(_Entry):
+    """``[[loop.laws]]``: the law of a rotor at one more speed."""
+
+    speed: QuantityEntry
+    A: Matrix
+    B: Matrix
+    C: Matrix
+    D: Matrix
+    G: Matrix | None = None
+
+
 class LoopEntry(_Entry):
     """``[loop]``: the controller, for simulation; see :class:`ambid.physics.loop.Loop` for its law and units."""
 
@@ -96,6 +107,7 @@ class LoopEntry(_Entry):
     C: Matrix | None = None
     D: Matrix | None = None
     G: Matrix | None = None
+    laws: tuple[LawEntry, ...] = ()
 
 
 class ResolutionsEntry(_Entry):
@@ -299,6 +311,7 @@ _ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
     ("speed",): QuantityEntry,
     ("operating_point", "*"): QuantityEntry,
     ("loop",): LoopEntry,
+    ("loop", "laws"): LawEntry,
     ("loop", "limits"): LimitsEntry,
     ("noise",): NoiseEntry,
     ("noise", "resolutions"): ResolutionsEntry,

@@ -370,6 +370,8 @@ def acting(values: Loop | Noise | Limits) -> dict[str, object]:
     found: dict[str, object] = {}
     for name in values.__slots__:
         value = getattr(values, name)
+        if name == "laws":  # the first of them is the law
+            continue
         if isinstance(value, StateLaw):
             found[name] = f"state space of order {value.order}"
         elif isinstance(value, tuple):
