@@ -145,7 +145,7 @@ def _any_command(rng, number):
     fields = {f.name: int(rng.integers(f.span[0], f.span[1], endpoint=True)) for f in kind.fixed}
     if rng.random() < 0.5:  # else most are refused by their first field
         fields |= {k: int(rng.integers(0, 4)) for k in fields if k in SHAPE}
-    values = rng.integers(-127, 128, int(rng.integers(1, 49))).tolist() if kind.tail else ()
+    values = rng.integers(-127, 128, int(rng.integers(1, 48 // kind.tail.width + 1))).tolist() if kind.tail else ()
     return message(kind.name, values=values, **(fields | {"id": number}))
 
 

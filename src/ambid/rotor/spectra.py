@@ -316,6 +316,7 @@ def _between(
     """Return the spectra between the excited lines, thinned where they are many."""
     count, n = found.count, found.period
     bins = (lines[:, None] * count + np.arange(1, count)).ravel()
+    bins = bins[bins <= n * count // 2]  # none above half the rate, where the highest line may be
     frequency = np.asarray(bins * (record.rate_hz / (n * count)), dtype=np.float64)
     clean = ~beside_harmonics(frequency, speed_hz, record.rate_hz / n)
     every = max(1, bins.size // _MOST_BETWEEN)
