@@ -84,6 +84,16 @@ def test_rotor_levitates_alike(pair: tuple[Rig, Rig]) -> None:
         np.testing.assert_allclose(runs[1][c.name].values, c.values, atol=1e-9 * float(np.ptp(c.values)) + 1e-15)
 
 
+def test_the_sign_of_a_law_is_that_of_kp_and_its_rate_that_of_the_rig(pair: tuple[Rig, Rig]) -> None:
+    rig, law = pair
+    assert rig.loop is not None
+    assert law.loop is not None
+    assert law.loop.pull * rig.loop.kp > 0.0
+    assert law.loop.scaled(-1.0, 1.0).pull * rig.loop.kp < 0.0
+    bare = replace(law, record=replace(law.record, rate_hz=None))
+    assert bare.rate_hz == law.loop.law.rate_hz if law.loop.law else False
+
+
 def test_a_limited_command_does_not_wind_the_law_up() -> None:
     integrator = StateLaw(A=[[1.0]], B=[[-0.5]], C=[[1.0]], D=[[0.0]], G=[[1.0]], rate_hz=1e3)  # type: ignore[arg-type]
     z, y, most = 0.0, -1.0, 2.0

@@ -217,9 +217,10 @@ def _way(sign: int) -> str:
 def _reversed(found: Polarity, rig: Rig) -> list[str]:
     """Name the sign that is not as the rig says, where the pulses tell it."""
     k_i = next((p.value for p in rig.parameters if p.name == "k_i"), None)
-    kp = 0.0 if rig.loop is None else rig.loop.kp
+    kp = 0.0 if rig.loop is None else rig.loop.pull
+    whose = "loop.kp" if rig.loop is None or rig.loop.law is None else "the answer of the law of [loop]"
     said = int(np.sign(k_i or kp))  # of the motion, by the rig; the loop pushes back where kp has the same sign
-    by = f"k_i = {k_i:g} N/A" if k_i else f"loop.kp = {kp:g} V/m"
+    by = f"k_i = {k_i:g} N/A" if k_i else f"{whose} = {kp:g} V/m"
     if found.current < 0:
         falls = "the current falls when the voltage rises"
         if not found.motion or not said:
@@ -248,7 +249,7 @@ def _reversed(found: Polarity, rig: Rig) -> list[str]:
         )
         return [f"{seen}: the rig says it {_way(said)} ({by}). {remedy}"]
     if kp != 0.0 and np.sign(kp) != found.motion:
-        return [f"{seen}, as the rig says, and loop.kp = {kp:g} V/m pushes it away: correct the sign of [loop]"]
+        return [f"{seen}, as the rig says, and {whose} = {kp:g} V/m pushes it away: correct the sign of [loop]"]
     return []
 
 

@@ -250,7 +250,7 @@ def _bench(
         return Bench.of(source, rate, source.usually_closed if closed is None else closed, nonlinear=nonlinear)
     if position is not None:
         source = replace(source, operating_point={**source.operating_point, "position": position})
-    if rate is None and source.record.rate_hz is None:
+    if rate is None and source.rate_hz is None:
         raise AmbidError(
             f"rig {source.source or source.name} gives no rate; a simulation needs one. Give --rate HZ, or "
             "record.rate_hz"

@@ -77,6 +77,14 @@ class Loop:
         laws = tuple((speed, change(law)) for speed, law in self.laws)
         return replace(self, law=laws[0][1] if laws else change(self.law), laws=laws)
 
+    @property
+    def pull(self) -> float:
+        """What the command answers to a slow motion of the first axis, with the sign of kp: V/m, of a law at a
+        hundredth of its rate."""
+        if self.law is None:
+            return self.kp
+        return -float(self.law.response(np.array([0.01 * self.law.rate_hz]))[0, 0, 0].real)
+
     def as_law(self, rate_hz: float, *, current: bool = True) -> StateLaw:
         """Return the law of one axis, of the gains with the states I and tau D + kd x.
 

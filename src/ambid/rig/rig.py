@@ -280,6 +280,12 @@ class Rig:
         """The linear model of the rig: the rotor of its bearings, or the one-axis model that it names."""
         return model(self.model) if self.rotor is None else self.rotor
 
+    @property
+    def rate_hz(self) -> float | None:
+        """Sampling rate that the rig gives: of its records, else of the law of its loop."""
+        law = None if self.loop is None else self.loop.law
+        return self.record.rate_hz if self.record.rate_hz is not None or law is None else law.rate_hz
+
     def channel(self, role: str) -> RigChannel:
         """Return the channel of a role.
 

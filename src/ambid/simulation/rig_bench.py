@@ -314,7 +314,7 @@ class Bench:
                 point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
             )  # fmt: skip
         plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
-        rate = source.record.rate_hz if rate_hz is None else rate_hz
+        rate = source.rate_hz if rate_hz is None else rate_hz
         if rate is None:
             raise RigError(
                 f"rig {source.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz"

@@ -13,7 +13,6 @@ from ambid.acquisition.scales import ADC_TOP, Scale, scale_of
 from ambid.acquisition.settings import has_position
 from ambid.errors import DeviceError, nearest
 from ambid.physics.linear_model import model
-from ambid.physics.loop import Loop
 from ambid.physics.magnet import CoEnergy, DifferentialPair
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.power_stage import IDEAL
@@ -40,8 +39,8 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
         raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
     found = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
     plant = found.plant
-    if truth is rig and rig.loop is not None and _pull(rig.loop) and isinstance(plant, LinearPlant):
-        held = math.copysign(plant.parameters["k_i"], _pull(rig.loop))
+    if truth is rig and rig.loop is not None and rig.loop.pull and isinstance(plant, LinearPlant):
+        held = math.copysign(plant.parameters["k_i"], rig.loop.pull)
         found = replace(found, plant=replace(plant, parameters={**plant.parameters, "k_i": held}))
     return replace(found, name=truth.name or "rig")
 
@@ -61,11 +60,6 @@ def instruments(rig: Rig, bench: Preset | Rig | None) -> dict[str, Scale]:
             known = own is not None and any(t.role == c.role and t.calibration is not None for t in own.channels)
             found[c.role] = scale_of(own, c.role) if own is not None and known else _rising(scale_of(rig, c.role))
     return found
-
-
-def _pull(loop: Loop) -> float:
-    """Return the loop's gain from the position error to its command."""
-    return loop.kp if loop.law is None else -float(loop.law.D[0, 0])
 
 
 def _rising(scale: Scale) -> Scale:
