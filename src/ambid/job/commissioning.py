@@ -59,6 +59,9 @@ _LIMIT = 1.5  # acceptable model error of tracking
 _SHOWN = 4000  # samples of a record that its picture shows
 _FIRST = 1 / 3  # of the excitation's part of the room, for the small one that the experiment is designed on
 _LINES = 60  # of the experiment
+# of that part of the room, which a designed excitation uses: it shows so much that over more of the gap the magnet,
+# which is not linear, would move the numbers by more than their standard deviations
+_DESIGNED = 0.7
 _RMS = 4.0  # peak over rms of noise
 _SECOND = 0.8  # amplitude of the second record's excitation, of what its part of the room allows
 _UNITS = {"voltage": "V", "current": "A", "position": "m"}
@@ -311,7 +314,8 @@ class _Guide:
         except AmbidError as failure:
             step, _ = judge.excite(look, room, plan, rate_hz, hover)
             return replace(step, cautions=(f"a flat multisine is played, as no experiment was designed: {failure}",))
-        step, self._program = judge.designed(look, room, plan, rate_hz, hover, made)
+        gentle = replace(plan, use=_DESIGNED * plan.use)
+        step, self._program = judge.designed(look, room, gentle, rate_hz, hover, made)
         self._experiment = made
         made.save(self._place / "experiment.json")
         low, high = room.voltage
@@ -341,7 +345,7 @@ class _Guide:
     def _experiment_for(self, estimate: Estimate, seconds: float, rig: Rig | None = None) -> Experiment:
         plan = self.plan
         return design_experiment(
-            estimate, rig, seconds=seconds, band=plan.band_hz, use=plan.use, lines=_LINES, tick=self._tick
+            estimate, rig, seconds=seconds, band=plan.band_hz, use=_DESIGNED * plan.use, lines=_LINES, tick=self._tick
         )  # fmt: skip
 
     def _record(self, amplitude_v: float) -> Step:
