@@ -90,6 +90,23 @@ def test_what_comes_in_many_short_blocks_waits_in_the_ring_while_the_tracker_is_
     assert done.track.totals.samples == 16_000
 
 
+def test_the_lag_from_sample_to_decision_is_measured(start):
+    lags, slept = [], []
+
+    def slow(line):
+        if line.t > 1.0 and not slept:
+            slept.append(time.sleep(0.3))
+
+    with Spoiled(RIG, pace="real") as device:
+        done = track_live(device, RIG, course(2.5), start=start, on_line=slow, on_lag=lags.append)
+    latency = done.track.totals.latency
+    assert max(lags) >= 0.3
+    assert latency.largest >= 0.3
+    assert latency.late >= 10  # blocks of 10 ms came while it slept
+    assert lags[-1] < 0.1
+    assert done.overruns == 0
+
+
 def test_a_gap_is_seen_by_the_tracker(start):
     with Spoiled(RIG, lose=lambda d: d.excited and d.blocks == 300) as device:
         done = track_live(device, RIG, course(4.0), start=start)

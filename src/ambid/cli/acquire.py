@@ -174,6 +174,7 @@ class Recording:
             made = track_live(
                 device, self.rig, course, start=start, taps=[tap], on_event=tap.tell, on_run=runs.append,
                 on_trouble=lost, on_header=follower.on_header, on_line=follower.on_line, keep=False,
+                on_lag=follower.on_lag,
             )  # fmt: skip
             if made.overruns:
                 typer.echo(

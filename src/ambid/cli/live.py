@@ -84,6 +84,7 @@ class Follower:
         self._pressed = ""
         self._stop: int | None = None
         self._begin_wall = self._begin_s = 0.0
+        self.lag_s: float | None = None  # of the block before, from its last sample to the end of its work
         self._before_header = ExitStack()
         self._say: Callable[[str], object] = str  # says nothing until there is a line of progress
         self._picture: _Picture | None = None
@@ -236,6 +237,10 @@ class Follower:
             return None
         return [self._flags.popleft() for _ in range(len(self._flags))]
 
+    def on_lag(self, lag_s: float) -> None:
+        """Take the time from the last sample of a block to the end of its work."""
+        self.lag_s = lag_s
+
     def _signalled(self, number: int) -> None:
         """Stop after the present line; at once where there is none yet, or when asked a second time."""
         if self.header is None or self._stop is not None:
@@ -261,7 +266,9 @@ class Follower:
         self._widen(line)
         wall = time.perf_counter() - self._begin_wall
         samples = header.record.get("samples")
-        behind = wall - (line.t - self._begin_s) if self._real_time else None
+        behind = self.lag_s
+        if behind is None and self._real_time:
+            behind = wall - (line.t - self._begin_s)
         return TrackView(
             header=header, line=line, errors=_copy_of(self._errors), decisions=self.events, ranges=dict(self._ranges),
             begin_s=self._begin_s,

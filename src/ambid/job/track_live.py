@@ -6,6 +6,7 @@ or what a given start is checked with; it is then tracked like the rest.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -67,6 +68,7 @@ def track_live(
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
     on_trouble: Callable[[AmbidError], object] | None = None,
+    on_lag: Callable[[float], object] = lambda _: None,
     stopped: Callable[[], bool] = lambda: False,
     **following: Unpack[FollowingWords],
 ) -> LiveTrack:
@@ -75,8 +77,9 @@ def track_live(
     `device`: opened, idle; `course`: what the device is to do; tracking begins when it has settled; `start`: where
     tracking begins; default: an identification of the first `start_s` of the stream; `taps`: others who listen to the
     run, such as a recorder; `on_event`: told of the device's events, in the thread of the run; `on_run`: given what
-    came of the run, also where tracking was interrupted; `following`: see `ambid.job.following.Following`; times count
-    from the first sample that is tracked. Returns the track up to the end of the course, a fault, or an interrupt.
+    came of the run, also where tracking was interrupted; `on_lag`: told, after each block, the time from its last
+    sample to the end of its work, s; `following`: see `ambid.job.following.Following`; times count from the first
+    sample that is tracked. Returns the track up to the end of the course, a fault, or an interrupt.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
@@ -99,7 +102,7 @@ def track_live(
         with runner:
             lead = _Lead(ring, runner, wanted_s, view, device.info.port)
             begin = start_of(lead.source, rig, given=start, start_s=lead_s, rig_speaks=True)
-            track = follow(lead.blocks(begin.first), lead.source, begin, Following(**following), live=True)
+            track = follow(lead.frames(begin.first, on_lag), lead.source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
 
 
@@ -107,13 +110,13 @@ class _Lead:
     """The beginning of the stream: read before tracking begins, and tracked with the rest."""
 
     def __init__(self, ring: BlockRing, runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
-        self._blocks, read = _blocks(ring), list[Block]()
+        self._frames, read = _frames(ring), list[Block]()
         wanted = round(wanted_s * view.rate_hz) + 1
         while not read or read[-1].first + len(read[-1].values) < wanted:
-            block = next(self._blocks, None)
-            if block is None:
+            frame = next(self._frames, None)
+            if frame is None:
                 raise _too_short(runner, wanted_s, view.rate_hz)
-            read.append(block)
+            read.append(frame.block)
         values = np.concatenate([b.values for b in read])
         numbers = np.concatenate([b.first + np.arange(len(b.values)) for b in read])
         stamps = np.concatenate([b.time_s + np.arange(len(b.values)) / view.rate_hz for b in read])
@@ -129,18 +132,21 @@ class _Lead:
             forcing=None, t0=0.0,
         )  # fmt: skip
 
-    def blocks(self, first: int) -> Iterator[Block]:
-        """Yield what was read, from a number on, and then what comes."""
+    def frames(self, first: int, on_lag: Callable[[float], object]) -> Iterator[Block | Frame]:
+        """Yield what was read, from a number on, and then what comes; what waited for the start counts from now."""
+        began = time.perf_counter()
         yield from self.source.replay.since(first)
-        yield from self._blocks
+        for frame in self._frames:
+            yield frame if frame.arrived_s >= began else frame.block
+            on_lag(time.perf_counter() - frame.arrived_s)
 
 
-def _blocks(ring: BlockRing) -> Iterator[Block]:
-    """Yield the blocks of a ring until it has ended and is empty."""
+def _frames(ring: BlockRing) -> Iterator[Frame]:
+    """Yield the frames of a ring until it has ended and is empty."""
     while True:
         frame = ring.read(LOOK_S)
         if frame is not None:
-            yield frame.block
+            yield frame
         elif ring.ended and not ring.filled:
             return
 

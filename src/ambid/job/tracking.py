@@ -34,7 +34,7 @@ from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig, load_rig
 from ambid.rotor.estimate import RotorEstimate
-from ambid.tracking.blocks import Block, Stretch
+from ambid.tracking.blocks import Block, Frame, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
 from ambid.tracking.guard import ABSURD, StreamGuard
@@ -175,7 +175,7 @@ def track(
 
 
 def follow(
-    blocks: Iterable[Block] | BlockRing, source: BenchRows, begin: Start, how: Following, *, live: bool = False
+    blocks: Iterable[Block | Frame] | BlockRing, source: BenchRows, begin: Start, how: Following, *, live: bool = False
 ) -> Track:
     """Follow the physical parameters of a bench through blocks, SI, from sample ``begin.first`` on.
 

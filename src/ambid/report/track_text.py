@@ -38,6 +38,7 @@ _MOST = 20  # events that are listed one by one
 _BAR = 25  # columns of a bar
 _SPARK = 40  # columns of the error's recent past
 _DECISIONS = 6
+LATE_S = 0.2  # a lag beyond which is shown in red, s
 
 
 def track_text(track: Track, *, events: Sequence[Event] = (), width: int = WIDTH, paint: Paint = plain) -> str:
@@ -163,7 +164,9 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
     if latency is not None and math.isfinite(latency.median):
         lost = f"; {counted(latency.overruns, 'block')} LOST" if latency.overruns else ""
         median, p99, largest = (sized(x, "s", 3) for x in (latency.median, latency.p99, latency.largest))
-        words = f"latency of a block: median {median}, 99 % {p99}, largest {largest}; {latency.late} late{lost}"
+        words = (
+            f"lag from sample to decision: median {median}, 99 % {p99}, largest {largest}; {latency.late} late{lost}"
+        )
         lines.append(paint(words, "bad" if lost else "dim"))
     return lines
 
@@ -195,7 +198,7 @@ class TrackView:
     begin_s: float = 0.0  # begin of the first reporting interval, s of record
     length_s: float | None = None  # of the record, s; None where it is not known
     wall_s: float = 0.0  # since tracking began, s
-    behind_s: float | None = None  # by how much tracking is behind a record that is replayed in real time, s
+    behind_s: float | None = None  # from a sample to what is decided on it, in real time, s
     rejected: int = 0
     updates: int = 0
     open_changes: int = 0  # changes that are not answered by accepted values
@@ -234,7 +237,7 @@ def _head(view: TrackView, ascii_only: bool) -> Parts:
         on, off = ("#", ".") if ascii_only else ("█", "░")
         parts.append(f" of {view.begin_s + view.length_s:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
     if view.behind_s is not None:
-        late = view.behind_s > 10 * h.every_s
+        late = view.behind_s > LATE_S
         parts.append((f"  {sized(max(view.behind_s, 0.0), 's')} behind", "bold red" if late else ""))
     return parts
 

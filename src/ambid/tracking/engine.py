@@ -18,7 +18,7 @@ from math import ceil, log10
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
 from types import FrameType, MappingProxyType
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
@@ -233,7 +233,7 @@ class StreamReport:
 
 
 def run(
-    source: Iterable[Block] | BlockRing,
+    source: Iterable[Block | Frame] | BlockRing,
     consume: Callable[[Stretch], object],
     reject: Callable[[Rejection], object] | None = None,
     *,
@@ -250,9 +250,10 @@ def run(
     says so. A second one interrupts the consumer itself. An exception of source or consumer ends everything and is
     raised again; the ring is removed in any case.
 
-    `consume`: given each clean stretch; `reject`: given each rejection; `guard`: a fresh one, of this stream; `pace`:
-    of a source that is no ring; `ring_blocks`, `block_samples`: capacity of the ring, with a producer; `stopped`: asked
-    between blocks; True ends the stream as an interrupt does.
+    `source`: blocks; with the fastest pace also frames, which keep their time of arrival; `consume`: given each clean
+    stretch; `reject`: given each rejection; `guard`: a fresh one, of this stream; `pace`: of a source that is no ring;
+    `ring_blocks`, `block_samples`: capacity of the ring, with a producer; `stopped`: asked between blocks; True ends
+    the stream as an interrupt does.
     """
     pump = _Pump(guard, consume, reject)
     with _Interrupt() as interrupt:
@@ -263,7 +264,11 @@ def run(
         if isinstance(source, BlockRing):
             pump.drain(source, ending, None)
         elif producer == "none":
-            frames = paced(source, guard.rate_hz, stopped=ending) if pace == "real-time" else _at_once(source)
+            frames = (
+                paced(cast("Iterable[Block]", source), guard.rate_hz, stopped=ending)
+                if pace == "real-time"
+                else _at_once(source)
+            )
             pump.pull(frames, ending, interrupt)
         else:
             names = [f"c{k}" for k in range(guard.n_channels)]
@@ -271,16 +276,16 @@ def run(
                 BlockRing.create(
                     rate_hz=guard.rate_hz, channels=names, slots=ring_blocks, block_samples=block_samples
                 ) as ring,
-                produced_beside(source, ring, guard.rate_hz, pace) as maker,
+                produced_beside(cast("Iterable[Block]", source), ring, guard.rate_hz, pace) as maker,
             ):
                 pump.drain(ring, ending, maker)
         pump.finish()
         return pump.report(interrupted=interrupt.came)
 
 
-def _at_once(source: Iterable[Block]) -> Iterator[Frame]:
-    for block in source:
-        yield Frame(block=block, arrived_s=time.perf_counter())
+def _at_once(source: Iterable[Block | Frame]) -> Iterator[Frame]:
+    for x in source:
+        yield x if isinstance(x, Frame) else Frame(block=x, arrived_s=time.perf_counter())
 
 
 class _Pump:
