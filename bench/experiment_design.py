@@ -76,7 +76,7 @@ def compared(case: Case) -> Iterator[tuple[str, ...]]:
     rig = case.rig
     # known within 1 %, as after a first short record
     found = ambid.design_experiment(rig, seconds=case.seconds, band=case.band, spread=0.01)
-    designed = found.played(found.period * found.periods, found.rate_hz)
+    designed = found.played(found.period * found.periods, found.rate_hz)[:, 0]
     flat = np.tile(
         ambid.excitation("schroeder", found.period, found.rate_hz, amplitude=1.0, band=case.band), found.periods
     )
@@ -102,7 +102,7 @@ def kept(case: Case) -> tuple[str, ...]:
     began = time.process_time()
     found = ambid.design_experiment(free, seconds=case.seconds, band=case.band)
     took = time.process_time() - began
-    wave, good, largest = found.played(3 * found.period, found.rate_hz), 0, 0.0
+    wave, good, largest = found.played(3 * found.period, found.rate_hz)[:, 0], 0, 0.0
     for seed in range(RUNS):
         rng = np.random.default_rng(seed)
         off = tuple(replace(p, value=float(p.value or 0.0) * (1.0 + rng.uniform(-_OFF, _OFF))) for p in rig.parameters)

@@ -165,7 +165,7 @@ def designed(bench):
 
 
 def test_the_limits_are_kept_by_plants_that_are_ten_percent_off_from_rest(bench, designed):
-    wave = designed.played(3 * designed.period, designed.rate_hz)
+    wave = designed.played(3 * designed.period, designed.rate_hz)[:, 0]
     for seed in range(6):
         rng = np.random.default_rng(seed)
         off = tuple(
@@ -188,7 +188,7 @@ def test_what_is_expected_is_what_identify_reports(bench, designed):
 
 def test_the_model_moves_as_the_simulator_does_from_rest(bench, designed):
     silent = replace(bench, noise=Noise())
-    wave = designed.played(2 * designed.period, designed.rate_hz)
+    wave = designed.played(2 * designed.period, designed.rate_hz)[:, 0]
     record = simulate_rig(silent, wave, rate_hz=designed.rate_hz, seed=0).record
     for name in ("position", "current", "voltage"):
         use = designed.signals[name]

@@ -50,7 +50,7 @@ class Room:
         `rig`: with ``[daq]``. Returns infinite where the rig knows no limit.
         """
         unlimited = (-math.inf, math.inf)
-        roles = [role for role in ("position", "current") if role in model(rig.model).outputs]
+        roles = [role for role in ("position", "current") if role in rig.plant.outputs]
         trips: dict[str, tuple[float, float]] = {role: rig.trip(role) or unlimited for role in roles}
         return cls(
             trips=MappingProxyType(trips), voltage=_ordered(rig, rig.limits.voltage if rig.limits else unlimited)

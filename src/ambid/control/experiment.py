@@ -18,6 +18,8 @@ from ambid.control.information import Information, Innovation, informed_lines, p
 from ambid.control.waves import Limited, Lines, joint_design, spread_power
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Estimate, Judged
+from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.spectra import beside_harmonics
 from ambid.signals.excitations import schroeder_phases
 
 SCHEMA = "ambid.experiment/1"
@@ -100,7 +102,7 @@ class Experiment(Judged):
         Of the record.
     frequency_hz : ndarray, shape (n_lines,)
     amplitude, phase : Mapping[str, ndarray], shape (n_lines,)
-        Of the lines, by input; peak in its unit, rad.
+        Of the lines, by input; peak in its unit, rad. Of several inputs each line excites one; zero at the others.
     excitation : Mapping[str, ndarray], shape (period,)
         What is added to the controller's output over one period, by input.
     table : Table or None
@@ -151,7 +153,7 @@ class Experiment(Judged):
         return self.periods * self.period / self.rate_hz
 
     def played(self, samples: int, rate_hz: float) -> Array:
-        """Return the excitation of the first input, from the beginning of a period.
+        """Return the excitation of the inputs, from the beginning of a period.
 
         Parameters
         ----------
@@ -161,7 +163,7 @@ class Experiment(Judged):
 
         Returns
         -------
-        ndarray, shape (samples,), in the unit of the input
+        ndarray, shape (samples, n_inputs), in the units of the inputs
 
         Raises
         ------
@@ -173,8 +175,8 @@ class Experiment(Judged):
                 f"the experiment is designed for {self.rate_hz:g} Hz, the bench samples at {rate_hz:g} Hz. Design it "
                 "with --rate, or correct the rate"
             )
-        wave = next(iter(self.excitation.values()))
-        return np.asarray(np.resize(wave, samples))
+        waves = np.column_stack(list(self.excitation.values()))
+        return np.asarray(np.resize(waves, (samples, waves.shape[1])))
 
     @property
     def program(self) -> Program:
@@ -192,10 +194,13 @@ class Experiment(Judged):
         return self.table.program
 
 
-def reached(experiment: Experiment, estimate: Estimate) -> Check:
-    """Compare the standard deviations of an estimate with what the experiment promised for a record of that length."""
-    seconds = float(str(estimate.record["samples"])) / float(str(estimate.record["rate_hz"]))
+def reached(experiment: Experiment, estimate: Estimate | RotorEstimate) -> Check:
+    """Compare the standard deviations of an estimate with what the experiment promised for records of that length."""
+    records = estimate.records if isinstance(estimate, RotorEstimate) else (estimate.record,)
+    seconds = sum(float(str(r["samples"])) / float(str(r["rate_hz"])) for r in records)
     found, ratio = {p.name: p.sd for p in estimate.parameters if p.sd > 0.0}, dict[str, float]()
+    if isinstance(estimate, RotorEstimate):  # frequencies and dampings of its modes too
+        found = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
     for name, x in experiment.expected.items():
         if name in found:
             curve = np.log(experiment.shown.by_length[name])
@@ -231,6 +236,7 @@ class Task:
     criterion: str
     prior_sd: Mapping[str, float]
     hold: int = 1  # samples an element of the excitation
+    speed: float = 0.0  # of the rotor, rad/s: lines beside its harmonics are left out
 
     @property
     def samples(self) -> float:
@@ -256,14 +262,22 @@ class Task:
                 f"{self.band_hz[1]:g} Hz. Widen the band, or make the period longer"
             )
         every = np.arange(first, last + 1)
+        every = every[
+            ~beside_harmonics(self.frequency_hz(every), self.speed / (2.0 * np.pi), self.rate_hz / self.period)
+        ]
+        if every.size < self.loops[0].e.shape[1]:
+            raise EstimationError(
+                f"the band has {every.size} lines that no harmonic of the speed is beside, fewer than inputs. Widen "
+                "the band, or make the period longer"
+            )
         if every.size <= _CANDIDATES:
             return every
         half = _CANDIDATES // 2
         return np.union1d(every[:half], np.geomspace(every[half], last, _CANDIDATES).astype(np.int64))
 
     def inputs(self, lines: Lines) -> Lines:
-        """Return the input that each line excites: neighbours belong to inputs in turn (zippered)."""
-        return np.asarray(np.arange(lines.size) % self.loops[0].e.shape[1])
+        """Return the input that each line excites: those of the period belong to inputs in turn (zippered)."""
+        return np.asarray(lines % self.loops[0].e.shape[1])
 
     def limited(self, lines: Lines, plants: Sequence[int]) -> Limited:
         """Return the signals of some of the plants."""
@@ -369,8 +383,9 @@ def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Ta
 
 
 def lines_of(wave: Array) -> tuple[Lines, Complex]:
-    """Return the lines of one period of an excitation of one input, and their amplitudes."""
-    X = np.fft.rfft(wave) / (0.5 * wave.size)
-    lines = np.flatnonzero(np.abs(X) > _SILENT * np.max(np.abs(X)))
-    lines = lines[(lines > 0) & (2 * lines < wave.size)]
-    return lines, np.asarray(X[lines])
+    """Return the lines of one period of an excitation, (period, n_inputs), and their amplitudes: a line, an input."""
+    X = np.fft.rfft(wave, axis=0) / (0.5 * wave.shape[0])
+    size = np.abs(X).max(axis=1)
+    lines = np.flatnonzero(size > _SILENT * np.max(size))
+    lines = lines[(lines > 0) & (2 * lines < wave.shape[0])]
+    return lines, np.asarray(X[lines, lines % wave.shape[1]])

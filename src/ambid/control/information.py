@@ -26,6 +26,8 @@ from ambid.estimation.predictor import predictor_gain, scales_for
 from ambid.estimation.uncertainty import natural_sizes
 from ambid.physics.linear_model import discretise
 from ambid.physics.loop import Noise
+from ambid.physics.rotor_model import RotorModel
+from ambid.rotor.unknowns import split_rows
 
 _ROUNDS = 2000  # of the multiplicative algorithm
 _SETTLED = 1e-3  # of the equivalence theorem: largest slope over the mean
@@ -51,8 +53,13 @@ class Innovation:
                 f"nothing is known of the noise of {silent!r}, and without noise any excitation would do. Give [noise] "
                 "in the rig, or an estimate"
             )
-        sc = scales_for(of, plant.theta, np.ones(len(of.inputs)), sensors, plant.rate_hz)
         pushed = np.array([force if "force" in name else voltage for name in of.disturbances])
+        return cls.of_sources(plant, sensors, pushed)
+
+    @classmethod
+    def of_sources(cls, plant: Plant, sensors: Array, pushed: Array) -> Innovation:
+        """Return that of the rms of each sensor's noise, and of each disturbance held over samples."""
+        sc = scales_for(plant.model, plant.theta, np.ones(len(plant.model.inputs)), sensors, plant.rate_hz)
         d, _ = discretise(plant.space, 1.0 / plant.rate_hz)
         A, E, C = d.A * sc.state / sc.state[:, None], d.E * pushed / sc.state[:, None], d.C * sc.state
         at = predictor_gain(A, C / sensors[:, None], E @ E.T, np.eye(sensors.size))
@@ -72,6 +79,11 @@ def _sensor_sd(noise: Noise, role: str) -> float:
     """Return the noise of an output's sensor with that of its resolution."""
     kind = role.split("_")[-1].rstrip("0123456789")
     return float(np.hypot(getattr(noise, kind), _QUANTISED * getattr(noise, f"{kind}_resolution")))
+
+
+def reported(name: str) -> bool:
+    """Return whether an estimated number stands for itself; shapes and gyroscopic terms of modes are numbers beside."""
+    return not name.startswith("gyro.") and (not name.startswith("mode") or name.endswith((".omega", ".zeta")))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -99,14 +111,16 @@ class Information:
             known, dict(first.theta), first.model.references(first.theta)
         )
         prior = np.array([sizes[k] / prior_sd[n] if n in prior_sd else 0.0 for k, n in enumerate(names)])
-        chosen = known if criterion in ("all", "worst") else [criterion]
+        chosen = [n for n in known if reported(n)] if criterion in ("all", "worst") else [criterion]
+        shapes = split_rows(first.model, first.theta, names) * sizes if isinstance(first.model, RotorModel) else None
         found = []
         for plant, noise, T in zip(plants, noises, driven, strict=True):
             rows = noise.whiten(plant, 2.0 * np.pi * frequency_hz) @ plant.slopes(plant.sampled(frequency_hz), T)
             rows = rows * sizes
             found.append(0.5 * np.real(np.swapaxes(rows.conj(), 1, 2) @ rows))
         return cls(
-            names=names, sizes=sizes, lines=np.array(found), prior=np.diag(prior**2),
+            names=names, sizes=sizes, lines=np.array(found),
+            prior=np.diag(prior**2) + (0.0 if shapes is None else shapes.T @ shapes),
             weights=np.array([(n in chosen) / len(chosen) for n in names]), worst=criterion == "worst",
         )  # fmt: skip
 

@@ -29,21 +29,26 @@ from ambid.control.experiment import (
     played,
     uses,
 )
-from ambid.control.information import Information, Innovation
+from ambid.control.information import Information, Innovation, reported
 from ambid.errors import AmbidError, check_positive, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.uncertainty import WEAK
+from ambid.job.closed_loop import plant_of
 from ambid.job.data import Clock, known_rig, rig_entry
 from ambid.job.results import load, rig_of
 from ambid.job.simulation import BenchSource, bench_of_source
-from ambid.physics.loop import Noise
+from ambid.physics.loop import Loop, Noise
 from ambid.physics.presets import Preset
+from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, Record
 from ambid.rig import Rig, rig_of_preset
+from ambid.rotor.estimate import RotorEstimate
 from ambid.signals.excitations import schroeder_phases
-from ambid.simulation.rig_bench import Bench
+from ambid.simulation.plant import LinearPlant
+from ambid.simulation.rig_bench import Bench, loop_of_rig
+from ambid.simulation.rotor_bench import RotorBench, kind_of
 
 SPREAD = 0.1
 """Part of their values within which free parameters of a rig lie, two standard deviations, for the drawn plants."""
@@ -61,7 +66,12 @@ _LENGTHS, _LEVELS = np.geomspace(0.1, 100.0, 31), np.geomspace(0.1, 1.0, 11)  # 
 _DIGITS = 6  # of what is drawn
 _KEPT = 1.0 + 1e-6  # largest pole
 _FULL = 1.0 + 1e-6  # use of a limit
+_TURNS_S = 1.0  # in which unbalance sets in, and is looked at
 _ROUNDINGS = 4  # of a table, each a little smaller
+
+
+Known = Estimate | RotorEstimate
+AnyBench = Bench | RotorBench
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,9 +116,9 @@ def design_experiment(
 
     Parameters
     ----------
-    source : str, Path, Rig, Preset or Estimate
-        A preset by its name; a rig or its file, designed for its values; a linear estimate or its file, designed for
-        what it found, with its noise.
+    source : str, Path, Rig, Preset, Estimate or RotorEstimate
+        A preset by its name; a rig or its file, designed for its values; a linear estimate, of one axis or of a rotor,
+        or its file, designed for what it found, with its noise.
     rig : Rig, str or Path, optional
         Of an estimate: with other limits, loop or controller than its own.
     seconds : float, optional
@@ -180,28 +190,28 @@ def design_experiment(
 
 def _given(
     source: BenchSource, rig: Rig | str | Path | None, rate_hz: float | None, closed: bool | None
-) -> tuple[Estimate | None, Bench]:
+) -> tuple[Known | None, AnyBench]:
     """Return the estimate, where that is the source, and the bench with the numbers that are designed for."""
     if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
         source = load(source)
+    known = source if isinstance(source, (Estimate, RotorEstimate)) else None
+    given = None if rig is None else known_rig(rig)
+    if given is not None and known is None:
+        raise AmbidError("--rig is for an estimate; a rig is there already. Omit --rig")
+    if isinstance(source, RotorEstimate):
+        return source, _rotor_of(source, given or rig_of(source, "the estimate"), rate_hz, closed)
     if not isinstance(source, (str, Path, Rig, Preset, Estimate)):
         raise AmbidError(
-            f"a {type(source).__name__} is no linear estimate of one axis, for which an experiment is designed. Give "
-            "what 'ambid identify --json' wrote, or a rig"
+            f"a {type(source).__name__} is no linear estimate, for which an experiment is designed. Give what 'ambid "
+            "identify --json' wrote, or a rig"
         )
     of = bench_of_source(source)
     of = rig_of_preset(of) if isinstance(of, Preset) else of
-    if rig is not None:
-        given = known_rig(rig)
-        if not isinstance(source, Estimate):
-            raise AmbidError("--rig is for an estimate; a rig is there already. Omit --rig")
+    if given is not None:
         loop = None if given.loop is None else replace(given.loop, delay=of.loop.delay if of.loop else 0.0)
         of = replace(given, parameters=of.parameters, operating_point=of.operating_point, loop=loop)
-    known = source if isinstance(source, Estimate) else None
     if of.rotor is not None:
-        raise AmbidError(
-            f"{of.name!r} has a rotor on many axes; an experiment is designed for one axis. Give another bench"
-        )
+        return None, RotorBench.of(of, rate_hz, closed)
     if rate_hz is None and of.daq is not None:
         rate_hz = of.daq.rate_hz
     if of.magnet is not None and any(p.value is None for p in of.parameters):
@@ -209,6 +219,18 @@ def _given(
         filled = tuple(replace(p, value=at_rest[p.name] if p.value is None else p.value) for p in of.parameters)
         of = replace(of, parameters=filled)
     return known, Bench.of(of if of.daq is None else _with_steps(of), rate_hz, closed)
+
+
+def _rotor_of(known: RotorEstimate, rig: Rig, rate_hz: float | None, closed: bool | None) -> RotorBench:
+    """Return the bench of a rotor's estimate, at its speed."""
+    if rig.rotor is None:
+        raise AmbidError(f"rig {rig.name!r} has no [bearings.X]; the estimate is of a rotor. Give its rig")
+    plant = plant_of(known, rate_hz or float(str(known.record["rate_hz"])), known.speed)
+    loop = replace(loop_of_rig(rig, closed) or Loop(), delay=float(np.mean(plant.delays)))
+    return RotorBench(
+        rig=rig, plant=LinearPlant(model=plant.model, parameters=plant.theta), loop=loop, rate_hz=plant.rate_hz,
+        shapes={},
+    )  # fmt: skip
 
 
 def _with_steps(rig: Rig) -> Rig:
@@ -220,7 +242,7 @@ def _with_steps(rig: Rig) -> Rig:
     return replace(rig, noise=replace(noise, **steps))
 
 
-def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -> Experiment:
+def _designed(known: Known | None, bench: AnyBench, wanted: Wanted, say: Tick) -> Experiment:
     """Draw plants, set the task, design, and say what comes of it."""
     plant, prior_sd = _plant(known, bench)
     loop = ExcitedLoop.of(plant, bench.loop)
@@ -233,7 +255,7 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
         )
     noise = _innovation(known, bench, plant)
     low, high = _room(bench, loop, wanted)
-    spare = _RESERVE * loop.noise_sd(noise)
+    spare = _RESERVE * loop.noise_sd(noise) + _turning(known, bench, loop)
     _refuse_full(loop.signals, spare, low, high)
     _refuse_criterion(wanted.criterion, plant.names)
     drawn = [ExcitedLoop.of(x, bench.loop) for x in _drawn(known, bench, plant, wanted)]
@@ -247,68 +269,94 @@ def _designed(known: Estimate | None, bench: Bench, wanted: Wanted, say: Tick) -
     return _told(bench, task, found, (low, high, spare), wanted, unstable)
 
 
-def _plant(known: Estimate | None, bench: Bench) -> tuple[Plant, dict[str, float]]:
+def _plant(known: Known | None, bench: AnyBench) -> tuple[Plant, dict[str, float]]:
     """Return the nominal plant with the names that identify estimates, and the priors' standard deviations."""
     rig = bench.rig if known is None else rig_of(known, "the estimate")
     assert rig is not None
-    of = bench.linear.model
+    linear = bench.plant if isinstance(bench, RotorBench) else bench.linear
+    of = linear.model
     names = [p.name for p in rig.parameters if p.role != "fixed"]
+    if isinstance(of, RotorModel):
+        names += [p.name for p in of.mode_parameters]
     if not names:
         raise AmbidError("every parameter of the rig is fixed, and none is left to identify. Free at least one")
     part = bench.loop.delay % 1.0
     if known is not None:
-        late = known.delay[of.inputs[0]].sd is not None
+        late = [role for role in of.inputs if known.delay[role].sd is not None]
     else:
-        late = rig.channel(of.inputs[0]).delay == "auto" and _WHOLE <= part <= 1.0 - _WHOLE
+        fraction = _WHOLE <= part <= 1.0 - _WHOLE
+        late = [role for role in of.inputs if fraction and rig.channel(role).delay == "auto"]
+    if isinstance(known, RotorEstimate):
+        names = [p.name for p in of.parameters if p.name in known.covariance_names]
     plant = Plant(
-        model=of, theta=bench.linear.parameters, delays=np.full(len(of.inputs), bench.loop.delay),
-        rate_hz=bench.rate_hz, names=(*names, *([f"{of.inputs[0]}.delay"] if late else [])),
+        model=of, theta=linear.parameters, delays=np.full(len(of.inputs), bench.loop.delay),
+        rate_hz=bench.rate_hz, names=(*names, *(f"{role}.delay" for role in late)),
     )  # fmt: skip
     return plant, {p.name: p.sd for p in rig.parameters if p.sd is not None}
 
 
-def _innovation(known: Estimate | None, bench: Bench, plant: Plant) -> Innovation:
+def _innovation(known: Known | None, bench: AnyBench, plant: Plant) -> Innovation:
     """Return the noise that an estimate found, else that of the rig."""
     if known is None:
         return Innovation.of(plant, bench.noise)
+    if isinstance(known, RotorEstimate):
+        sd = [np.array([known.noise[n] for n in x]) for x in (plant.model.outputs, plant.model.disturbances)]
+        return Innovation.of_sources(plant, *sd)
     return Innovation(gain=known.noise.gain, covariance=known.noise.innovation_covariance)
 
 
-def _drawn(known: Estimate | None, bench: Bench, plant: Plant, wanted: Wanted) -> list[Plant]:
+def _drawn(known: Known | None, bench: AnyBench, plant: Plant, wanted: Wanted) -> list[Plant]:
     """Return drawn plants: of an estimate by its covariance, of a rig by priors and spread."""
     assert bench.rig is not None
+    own = {p.name: p.sd for p in bench.rig.parameters}
     names = tuple(n for n in plant.names if n in plant.theta)
     if known is not None:
         names, covariance = known.covariance_names, known.covariance
     else:
         half = [abs(plant.theta[n]) * wanted.spread / 2.0 for n in names]
-        covariance = np.diag([bench.rig.parameter(n).sd or x for n, x in zip(names, half, strict=True)]) ** 2
+        covariance = np.diag([own.get(n) or x for n, x in zip(names, half, strict=True)]) ** 2
     around = replace(plant, names=names, covariance=covariance)
     drawn = draw_plants(around, bench.rig, 1 + _PLANTS, seed=wanted.seed, spread=_SCATTER).plants[1:]
     return [replace(d.plant, names=plant.names) for d in drawn]
 
 
-def _room(bench: Bench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array]:
+def _room(bench: AnyBench, loop: ExcitedLoop, wanted: Wanted) -> tuple[Array, Array]:
     """Return how far each signal may go down and up from rest, SI."""
     assert bench.rig is not None
-    room, point = Room.of(bench.rig), bench.point._asdict()
+    room, point = Room.of(bench.rig), {} if isinstance(bench, RotorBench) else bench.point._asdict()
     low, high = [], []
     for name in loop.signals:
         if name.endswith(SLEW):
             most = np.inf if wanted.slew is None else wanted.slew
             ends, share = (-most, most), 1.0
         else:
-            trip = bench.rig.trip("current" if name == "current" else "position")
-            ends, share = (room.voltage, VOLTAGE) if name == "voltage" else (trip, wanted.use)
-        rest = 0.0 if name.endswith(SLEW) else point[name]
+            kind = kind_of(name)
+            trip = bench.rig.trip("current" if kind == "current" else "position")
+            ends, share = (room.voltage, VOLTAGE) if kind == "voltage" else (trip, wanted.use)
+        rest = point.get(name, 0.0)
         low.append(share * (ends[0] - rest))
         high.append(share * (ends[1] - rest))
     if not np.any(np.isfinite([*low, *high])):
         raise AmbidError(
-            f"rig {bench.name!r} has no limits of voltage, current or position; an excitation is designed for them. "
-            "Give [loop.limits]"
+            f"rig {bench.rig.name!r} has no limits of voltage, current or position; an excitation is designed for "
+            "them. Give [loop.limits]"
         )
     return np.array(low), np.array(high)
+
+
+def _turning(known: Known | None, bench: AnyBench, loop: ExcitedLoop) -> Array:
+    """Return how far unbalance and runout move the signals of a rotor that turns, (n_signals,)."""
+    if not isinstance(bench, RotorBench) or not bench.model.speed:
+        return np.zeros(len(loop.signals))
+    if isinstance(known, RotorEstimate):
+        seen = [r["response"] for r in known.synchronous.get("records", ())]
+        moved = {n: max((sum(r[n]["amplitude"]) for r in seen if n in r), default=0.0) for n in loop.signals}
+    else:
+        n, still = round(_TURNS_S * bench.rate_hz), replace(bench, rig=replace(bench.rig, noise=None))
+        unexcited = np.zeros((2 * n, len(bench.model.inputs)))
+        record = still.simulate(unexcited, seed=0, columns=False, settle=n).record
+        moved = {c.name: float(np.max(np.abs(c.values))) for c in record.channels}
+    return np.array([moved.get(name, 0.0) for name in loop.signals])
 
 
 def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array) -> None:
@@ -324,7 +372,8 @@ def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array
 
 def _refuse_criterion(criterion: str, names: tuple[str, ...]) -> None:
     """Refuse the name of what is not estimated."""
-    if criterion not in ("all", "worst", *(n for n in names if not n.endswith(".delay"))):
+    names = tuple(n for n in names if reported(n) and not n.endswith(".delay"))
+    if criterion not in ("all", "worst", *names):
         raise AmbidError(
             f"--criterion {criterion!r}; it must be all, worst or an estimated parameter: {', '.join(names)}."
             f"{nearest(criterion, list(names))} Correct it"
@@ -332,7 +381,7 @@ def _refuse_criterion(criterion: str, names: tuple[str, ...]) -> None:
 
 
 def _task(
-    bench: Bench, loops: list[ExcitedLoop], noise: Callable[[Plant], Innovation], ends: tuple[Array, Array],
+    bench: AnyBench, loops: list[ExcitedLoop], noise: Callable[[Plant], Innovation], ends: tuple[Array, Array],
     wanted: Wanted, prior_sd: dict[str, float],
 ) -> Task:  # fmt: skip
     """Return the task: period, lines and length beside plants and limits."""
@@ -342,7 +391,7 @@ def _task(
     hold, period = 1, min(round(seconds * rate / _PERIODS), _LONGEST)
     if wanted.period_s is not None:
         period = round(wanted.period_s * rate)
-    if bench.rig.daq is not None:
+    if bench.rig.daq is not None and bench.rig.rotor is None:
         if wanted.period_s is None:
             period = TABLE_LENGTH if wanted.band is None else int(np.ceil(rate / wanted.band[0] - 1e-9))
         hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
@@ -352,22 +401,22 @@ def _task(
     return Task(
         loops=loops, noise=noise, low=ends[0], high=ends[1], period=period, periods=periods,
         band_hz=(band[0], min(band[1], 0.4 * rate / hold)), n_lines=wanted.lines, criterion=wanted.criterion,
-        prior_sd=prior_sd, hold=hold,
+        prior_sd=prior_sd, hold=hold, speed=abs(getattr(loops[0].plant.model, "speed", 0.0)),
     )  # fmt: skip
 
 
 def _told(
-    bench: Bench, task: Task, found: Design, ends: tuple[Array, Array, Array], wanted: Wanted, unstable: int
+    bench: AnyBench, task: Task, found: Design, ends: tuple[Array, Array, Array], wanted: Wanted, unstable: int
 ) -> Experiment:
     """Play the design, and say what it uses and what a record of it will show."""
     assert bench.rig is not None
     loop, of, quantum = task.loops[0], task.loops[0].plant.model, None
-    if bench.rig.daq is not None:
+    if bench.rig.daq is not None and bench.rig.rotor is None:
         full = with_default_daq(bench.rig)
         quantum = abs(scale_of(full, "voltage").slope(controller_settings(full).duty_bias))
     for _ in range(_ROUNDINGS):
         wave, table = played(found, task, quantum)
-        lines, c = lines_of(wave[:, 0])
+        lines, c = lines_of(wave)
         used = uses(task, lines, c)
         if table is None or quantum is None or used.max() <= _FULL:
             break
@@ -375,19 +424,25 @@ def _told(
     information, power = task.information(lines, [0]), np.abs(c) ** 2
     expected = _expected(task, information, power, _flat_sd(task, found), wanted.target)
     waves = dict(zip(loop.signals, task.limited(lines, [0]).waves(c).T, strict=True))
-    by_length = np.array([information.relative_sd(power, x * task.samples) for x in _LENGTHS])
-    by_level = np.array([information.relative_sd(power * x**2, task.samples) for x in _LEVELS])
+    by_length = [information.relative_sd(power, x * task.samples) for x in _LENGTHS]
+    by_level = [information.relative_sd(power * x**2, task.samples) for x in _LEVELS]
+    curves = [
+        {name: x for name, x in zip(information.names, np.transpose(sd), strict=True) if name in expected}
+        for sd in (by_length, by_level)
+    ]
+    drive = np.eye(len(of.inputs))[task.inputs(found.lines)] * found.c[:, None]
+    by_input = dict(zip(of.inputs, drive.T, strict=True))
     return Experiment(
         model=of.name, criterion=task.criterion, rate_hz=task.rate_hz, period=task.period, periods=task.periods,
-        frequency_hz=task.frequency_hz(found.lines), amplitude={of.inputs[0]: np.abs(found.c)},
-        phase={of.inputs[0]: np.angle(found.c)}, excitation={of.inputs[0]: wave[:, 0]}, table=table,
+        frequency_hz=task.frequency_hz(found.lines), amplitude={name: np.abs(c) for name, c in by_input.items()},
+        phase={name: np.angle(c) for name, c in by_input.items()},
+        excitation=dict(zip(of.inputs, wave.T, strict=True)), table=table,
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
         gap=found.gap, drawn=len(task.loops) - 1, checks=_checks(used, expected, unstable),
         shown=Shown(
             waves={name: rounded(x) for name, x in waves.items()},
             seconds=_LENGTHS * (task.samples / task.rate_hz),
-            by_length=dict(zip(information.names, by_length.T, strict=True)), levels=_LEVELS,
-            by_level=dict(zip(information.names, by_level.T, strict=True)),
+            by_length=curves[0], levels=_LEVELS, by_level=curves[1],
         ),
     )  # fmt: skip
 
@@ -406,10 +461,12 @@ def _expected(task: Task, known: Information, power: Array, flat: Array, target:
     plant, relative = task.loops[0].plant, known.relative_sd(power, task.samples)
     units, found = {p.name: p.unit for p in plant.model.parameters}, {}
     for k, name in enumerate(known.names):
+        if not reported(name):
+            continue
         aim = task.period * max(1.0, task.periods * (relative[k] / target) ** 2)
         seen = bool(relative[k] < WEAK)
         found[name] = Expected(
-            value=plant.theta.get(name, float(plant.delays[0])), unit=units.get(name, "1"),
+            value=plant.theta.get(name, float(plant.delays.mean())), unit=units.get(name, "1"),
             sd=float(relative[k] * known.sizes[k]), relative_sd=float(relative[k]),
             flat_sd=float(flat[k] * known.sizes[k]), identifiable=seen,
             seconds=float(aim / task.rate_hz) if seen else None,
@@ -467,5 +524,8 @@ def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dic
 
 def one_period(found: Experiment) -> Record:
     """Return one period of the excitation as a record, a column an input."""
-    channels = tuple(Channel(name=f"{name}.excitation", unit="V", values=x) for name, x in found.excitation.items())
+    channels = tuple(
+        Channel(name=f"{name}.excitation", unit=found.signals[name].unit, values=x)
+        for name, x in found.excitation.items()
+    )
     return Record(channels=channels, rate_hz=found.rate_hz)

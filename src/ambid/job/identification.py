@@ -96,12 +96,13 @@ def identify(
     A table takes the place of the record: ``ambid.identify(record.to_dataframe(), "bench.toml")``.
     """
     bench, sources = known_rig(rig), sources_of(record)
-    planned = None if experiment is None else _planned(experiment, bench)
+    planned = None if experiment is None else _planned(experiment)
     reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
     if bench.rotor is not None:
         from ambid.job.rotor import identify_rotor, validated
 
         found = identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
+        found = replace(found, checks={**found.checks, **_reached(planned, found)})
         if validate is None:
             return found
         second = validated(found, (load_bench(validate, bench, **reading),))
@@ -114,25 +115,28 @@ def identify(
             "operating point to the next. Give --nonlinear for one model of all, or one record"
         )
     estimate = identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
-    if planned is None:
-        return estimate
-    from ambid.control.experiment import reached
-
-    return replace(estimate, checks={**estimate.checks, "experiment": reached(planned, estimate)})
+    return replace(estimate, checks={**estimate.checks, **_reached(planned, estimate)})
 
 
-def _planned(experiment: Experiment | str | Path, rig: Rig) -> Experiment:
+def _planned(experiment: Experiment | str | Path) -> Experiment:
     """Return the experiment that is meant."""
     from ambid.job.results import experiment_of
 
-    if rig.rotor is not None:
-        raise EstimationError("--experiment is of one axis; the rig has a rotor on many. Omit it")
     found = experiment_of(experiment)
     if found is None:
         raise EstimationError(
             f"--experiment {experiment} is no experiment. Give what 'ambid design experiment --json' wrote"
         )
     return found
+
+
+def _reached(planned: Experiment | None, estimate: Estimate | RotorEstimate) -> dict[str, Check]:
+    """Return the check of what the experiment promised, where one is given."""
+    if planned is None:
+        return {}
+    from ambid.control.experiment import reached
+
+    return {"experiment": reached(planned, estimate)}
 
 
 def identify_axis(

@@ -29,6 +29,7 @@ BenchSource = str | Path | Rig | Preset | Estimate
 
 _LEAST_PERIODS = 4  # of a rotor's record: their scatter is its noise
 _REACH = 10.0  # of the rate over the highest line of a rotor's excitation
+_NO_LOG = "--log-excitation is for one axis; a rotor's record has <axis>_reference. Omit it"
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
@@ -149,11 +150,25 @@ def simulate_used(
     if not force:
         bench.refuse_unstable()
     if experiment is not None:
-        of_others = {"--amplitude": amplitude, "--band": band, "--periods": periods, "--axes": axes, "--settle": settle}
+        of_others = {"--amplitude": amplitude, "--band": band, "--periods": periods, "--axes": axes}
         refuse_given(of_others, "--excitation is an experiment, which takes no {}. Omit {}")
+        of = bench.model if isinstance(bench, RotorBench) else bench.linear.model
+        if tuple(experiment.excitation) != of.inputs:
+            raise AmbidError(
+                f"--excitation is an experiment of {', '.join(experiment.excitation)}, the bench has "
+                f"{', '.join(of.inputs)}. Give another"
+            )
         if isinstance(bench, RotorBench):
-            raise AmbidError("--excitation is an experiment of one axis, the bench a rotor. Give another")
-        wave = experiment.played(n, bench.rate_hz)
+            if log_excitation:
+                raise AmbidError(_NO_LOG)
+            sets_in = experiment.period * (1 if settle is None else settle)
+            waves = experiment.played(sets_in + n, bench.rate_hz)
+            excited = Excited(
+                kind="experiment", peak=float(np.max(np.abs(waves))), unit=bench.model.units[of.inputs[0]]
+            )  # fmt: skip
+            return bench.simulate(waves, seed=seed, settle=sets_in), excited
+        refuse_given({"--settle": settle}, "--excitation is an experiment, which takes no {}. Omit {}")
+        wave = experiment.played(n, bench.rate_hz)[:, 0]
         return _with_excitation(bench.simulate(wave, seed=seed), wave if log_excitation else None), Excited(
             kind="experiment", peak=float(np.max(np.abs(wave)))
         )
@@ -163,7 +178,7 @@ def simulate_used(
         )
     if isinstance(bench, RotorBench):
         if log_excitation:
-            raise AmbidError("--log-excitation is for one axis; a rotor's record has <axis>_reference. Omit it")
+            raise AmbidError(_NO_LOG)
         kind, held = str(excitation or "zippered"), 1 if settle is None else settle
         shape, period = _of_axes(bench, kind, n, periods, axes, band, seed)
         trial = shape[: 2 * period]  # begins at rest: what it needs is no less than later

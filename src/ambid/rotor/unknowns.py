@@ -155,3 +155,19 @@ class Unknowns:
         return tuple(
             [p.name for p in self.model.parameters if roles.get(p.name, "mode") in ("free", "prior")] + of_modes
         )
+
+
+def split_rows(model: RotorModel, theta: Mapping[str, float], names: Sequence[str]) -> Array:
+    """Return the priors of the shapes' parts over numbers by `names`, as rows over their sd, (n_modes, n_names).
+
+    ln(|bearings' part| / |sensors' part|) is 2 l with the convention's scatter.
+    """
+    n, rows = sum(not b.axial for b in model.bearings), np.zeros((model.n_modes, len(names)))
+    sd = float(np.hypot(2.0 * _SPLIT_SD, _GAUGE_SD))
+    for r, row in enumerate(rows, 1):
+        for at, sign in ((model.places[:n], 1.0), (model.places[n:], -1.0)):
+            part = np.array([theta[f"mode{r}.{x}"] for x in at])
+            for x, slope in zip(at, sign * part / max(float(part @ part), _LEAST_LENGTH) / sd, strict=True):
+                if f"mode{r}.{x}" in names:
+                    row[names.index(f"mode{r}.{x}")] = slope
+    return rows

@@ -229,7 +229,7 @@ class RotorBench:
             raise ModelError(
                 f"axes are driven by {', '.join(sorted(set(kinds)))}; one loop drives all alike. Correct it"
             )
-        steps = [getattr(self.noise, f"{_kind(name)}_resolution") for name in (*of.outputs, of.inputs[0])]
+        steps = [getattr(self.noise, f"{kind_of(name)}_resolution") for name in (*of.outputs, of.inputs[0])]
         magnets, _ = of.rows(self.plant.parameters)
         mass, _, _ = of.rotor_matrices(self.plant.parameters)
         pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
@@ -245,7 +245,7 @@ class RotorBench:
                 equations, np.ascontiguousarray(continuous.C), fed_back(of),
                 np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
                 matrices_of(law_on(c, of, self.rate_hz)), np.array(steps[:-1]),
-                (*getattr(self.limits, _kind(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
+                (*getattr(self.limits, kind_of(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
                 self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), x, counts,
                 measured, command, truth,
             )
@@ -300,7 +300,7 @@ class RotorBench:
         of = self.model
         force, voltage = self.noise.held_rms(self.rate_hz)
         sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
-        size = np.array([sizes[_kind(name)] for name in (*of.outputs, *of.disturbances)])
+        size = np.array([sizes[kind_of(name)] for name in (*of.outputs, *of.disturbances)])
         return np.asarray(rng.standard_normal((n, size.size)) * size)
 
     def _runout(self, angle: Array) -> Array:
@@ -341,7 +341,7 @@ def _drawn(
     return n, found
 
 
-def _kind(name: str) -> str:
+def kind_of(name: str) -> str:
     """Return what a role of an axis is: ``ax_position2`` is a position; a command is a voltage."""
     kind = name.rsplit("_", 1)[-1].rstrip("0123456789")
     return "voltage" if kind == "command" else kind
