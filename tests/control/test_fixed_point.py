@@ -40,6 +40,8 @@ def test_l1_norms_are_the_largest_answers_to_bounded_signals():
     slow = np.array([[0.9999]])
     assert l1_norms(slow, np.ones((1, 1)))[0, 0] == pytest.approx(1e4, rel=2e-4)
     assert np.isinf(l1_norms(np.array([[1.0]]), np.ones((1, 1))))[0, 0]
+    weak = np.array([[1.0, 1e-5]])  # a slow pole that is seen late, behind a fast one
+    assert l1_norms(np.diag([0.5, 1.0 - 1e-5]), np.ones((2, 1)), weak)[0, 0] == pytest.approx(3.0, rel=2e-4)
 
 
 @pytest.mark.parametrize(("effort", "disturbance"), KNOBS)
