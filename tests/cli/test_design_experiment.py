@@ -109,7 +109,7 @@ def test_texts_fit_and_name_what_is_shown(designed):
         (("design", "experiment", "thesis", "--criterion", "q"), "--criterion 'q'"),
         (("design", "experiment", "thesis", "--target", "little"), "--target is 'little'"),
         (("design", "experiment", "jeffcott"), "unknown"),
-        (("design", "experiment", "spindle"), "rotor"),
+        (("simulate", "rmit", "--excitation", "d.json", "-o", "x.csv"), "the bench has xL_voltage"),
         (("design", "experiment", "thesis", "--rig", "rig.toml"), "--rig is for an estimate"),
         (("simulate", "thesis", "--excitation", "e.json", "-o", "x.csv"), "is no experiment"),
         (("simulate", "thesis", "--excitation", "d.json", "-o", "x.csv"), "designed for 2000 Hz"),

@@ -152,19 +152,17 @@ def simulate_used(
     if experiment is not None:
         of_others = {"--amplitude": amplitude, "--band": band, "--periods": periods, "--axes": axes}
         refuse_given(of_others, "--excitation is an experiment, which takes no {}. Omit {}")
-        of = bench.model if isinstance(bench, RotorBench) else bench.linear.model
-        if tuple(experiment.excitation) != of.inputs:
-            raise AmbidError(
-                f"--excitation is an experiment of {', '.join(experiment.excitation)}, the bench has "
-                f"{', '.join(of.inputs)}. Give another"
-            )
+        moved = tuple(experiment.excitation)
+        if moved != bench.model.inputs if isinstance(bench, RotorBench) else len(moved) > 1:
+            has = ", ".join(bench.model.inputs) if isinstance(bench, RotorBench) else "one axis"
+            raise AmbidError(f"--excitation is an experiment of {', '.join(moved)}, the bench has {has}. Give another")
         if isinstance(bench, RotorBench):
             if log_excitation:
                 raise AmbidError(_NO_LOG)
             sets_in = experiment.period * (1 if settle is None else settle)
             waves = experiment.played(sets_in + n, bench.rate_hz)
             excited = Excited(
-                kind="experiment", peak=float(np.max(np.abs(waves))), unit=bench.model.units[of.inputs[0]]
+                kind="experiment", peak=float(np.max(np.abs(waves))), unit=bench.model.units[moved[0]]
             )  # fmt: skip
             return bench.simulate(waves, seed=seed, settle=sets_in), excited
         refuse_given({"--settle": settle}, "--excitation is an experiment, which takes no {}. Omit {}")
