@@ -66,6 +66,18 @@ def test_goals_become_better_and_nothing_else_worse(bench):
     assert loop.ki > 0.0
 
 
+def test_a_plant_that_is_hardly_held_leaves_the_peak_a_goal(bench):
+    plants, rig, noise, _ = bench
+    weak = replace(rig, loop=replace(rig.loop, kd=0.4 * rig.loop.kd))
+    before = worst_of([examine(p, weak.loop, noise).figures for p in plants])
+    assert before.peak > 8.0
+    goals = Goals.of(GOALS, {}, before)
+    assert goals.reference["peak"] == 3.0
+    assert goals.limits == {name: getattr(before, name) for name in ("peak", "compliance", "noise", "settling")}
+    loop = tune_pid(plants, weak, goals, silent)
+    assert worst_of([examine(p, loop, noise).figures for p in plants]).peak < 2.0
+
+
 def test_a_limit_that_no_loop_meets_is_refused_with_the_one_to_move(bench):
     plants, rig, _, before = bench
     goals = Goals.of(GOALS, {"noise": 0.3 * before.noise, "peak": 1.3}, before)

@@ -1,8 +1,9 @@
 """What is asked of a controller, what it does on one plant and on many, and the design as a result.
 
 A design is judged on plants of `ambid.control.drawn` that its method has not seen. Figures that are to be small are
-minimised together, as the largest over the plants of each over that of the present loop; every other figure is limited,
-by what the present loop has where nothing else is said. So the peak of the sensitivity, which is smallest without an
+minimised together, as the largest over the plants of each over that of the present loop, of the peak no more than zone
+A allows: one plant that the present loop hardly holds would else make any peak a good one. All figures are limited, by
+what the present loop has where nothing else is said. So the peak of the sensitivity, which is smallest without an
 integrator, is never the only thing that is looked at.
 """
 
@@ -38,7 +39,7 @@ from ambid.physics.law import StateLaw, beside
 from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
 from ambid.rig import Rig, rig_from_text
-from ambid.simulation.margins import zone_of
+from ambid.simulation.margins import ZONES, zone_of
 from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
 
 SCHEMA = "ambid.design/1"
@@ -99,7 +100,7 @@ class Goals:
 
     @classmethod
     def of(cls, minimise: Sequence[str], limits: Mapping[str, float], before: Figures) -> Goals:
-        """Return the goals of a design; a figure that is no goal and has no limit must not become worse."""
+        """Return the goals of a design; no figure, goal or not, must become worse where nothing limits it."""
         for name in (*minimise, *limits):
             if name not in FIGURES:
                 known = f"{', '.join(FIGURES)}.{nearest(name, list(FIGURES))}"
@@ -111,10 +112,10 @@ class Goals:
                 raise ModelError(f"limit {name} is {x:g}; it must be a finite number. Correct it")
             if not x > (1.0 if name == "peak" else 0.0):
                 raise ModelError(f"limit {name} is {x:g} {FIGURES[name]}; no loop is that good. Raise it")
-        kept = {name: getattr(before, name) for name in FIGURES if name not in minimise}
+        present = {name: getattr(before, name) for name in FIGURES}
         return cls(
-            minimise=tuple(minimise), reference={name: getattr(before, name) for name in FIGURES},
-            limits={**kept, **limits},
+            minimise=tuple(minimise), reference={**present, "peak": min(before.peak, ZONES[0][0])},
+            limits={**present, **limits},
         )  # fmt: skip
 
     def missed(self, worst: Figures) -> tuple[str, ...]:

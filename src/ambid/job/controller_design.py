@@ -17,6 +17,7 @@ import numpy as np
 from ambid.control.closed import Plant
 from ambid.control.design import (
     GOALS,
+    SAME,
     UNSTABLE,
     Design,
     Examined,
@@ -48,6 +49,7 @@ from ambid.physics.loop import Interval, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
+from ambid.simulation.margins import zone_of
 
 _ROUNDS = 3  # in which the limits are met on the plants that judge too
 _STEP = 1.5  # settling times over which a force step is drawn
@@ -94,10 +96,10 @@ def design_controller(
 ) -> Design:
     """Design the controller of an identified bearing, and verify it on plants around the estimate.
 
-    The largest over many plants of each goal, over what the present loop has, is minimised; every figure that is no
-    goal must not become worse, unless a limit says otherwise. The plants are drawn by the covariance of the estimate
-    and by what a record does not show: a displaced rotor, another load, the delay, eddy currents, a warm coil. Other
-    plants judge.
+    The largest over many plants of each goal, over what the present loop has (of the peak, what zone A allows where
+    the present one is higher), is minimised; no figure may become worse, unless a limit says otherwise. The plants
+    are drawn by the covariance of the estimate and by what a record does not show: a displaced rotor, another load,
+    the delay, eddy currents, a warm coil. Other plants judge.
 
     Parameters
     ----------
@@ -140,7 +142,8 @@ def design_controller(
     AmbidError
         If estimate, rig, goals or limits break a rule.
     EstimationError
-        If no loop meets the limits; the message says which one to move, and how far.
+        If no loop meets the limits, or the best has a higher peak than they allow on the plants that judge, by default
+        that of the present loop; the message says which one to move, and how far.
 
     Examples
     --------
@@ -282,22 +285,50 @@ def _designed(
     clock.lap("draw")
     asked = Goals.of(goals, limits, worst_of([x.figures for x in before]))
     judged = Goals.of(goals, limits, worst_of([x.figures for x in first]))  # the present loop on the same plants
-    for _ in range(_ROUNDS):
-        loop = held_by(of.bench, design(plants, of.rig, asked, say))
+    for k in range(_ROUNDS):
+        try:
+            made = design(plants, of.rig, asked, say)
+        except EstimationError:
+            if not k:
+                raise
+            break  # no loop is as much closer: what there is must do
+        loop = held_by(of.bench, made)
         seen = verify(of.judging.plants, loop, of.noise, say)
         closer = judged.closer(asked, worst_of([x.figures for x in seen]))
         if closer is None:
             break
         asked = closer
     clock.lap("design")
-    found = _result(of, method, judged, ((of.present, first), (loop, seen)), say)
+    _refuse_worse(judged, first, seen)
+    found = _result(of, method, judged, ((of.present, first), (loop, seen)), made, say)
     clock.lap("verify")
     return found
 
 
+def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Examined]) -> None:
+    """Refuse a loop that loses more of the plants that judge than the present one, or whose peak passes its limit."""
+    from ambid.control.tuning import option, said
+
+    lost = [sum(not x.figures.stable for x in seen) for seen in (before, after)]
+    if lost[1] > lost[0]:
+        raise EstimationError(
+            f"the best loop found does not hold {lost[1]} of the {len(after)} plants that judge, the present one loses "
+            f"{lost[0]}; none is offered. Tune over more plants, lower the spread, or give other goals"
+        )
+    peak, most = worst_of([x.figures for x in after]).peak, goals.limits["peak"]
+    if peak > SAME * most or zone_of(peak) > zone_of(most):
+        raise EstimationError(
+            f"the best loop found has {said('peak', peak)} (zone {zone_of(peak)}) on the plants that judge, above the "
+            f"limit of {said('peak', most)} (zone {zone_of(most)}), by default what the present loop has; none is "
+            f"offered. Give the goal peak alone, or --limit {option('peak', peak)}"
+        )
+
+
 def _result(
-    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...], say: Tick
-) -> Design:
+    of: _Problem, method: str, goals: Goals, loops: tuple[tuple[Loop, Sequence[Examined]], ...], made: Loop,
+    say: Tick,
+) -> Design:  # fmt: skip
+    """Return the result; `made`: the new loop before rounding, which the controller rounds once."""
     was, now = (situation_of(seen, of.plant, loop) for loop, seen in loops)
     loop, seen = loops[1]
     worst = worst_plant(of.judging.plants, seen)
@@ -312,7 +343,7 @@ def _result(
         reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
     until = _STEP * max(was.figures.settling, now.figures.settling)
-    kept = replace(loop, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
+    kept = replace(made, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
     return Design(
         status=of.known.status, model=of.known.model, method=method, record=of.known.record, goals=goals, before=was,
         after=now, worst_plant=worst, checks=checks, rate_hz=of.plant.rate_hz, trials=trials,
@@ -330,9 +361,12 @@ def _result(
 
 
 def held_by(rig: Rig, loop: Loop | None) -> Loop:
-    """Return a loop as the rig's controller holds it in fixed point; as it is where there is no ``[daq]``."""
+    """Return a loop, gains or law, as the rig's controller holds it in fixed point.
+
+    As it is where there is no ``[daq]``, and of a rotor: the controller drives one axis.
+    """
     assert loop is not None
-    if rig.daq is None or loop.law is not None:
+    if rig.daq is None or rig.rotor is not None:
         return loop
     from ambid.acquisition.default_daq import with_default_daq
     from ambid.acquisition.settings import controller_settings, realised

@@ -1,0 +1,48 @@
+"""What a design's job promises: the loop as the controller holds it, and none that is worse than the present one."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.acquisition.settings import law_trial
+from ambid.errors import EstimationError
+from ambid.job import controller_design as room
+from ambid.job.controller_design import design_controller, held_by
+from ambid.physics.loop import Loop
+from ambid.rig.preset_rig import rig_of_preset
+from tests.job.benches import prototype
+
+
+def test_a_law_is_judged_as_the_words_that_the_controller_gets():
+    rig = prototype()
+    law = rig.loop.as_law(rig.daq.rate_hz)
+    asked = Loop(law=law, delay=0.5)
+    held = held_by(rig, asked)
+    assert held.delay == 0.5
+    f = np.geomspace(1.0, 0.45 * law.rate_hz, 50)
+    off = np.abs(held.law.response(f) / law.response(f) - 1.0).max()
+    assert 1e-7 < off < 0.01  # rounded, and to little
+    words = law_trial(rig, replace(rig, loop=asked)).law.law(law.rate_hz)  # as they are sent, from counts to counts
+    gain = [held.law.D / words.D, held.law.response(f) / words.response(f)]
+    np.testing.assert_allclose(gain[1], np.broadcast_to(gain[0], gain[1].shape), rtol=1e-12)
+    assert held_by(replace(rig, daq=None), asked) is asked
+
+
+def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
+    rig = rig_of_preset(ambid.preset("rmit-axis"))
+    known = ambid.identify(ambid.simulate("rmit-axis", duration=0.3, seed=1), rig)
+
+    def given(change):
+        monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: change(rig.loop))
+
+    given(lambda loop: replace(loop, kd=0.7 * loop.kd))
+    with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or --limit peak=") as told:
+        design_controller(known, rig, plants=3, judges=3)
+    least = float(str(told.value).rpartition("peak=")[2].removesuffix("dB"))
+    found = design_controller(known, rig, plants=3, judges=3, limits={"peak": least})
+    assert found.after.worst.peak > found.before.worst.peak
+    given(lambda loop: replace(loop, kd=0.0))
+    with pytest.raises(EstimationError, match=r"does not hold 3 of the 3 plants that judge, the present one loses 0"):
+        design_controller(known, rig, plants=3, judges=3)
