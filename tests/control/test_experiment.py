@@ -186,6 +186,20 @@ def test_what_is_expected_is_what_identify_reports(bench, designed):
         assert x.sd < (0.6 if name in found else 1.0) * x.flat_sd
 
 
+def test_the_length_for_a_target_counts_what_a_prior_knows_once(bench):
+    known = tuple(replace(p, role="prior", sd=0.02 * abs(p.value)) if p.role == "free" else p for p in bench.parameters)
+    found = ambid.design_experiment(
+        replace(bench, parameters=known), seconds=0.4, period=0.1, lines=4, spread=0.01, target=2e-3
+    )
+    lengths, asked = found.shown.seconds, 0
+    for name, x in found.expected.items():
+        if name in {p.name for p in known} and lengths[0] < x.seconds < lengths[-1]:
+            there = np.exp(np.interp(np.log(x.seconds), np.log(lengths), np.log(found.shown.by_length[name])))
+            assert there == pytest.approx(found.target, rel=0.01), name
+            asked += 1
+    assert asked
+
+
 def test_the_model_moves_as_the_simulator_does_from_rest(bench, designed):
     silent = replace(bench, noise=Noise())
     wave = designed.played(2 * designed.period, designed.rate_hz)[:, 0]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,6 +65,7 @@ _LINES = 100
 _WHOLE = 0.1  # of a sample, from which identify estimates a fraction of the delay
 _LENGTHS, _LEVELS = np.geomspace(0.1, 100.0, 31), np.geomspace(0.1, 1.0, 11)  # of the record, of its amplitude
 _DIGITS = 6  # of what is drawn
+_EVER, _HALVINGS = 1e12, 40  # periods beyond which no length is sought, and steps of the search
 _KEPT = 1.0 + 1e-6  # largest pole
 _FULL = 1.0 + 1e-6  # use of a limit
 _TURNS_S = 1.0  # in which unbalance sets in, and is looked at
@@ -463,15 +465,27 @@ def _expected(task: Task, known: Information, power: Array, flat: Array, target:
     for k, name in enumerate(known.names):
         if not reported(name):
             continue
-        aim = task.period * max(1.0, task.periods * (relative[k] / target) ** 2)
         seen = bool(relative[k] < WEAK)
         found[name] = Expected(
             value=plant.theta.get(name, float(plant.delays.mean())), unit=units.get(name, "1"),
             sd=float(relative[k] * known.sizes[k]), relative_sd=float(relative[k]),
             flat_sd=float(flat[k] * known.sizes[k]), identifiable=seen,
-            seconds=float(aim / task.rate_hz) if seen else None,
+            seconds=_seconds(task, known, power, (k, target)) if seen else None,
         )  # fmt: skip
     return found
+
+
+def _seconds(task: Task, known: Information, power: Array, aim: tuple[int, float]) -> float:
+    """Return the length of a record, a period at least, in which a number reaches a relative standard deviation.
+
+    What a prior knows does not grow with the length, so that the root of the length is no rule.
+    """
+    low, high = 0.0, math.log(_EVER)
+    for _ in range(_HALVINGS):
+        middle = 0.5 * (low + high)
+        reached = known.relative_sd(power, task.period * math.exp(middle))[aim[0]] <= aim[1]
+        low, high = (low, middle) if reached else (middle, high)
+    return task.period * (math.exp(high) if low else 1.0) / task.rate_hz
 
 
 def _signals(
