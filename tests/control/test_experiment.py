@@ -9,6 +9,7 @@ from scipy.optimize import minimize
 import ambid
 from ambid.control.closed import Plant
 from ambid.control.excited import ExcitedLoop
+from ambid.control.experiment import reached
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import BROADBAND, Limited, joint_design
 from ambid.errors import AmbidError, EstimationError
@@ -184,6 +185,16 @@ def test_what_is_expected_is_what_identify_reports(bench, designed):
         sd = found.delay["voltage"].sd if name == "voltage.delay" else found[name].sd
         assert x.sd == pytest.approx(sd, rel=0.1), name
         assert x.sd < (0.6 if name in found else 1.0) * x.flat_sd
+
+
+@pytest.mark.parametrize("share", [0.02, 1.0, 500.0])
+def test_what_was_promised_follows_any_length_of_the_record(bench, designed, share):
+    found = ambid.identify(ambid.simulate(bench, excitation=designed, duration=1.0, seed=5), bench)
+    samples = round(share * designed.seconds * found.record["rate_hz"])
+    sd = {p.name: designed.expected[p.name].sd / np.sqrt(share) for p in found.parameters if p.sd > 0.0}
+    same = tuple(replace(p, sd=sd.get(p.name, p.sd)) for p in found.parameters)
+    said = reached(designed, replace(found, parameters=same, record={**found.record, "samples": samples})).values
+    assert {name: said[name] for name in sd} == pytest.approx(dict.fromkeys(sd, 1.0), rel=0.01)
 
 
 def test_the_length_for_a_target_counts_what_a_prior_knows_once(bench):

@@ -201,10 +201,12 @@ def reached(experiment: Experiment, estimate: Estimate | RotorEstimate) -> Check
     found, ratio = {p.name: p.sd for p in estimate.parameters if p.sd > 0.0}, dict[str, float]()
     if isinstance(estimate, RotorEstimate):  # frequencies and dampings of its modes too
         found = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
+    lengths = experiment.shown.seconds
+    nearest = np.clip(seconds, lengths[0], lengths[-1])
     for name, x in experiment.expected.items():
         if name in found:
             curve = np.log(experiment.shown.by_length[name])
-            there = np.exp(np.interp(np.log(seconds), np.log(experiment.shown.seconds), curve))
+            there = np.exp(np.interp(np.log(nearest), np.log(lengths), curve)) * np.sqrt(nearest / seconds)
             ratio[name] = float(found[name] / (x.sd / x.relative_sd * there))
     if not ratio:
         raise EstimationError(
