@@ -121,7 +121,7 @@ def draw_plants(
     """
     spread = spread or Spread()
     at = rig.operating_point if point is None else point
-    laws, assumed = _laws(plant, rig, at)
+    laws, assumed = laws_of(plant, rig, at)
     found, rejected = [Drawn(plant=replace(plant, names=(), covariance=None), number=0, changed=_NONE)], 0
     for number in range(1, n):
         rng = np.random.default_rng([seed, number])
@@ -166,13 +166,14 @@ def over_speeds(draws: Draws, speeds: Interval) -> Draws:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Law:
+class Law:
     """The magnet of one axis: its law, where it rests, and the ways from there that are open."""
 
     energy: Energy
     rest: tuple[float, float]  # position, m, and current, A
     position: Interval  # from rest, m
     current: Interval  # from rest, A
+    known: bool  # whether the rig gives the law, or its gap
 
     def numbers(self, x: float, i: float) -> Array:
         """Return k_x, k_i, L at some position and current."""
@@ -187,7 +188,7 @@ class _Law:
         return i
 
 
-def _drawn(plant: Plant, rig: Rig, laws: Mapping[str, _Law], spread: Spread, rng: np.random.Generator) -> Drawn | None:
+def _drawn(plant: Plant, rig: Rig, laws: Mapping[str, Law], spread: Spread, rng: np.random.Generator) -> Drawn | None:
     """Return one plant; None where it is not physical."""
     theta, delays = _scattered(plant, spread.covariance, rng)
     changed: dict[str, float] = {}
@@ -291,7 +292,7 @@ def _lagged(
     return (replace(of, extras=(*of.extras, "a")) if isinstance(of, RotorModel) else _EddyAxis()), lag
 
 
-def _laws(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, _Law], tuple[str, ...]]:
+def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, Law], tuple[str, ...]]:
     """Return the law of each axis by the prefix of its numbers, and what is assumed of it."""
     of, theta = plant.model, plant.theta
     prefixes = [f"{axis}." for axis in of.axes] if isinstance(of, RotorModel) else [""]
@@ -301,9 +302,9 @@ def _laws(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, _L
         try:
             known = plant_of_rig(rig)
             rest = rest_of_rig(rig, known)
-            law = _Law(
+            law = Law(
                 energy=known.magnet.coenergy, rest=(rest.position, rest.current),
-                position=_ways(rest.position, travel), current=_ways(rest.current, most),
+                position=_ways(rest.position, travel), current=_ways(rest.current, most), known=True,
             )  # fmt: skip
             return {"": law}, ("the law of the magnet is the rig's [magnet]",)
         except (RigError, ModelError):  # some numbers are to be found by an identification
@@ -322,9 +323,10 @@ def _laws(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, _L
         energy = CoEnergy.opposed(k_i=k_i, k_x=k_x, L=max(L, -(k_i**2) / k_x), gap=gap)
         middle = at.get("position", 0.0) if not isinstance(of, RotorModel) else 0.0
         inside = middle if travel[0] < middle < travel[1] else (travel[0] + travel[1]) / 2.0
-        laws[p] = _Law(
+        laws[p] = Law(
             energy=energy, rest=(0.0, 0.0), position=_ways(inside, travel),
             current=_ways(0.0, most) if all(map(math.isfinite, most)) else (-energy.i0, energy.i0),
+            known=given is not None and bool(given.value),
         )  # fmt: skip
     whose = "the rig's gap" if given is not None and given.value else "a gap of twice the travel inside limits.position"
     return laws, (f"the law of the magnets is that of two opposed ones with {whose}, {1e6 * gap:.4g} µm",)

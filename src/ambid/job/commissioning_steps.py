@@ -72,8 +72,9 @@ _WANDER = 0.25  # of the trips' width: how far the rotor may stray without excit
 _NEAR = 0.85  # of the voltage: no room left
 _UNITS = MappingProxyType({"position": "m", "current": "A", "voltage": "V"})
 _SATURATED = 1e-3  # of the samples at the end of a converter's range
-_RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree")
-"""Checks that a model which does not fully fit the record fails: the standard deviations then allow for it."""
+_RESIDUAL = ("residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree", "curvature")
+"""Checks that a model which does not fully fit the record fails: the standard deviations then allow for it, or the
+check says by how much they do not."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

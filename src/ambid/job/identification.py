@@ -189,6 +189,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     from ambid.bearing.lag import check_lag
     from ambid.bearing.rescue import warnings_of
     from ambid.bearing.uncertainty import estimate_of, uncertainty
+    from ambid.control.curvature import curvature_check
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validation import physical
@@ -196,6 +197,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     from ambid.validation.residuals import fit_of
 
     problem = fit.problem
+    means = {role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)}
     e = innovations(problem, fit.vector, None if fit.work is None else fit.work.of(problem))
     if e is None:
         raise EstimationError(
@@ -217,12 +219,14 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
             theta = problem.parameters(fit.vector)
             checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
+        curved = curvature_check(fit, e, rig, means, known.standard_deviations(robust=robust))
+        checks |= {} if curved is None else {"curvature": curved}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
         fit, known, rig.parameters, robust=robust, delay_how=delay_how,
-        means={role: float(bench[role].values.mean()) for role in (*problem.model.inputs, *problem.model.outputs)},
-        one_step=fit_of(e * problem.scales.output, y), simulation=None if error is None else fit_of(error, y),
+        means=means, one_step=fit_of(e * problem.scales.output, y),
+        simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     return replace(estimate, global_search=fit.global_search)

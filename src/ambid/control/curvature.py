@@ -1,0 +1,109 @@
+"""How far the magnet's curvature moves a linear estimate from its numbers at the operating point.
+
+What a magnet does beyond its tangent, f - k_i i + k_x x of the force and λ - L i - k_i x of the flux linkage, is to the
+linear model a disturbance w = (of the force, less the slope of that of the flux) of known course: the law's at the
+motion. It reaches the prediction error as v = C (q - A + K C)⁻¹ E w, and moves the estimate to first order by
+-(JᵀJ)⁻¹ Jᵀ v, J the slopes of the weighted errors: the best linear approximation (Pintelon and Schoukens 2012, ch. 3)
+as it is seen through the predictor, theory.md sec. 11.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.control.closed import Plant
+from ambid.control.drawn import Law, laws_of
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit, weight_of, workspace_near
+from ambid.estimation.predictor import assemble
+from ambid.estimation.sensitivity import products, run
+from ambid.rig import Rig
+
+MOST = 1.5
+"""Standard deviations by which curvature may move a number: its 95 % interval then holds it in two of three records."""
+_TOLD = 0.25  # sd of the part of the curvature that a record shows, up to which the record is believed and not the law
+_UNTOLD = 0.5  # sd from which it does not tell whether the law is there at all
+_STEP = 1e-30  # of complex differences, which lose no digits
+
+
+def beyond_tangent(law: Law, moved: Array, rate_hz: float) -> Array:
+    """Return what the magnet does beyond its tangent from each sample to the next, force in N and voltage in V.
+
+    `moved`: (n, 2), position and current from rest, SI. Returns (n - 1, 2).
+    """
+    x, i = moved.T
+    (x0, i0), w, (k_x, k_i, L) = law.rest, law.energy, law.numbers(*law.rest)
+    slope: Any = (w.value(x0 + x + 1j * _STEP, i0 + i), w.value(x0 + x, i0 + i + 1j * _STEP))  # of the co-energy
+    force, flux = slope[0].imag / _STEP + k_x * x - k_i * i, slope[1].imag / _STEP - L * i - k_i * x
+    return np.column_stack([0.5 * (force[1:] + force[:-1]), -np.diff(flux) * rate_hz])
+
+
+def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
+    """Return the shift of each physical parameter, SI, the part of the law that the record shows, and its sd.
+
+    `e`: (n_used, 2), innovations at the fit, scaled. The motion is that of the predictor, which does not know the noise
+    of the sample that it predicts: the part is then not biased by that.
+    """
+    problem, weight = fit.problem, weight_of(fit.covariance)
+    at = assemble(problem, fit.vector, with_derivatives=False)
+    assert at is not None
+    sc = problem.scales
+    w = beyond_tangent(law, problem.y[problem.skip :] - e * sc.output, problem.rate_hz)
+    v = run(np.hstack([at.A - at.gain @ at.C, at.E]), w / sc.disturbance, np.zeros(at.A.shape[0])) @ at.C.T @ weight.T
+    found = products(problem, fit.vector, weight, workspace_near(fit, problem), [(v, (0,))])
+    assert found is not None
+    own, p = range(v.shape[1]), problem.size
+    prior = fit.J_prior @ found.turn
+    along = np.sum([found.cross[o, :, o] for o in own], axis=0)
+    inverse = np.linalg.pinv(found.rows[:p, :p] + prior.T @ prior, rcond=1e-13, hermitian=True)
+    step = inverse @ along[:p]
+    left = float(np.trace(found.inner)) - along[:p] @ step
+    pull = along[p] - step @ (found.rows[:p, p] + prior.T @ fit.r_prior)
+    shift = -(found.turn @ step)[: problem.n_physical] * problem.magnitude
+    return shift, float(pull / left), float(left**-0.5)
+
+
+def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Array) -> Check | None:
+    """Check that curvature moves no number by more than its standard deviation allows; None where no law is known.
+
+    `e`: as for `seen_shift`; `at`: operating point; `sd`: (n_physical,), SI. The law of a rig counts unless the record
+    contradicts it; one with an assumed gap only as far as the record shows it.
+    """
+    theta = fit.problem.parameters(fit.vector)
+    plant = Plant(model=fit.problem.model, theta=theta, delays=np.zeros(1), rate_hz=fit.problem.rate_hz)
+    laws, assumed = laws_of(plant, rig, at)
+    if not laws:
+        return None
+    shift, part, part_sd = seen_shift(fit, e, laws[""])
+    if not np.all(np.isfinite([*shift, part, part_sd])):  # a gap that the motion would close
+        return None
+    counted = max(part, 0.0)
+    if part_sd > _TOLD:
+        counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
+    names = fit.problem.estimated
+    values = dict(zip(names, (counted * shift / sd).tolist(), strict=True))
+    passed, said = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta)
+    if not passed:
+        said += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
+        said += f". Record with {advised(values):.2g} of the excitation or less, or identify with --nonlinear"
+    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=said)
+
+
+def advised(shift: Mapping[str, float]) -> float:
+    """Return the part of the amplitude with which no number moves too far: shift over sd grows with its third power."""
+    return float((MOST / max(map(abs, shift.values()))) ** (1.0 / 3.0))
+
+
+def judge_shift(shift: Mapping[str, float], size: Mapping[str, float], theta: Mapping[str, float]) -> tuple[bool, str]:
+    """Return whether shifts in sd are small, and what is said of them; `size`: SI."""
+    worst = sorted(shift, key=lambda name: -abs(shift[name]))
+    far = [name for name in worst if abs(shift[name]) > MOST]
+    if not far:
+        most = f"{worst[0]} by {shift[worst[0]]:+.2f} sd"
+        return True, f"over this motion the magnet's curvature moves no number far ({most} at most)"
+    told = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
+    return False, f"over this motion the magnet's curvature moves {told} from the value at the operating point"

@@ -1,0 +1,61 @@
+"""The magnet's curvature in linear estimates: what the check expects is what estimates are off by."""
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.control.closed import Plant
+from ambid.control.drawn import laws_of
+from ambid.physics.presets import preset
+from ambid.rig import rig_of_preset
+
+SEEDS = range(4)
+
+
+@pytest.fixture(scope="module")
+def experiment():
+    return ambid.design_experiment("prototype", seconds=4.0, lines=40, use=0.63)
+
+
+@pytest.fixture(scope="module")
+def bent(experiment):
+    """Estimates of records of the nonlinear bench."""
+    return [identified(experiment, seed, nonlinear=True) for seed in SEEDS]
+
+
+def identified(experiment, seed, *, nonlinear):
+    record = ambid.simulate("prototype", duration=4.0, seed=seed, nonlinear=nonlinear, excitation=experiment)
+    return ambid.identify(record, rig_of_preset(preset("prototype")))
+
+
+def test_the_shift_expected_is_the_shift_seen(bent):
+    rig = rig_of_preset(preset("prototype"))
+    of = Plant(model=rig.plant, theta=bent[0].values, delays=np.zeros(1), rate_hz=2000.0)
+    law = laws_of(of, rig, {})[0][""]
+    truth = dict(zip(("k_x", "k_i", "L"), law.numbers(*law.rest), strict=True))
+    expected = np.array([[x.checks["curvature"].values[n] for n in truth] for x in bent])
+    seen = np.array([[(x[n].value - truth[n]) / x[n].sd for n in truth] for x in bent])
+    assert expected[:, 2].mean() > 3.0  # of L
+    # sd of a mean of four is a half; 4 of those
+    assert np.all(np.abs((seen - expected).mean(axis=0)) < 2.0)
+
+
+def test_a_curved_record_is_used_with_caution_and_told_what_to_do(bent):
+    for estimate in bent:
+        reason = next(r for r in estimate.verdict.reasons if r.check == "curvature")
+        assert estimate.verdict.word == "caution"
+        assert "L by +" in reason.text
+        assert "--nonlinear" in reason.text
+
+
+def test_a_linear_bench_is_not_cautioned_for_the_magnet_of_its_rig(experiment):
+    check = identified(experiment, 1, nonlinear=False).checks["curvature"]
+    assert check.passed, check.detail
+    assert abs(check.values["part"]) < 5.0 * check.values["part_sd"]
+
+
+def test_small_motion_is_not_cautioned():
+    record = ambid.simulate("prototype", duration=2.0, seed=1, nonlinear=True, amplitude=3.0)
+    check = ambid.identify(record, rig_of_preset(preset("prototype"))).checks["curvature"]
+    assert check.passed
+    assert max(abs(check.values[n]) for n in ("k_x", "k_i", "L")) < 0.3
