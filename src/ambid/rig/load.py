@@ -335,15 +335,8 @@ def _limits(entry: LimitsEntry, where: str) -> Limits:
 
 
 def _noise(entry: NoiseEntry) -> Noise:
-    return Noise(
-        position=entry.position,
-        current=entry.current,
-        force=entry.force,
-        voltage=entry.voltage,
-        position_resolution=entry.resolutions.position,
-        current_resolution=entry.resolutions.current,
-        voltage_resolution=entry.resolutions.voltage,
-    )
+    steps = {f"{role}_resolution": step for role, step in entry.resolutions.model_dump().items()}
+    return Noise(**entry.model_dump(exclude={"resolutions"}), **steps)
 
 
 if TYPE_CHECKING:
@@ -382,18 +375,11 @@ def daq_of(
         if not low <= value <= high:
             raise RigError(f"{place}.{name} is {value}; the controller takes {low} to {high} ms. Correct it")
     _check_third(entry.third, channels, plant, place)
-    return Daq(
-        rate_hz=entry.rate_hz or record_rate_hz or DAQ_RATE_HZ,
-        baud=entry.baud,
-        duty=entry.duty,
-        duty_off=entry.duty_off,
-        host_ms=entry.host_ms,
-        lift_ms=entry.lift_ms,
-        third=entry.third,
-        bench=entry.bench,
-        position_trip=_trip("position", entry.trip.position, limits, plant, place),
-        current_trip=_trip("current", entry.trip.current, limits, plant, place),
-    )
+    trips = {
+        f"{role}_trip": _trip(role, getattr(entry.trip, role), limits, plant, place) for role in ("position", "current")
+    }
+    rate_hz = entry.rate_hz or record_rate_hz or DAQ_RATE_HZ
+    return Daq(**{**entry.model_dump(exclude={"trip"}), "rate_hz": rate_hz, **trips})
 
 
 def _check_third(third: str | None, channels: Sequence[RigChannel], plant: LinearModel, place: str) -> None:
@@ -497,18 +483,7 @@ def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
             raise RigError(f"{place} ({specs[name].meaning}) is {given.value} {given.unit}; it {rule}. Correct value")
     known = tuple(parameter_of(specs[n], p, f"{where}: magnet.parameters.{n}") for n, p in entry.parameters.items())
     try:
-        return RigMagnet(
-            kind=entry.kind,
-            gap=_gap(entry, where),
-            asymmetric=entry.asymmetric,
-            saturation=entry.saturation,
-            rise=entry.rise,
-            eddy=entry.eddy,
-            drift=entry.drift,
-            off_below=entry.off_below,
-            cone=entry.cone,
-            parameters=known,
-        )
+        return RigMagnet(**{**entry.model_dump(), "gap": _gap(entry, where), "parameters": known})
     except RigError as error:
         raise RigError(f"{where}: {error}") from None
 

@@ -7,8 +7,9 @@ rig is built.
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_origin
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -287,41 +288,6 @@ class RigFile(_Entry):
     open_loop: Annotated[bool, Field(strict=True)] = False
 
 
-_ENTRIES: dict[tuple[str, ...], type[_Entry]] = {
-    (): RigFile,
-    ("channels", "*"): ChannelEntry,
-    ("parameters", "*"): ParameterEntry,
-    ("magnet",): MagnetEntry,
-    ("magnet", "parameters", "*"): ParameterEntry,
-    ("bearings", "*"): BearingEntry,
-    ("bearings", "*", "z"): PlaneEntry,
-    ("bearings", "*", "z_sensor"): PlaneEntry,
-    ("bearings", "*", "runout"): TurningEntry,
-    ("modes",): ModesEntry,
-    ("shaft",): ShaftEntry,
-    ("shaft", "material"): MaterialEntry,
-    ("shaft", "steps", "*"): StepEntry,
-    ("shaft", "steps", "*", "material"): MaterialEntry,
-    ("shaft", "discs", "*"): DiscEntry,
-    ("shaft", "*"): QuantityEntry,
-    ("shaft", "*", "*"): QuantityEntry,
-    ("shaft", "*", "*", "*"): QuantityEntry,
-    ("unbalance", "*"): UnbalanceEntry,
-    ("unbalance", "*", "z"): QuantityEntry,
-    ("speed",): QuantityEntry,
-    ("operating_point", "*"): QuantityEntry,
-    ("loop",): LoopEntry,
-    ("loop", "laws"): LawEntry,
-    ("loop", "limits"): LimitsEntry,
-    ("noise",): NoiseEntry,
-    ("noise", "resolutions"): ResolutionsEntry,
-    ("record",): RecordEntry,
-    ("record", "time"): TimeEntry,
-    ("daq",): DaqEntry,
-    ("daq", "trip"): TripEntry,
-}
-
-
 def read_rig_file(path: Path) -> RigFile:
     """Read a rig file and check its shape.
 
@@ -425,11 +391,32 @@ def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
 def _unknown_key(keys: list[str]) -> str:
     """Name an unknown key, the table it stands in, and the nearest known key."""
     *table, key = keys
-    pattern = tuple(table)
-    near = (
-        p for p in _ENTRIES if len(p) == len(pattern) and all(a in ("*", b) for a, b in zip(p, pattern, strict=True))
-    )
-    entry = _ENTRIES[next(near, ())]
-    known = [field.alias or name for name, field in entry.model_fields.items()]
+    known = list(_keys(_entry_at(table)))
     inside = f"in [{'.'.join(table)}]" if table else "at the top"
     return f"unknown key {key!r} {inside}; known: {', '.join(known)}.{nearest(key, known)}"
+
+
+def _keys(entry: type[_Entry]) -> dict[str, Any]:
+    """Return the keys of an entry as they are written, with their types."""
+    return {field.alias or name: field.annotation for name, field in entry.model_fields.items()}
+
+
+def _entry_at(table: Sequence[str]) -> type[_Entry]:
+    """Return the entry that a table of the file is: names in a table of tables, numbers in an array, lead to it too."""
+    entry: type[_Entry] = RigFile
+    keys = iter(table)
+    for key in keys:
+        found = _entry_in(_keys(entry)[key])
+        assert found is not None
+        entry, several = found
+        if several:
+            next(keys, None)
+    return entry
+
+
+def _entry_in(annotation: Any) -> tuple[type[_Entry], bool] | None:
+    """Return the entry that a type holds, and whether it holds several."""
+    if isinstance(annotation, type) and issubclass(annotation, _Entry):
+        return annotation, False
+    held = next((x for x in map(_entry_in, get_args(annotation)) if x is not None), None)
+    return held and (held[0], held[1] or get_origin(annotation) in (dict, list, tuple))
