@@ -21,6 +21,7 @@ from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
+from ambid.rig.quantity import si_of, unit_of
 from ambid.rig.rig import (
     DAQ_RATE_HZ,
     Daq,
@@ -33,7 +34,7 @@ from ambid.rig.rig import (
 )
 from ambid.rig.rotor import modes_of, planes_of, rotor_of, speed_of, turning_of
 from ambid.rig.shaft import shaft_of
-from ambid.units import UNKNOWN, Unit, parse_unit
+from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, LawEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
@@ -211,7 +212,7 @@ def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path
     return RigChannel(
         role=role,
         column=entry.column or role,
-        unit=unit_of(entry.unit, f"{place}.unit").symbol if entry.unit else None,
+        unit=unit_of(entry.unit, place).symbol if entry.unit else None,
         calibration=_calibration(entry, unit, place, path.parent),
         delay=delay,
         variable=entry.variable,
@@ -281,11 +282,7 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
             )
         if quantity == "auto":
             continue
-        place = f"{where}: operating_point.{role}"
-        unit = unit_of(quantity.unit, f"{place}.unit")
-        if unit.si != units[role]:
-            raise RigError(f"{place} is in [{quantity.unit}]; it is measured in [{units[role]}]. Correct unit")
-        values[role] = unit.to_si(quantity.value)
+        values[role] = si_of(quantity, units[role], f"{where}: operating_point.{role}")
     return MappingProxyType(values)
 
 
@@ -429,7 +426,7 @@ def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Para
     """
     unit = None
     if entry.unit is not None:
-        unit = unit_of(entry.unit, f"{place}.unit")
+        unit = unit_of(entry.unit, place)
         if unit.si != parse_unit(spec.unit).si:
             raise RigError(
                 f"{place} ({spec.meaning}) is in [{entry.unit}]; it is measured in [{spec.unit}]. Correct unit"
@@ -503,17 +500,6 @@ def _gap(entry: MagnetEntry, where: str) -> Literal["hyperbolic", "exponential"]
             f"{where}: [magnet.parameters] names parameters of both gap laws (k, s and L_g, zeta). Omit one pair"
         )
     return entry.gap or (told[0] if told else None)
-
-
-def unit_of(text: str, place: str) -> Unit:
-    """Read a unit of a rig file.
-
-    `text`, `place`: the unit, and where it stands, for messages.
-    """
-    try:
-        return parse_unit(text)
-    except UnitError as error:
-        raise RigError(f"{place}: {error}") from None
 
 
 def read_bench(

@@ -7,15 +7,15 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.errors import RigError, UnitError, nearest
+from ambid.errors import RigError, nearest
 from ambid.physics.named_bench import Turning
 from ambid.physics.rotor_model import Bearing, Drive, RotorModel
+from ambid.rig.quantity import si_of, unit_of
 from ambid.rig.rig import RigModes
-from ambid.units import parse_unit
 
 if TYPE_CHECKING:
     from ambid.physics.linear_model import LinearModel
-    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, QuantityEntry, RigFile, TurningEntry
+    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, QuantityEntry, RigFile
 
 _DRIVES: tuple[Drive, ...] = ("voltage", "current", "command")
 TURN = 2.0 * math.pi
@@ -120,13 +120,13 @@ def turning_of(file: RigFile, where: str) -> tuple[tuple[Turning, ...], tuple[Tu
     """Return unbalances and run-outs of a rig file."""
     unbalance = tuple(
         Turning(
-            name=name, phase=u.phase, value=_si(u, "kg m", f"{where}: unbalance.{name}"),
-            z=_si(u.z, "m", f"{where}: unbalance.{name}.z"),
+            name=name, phase=u.phase, value=si_of(u, "kg m", f"{where}: unbalance.{name}"),
+            z=si_of(u.z, "m", f"{where}: unbalance.{name}.z"),
         )
         for name, u in file.unbalance.items()
     )  # fmt: skip
     runout = tuple(
-        Turning(name=name, phase=b.runout.phase, value=_si(b.runout, "m", f"{where}: bearings.{name}.runout"))
+        Turning(name=name, phase=b.runout.phase, value=si_of(b.runout, "m", f"{where}: bearings.{name}.runout"))
         for name, b in file.bearings.items()
         if b.runout is not None
     )
@@ -149,11 +149,11 @@ def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
         raise RigError(
             f"{place}.z_sensor is missing; it is the plane of the sensor. Give it, equal to z if they are one"
         )
-    values = [None if plane.value is None else _si(plane, "m", place) for plane in sensors]
+    values = [None if plane.value is None else si_of(plane, "m", place) for plane in sensors]
     return Bearing(
         name=name,
         axes=tuple(given.axes),
-        z=None if given.z.value is None else _si(given.z, "m", place),
+        z=None if given.z.value is None else si_of(given.z, "m", place),
         z_sensors=tuple(values),
     )
 
@@ -177,26 +177,11 @@ def _read_at(given: BearingEntry) -> list[PlaneEntry]:
     return given.z_sensors or ([] if given.z_sensor is None else [given.z_sensor])
 
 
-def _si(given: PlaneEntry | QuantityEntry | TurningEntry, si: str, place: str) -> float:
-    """Return a quantity in its SI unit."""
-    try:
-        unit = parse_unit(given.unit)
-    except UnitError as error:
-        raise RigError(f"{place}: {error}") from None
-    if unit.si != si:
-        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{si}]. Correct unit")
-    assert given.value is not None
-    return unit.to_si(given.value)
-
-
 def speed_of(entry: QuantityEntry | None, where: str) -> float:
     """Return a speed of a rig in rad/s, 0 where it gives none."""
     if entry is None:
         return 0.0
-    try:
-        unit = parse_unit(entry.unit)
-    except UnitError as error:
-        raise RigError(f"{where}: speed.unit: {error}") from None
+    unit = unit_of(entry.unit, f"{where}: speed")
     if unit.si not in _SPEEDS:
         raise RigError(f"{where}: speed is in [{entry.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit")
     return unit.to_si(entry.value) * _SPEEDS[unit.si]

@@ -5,13 +5,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ambid.errors import ModelError, RigError, UnitError
+from ambid.errors import ModelError, RigError
 from ambid.physics.linear_model import Parameter
 from ambid.physics.shaft import Disc, Material, Shaft, Step
-from ambid.units import parse_unit
+from ambid.rig.quantity import si_of
 
 if TYPE_CHECKING:
-    from ambid.rig.schema import DiscEntry, MaterialEntry, QuantityEntry, ShaftEntry, StepEntry
+    from ambid.rig.schema import DiscEntry, MaterialEntry, ShaftEntry, StepEntry
 
 _DISC = {"m": "kg", "Id": "kg m^2", "Ip": "kg m^2", "outer": "m", "inner": "m", "width": "m", "rho": "kg/m^3"}
 
@@ -25,7 +25,7 @@ def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> 
             steps=tuple(_step(x, f"{place}.steps.{k}") for k, x in enumerate(entry.steps, 1)),
             discs=tuple(_disc(x, material, f"{place}.discs.{k}") for k, x in enumerate(entry.discs, 1)),
             material=material,
-            z=_si(entry.z, "m", f"{place}.z"),
+            z=si_of(entry.z, "m", f"{place}.z"),
             zeta=tuple(entry.damping) if isinstance(entry.damping, list) else (entry.damping,),
         )
     except ModelError as error:
@@ -54,15 +54,15 @@ def shaft_lines(shaft: Shaft) -> list[str]:
 
 
 def _material(entry: MaterialEntry, place: str) -> Material:
-    return Material(E=_si(entry.E, "Pa", f"{place}.E"), rho=_si(entry.rho, "kg/m^3", f"{place}.rho"), nu=entry.nu)
+    return Material(E=si_of(entry.E, "Pa", f"{place}.E"), rho=si_of(entry.rho, "kg/m^3", f"{place}.rho"), nu=entry.nu)
 
 
 def _step(entry: StepEntry, place: str) -> Step:
     try:
         return Step(
-            length=_si(entry.length, "m", f"{place}.length"),
-            diameter=_si(entry.diameter, "m", f"{place}.diameter"),
-            bore=_si(entry.bore, "m", f"{place}.bore"),
+            length=si_of(entry.length, "m", f"{place}.length"),
+            diameter=si_of(entry.diameter, "m", f"{place}.diameter"),
+            bore=si_of(entry.bore, "m", f"{place}.bore"),
             material=None if entry.material is None else _material(entry.material, f"{place}.material"),
         )
     except ModelError as error:
@@ -70,9 +70,9 @@ def _step(entry: StepEntry, place: str) -> Step:
 
 
 def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
-    z = _si(entry.z, "m", f"{place}.z")
+    z = si_of(entry.z, "m", f"{place}.z")
     given = {name: getattr(entry, name) for name in _DISC if getattr(entry, name) is not None}
-    sizes = {name: _si(x, _DISC[name], f"{place}.{name}") for name, x in given.items()}
+    sizes = {name: si_of(x, _DISC[name], f"{place}.{name}") for name, x in given.items()}
     try:
         if set(sizes) in ({"m"}, {"m", "Id", "Ip"}):
             return Disc(z=z, **sizes)
@@ -84,19 +84,6 @@ def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
         f"{place} has {', '.join(sizes) or 'a plane alone'}; a disc has m, or m, Id and Ip, or outer and width (and "
         "inner, rho). Give one of these sets"
     )
-
-
-def _si(given: QuantityEntry | None, unit: str, place: str) -> float:
-    """Return a quantity in an SI unit, 0 where none is given."""
-    if given is None:
-        return 0.0
-    try:
-        found = parse_unit(given.unit)
-    except UnitError as error:
-        raise RigError(f"{place}.unit: {error}") from None
-    if found.si != parse_unit(unit).si:
-        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{unit}]. Correct unit")
-    return found.to_si(given.value)
 
 
 def _quantity(value: float, unit: str) -> str:
