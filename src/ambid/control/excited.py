@@ -98,20 +98,21 @@ class ExcitedLoop:
 
 def begin_at(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> tuple[int, Array]:
     """Return the sample at which the period best begins from rest, and the largest part of each signal from there."""
-    found = [(s, from_rest(excited, limited, c, inputs, s)) for s in _candidates(excited, limited, c, inputs)]
-    best = int(np.argmin([part.max() for _, part in found]))
-    return found[best]
+    starts = _candidates(excited, limited, c, inputs)
+    found = from_rest(excited, limited, c, inputs, starts)
+    best = int(np.argmin(found.max(axis=1)))
+    return int(starts[best]), found[best]
 
 
-def from_rest(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines, start: int) -> Array:
-    """Return the largest part of each signal from rest, the period begun at a sample, (n_signals,)."""
-    waves, n = limited.waves(c), limited.period
-    z = _steady(excited, limited, c, inputs)[start]
-    left = excited.decay(_PERIODS * n) @ z
-    moved = np.tile(np.roll(waves, -start, axis=0), (_PERIODS, 1)) - left
-    n_u = excited.e.shape[1]
-    moved[0, -n_u:] = moved[0, -2 * n_u : -n_u] * excited.plant.rate_hz  # from 0
-    return np.asarray(limited.part(moved).max(axis=0))
+def from_rest(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines, starts: Lines) -> Array:
+    """Return the largest part of each signal from rest, the period begun at some samples, (n_starts, n_signals)."""
+    waves, n, n_u = limited.waves(c), limited.period, excited.e.shape[1]
+    z, decay, found = _steady(excited, limited, c, inputs), excited.decay(_PERIODS * n), []
+    for start in starts:
+        moved = np.tile(np.roll(waves, -start, axis=0), (_PERIODS, 1)) - decay @ z[start]
+        moved[0, -n_u:] = moved[0, -2 * n_u : -n_u] * excited.plant.rate_hz  # from 0
+        found.append(limited.part(moved).max(axis=0))
+    return np.array(found)
 
 
 def _steady(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> Array:

@@ -360,7 +360,9 @@ def uses(task: Task, lines: Lines, c: Complex) -> Array:
     steady = np.array([task.limited(lines, [k]).use(c) for k in range(len(task.loops))])
     found = np.repeat(steady[:, None], 2, axis=1)
     for k in {0, *np.argsort(-steady.max(axis=1))[:_FROM_REST].tolist()}:
-        found[k, 1] = from_rest(task.loops[k], task.limited(lines, [k]), c, task.inputs(lines), 0)
+        found[k, 1] = from_rest(task.loops[k], task.limited(lines, [k]), c, task.inputs(lines), np.zeros(1, dtype=int))[
+            0
+        ]
     return found
 
 

@@ -30,6 +30,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.unknowns import split_rows
 
 _ROUNDS = 2000  # of the multiplicative algorithm
+_MOST_TERMS = 2e9  # that it adds up, of many lines and parameters in fewer rounds
 _SETTLED = 1e-3  # of the equivalence theorem: largest slope over the mean
 _SHARP = 8.0  # power mean by which the worst of several is taken
 _QUANTISED = 12.0**-0.5  # sd of a step's rounding
@@ -162,7 +163,7 @@ def power_design(information: Information, cost: Array, samples: float) -> tuple
     """
     lines = information.lines / cost[:, None, None]
     share, gap = np.full(cost.size, 1.0 / cost.size), np.inf
-    for _ in range(_ROUNDS):
+    for _ in range(min(_ROUNDS, int(_MOST_TERMS / lines.size))):
         _, slope = information.judge(samples * np.einsum("k,pkij->pij", share, lines) + information.prior)
         gain = -np.einsum("pkij,pij->k", lines, slope)
         mean = float(share @ gain)

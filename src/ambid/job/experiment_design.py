@@ -31,6 +31,7 @@ from ambid.control.experiment import (
     uses,
 )
 from ambid.control.information import Information, Innovation, reported
+from ambid.control.waves import Lines
 from ambid.errors import AmbidError, check_positive, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -68,6 +69,7 @@ _DIGITS = 6  # of what is drawn
 _EVER, _HALVINGS = 1e12, 40  # periods beyond which no length is sought, and steps of the search
 _KEPT = 1.0 + 1e-6  # largest pole
 _FULL = 1.0 + 1e-6  # use of a limit
+_ESTIMATES, _UNSURE = 8, 0.1  # drawn by what is promised; scatter of a promise, relative, from which it is said
 _TURNS_S = 1.0  # in which unbalance sets in, and is looked at
 _ROUNDINGS = 4  # of a table, each a little smaller
 
@@ -441,11 +443,36 @@ def _told(
         excitation=dict(zip(of.inputs, wave.T, strict=True)), table=table,
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
         gap=found.gap, drawn=len(task.loops) - 1, checks=_checks(used, expected, unstable),
+        warnings=_cautions(bench.rig, task, lines, power, information),
         shown=Shown(
             waves={name: rounded(x) for name, x in waves.items()},
             seconds=_LENGTHS * (task.samples / task.rate_hz),
             by_length=curves[0], levels=_LEVELS, by_level=curves[1],
         ),
+    )  # fmt: skip
+
+
+def _cautions(rig: Rig, task: Task, lines: Lines, power: Array, known: Information) -> tuple[str, ...]:
+    """Say what is promised of a rotor with modes, but hangs on numbers that the record shows too weakly.
+
+    A rotor that turns trades frequencies at rest for gyroscopic terms: at an estimate, which scatters by what is
+    promised, the information is another than at the numbers that are designed for.
+    """
+    plant = task.loops[0].plant
+    if not getattr(plant.model, "n_modes", 0):
+        return ()
+    covariance = np.linalg.pinv(known.total(power, task.samples)[0], hermitian=True) * np.outer(
+        known.sizes, known.sizes
+    )
+    around = draw_plants(replace(plant, covariance=covariance), rig, 1 + _ESTIMATES, seed=0, spread=_SCATTER)
+    loops = [ExcitedLoop.of(replace(d.plant, names=plant.names), task.loops[0].loop) for d in around.plants]
+    found = [replace(task, loops=[x]).information(lines, [0]) for x in loops]
+    sd = np.array([x.relative_sd(power, task.samples) * x.sizes for x in found])
+    scatter = np.sqrt(np.mean((sd[1:] / sd[0] - 1.0) ** 2, axis=0))
+    said = [f"{n} {100 * x:.0f} %" for n, x in zip(known.names, scatter, strict=True) if reported(n) and x > _UNSURE]
+    return () if not said else (
+        f"promised standard deviations are themselves uncertain ({', '.join(said)}): they depend on gyroscopic terms "
+        "that a record at one speed shows weakly. Add a record at another speed, or one at rest",
     )  # fmt: skip
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from ambid.control.experiment import Experiment
 from ambid.report.drawing import BOUND, CYCLE, MEASURED, ORANGE, Block, curve, head, log_axis, panel, stacked
 from ambid.report.numbers import prefixed
+from ambid.simulation.rotor_bench import kind_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -17,8 +18,10 @@ if TYPE_CHECKING:
 
 def experiment_figure(found: Experiment, title: str, width: float) -> Figure:
     """Draw a design."""
-    moved = [name for name, x in found.signals.items() if x.low is not None or x.high is not None]
-    waves = [panel(_excitation, found)] + [panel(_wave, found, name) for name in moved]
+    limited = [name for name, x in found.signals.items() if x.low is not None or x.high is not None]
+    most = {kind_of(name): name for name in sorted(limited, key=lambda name: found.signals[name].drawn)}
+    shown_of_kind = [name for name in limited if name in most.values()]  # of many axes that which uses most
+    waves = [panel(_excitation, found)] + [panel(_wave, found, name) for name in shown_of_kind]
     shown = [
         panel(_lines, found, height=2.4),
         panel(_by_length, found, height=2.6),
@@ -30,8 +33,8 @@ def experiment_figure(found: Experiment, title: str, width: float) -> Figure:
 def _excitation(axes: Axes, found: Experiment) -> None:
     t = np.arange(found.period) / found.rate_hz
     for (name, wave), color in zip(found.excitation.items(), CYCLE, strict=False):
-        curve(axes, t, wave, color, None)
-        head(axes, f"one period of the excitation of {name}")
+        curve(axes, t, wave, color, name if len(found.excitation) > 1 else None)
+    head(axes, f"one period of the excitation of {_inputs(found)}")
     axes.set_ylabel("[V]")
 
 
@@ -50,13 +53,19 @@ def _wave(axes: Axes, found: Experiment, name: str) -> None:
          good=of.drawn <= 1.001)  # fmt: skip
 
 
+def _inputs(found: Experiment) -> str:
+    names = list(found.excitation)
+    return names[0] if len(names) == 1 else f"{len(names)} inputs"
+
+
 def _lines(axes: Axes, found: Experiment) -> None:
-    for (name, size), color in zip(found.amplitude.items(), CYCLE, strict=False):
-        axes.vlines(found.frequency_hz, 1e-3 * size.max(), size, color=color, linewidth=0.8)
-        axes.plot(found.frequency_hz, size, ".", color=color, markersize=3)
-        head(axes, f"{size.size} lines of {name}")
+    for size, color in zip(found.amplitude.values(), CYCLE, strict=False):
+        f, own = found.frequency_hz[size > 0.0], size[size > 0.0]
+        axes.vlines(f, 1e-3 * own.max(), own, color=color, linewidth=0.8)
+        axes.plot(f, own, ".", color=color, markersize=3)
+    head(axes, f"{found.frequency_hz.size} lines of {_inputs(found)}")
     largest = max(float(size.max()) for size in found.amplitude.values())
-    least = min(float(size.min()) for size in found.amplitude.values())
+    least = min(float(size[size > 0.0].min()) for size in found.amplitude.values())
     log_axis(axes.xaxis, float(found.frequency_hz[0]), float(found.frequency_hz[-1]))
     log_axis(axes.yaxis, max(0.5 * least, 1e-3 * largest), largest)
     axes.set_xlabel("frequency [Hz]")
