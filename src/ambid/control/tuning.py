@@ -54,6 +54,7 @@ _STEPS = 60  # of a search
 _PENALTY = 10.0  # of the common excess over the limits
 _MET = 2e-3  # excess in logarithms that counts as none
 _SLACK = 0.01  # by which limits are kept from, in logarithms: other plants judge
+_SMOOTH = 0.03  # by which smooth maxima are too large: the present loop must not pass the limits that follow from it
 _ROUNDS = 5  # of corrections by the force steps
 _WAYS = 10  # loops that are tried between the present one and the best
 _AWAY = math.log(2.0)  # of the frequencies of a filter from those of its mode
@@ -358,8 +359,10 @@ def _tuned(of: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
     def figures_of(loop: Loop) -> list[Figures]:
         return [examine(p, loop, of.noise).figures for p in of.plants]
 
+    kept, own = _worsened(goals), {n for n in goals.minimise if goals.limits[n] >= goals.reference[n]}
     limits = {
-        n: math.log(x / goals.reference[n]) - _SLACK * (n not in _worsened(goals)) for n, x in goals.limits.items()
+        n: math.log(x / goals.reference[n]) + (_SMOOTH if n in own else -_SLACK * (n not in kept))
+        for n, x in goals.limits.items()
     }
     which = of.looked_at([] if isinstance(of, _OneAxis) else figures_of(of.present), [])
     first = best = starts[0]
