@@ -230,6 +230,17 @@ def test_a_noisy_measured_sensitivity_has_no_peak():
     assert alone == pytest.approx((2.0, f[50], 0.02), rel=0.02)
 
 
+def test_a_peak_in_noise_is_not_taken_for_a_lower_one_beside_it():
+    from ambid.control.measured import MeasuredSensitivity
+
+    rng, f = np.random.default_rng(3), np.arange(1.0, 101.0)
+    S, noise = 1.0 + 2.0 / (1.0 + ((f - 30.0) / 20.0) ** 2), np.where(f < 60.0, 0.2, 0.04)
+    for _ in range(30):
+        seen = S * (1.0 + noise * (rng.standard_normal(f.size) + 1j * rng.standard_normal(f.size)))
+        found = MeasuredSensitivity(frequency_hz=f, ratio=np.abs(seen), sd=noise * S, phase=np.angle(seen)).peak
+        assert found is None
+
+
 def test_a_measured_peak_is_that_of_many_lines():
     """A peak with 2 % noise on each line: its top is known better than a line, without bias, and its interval covers.
 

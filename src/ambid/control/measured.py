@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.control.closed import ClosedLoop
@@ -26,6 +27,7 @@ _ORDERS = (2, 6)  # of the polynomial, and at most half the lines
 _MISFIT = 4.0  # mean square of what a fit leaves, over the scatter, from which it is none
 _INNER = 0.5  # part of the fitted lines where the top is looked for: towards their ends a polynomial swings
 _SEEN = 0.1  # relative standard deviation of a peak that the record shows
+_TOGETHER = 6  # lines on either side of one that may hide a peak, whose powers are averaged
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -41,13 +43,26 @@ class MeasuredSensitivity:
     def peak(self) -> tuple[float, float, float] | None:
         """Ratio, frequency in Hz and standard deviation of the peak; None where noise hides it.
 
+        It is hidden too where lines that are too noisy to show a peak stand higher, taken together, than the one found.
+        """
+        known = self.ratio > 0.0
+        relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=known)
+        noise = np.sqrt(smoothed(relative[:, None] ** 2)[:, 0])
+        top = self._found(known, noise)
+        if top is None:
+            return None
+        power = smoothed((self.ratio**2 - 2.0 * self.sd**2)[:, None], _TOGETHER)[:, 0]
+        surely = power * (1.0 - 4.0 * noise / np.sqrt(2.0 * _TOGETHER + 1.0))  # by two standard deviations
+        return None if np.any(surely[noise > _SEEN] > top[0] ** 2) else top
+
+    def _found(self, known: NDArray[np.bool_], noise: Array) -> tuple[float, float, float] | None:
+        """Return the peak by the relative noise of the lines.
+
         It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
         noise, the largest lower bound is not. Around it a polynomial is fitted to 1/S, whose poles, those of the plant
         and the controller, are farther away than the poles of S; the noise of 1/S is circular, and has no bias.
         """
-        f, known = self.frequency_hz, self.ratio > 0.0
-        relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=known)
-        noise = np.sqrt(smoothed(relative[:, None] ** 2)[:, 0])
+        f = self.frequency_hz
         k = int(np.argmax(self.ratio * (1.0 - _BOUND * noise)))
         if noise[k] > _SEEN:
             return None
