@@ -11,7 +11,7 @@ from ambid.physics.loop import Loop
 from ambid.physics.presets import preset
 from ambid.rig.preset_rig import rig_of_preset
 from ambid.simulation import closed_loop_poles, simulate_rig
-from ambid.simulation.margins import loop_margins
+from ambid.simulation.margins import OpenLoop, loop_margins
 
 BENCH = preset("prototype")
 
@@ -80,3 +80,13 @@ def test_a_rig_whose_loop_is_unstable_is_simulated_only_by_force():
         simulate_rig(rig, np.zeros(50), rate_hz=2000.0, seed=1)
     assert simulate_rig(rig, np.zeros(50), rate_hz=2000.0, seed=1, force=True).largest_pole > 1.0
     assert simulate_rig(rig, np.zeros(50), rate_hz=2000.0, seed=1, closed=False).record.n_samples == 50
+
+
+def test_an_integrator_that_is_seen_from_above_its_corner_has_no_margin_at_rest():
+    f = np.geomspace(1e-2, 1e3, 4000)
+    s = 2j * np.pi * f
+    flat, behind = 5e3 / ((s + 6.0) * (s + 400.0)), 1.0 + 0.02 / s
+    assert OpenLoop(frequency_hz=f, open_loop=-flat).gain_between[0] == pytest.approx(6.0 * 400.0 / 5e3, rel=1e-3)
+    assert OpenLoop(frequency_hz=f, open_loop=flat * behind / s).gain_between[0] is None
+    slow = 1e4 * (s + 1.0) / (s * (s + 0.007) * (s + 400.0))  # near -180 degrees above its corner, -90 below
+    assert OpenLoop(frequency_hz=f, open_loop=slow).gain_between[0] is None

@@ -35,6 +35,7 @@ _REACH = 20.0  # factor on the gains that is looked at, up and down
 _GAINS = 81  # of them, even in the logarithm
 _SLACK = 1e-9  # of a pole on the circle: an integrator that nothing holds
 _REAL = 0.3  # imaginary over real part up to which L is on its way to the real axis
+_STEEP = 0.5  # slope of ln |L| over ln f down to rest, from which L is behind an integrator
 _SPAN = 1e-4  # of the rate: the lowest frequency
 _FREQUENCIES = 400
 
@@ -78,6 +79,9 @@ class OpenLoop:
     def gain_between(self) -> tuple[float | None, float | None]:
         """Factors on the gain nearest to 1, down and up, at which L passes -1; None: there is none."""
         first, last = (x.conj() if abs(x.imag) < _REAL * abs(x.real) else x for x in self.open_loop[[0, -1]])
+        f, size = np.log(self.frequency_hz[:2]), np.log(np.abs(self.open_loop[:2]))
+        if size[0] - size[1] > _STEEP * (f[1] - f[0]):
+            first = self.open_loop[0]
         L = np.concatenate([[first], self.open_loop, [last]])  # real at rest, but behind an integrator, and at the end
         k = np.flatnonzero(np.diff(np.sign(L.imag)))
         share = L.imag[k] / (L.imag[k] - L.imag[k + 1])
