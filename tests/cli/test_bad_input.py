@@ -202,6 +202,13 @@ RIGS = {
     "no TOML": ('model  = "one-axis"', "model  = one-axis", r"not valid TOML.*line 4"),
     "another schema": ("ambid.rig/1", "ambid.rig/9", r"schema 'ambid\.rig/9'.*'ambid\.rig/1'"),
     "no schema": ('schema = "ambid.rig/1"', "", r"has no schema"),
+    "row as matrix of a law": (
+        "[parameters]", '[loop]\nkind = "state-space"\nA = [1.0]\n[parameters]', r"loop\.A\.1 is 1\.0; .*list of rows"
+    ),
+    "law without a command": (
+        "[parameters]", '[loop]\nkind = "state-space"\nrate_hz = 2e4\nA = []\nB = []\nC = []\nD = []\n[parameters]',
+        r"loop\.D is empty",
+    ),
     "part that ends too early": ("[parameters]", "[record]\nfrom = 0.1\nto = 0.05\n[parameters]", r"to is 0\.05"),
     "part beyond the end": ("[parameters]", "[record]\nfrom = 9.0\n[parameters]", r"9 s; the record spans 0 to"),
     "operating point in another unit": (

@@ -111,6 +111,14 @@ def test_texts_fit_and_name_what_is_shown(designed):
         (("design", "experiment", "jeffcott"), "unknown"),
         (("simulate", "rmit", "--excitation", "d.json", "-o", "x.csv"), "the bench has xL_voltage"),
         (("design", "experiment", "thesis", "--rig", "rig.toml"), "--rig is for an estimate"),
+        (("design", "experiment", "thesis", "--seconds", "1e9"), "it must be 1 to 1e8"),
+        (("design", "experiment", "thesis", "--lines", "1000000"), "--lines 2 to 32768"),
+        (("design", "experiment", "thesis", "--period", "1e-9"), "the period has 0 samples"),
+        (("design", "experiment", "thesis", "--period", "100"), "it must be 4 to 65536"),
+        (("design", "experiment", "thesis", "--band", "3:1e9"), "it may go to 4000 Hz"),
+        (("simulate", "thesis", "--excitation", ".", "-o", "x.csv"), "'.' is no experiment"),
+        (("simulate", "thesis", "--excitation", "list.json", "-o", "x.csv"), "experiment list.json holds '[]'"),
+        (("simulate", "thesis", "--excitation", "cut.json", "-o", "x.csv"), "experiment cut.json, row 1: not JSON"),
         (("simulate", "thesis", "--excitation", "e.json", "-o", "x.csv"), "is no experiment"),
         (("simulate", "thesis", "--excitation", "d.json", "-o", "x.csv"), "designed for 2000 Hz"),
         (("simulate", "prototype", "--excitation", "d.json", "--amplitude", "1", "-o", "x.csv"), "--amplitude"),
@@ -121,6 +129,8 @@ def test_texts_fit_and_name_what_is_shown(designed):
 )  # fmt: skip
 def test_what_is_asked_for_wrongly_is_refused(made, ambid, monkeypatch, words, said):
     monkeypatch.chdir(made)
+    (made / "list.json").write_text("[]")
+    (made / "cut.json").write_text('{"schema":')
     done = ambid(*words)
     assert done.code == 2
     assert said in done.err

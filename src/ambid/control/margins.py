@@ -26,7 +26,7 @@ _FAR = 8.0  # mean square of measured less predicted sensitivity, over its scatt
 _NEAR = 0.03  # rms of that difference that is passed whatever the scatter
 _STANDARD: Mapping[str, object] = MappingProxyType(
     {
-        "edition": STANDARD, "limits_db": [round(float(20.0 * np.log10(x)), 1) for x, _ in ZONES],
+        "edition": STANDARD, "limits_db": [round(float(20.0 * np.log10(x)), 2) for x, _ in ZONES],
         "note": "check these limits against the text of the standard",
     }
 )  # fmt: skip

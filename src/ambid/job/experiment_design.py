@@ -40,7 +40,7 @@ from ambid.estimation.uncertainty import WEAK
 from ambid.job.closed_loop import plant_of
 from ambid.job.data import Clock, known_rig, rig_entry
 from ambid.job.results import load, rig_of
-from ambid.job.simulation import BenchSource, bench_of_source
+from ambid.job.simulation import BenchSource, bench_of_source, samples_of
 from ambid.physics.loop import Loop, Noise
 from ambid.physics.presets import Preset
 from ambid.physics.rotor_model import RotorModel
@@ -62,6 +62,7 @@ _RESERVE = 4.0  # standard deviations of noise that are kept free
 _SECONDS = 10.0
 _PERIODS = 4  # of a record
 _LONGEST = 8192  # samples of a period, unless another is given
+_MOST = 65536  # samples of a period that is given
 _LINES = 100
 _WHOLE = 0.1  # of a sample, from which identify estimates a fraction of the delay
 _LENGTHS, _LEVELS = np.geomspace(0.1, 100.0, 31), np.geomspace(0.1, 1.0, 11)  # of the record, of its amplitude
@@ -173,10 +174,10 @@ def design_experiment(
     """
     say, clock = tick or silent, Clock()
     check_positive({"--seconds": seconds, "--period": period, "--target": target, "--slew": slew, "--rate": rate_hz})
-    if not 0.0 < use <= 1.0 or not 0.0 <= spread < 1.0 or lines < 2:
+    if not 0.0 < use <= 1.0 or not 0.0 <= spread < 1.0 or not 2 <= lines <= _MOST // 2:
         raise AmbidError(
             f"--use {use:g}, --spread {spread:g}, --lines {lines}; --use must be above 0 and at most 1, --spread 0 to "
-            "below 1, --lines at least 2. Correct it"
+            f"below 1, --lines 2 to {_MOST // 2}. Correct it"
         )
     wanted = Wanted(
         seconds=seconds, period_s=period, band=band, lines=lines, criterion=criterion, target=target, use=use,
@@ -392,6 +393,7 @@ def _task(
     rate = bench.rate_hz
     assert bench.rig is not None
     seconds = wanted.seconds or _SECONDS
+    samples_of(seconds, rate, "--seconds")  # no longer than can be simulated
     hold, period = 1, min(round(seconds * rate / _PERIODS), _LONGEST)
     if wanted.period_s is not None:
         period = round(wanted.period_s * rate)
@@ -400,11 +402,15 @@ def _task(
             period = TABLE_LENGTH if wanted.band is None else int(np.ceil(rate / wanted.band[0] - 1e-9))
         hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
         period -= period % hold
-    band = wanted.band or (rate / period, rate / 5.0)
+    if not 4 <= period <= _MOST:
+        raise AmbidError(f"the period has {period} samples; it must be 4 to {_MOST}. Correct --period or --band")
+    band, highest = wanted.band or (rate / period, rate / 5.0), 0.4 * rate
+    if band[1] > highest:
+        raise AmbidError(f"--band goes up to {band[1]:g} Hz; it may go to {highest:g} Hz, 0.4 of the rate. Lower it")
     periods = max(1, round(seconds * rate / period))
     return Task(
         loops=loops, noise=noise, low=ends[0], high=ends[1], period=period, periods=periods,
-        band_hz=(band[0], min(band[1], 0.4 * rate / hold)), n_lines=wanted.lines, criterion=wanted.criterion,
+        band_hz=(band[0], min(band[1], highest / hold)), n_lines=wanted.lines, criterion=wanted.criterion,
         prior_sd=prior_sd, hold=hold, speed=abs(getattr(loops[0].plant.model, "speed", 0.0)),
     )  # fmt: skip
 

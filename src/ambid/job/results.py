@@ -35,6 +35,8 @@ from ambid.validation.second_result import Validation
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate | RotorEstimate
 _BEGIN = 200  # letters in which a track says that it is one
+_SHOWN = 12  # letters of what is no result
+_EXPERIMENT = "ambid.experiment/1"
 
 
 def load(path: str | Path) -> Any:
@@ -57,29 +59,37 @@ def load(path: str | Path) -> Any:
         If the file cannot be read, or is not a complete result.
     """
     path = Path(path)
-    text = utf8_text(file_bytes(path, EstimationError, "estimate"), path, EstimationError, "estimate")
+    text = _text(path, "estimate")
     if f'"{TRACK}"' in text[:_BEGIN]:
         return read_track(path)
-    try:
-        document = json.loads(text)
-    except json.JSONDecodeError as failure:
-        raise EstimationError(
-            f"estimate {path}, row {failure.lineno}: not JSON ({failure.msg}). Give what 'ambid identify --json' wrote"
-        ) from None
-    except (RecursionError, ValueError):
-        raise EstimationError(
-            f"estimate {path} is nested too deeply, or holds a number that is too long. Give what 'ambid identify "
-            "--json' wrote"
-        ) from None
-    schema = str(document.get("schema")) if isinstance(document, dict) else ""
-    read: Callable[[Mapping[str, Any], str], Any] = _READERS.get(schema, _estimate)
+    document = _object(text, path, "estimate", "identify")
+    read: Callable[[Mapping[str, Any], str], Any] = _READERS.get(str(document.get("schema")), _estimate)
     return read(document, str(path))
 
 
+def _text(path: Path, what: str) -> str:
+    return utf8_text(file_bytes(path, EstimationError, what), path, EstimationError, what)
+
+
+def _object(text: str, path: Path, what: str, verb: str) -> Mapping[str, Any]:
+    """Parse the object that a result's file holds; `what` and `verb`: the result and who wrote it, for messages."""
+    advice = f"Give what 'ambid {verb} --json' wrote"
+    try:
+        document = json.loads(text)
+    except json.JSONDecodeError as failure:
+        raise EstimationError(f"{what} {path}, row {failure.lineno}: not JSON ({failure.msg}). {advice}") from None
+    except (RecursionError, ValueError):
+        raise EstimationError(
+            f"{what} {path} is nested too deeply, or holds a number that is too long. {advice}"
+        ) from None
+    if not isinstance(document, dict):
+        raise EstimationError(f"{what} {path} holds {text.strip()[:_SHOWN]!r}, and no result, {{...}}. {advice}")
+    return document
+
+
 def _estimate(document: Mapping[str, Any], path: str) -> Any:
-    nonlinear = isinstance(document, dict) and "law" in document
-    where = f"estimate {path}"
-    if isinstance(document, dict) and "modes" in document:
+    nonlinear, where = "law" in document, f"estimate {path}"
+    if "modes" in document:
         from ambid.rotor.estimate import rotor_estimate_from_json
 
         return rotor_estimate_from_json(document, where)
@@ -119,7 +129,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     FIT_SCHEMA: _fit,
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
-    "ambid.experiment/1": _whole("control.experiment", "Experiment", "design experiment"),
+    _EXPERIMENT: _whole("control.experiment", "Experiment", "design experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design controller"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
@@ -134,14 +144,19 @@ def experiment_of(excitation: object) -> Experiment | None:
     """Return the experiment that an excitation is, or the file of one; None for the name of another excitation."""
     if not isinstance(excitation, (str, Path)):
         return excitation if isinstance(excitation, Experiment) else None
-    if not str(excitation).lower().endswith(".json"):
+    if str(excitation).isalpha():
         return None
-    found = load(excitation)
-    if not isinstance(found, Experiment):
-        raise AmbidError(
-            f"{excitation} is no experiment. Give what 'ambid design experiment --json' wrote, or the "
-            "name of an excitation"
-        )
+    refusal = (
+        f"{str(excitation)!r} is no experiment. Give what 'ambid design experiment --json' wrote, or the name of an "
+        "excitation"
+    )
+    path = Path(excitation)
+    if path.suffix.lower() != ".json":
+        raise AmbidError(refusal)
+    document = _object(_text(path, "experiment"), path, "experiment", "design experiment")
+    if document.get("schema") != _EXPERIMENT:
+        raise AmbidError(refusal)
+    found: Experiment = _READERS[_EXPERIMENT](document, str(path))
     return found
 
 

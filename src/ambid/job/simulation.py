@@ -146,7 +146,7 @@ def simulate_used(
     bench, experiment = _bench(source, rate_hz, closed, nonlinear, position), experiment_of(excitation)
     if duration is None:
         duration = 1.0 if experiment is None else experiment.seconds
-    n = _samples(duration, bench.rate_hz)
+    n = samples_of(duration, bench.rate_hz)
     if not force:
         bench.refuse_unstable()
     if experiment is not None:
@@ -288,11 +288,12 @@ def _rig_of_estimate(estimate: Estimate) -> Rig:
     )  # fmt: skip
 
 
-def _samples(duration: float, rate_hz: float) -> int:
+def samples_of(duration: float, rate_hz: float, option: str = "--duration") -> int:
+    """Return the samples of a record, and refuse one that is none or does not fit into memory."""
     count = duration * rate_hz
     if not 1 <= count <= 1e8:
         raise AmbidError(
-            f"--duration {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
+            f"{option} {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
         )
     return round(count)
 

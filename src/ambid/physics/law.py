@@ -37,6 +37,8 @@ class StateLaw:
     def __post_init__(self) -> None:
         rows = {name: _matrix(name, getattr(self, name)) for name in ("B", "D")}
         n, (n_u, n_y) = rows["B"].shape[0], rows["D"].shape
+        if not rows["D"].size:
+            raise ModelError("loop.D is empty; it has a row for each command, a column for each signal. Give them")
         shapes = {"A": (n, n), "B": (n, n_y), "C": (n_u, n), "D": (n_u, n_y), "G": (n, n_u)}
         for name, shape in shapes.items():
             given = getattr(self, name)

@@ -288,6 +288,9 @@ class RigFile(_Entry):
     open_loop: Annotated[bool, Field(strict=True)] = False
 
 
+_MATRICES = frozenset("ABCDG")  # of a law
+
+
 def read_rig_file(path: Path) -> RigFile:
     """Read a rig file and check its shape.
 
@@ -368,6 +371,8 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     elif kind.startswith("int"):
         of = "" if keys[0] == "daq" else " of samples"
         rule = f"it must be a whole number{of}" + (', or "auto"' if keys[0] == "channels" else "")
+    elif keys[0] == "loop" and not _MATRICES.isdisjoint(keys) and not isinstance(got, str):
+        rule = "it must be a matrix of numbers, a list of rows such as [[1.0, 2.0], [3.0, 4.0]]"
     else:
         rule = "it must be a number, without quotes"
     return f"{place} is {shown}; {rule}{'' if rule.endswith('?') else '.'} Correct it"

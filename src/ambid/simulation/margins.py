@@ -21,7 +21,7 @@ from ambid.simulation.plant import closed_loop_poles, excited_loop
 Complex = NDArray[np.complex128]
 
 ZONES = ((3.0, "A"), (4.0, "B"), (5.0, "C"))
-"""Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio: 9.5, 12 and 14 dB; beyond is zone D."""
+"""Largest peak of the sensitivity of each zone of ISO 14839-3, as a ratio (9.54, 12.04, 13.98 dB); beyond is zone D."""
 STANDARD = "ISO 14839-3:2006"
 """The edition that `ZONES` are of; users are asked to check them against its text."""
 
