@@ -92,7 +92,9 @@ def test_the_next_is_designed_from_the_estimate(made, ambid):
     found = json.loads(done.out)
     assert found["schema"] == "ambid.experiment/1"
     assert found["target"] == 0.005
-    assert found["verdict"]["word"] == "usable"
+    # all of the room: more precise than a linear model is right
+    assert [r["check"] for r in found["verdict"]["reasons"]] == ["curvature"]
+    assert found["expected"]["L"]["shift"] > 1.5
     assert found["signals"]["position"]["drawn"] - found["signals"]["position"]["steady"] < 0.1  # it is known well
 
 

@@ -59,3 +59,19 @@ def test_small_motion_is_not_cautioned():
     check = ambid.identify(record, rig_of_preset(preset("prototype"))).checks["curvature"]
     assert check.passed
     assert max(abs(check.values[n]) for n in ("k_x", "k_i", "L")) < 0.3
+
+
+def test_a_design_says_what_its_record_will_be_off_by(experiment, bent):
+    check = experiment.checks["curvature"]
+    for name in ("k_x", "k_i", "L"):
+        expected = experiment.expected[name].shift
+        mean = np.mean([x.checks["curvature"].values[name] / x.checks["curvature"].values["part"] for x in bent])
+        assert abs(expected - mean) < max(0.3, 0.15 * abs(expected))
+        assert check.values[name] == expected
+    assert not check.passed
+    assert experiment.verdict.word == "caution"
+
+
+def test_a_design_of_little_motion_is_not_cautioned():
+    found = ambid.design_experiment("prototype", seconds=1.0, lines=20, use=0.1)
+    assert found.checks["curvature"].passed

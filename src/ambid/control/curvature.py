@@ -14,13 +14,17 @@ from typing import Any
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.drawn import Law, laws_of
+from ambid.control.experiment import Task
+from ambid.control.information import Information
+from ambid.control.waves import Lines
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, weight_of, workspace_near
 from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import products, run
+from ambid.physics.linear_model import discretise
 from ambid.rig import Rig
 
 MOST = 1.5
@@ -40,6 +44,27 @@ def beyond_tangent(law: Law, moved: Array, rate_hz: float) -> Array:
     slope: Any = (w.value(x0 + x + 1j * _STEP, i0 + i), w.value(x0 + x, i0 + i + 1j * _STEP))  # of the co-energy
     force, flux = slope[0].imag / _STEP + k_x * x - k_i * i, slope[1].imag / _STEP - L * i - k_i * x
     return np.column_stack([0.5 * (force[1:] + force[:-1]), -np.diff(flux) * rate_hz])
+
+
+def expected_shift(task: Task, lines: Lines, c: Complex, known: Information, law: Law) -> Array:
+    """Return the shift of what is estimated from a record of an excitation, in standard deviations, (n,).
+
+    `known`: information of the lines.
+    """
+    of = task.loops[0].plant
+    waves = task.limited(lines, [0]).waves(c)[:, :2]
+    w = beyond_tangent(law, np.vstack([waves, waves[:1]]), task.rate_hz)
+    spectrum = np.fft.rfft(w, axis=0)[lines] / (0.5 * task.period)
+    omega = 2.0 * np.pi * task.frequency_hz(lines)
+    d, _ = discretise(of.space, 1.0 / task.rate_hz)
+    z = np.exp(1j * omega / task.rate_hz)[:, None, None]
+    y = d.C @ np.linalg.solve(z * np.eye(d.A.shape[0]) - d.A, d.E @ spectrum[:, :, None])
+    sampled, driven = of.sampled(task.frequency_hz(lines)), task.driven(lines, 0) * c[:, None]
+    whiten = task.noise(of).whiten(of, omega)
+    rows = whiten @ of.slopes(sampled, driven) * known.sizes
+    pull = 0.5 * task.samples * np.real(np.sum(rows.conj() * (whiten @ y), axis=(0, 1)))
+    covariance = np.linalg.inv(known.total(np.abs(c) ** 2, task.samples)[0])
+    return np.asarray(covariance @ pull / np.sqrt(np.diag(covariance)))
 
 
 def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:

@@ -42,6 +42,7 @@ class Expected:
     flat_sd: float  # of a flat multisine with Schroeder's phases in the same band, at the same use of the limits
     identifiable: bool
     seconds: float | None  # of record until the relative sd that is aimed at, a period at least; None: hardly seen
+    shift: float | None = None  # by which the magnet's curvature moves it, sd; None: no law is known
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -296,16 +297,17 @@ class Task:
 
     def information(self, lines: Lines, plants: Sequence[int]) -> Information:
         """Return the information of lines, of some of the plants."""
-        on, n_u = self.inputs(lines), self.loops[0].e.shape[1]
-        n_y = len(self.loops[0].plant.model.outputs)
-        driven = []
-        for k in plants:
-            of = self.loops[k]
-            driven.append(of.states(lines, self.period, on) @ of.rows[n_y:].T + np.eye(n_u)[on])
         return Information.of(
             [self.loops[k].plant for k in plants], [self.noise(self.loops[k].plant) for k in plants],
-            self.frequency_hz(lines), driven, prior_sd=self.prior_sd, criterion=self.criterion,
+            self.frequency_hz(lines), [self.driven(lines, k) for k in plants], prior_sd=self.prior_sd,
+            criterion=self.criterion,
         )  # fmt: skip
+
+    def driven(self, lines: Lines, plant: int) -> Complex:
+        """Return the inputs of a plant by unit excitation of each line's input, (n_lines, n_inputs)."""
+        on, of = self.inputs(lines), self.loops[plant]
+        rows = of.rows[len(of.plant.model.outputs) :]
+        return np.asarray(of.states(lines, self.period, on) @ rows.T + np.eye(of.e.shape[1])[on])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

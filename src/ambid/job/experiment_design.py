@@ -15,7 +15,8 @@ from ambid.acquisition.scales import TABLE_LENGTH, scale_of
 from ambid.acquisition.settings import controller_settings
 from ambid.arrays import Array
 from ambid.control.closed import Plant
-from ambid.control.drawn import Spread, draw_plants
+from ambid.control.curvature import advised, expected_shift, judge_shift
+from ambid.control.drawn import Spread, draw_plants, laws_of
 from ambid.control.excited import SLEW, ExcitedLoop
 from ambid.control.experiment import (
     Design,
@@ -433,6 +434,15 @@ def _told(
         found = replace(found, c=found.c / (used.max() + quantum / table.amplitude))  # a step less at least
     information, power = task.information(lines, [0]), np.abs(c) ** 2
     expected = _expected(task, information, power, _flat_sd(task, found), wanted.target)
+    curved = None
+    if isinstance(bench, Bench) and of.name == "one-axis":
+        laws, assumed = laws_of(loop.plant, bench.rig, bench.point._asdict())
+        if laws:
+            shift = expected_shift(task, lines, c, information, laws[""]).tolist()
+            expected = {
+                n: replace(expected[n], shift=x) for n, x in zip(information.names, shift, strict=True) if n in expected
+            }
+            curved = _curvature(expected, assumed[0])
     waves = dict(zip(loop.signals, task.limited(lines, [0]).waves(c).T, strict=True))
     by_length = [information.relative_sd(power, x * task.samples) for x in _LENGTHS]
     by_level = [information.relative_sd(power * x**2, task.samples) for x in _LEVELS]
@@ -448,7 +458,8 @@ def _told(
         phase={name: np.angle(c) for name, c in by_input.items()},
         excitation=dict(zip(of.inputs, wave.T, strict=True)), table=table,
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
-        gap=found.gap, drawn=len(task.loops) - 1, checks=_checks(used, expected, unstable),
+gap=found.gap, drawn=len(task.loops) - 1,
+        checks=_checks(used, expected, unstable) | ({} if curved is None else {"curvature": curved}),
         warnings=_cautions(bench.rig, task, lines, power, information),
         shown=Shown(
             waves={name: rounded(x) for name, x in waves.items()},
@@ -567,6 +578,16 @@ def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dic
             "give a prior",
         ),
     }  # fmt: skip
+
+
+def _curvature(expected: Mapping[str, Expected], assumed: str) -> Check:
+    """Judge what curvature will move."""
+    shift = {name: x.shift for name, x in expected.items() if x.shift is not None and not name.endswith(".delay")}
+    size = {name: far * expected[name].sd for name, far in shift.items()}
+    passed, said = judge_shift(shift, size, {name: expected[name].value for name in shift})
+    if not passed:
+        said += f" ({assumed}). Play {advised(shift):.2g} of it or less (--use), or identify with --nonlinear"
+    return Check(passed=passed, values=shift, detail=said)
 
 
 def one_period(found: Experiment) -> Record:

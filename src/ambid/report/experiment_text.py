@@ -57,11 +57,12 @@ def _head(found: Experiment, width: int, paint: Paint) -> list[str]:
 
 def _expected(found: Experiment, width: int, paint: Paint) -> list[str]:
     aim = f"{100.0 * found.target:.3g} % after"
-    rows: list[tuple[str, ...]] = [("", "designed for", "relative", "flat", aim)]
+    rows: list[tuple[str, ...]] = [("", "designed for", "relative", "flat", "curvature", aim)]
     for name, x in found.expected.items():
         needed = _NONE if x.seconds is None or not x.identifiable else sized(x.seconds, "s")
         said = quantity(x.value, x.sd, x.unit).text.removesuffix(" 1")
-        rows.append((name, said, f"{100.0 * x.relative_sd:.2g} %", f"{x.flat_sd / x.sd:.2g} times", needed))
+        moved = _NONE if x.shift is None else f"{x.shift:+.1f} sd"
+        rows.append((name, said, f"{100.0 * x.relative_sd:.2g} %", f"{x.flat_sd / x.sd:.2g} times", moved, needed))
     return [
         paint("what the record will show", "strong"),
         *columns(rows),
