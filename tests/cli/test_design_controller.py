@@ -75,6 +75,7 @@ def test_the_loop_becomes_an_object_of_python_control(designed):
         (("--limit", "peak=-3dB"), "no loop is that good"),
         (("--spread", "delay=x"), "--spread delay=x has no number"),
         (("--spread", "dealy=1"), "source 'dealy' of spread is unknown"),
+        (("--spread", "warm_k=0.1"), "it must be two numbers"),
         (("--method", "pod"), "method 'pod' of a design is unknown"),
     ],
 )

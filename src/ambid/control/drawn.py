@@ -59,13 +59,18 @@ class Spread:
     damping: float = 0.5  # share of their damping that may be missing
 
     def __post_init__(self) -> None:
-        for name in (f.name for f in fields(self) if f.name != "warm_k"):
-            value = getattr(self, name)
+        for name in (f.name for f in fields(self)):
+            value, pair = getattr(self, name), name == "warm_k"
+            if np.shape(value) != ((2,) if pair else ()) or np.asarray(value).dtype.kind not in "fiu":
+                number = "two numbers, such as -10:60" if pair else "one number"
+                raise ModelError(f"spread.{name} is {value!r}; it must be {number}. Correct it")
+            if pair:
+                continue
             if not (math.isfinite(value) and value >= 0.0):
                 raise ModelError(f"spread.{name} is {value}; it must be zero or positive. Correct it")
         if max(self.position, self.current, self.damping, self.frequency) >= 1.0:
             raise ModelError("spread.position, current, damping and frequency are shares below 1. Correct them")
-        if not -200.0 < self.warm_k[0] <= self.warm_k[1]:
+        if not -200.0 < self.warm_k[0] <= self.warm_k[1] < math.inf:
             raise ModelError(f"spread.warm_k is {self.warm_k}; the colder comes first. Swap or correct them")
 
 
