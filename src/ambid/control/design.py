@@ -38,6 +38,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.physics.law import StateLaw, beside
 from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop, Noise
+from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, rig_from_text
 from ambid.simulation.margins import ZONES, zone_of
 from ambid.simulation.plant import closed_loop_matrix, fed_back, signals_fed_back
@@ -63,6 +64,7 @@ _LONGEST = 20.0  # time constants of the slowest pole over which a force step is
 _MOST = 2**17  # samples of it
 _ENOUGH = 2048  # of them that tell when it is settled
 _SHOWN = 400  # of it that are drawn
+_TURNED = 9  # speeds at which the peak is told
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -309,6 +311,29 @@ class LoopCurves:
     step: Mapping[str, Array]  # deflection of the estimate by a force step of 1 N, m
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class OverSpeed:
+    """The highest peak of the sensitivity over some of the plants that judge, by the speed of the rotor."""
+
+    speed: Array  # (n,), rad/s
+    # "before", "after" and, of a schedule, "one law": the best of its laws alone; (n,), as a ratio, infinite where one
+    # of the plants is not held
+    peak: Mapping[str, Array]
+
+    @classmethod
+    def of(cls, plants: Sequence[Plant], loops: Mapping[str, Loop], speeds: tuple[float, float]) -> OverSpeed:
+        """Return the curve of loops over speeds in rad/s."""
+        at = np.linspace(*speeds, _TURNED)
+
+        def peaks(loop: Loop) -> Array:
+            turned = [[replace(p, model=_turning(p.model, w)) for p in plants] for w in at.tolist()]
+            return np.array([max(examine(p, loop, (0.0, 0.0)).figures.peak for p in each) for each in turned])
+
+        alone = [peaks(Loop(law=law, delay=loop.delay)) for loop in loops.values() for _, law in loop.laws]
+        one = {"one law": min(alone, key=np.max)} if alone else {}
+        return cls(speed=at, peak={**{name: peaks(loop) for name, loop in loops.items()}, **one})
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
 class Design(Judged):
     """A controller, designed on an estimate and verified on plants around it.
@@ -332,6 +357,8 @@ class Design(Judged):
     checks : Mapping[str, Check]
     curves : Mapping[str, LoopCurves]
         ``before`` and ``after``.
+    over_speed : OverSpeed, optional
+        Of a rotor that turns.
     trials : Mapping[str, tuple of Verification]
         ``before`` and ``after``: nonlinear simulation on the estimate, then on the worst plants.
     warnings : tuple of str
@@ -352,6 +379,7 @@ class Design(Judged):
     plants: Mapping[str, object]
     checks: Mapping[str, Check]
     curves: Mapping[str, LoopCurves]
+    over_speed: OverSpeed | None = None
     trials: Mapping[str, tuple[Verification, ...]] = field(default_factory=lambda: MappingProxyType({}))
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
@@ -410,6 +438,11 @@ class Design(Judged):
         of = self._model
         signals = [of.outputs[k] for k in signals_fed_back(of)]
         write_law(self.law, path, self.new_rig.name, signals, of.inputs)
+
+
+def _turning(of: LinearModel, speed: float) -> LinearModel:
+    assert isinstance(of, RotorModel)
+    return of.at_speed(speed)
 
 
 def situation_of(seen: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:

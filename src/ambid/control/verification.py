@@ -27,7 +27,7 @@ from ambid.rig.rig import Rig
 from ambid.simulation.plant import closed_loop_poles
 from ambid.simulation.scenarios import GRADE, TOP_SPEED
 
-KINDS = ("lift-off", "force step", "impact", "unbalance", "noise", "limit cycle")
+KINDS = ("lift-off", "force step", "impact", "unbalance", "noise", "limit cycle", "run-up")
 """What is tried, in the order in which it is told."""
 
 ORBIT = 0.4
@@ -40,7 +40,7 @@ _LIFTED = 0.05  # of the way from the stop: away from it, and at rest
 _AT_STOP = 1e-3  # of the clearance: nearer is contact
 _CYCLE = 0.05  # largest limit cycle over the clearance
 _LONGEST = {True: 12_000, False: 60_000}  # samples of a case, of a rotor and of one axis
-_RUN_UP_S = 2.0
+_RUN_UP_S = 1.5
 _SPEEDS = 10
 _FASTEST = 0.1  # of the rate: highest frequency of rotation that is tried
 _POINTS = 250  # of a trace
@@ -58,6 +58,7 @@ class Trials:
     # kg m; default that of the rig, else balance quality G 2.5 (ISO 21940-11) at the highest speed
     unbalance: float | None = None
     speed: float | None = None  # highest, rad/s; default the rotor's own, else 15 000 rpm
+    run_up: bool = False  # from rest to the highest speed, the laws of a schedule taking turns
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -129,7 +130,7 @@ def verify(
     bench, todo = workbench(plant, rig, loop, nonlinear=nonlinear), trials or Trials()
     trying = _Trying(bench=bench, trials=todo, seed=seed)
     cases = [*trying.lift_off(), *trying.force_steps(), *trying.impacts(), *trying.unbalance()]
-    cases += [*trying.noise(), *trying.limit_cycle]
+    cases += [*trying.noise(), *trying.limit_cycle, *trying.run_up()]
     return Verification(
         plant=name,
         clearance=trying.clearance if math.isfinite(trying.clearance) else None,
@@ -429,14 +430,33 @@ class _Trying:
             found.append(self._orbit(answers[at], speeds[at], f"{kind} unbalance", np.array(speeds), most))
         return found
 
-    def _orbit(self, answer: Answer, speed: float, name: str, at: Array, most: Sequence[Array]) -> Case:
+    def run_up(self) -> list[Case]:
+        """Run up from rest with the static unbalance, the commands of one law handed over to the next."""
+        if not self.trials.run_up:
+            return []
+        n = round(_RUN_UP_S * self.rate_hz)
+        speed: Array = self.speed * np.arange(1, n + 1, dtype=np.float64) / n
+        angle: Array = np.cumsum(speed) / self.rate_hz
+        load = self._whirl(self._shares()["static"], speed, angle)
+        try:
+            answer = self.bench.respond(n, load=load, speed=speed)
+        except ModelError as problem:
+            return [self.broken("run-up", "run-up", problem)]
+        edges = np.linspace(0, n, _POINTS, endpoint=False).astype(int)
+        most = [np.maximum.reduceat(np.abs(x).max(axis=1), edges) for x in answer[:3]]
+        at = int(np.argmax(np.abs(answer.position).max(axis=1)))
+        return [self._orbit(answer, float(speed[at]), "run-up", speed[edges], most, kind="run-up")]
+
+    def _orbit(
+        self, answer: Answer, speed: float, name: str, at: Array, most: Sequence[Array], kind: str = "unbalance"
+    ) -> Case:
         peak = float(np.abs(answer.position).max())
         share = peak / self.clearance if math.isfinite(self.clearance) else 0.0
         said = f"at most {_length(peak)} at {speed * _RPM:.0f} rpm"
         said += f", {100.0 * share:.3g} % of the clearance" if share else ""
         said += f", more than the {100.0 * ORBIT:g} % of ISO 14839-2 zone B" if share > ORBIT else ""
         return self.case(
-            "unbalance", name, answer, said, size=self.moment, unit="kg m", passed=share <= ORBIT,
+            kind, name, answer, said, size=self.moment, unit="kg m", passed=share <= ORBIT,
             trace=Trace(over="speed", at=at, position=most[0], current=most[1], command=most[2]),
         )  # fmt: skip
 
@@ -462,20 +482,21 @@ class _Trying:
         return {"static": static, "couple": static * signs} if len(names) > 1 else {"static": static}
 
     def _turned(self, speed: float, weights: Array, *, linear: bool) -> Answer:
-        of = self.bench.plant.model
-        assert isinstance(of, RotorModel)
         rate = self.rate_hz
         settle = min(max(self.samples // 2, round(6.0 * math.pi * rate / speed)), _LONGEST[True] // 2)
         n = settle + math.ceil(2.0 * math.pi * rate / speed)
-        angle = speed * (np.arange(n) + 0.5) / rate
-        turn = {0: np.cos(angle), 1: np.sin(angle), 2: np.zeros(n)}
-        load = (
-            self.moment
-            * speed**2
-            * np.column_stack([w * turn[p] for w, (_, p) in zip(weights, of.placed, strict=True)])
-        )
+        angle: Array = speed * (np.arange(n, dtype=np.float64) + 0.5) / rate
+        load = self._whirl(weights, speed * np.ones(n), angle)
         found = self.bench.respond(n, load=load, speed=speed, linear=linear)
         return found._replace(**{q: getattr(found, q)[settle:] for q in ("position", "current", "command")})
+
+    def _whirl(self, weights: Array, speed: Array, angle: Array) -> Array:
+        """Return the forces of the unbalance on the axes, (n, n_axes)."""
+        of = self.bench.plant.model
+        assert isinstance(of, RotorModel)
+        turn = {0: np.cos(angle), 1: np.sin(angle), 2: np.zeros(angle.size)}
+        each = [w * turn[p] for w, (_, p) in zip(weights, of.placed, strict=True)]
+        return np.asarray(self.moment * (speed**2)[:, None] * np.column_stack(each))
 
     def noise(self) -> list[Case]:
         """Leave the loop alone with its noise."""

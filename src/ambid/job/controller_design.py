@@ -23,6 +23,7 @@ from ambid.control.design import (
     Examined,
     Goals,
     Method,
+    OverSpeed,
     checks_of,
     curves_of,
     examine,
@@ -36,7 +37,7 @@ from ambid.control.design import (
 )
 from ambid.control.drawn import Draws, Spread, draw_plants, over_speeds
 from ambid.control.gain_sets import FORMS
-from ambid.control.verification import checks_of_verifications, verify_all
+from ambid.control.verification import Trials, checks_of_verifications, verify_all
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
@@ -52,6 +53,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.simulation.margins import zone_of
 
 _ROUNDS = 3  # in which the limits are met on the plants that judge too
+_TURNED = 5  # plants that are turned at speeds, for the curve
 _STEP = 1.5  # settling times over which a force step is drawn
 
 
@@ -192,6 +194,7 @@ class _Problem:
     tuning: Draws
     judging: Draws
     seeds: tuple[int, int]
+    speeds: Interval | None  # rad/s
     assumed: str  # of the noise
 
     @property
@@ -270,7 +273,7 @@ def _problem(
         tuning, judging = over_speeds(tuning, speeds), over_speeds(judging, speeds)
     return _Problem(
         known=known, bench=bench, rig=rig, plant=plant, noise=(position, current), tuning=tuning, judging=judging,
-        seeds=seeds, assumed=assumed,
+        seeds=seeds, speeds=speeds, assumed=assumed,
     )  # fmt: skip
 
 
@@ -334,14 +337,23 @@ def _result(
     worst = worst_plant(of.judging.plants, seen)
     bench = replace(of.bench, noise=of.bench.noise or of.rig.noise)  # with its resolutions
     tried = hardest(of.judging.plants, seen)
+    todo, both = (
+        Trials(run_up=bool(loop.laws)),
+        {name: x for name, (x, _) in zip(("before", "after"), loops, strict=True)},
+    )
     trials = {
-        name: verify_all(tried, bench, x, tick=part_of(say, a, a + 0.5) or silent)
+        name: verify_all(tried, bench, x, trials=todo, tick=part_of(say, a, a + 0.5) or silent)
         for name, (x, _), a in zip(("before", "after"), loops, (0.0, 0.5), strict=True)
     }
     checks = {**checks_of(goals, was, now, worst, len(seen)), **checks_of_verifications(trials["after"])}
     if not of.known.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    turns = of.speeds is not None and of.speeds[1] > of.speeds[0]
+    say("speeds")
+    curve = (
+        OverSpeed.of([d.plant for d in of.judging.plants[:_TURNED]], both, of.speeds) if turns and of.speeds else None
+    )
     until = _STEP * max(was.figures.settling, now.figures.settling)
     kept = replace(made, delay=of.bench.loop.delay if of.bench.loop else loop.delay)  # the rig's own, as it says it
     return Design(
@@ -351,7 +363,7 @@ def _result(
             name: curves_of(x, of.plant, loop, until)
             for name, (loop, x) in zip(("before", "after"), loops, strict=True)
         },
-        rig=rig_entry(replace(of.bench, loop=kept)),
+        over_speed=curve, rig=rig_entry(replace(of.bench, loop=kept)),
         plants={
             "tuning": len(of.tuning.plants), "verification": len(seen),
             "rejected": of.tuning.rejected + of.judging.rejected, "seeds": list(of.seeds),

@@ -8,7 +8,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.control.design import Design
-from ambid.report.drawing import MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
+from ambid.report.drawing import BOUND, MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
 from ambid.report.margins_figures import zone_lines
 from ambid.report.numbers import prefixed, sized
 from ambid.report.verification import verification_block
@@ -19,12 +19,15 @@ if TYPE_CHECKING:
 
 _LOOPS = (("before", MEASURED), ("after", PREDICTED))
 _DB = (-20.0, 16.0)
+_RPM = 30.0 / np.pi
 _SHALLOW = 1e-4  # of the largest compliance: the lowest that is drawn
 
 
 def design_figure(found: Design, title: str, width: float) -> Figure:
     """Draw both loops, a row of panels an axis."""
     blocks = [loops_block(found)]
+    if found.over_speed is not None:
+        blocks.append(Block(columns=[[panel(_over_speed, found, height=2.4)]]))
     if found.trials:
         blocks.append(verification_block(found.trials["before"][0], found.trials["after"][0]))
     return stacked(title, blocks, width)
@@ -56,6 +59,29 @@ def _sensitivity(axes: Axes, found: Design, axis: str) -> None:
         axes,
         f"axis {axis}: {was.peak_db.value:.1f} → {now.peak_db.value:.1f} dB, zone {was.zone} → {now.zone}",
         good=good,
+    )
+
+
+def _over_speed(axes: Axes, found: Design) -> None:
+    of = found.over_speed
+    assert of is not None
+    tops = {name: x[np.isfinite(x)] for name, x in of.peak.items()}
+    for (name, peak), color in zip(of.peak.items(), (MEASURED, PREDICTED, BOUND), strict=False):
+        shown = 20.0 * np.log10(np.where(np.isfinite(peak), peak, np.nan))
+        axes.plot(
+            of.speed * _RPM, shown, color=color, marker=".", linestyle="--" if name == "one law" else "-", label=name
+        )
+    zone_lines(axes)
+    axes.set_ylim(0.0, max(_DB[1], min(20.0 * np.log10(max(x.max(initial=1.0) for x in tops.values())) + 2.0, 40.0)))
+    axes.set_xlabel("speed [1/min]")
+    axes.set_ylabel("peak of sensitivity [dB]")
+    lost = [
+        f"{name} loses plants at {np.sum(~np.isfinite(x))} speeds"
+        for name, x in of.peak.items()
+        if len(tops[name]) < x.size
+    ]
+    head(
+        axes, "; ".join(["worst of some plants over the speed", *lost]), good=bool(np.isfinite(of.peak["after"]).all())
     )
 
 

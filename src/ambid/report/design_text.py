@@ -41,6 +41,7 @@ def design_text(found: Design, *, width: int = WIDTH, paint: Paint = plain) -> s
         [
             [head, *wrapped([_goals(found)], width, "  ")],
             _figures(found, paint),
+            _speeds(found, paint),
             _margins(found, paint),
             _simulated(found, width, paint),
             _plants(found, width, paint),
@@ -79,6 +80,15 @@ def _figures(found: Design, paint: Paint) -> list[str]:
     rows.append(("plants that are held", "", "", *held))
     head = paint(f"both loops: on the estimate, and the worst of {n} plants around it", "strong")
     return [head, *columns(rows), f"in brackets: zones of {STANDARD}; check their limits against its text"]
+
+
+def _speeds(found: Design, paint: Paint) -> list[str]:
+    of = found.over_speed
+    if of is None:
+        return []
+    rows = [("rpm", *of.peak), *((f"{w * 30.0 / np.pi:.0f}", *(said("peak", x[k]) for x in of.peak.values()))
+                                 for k, w in enumerate(of.speed))]  # fmt: skip
+    return [paint("highest peak over the speed, of some plants that judge", "strong"), *columns(rows)]
 
 
 def _margins(found: Design, paint: Paint) -> list[str]:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 _NONE = "–"
 _RPM = 30.0 / np.pi
-_DRAWN = KINDS[:4]
+_DRAWN = (*KINDS[:4], "run-up")
 _MEANING = (
     "limits, quantisation and delay act; lift-off: time to rest, overshoot; force step, impact: largest deflection, "
     "time to rest; noise: rms of position and command; else the largest deflection"

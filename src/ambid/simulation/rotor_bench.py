@@ -19,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
 from ambid.physics.drawn_rotor import drawn_numbers
+from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.named_bench import Turning
@@ -28,7 +29,14 @@ from ambid.physics.shaft import Shaft
 from ambid.record.record import Channel, Record, Step
 from ambid.rig.rig import Rig
 from ambid.simulation.bench import Simulation, acting, largest_amplitude
-from ambid.simulation.plant import LinearPlant, closed_loop_poles, fed_back, law_on, matrices_of
+from ambid.simulation.plant import (
+    LinearPlant,
+    closed_loop_poles,
+    fed_back,
+    law_on,
+    matrices_of,
+    signals_fed_back,
+)
 from ambid.simulation.rig_bench import FINE, as_columns, loop_of_rig
 from ambid.simulation.rotor_magnets import Poles, poles_of
 
@@ -36,6 +44,27 @@ if TYPE_CHECKING:
     from ambid.simulation.rotor_kernels import Linear, Nonlinear
 
 _MOST_MODES = 12  # of a drawing that are looked at
+
+
+@dataclass(slots=True, kw_only=True, eq=False)
+class Running:
+    """Where a loop stands between two runs of its simulation, each of which carries it on."""
+
+    x: Array  # states of the plant, cos and sin of the angle
+    z: Array  # states of the law
+    memory: Array  # (n_axes, 3), of gains
+    line: Array  # commands on their way, (whole delay + 2, n_axes)
+    law: StateLaw | None
+
+    def hand_over(self, law: StateLaw, y: Array) -> None:
+        """Go on with another law, whose states are those of the last one but for what keeps the command where it is.
+
+        z+ = z + C⁺ (w - C z - D y), of another order from z = 0; w: what the last law would order.
+        """
+        assert self.law is not None
+        wanted = self.law.C @ self.z + self.law.D @ y
+        z = self.z if self.z.size == law.order else np.zeros(law.order)
+        self.z, self.law = z + np.linalg.pinv(law.C) @ (wanted - law.C @ z - law.D @ y), law
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -117,13 +146,13 @@ class RotorBench:
 
     def simulate(
         self, excitation: ArrayLike, *, seed: int, columns: bool = True, settle: int = 0, load: Array | None = None,
-        start: Array | None = None,
+        start: Array | Running | None = None,
     ) -> Simulation:  # fmt: skip
         """Simulate the bench, excited at the controllers' outputs, (n_samples, n_axes).
 
-        `load` (n_samples, n_axes): force over each sample in N; `start` (n_states,): default at rest. Of `settle`
-        samples at the beginning nothing is logged but that limits were met. The record holds voltage, current, position
-        and reference of each axis and, of a rotor that turns, its angle.
+        `load` (n_samples, n_axes): force over each sample in N; `start` (n_states,): default at rest; or a loop that
+        runs and goes on. Of `settle` samples at the beginning nothing is logged but that limits were met. The record
+        holds voltage, current, position and reference of each axis and, of a rotor that turns, its angle.
         """
         of, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != len(of.inputs) or u.shape[0] <= settle:
@@ -214,7 +243,7 @@ class RotorBench:
         self,
         u: Array,
         disturbed: Array,
-        start: Array | None,
+        start: Array | Running | None,
         angle: Array,
         counts: NDArray[np.int64],
         measured: Array,
@@ -223,8 +252,8 @@ class RotorBench:
     ) -> int:
         from ambid.simulation.rotor_kernels import run_rotor
 
-        of, period, whole = self.model, 1.0 / self.rate_hz, math.floor(self.loop.delay)
-        c, fraction, kinds = self.loop, self.loop.delay - whole, [name.rsplit("_", 1)[-1] for name in of.inputs]
+        of, period = self.model, 1.0 / self.rate_hz
+        c, fraction, kinds = self.loop, self.loop.delay % 1.0, [name.rsplit("_", 1)[-1] for name in of.inputs]
         if len(set(kinds)) > 1:
             raise ModelError(
                 f"axes are driven by {', '.join(sorted(set(kinds)))}; one loop drives all alike. Correct it"
@@ -235,21 +264,30 @@ class RotorBench:
         pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
         continuous = self._continuous()
         equations = self._sampled(continuous, fraction) if self.poles is None else self._nonlinear(self.poles, fraction)
-        x = np.zeros(continuous.A.shape[0])
-        x[: len(of.states)] = 0.0 if start is None else start
-        x[len(of.states) :: 2] = 1.0
+        at, law = start if isinstance(start, Running) else self.begun(start), law_on(c, of, self.rate_hz)
+        if law is not None and law is not at.law:
+            at.hand_over(law, (continuous.C @ at.x)[signals_fed_back(of)])
         states = [of.states.index(name) for name in self._currents]
         return int(
             run_rotor(
                 u, disturbed, self._runout(angle),
                 equations, np.ascontiguousarray(continuous.C), fed_back(of),
                 np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
-                matrices_of(law_on(c, of, self.rate_hz)), np.array(steps[:-1]),
-                (*getattr(self.limits, kind_of(of.inputs[0])), steps[-1]), np.zeros((whole + 2, u.shape[1])),
-                self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), x, counts,
+                matrices_of(law), np.array(steps[:-1]),
+                (*getattr(self.limits, kind_of(of.inputs[0])), steps[-1]), at.line,
+                self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), at.x, at.z, at.memory, counts,
                 measured, command, truth,
             )
         )  # fmt: skip
+
+    def begun(self, start: Array | None = None) -> Running:
+        """Return the loop at its beginning, with some states of the plant, by default at rest."""
+        of, law, n = self.model, law_on(self.loop, self.model, self.rate_hz), len(self.model.inputs)
+        x, memory = np.zeros(len(of.states) + 2), np.zeros((n, 3))
+        x[: len(of.states)] = 0.0 if start is None else start
+        x[-2], memory[:, 2] = 1.0, np.nan
+        line = np.zeros((math.floor(self.loop.delay) + 2, n))
+        return Running(x=x, z=np.zeros(0 if law is None else law.order), memory=memory, line=line, law=law)
 
     def _continuous(self, theta: Mapping[str, float] | None = None) -> StateSpace:
         """Return the plant; after its states cos and sin of the angle, from which unbalance pushes."""

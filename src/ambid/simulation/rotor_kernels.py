@@ -169,24 +169,26 @@ def run_rotor(
     pushes: Array,
     carried: Integers,
     x: Array,
+    z: Array,
+    memory: Array,
     counts: Integers,
     measured: Array,
     command: Array,
     truth: Array,
 ) -> int:
-    """Run the loop of all axes from its beginning.
+    """Run the loop of all axes from where it stands.
 
     `excitation` (n, n_inputs); `noise` (n, n_outputs + n_disturbances); `offsets` (n, n_outputs) run-out, or (0, ...).
     `read` (n_outputs, n_states); `roles` (n_inputs, 2): outputs of position and current that each axis feeds back, -1:
-    none; `gains` kp, ki T, kd, kc, tau, T; `limits` low, high and resolution of the commands; `line` (whole delay + 2,
-    n_inputs), zero at first; `carried`: states that are currents. Filled: measured, command, truth = what each axis
-    sees of the rotor, then the currents; counts = first contact, first limited sample (-1: none), limited samples.
-    Returns the first sample that is not finite or in which a gap closes, -1 for none.
+    none; `gains` kp, ki T, kd, kc, tau, T; `limits` low, high and resolution of the commands; `line` (whole delay +
+    2, n_inputs); `carried`: states that are currents; states `x` of the plant, `z` of the law; `memory` (n_inputs, 3)
+    of gains: integral, derivative, last position, NaN at first. All four go on. Filled: measured, command, truth =
+    what each axis sees of the rotor, then the currents; counts = first contact, first limited sample (-1: none),
+    limited samples. Returns the first sample that is not finite or in which a gap closes, -1 for none.
     """
     n, n_inputs, n_outputs = command.shape[0], command.shape[1], measured.shape[1]
     n_axes = magnets.shape[0]
-    memory = np.zeros((n_inputs, 3))
-    z, fed, wanted, lost = np.zeros(law[0].shape[0]), np.zeros(law[3].shape[1]), np.zeros(n_inputs), np.zeros(n_inputs)
+    fed, wanted, lost = np.zeros(law[3].shape[1]), np.zeros(n_inputs), np.zeros(n_inputs)
     disturbance, after, seen = np.empty(noise.shape[1] - n_outputs), np.empty(x.size), np.empty(n_outputs)
     whole = line.shape[0] - 2
     for k in range(n):
@@ -215,7 +217,7 @@ def run_rotor(
             error, moved, current = 0.0, 0.0, 0.0
             if roles[j, 0] >= 0:
                 error = -measured[k, roles[j, 0]]
-                moved = -error - memory[j, 2] if k > 0 else 0.0
+                moved = -error - memory[j, 2] if math.isfinite(memory[j, 2]) else 0.0
                 memory[j, 2] = -error
             if roles[j, 1] >= 0:
                 current = measured[k, roles[j, 1]]
