@@ -7,7 +7,8 @@ from collections.abc import Iterator
 
 # Highest first. A room may import any tier below its own: neither upward nor sideways.
 TIERS: tuple[tuple[str, ...], ...] = (
-    ("cli", "console", "fleet"),
+    ("cli",),
+    ("console", "fleet"),
     ("job",),
     ("report",),
     ("control",),

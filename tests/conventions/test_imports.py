@@ -56,7 +56,7 @@ FABRICATED = {
     "upward by two dots": ("ambid.record.csv_format", "from ..physics import models", "upward"),
     "upward, plain import": ("ambid.units", "import ambid.record.record as r", "upward"),
     "sideways": ("ambid.signals.conditioning", "from ambid.physics import models", "sideways"),
-    "sideways, top": ("ambid.fleet.many", "import ambid.cli", "sideways"),
+    "sideways, top": ("ambid.fleet.many", "import ambid.console", "sideways"),
     "inside a function": ("ambid.rig.load", "def f():\n    from ambid.bearing import greybox\n", "line 2: rig"),
     "for typing only": (
         "ambid.errors",

@@ -14,6 +14,7 @@ from ambid.cli import (
     acquire,
     commission,
     compare,
+    console,
     demo,
     design,
     fit,
@@ -43,6 +44,7 @@ app.command("frf", short_help="measure a frequency response, and fit models to i
 app.command("compare", short_help="compare several black-box structures")(compare.command)
 app.command("acquire", short_help="take a record from a controller, real or emulated")(acquire.command)
 app.command("commission", short_help="go from a controller to tracked parameters, step by step")(commission.command)
+app.command("console", short_help="watch, commission and judge a bearing in the browser")(console.command)
 app.command("track", short_help="track parameters through a record, as on-line")(track.command)
 app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
 app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")

@@ -1,0 +1,140 @@
+"""A feed: frames that one process appends to files and others read at their own pace.
+
+Who writes never waits for who reads, and needs nobody who reads. A frame is its length and kind (little endian, 5
+bytes), then JSON (``J``) or an envelope of signals (``E``). Files are numbered parts; old parts go, and each part
+begins with the frames that a reader has to know (`sticky`), so that any part can be read alone.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import threading
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+_HEAD = struct.Struct("<Ic")
+_PART = 2 << 20  # bytes after which a new part begins: 2.7 minutes of eight signals at 200 envelopes a second
+_KEPT = 24  # parts: about an hour
+
+
+class FeedWriter:
+    """Appends frames to the feed of a folder.
+
+    `folder`: exists; `part_bytes`, `kept`: size and number of the parts.
+    """
+
+    def __init__(self, folder: Path, *, part_bytes: int = _PART, kept: int = _KEPT) -> None:
+        self._folder, self._size, self._kept = folder, part_bytes, kept
+        self._lock = threading.Lock()
+        self._sticky: dict[str, bytes] = {}
+        self._number = next_part(folder)
+        self._file = part(folder, self._number).open("ab", buffering=0)
+
+    def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None) -> None:
+        """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part."""
+        text = json.dumps({"kind": kind, **content}, ensure_ascii=False, allow_nan=False, default=str)
+        frame = _framed(b"J", text.encode())
+        with self._lock:
+            if sticky is not None:
+                self._sticky[sticky] = frame
+            self._append(frame)
+
+    def envelope(self, payload: bytes) -> None:
+        """Append an envelope of signals; see `Envelope`."""
+        with self._lock:
+            self._append(_framed(b"E", payload))
+
+    def close(self) -> None:
+        """End the feed."""
+        with self._lock:
+            self._file.close()
+
+    def _append(self, frame: bytes) -> None:
+        if self._file.closed:
+            return
+        if self._file.tell() + len(frame) > self._size:
+            self._file.close()
+            self._number += 1
+            self._file = part(self._folder, self._number).open("ab", buffering=0)
+            part(self._folder, self._number - self._kept).unlink(missing_ok=True)
+            frame = b"".join((*self._sticky.values(), frame))
+        self._file.write(frame)
+
+
+class FeedReader:
+    """Reads whole frames of a feed as they come; a part that is gone is passed over.
+
+    `parts`: how many of the last ones to begin with.
+    """
+
+    def __init__(self, folder: Path, *, parts: int = 2) -> None:
+        self._folder = folder
+        last = next_part(folder) - 1
+        self._number = max(first_part(folder), last - parts + 1)
+        self._at, self.behind = 0, 0  # `behind`: bytes of this part that were not read yet, after the last read
+
+    def read(self, most: int = 1 << 18) -> bytes:
+        """Return whole frames, `most` bytes of them or the next one; empty where there is nothing new."""
+        path = part(self._folder, self._number)
+        try:
+            with path.open("rb") as file:
+                file.seek(self._at)
+                data = file.read(most)
+                self.behind = max(0, path.stat().st_size - self._at - len(data))
+        except FileNotFoundError:
+            data = b""
+        whole = whole_frames(data)
+        if data and not whole and len(data) == most:
+            return self.read(4 * most)
+        self._at += whole
+        if not data and part(self._folder, self._number + 1).exists():
+            self._number, self._at = max(self._number + 1, first_part(self._folder)), 0
+            return self.read(most)
+        return data[:whole]
+
+
+def whole_frames(data: bytes) -> int:
+    """Return how many bytes at the begin of `data` are whole frames."""
+    at = 0
+    while at + _HEAD.size <= len(data):
+        end = at + _HEAD.size + _HEAD.unpack_from(data, at)[0]
+        if end > len(data):
+            break
+        at = end
+    return at
+
+
+def json_frames(data: bytes) -> list[dict[str, Any]]:
+    """Return the JSON frames of whole frames."""
+    found, at = [], 0
+    while at + _HEAD.size <= len(data):
+        length, kind = _HEAD.unpack_from(data, at)
+        if kind == b"J":
+            found.append(json.loads(data[at + _HEAD.size : at + _HEAD.size + length]))
+        at += _HEAD.size + length
+    return found
+
+
+def part(folder: Path, number: int) -> Path:
+    """Return where a part of a feed is."""
+    return folder / f"feed-{number:06d}.bin"
+
+
+def first_part(folder: Path) -> int:
+    """Return the number of the oldest part; 0 without any."""
+    return min(_numbers(folder), default=0)
+
+
+def next_part(folder: Path) -> int:
+    """Return the number after the newest part; 0 without any."""
+    return max(_numbers(folder), default=-1) + 1
+
+
+def _numbers(folder: Path) -> list[int]:
+    return [int(p.stem.removeprefix("feed-")) for p in folder.glob("feed-*.bin")]
+
+
+def _framed(kind: bytes, payload: bytes) -> bytes:
+    return _HEAD.pack(len(payload), kind) + payload

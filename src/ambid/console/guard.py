@@ -1,0 +1,182 @@
+"""Who may do what: the one door through which every request of a console comes.
+
+The page is for the person who started it. A one-time token in the link becomes a cookie that scripts cannot read and
+other sites cannot send; Host and Origin must be the console's own, so that no other page, and no name that is bound to
+the loopback address later, reaches it; what changes something needs a header that a plain form cannot send.
+"""
+
+from __future__ import annotations
+
+import hmac
+import secrets
+from collections.abc import Iterable, MutableMapping
+from http.cookies import CookieError, SimpleCookie
+from typing import Any
+from urllib.parse import parse_qs
+
+from starlette.responses import PlainTextResponse, RedirectResponse, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+COOKIE = "ambid_console"
+HEADER = b"x-ambid"
+MOST_BYTES = 1 << 16  # of the body of a request
+MOST_HEADERS = 1 << 14
+_SANDBOXED = "/reports/"
+_POLICY = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "font-src 'self'; base-uri 'none'; form-action 'self'; frame-ancestors 'none'"
+)
+_REPORT_POLICY = (
+    "sandbox allow-scripts allow-modals allow-popups; default-src 'none'; script-src 'unsafe-inline'; style-src "
+    "'unsafe-inline'; img-src data: blob:; base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+
+
+class Guard:
+    """Lets through what belongs here.
+
+    `hosts`: values of Host that are the console's own; `scheme`: http or https; `password`: that opens another session;
+    None: only the token does; `read_only`: nothing may be changed.
+    """
+
+    def __init__(
+        self, app: ASGIApp, *, hosts: Iterable[str], scheme: str = "http", password: str | None = None,
+        read_only: bool = False,
+    ) -> None:  # fmt: skip
+        self._app, self._hosts, self._scheme = app, frozenset(hosts), scheme
+        self._password, self._read_only = password, read_only
+        self.token: str | None = secrets.token_urlsafe(32)
+        self._sessions: set[str] = set()
+        self._wrong = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Let a request through, or answer why not."""
+        if scope["type"] == "lifespan":
+            await self._app(scope, receive, send)
+            return
+        headers = _headers(scope)
+        refusal = self._refusal(scope, headers)
+        if scope["type"] == "websocket":
+            if refusal is None:
+                await self._app(scope, receive, send)
+            else:
+                await receive()
+                await send({"type": "websocket.close", "code": 1008})
+            return
+
+        async def guarded(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                _protect(message, sandboxed=scope["path"].startswith(_SANDBOXED))
+            await send(message)
+
+        if refusal is None:
+            await self._app(scope, _limited(receive), guarded)
+        else:
+            await refusal(scope, receive, guarded)
+
+    def _refusal(self, scope: Scope, headers: MutableMapping[bytes, bytes]) -> Response | None:
+        """Return the answer to what is not let through; None where it is."""
+        if sum(len(name) + len(value) for name, value in scope["headers"]) > MOST_HEADERS:
+            return _no(431, "the head of the request is too long")
+        host, origin = headers.get(b"host", b"").decode("latin-1"), headers.get(b"origin", b"").decode("latin-1")
+        if host not in self._hosts:
+            return _no(421, "this console answers to its own address only. Open the link that it printed")
+        if origin and origin != f"{self._scheme}://{host}":
+            return _no(403, "the request comes from another page")
+        if scope["type"] == "websocket":
+            return None if origin and self._known(headers) else _no(403, "")
+        if scope["method"] == "POST":
+            if self._password is not None and scope["path"] == "/login":
+                return None
+            if HEADER not in headers or not headers.get(b"content-type", b"").startswith(b"application/json"):
+                return _no(403, "a change needs the header X-Ambid and JSON")
+            if int(headers.get(b"content-length", b"0") or 0) > MOST_BYTES:
+                return _no(413, "the request is too long")
+        elif scope["method"] not in ("GET", "HEAD"):
+            return _no(405, "GET and POST only")
+        if scope["path"] == "/" and scope["query_string"]:
+            return self._opened(parse_qs(scope["query_string"].decode("latin-1")).get("token", [""])[0])
+        if not self._known(headers):
+            if self._password is not None and scope["path"] == "/":
+                return Response(_LOGIN, media_type="text/html")
+            return _no(403, "open the link that 'ambid console' printed; each link opens one page. Start it again")
+        if scope["method"] == "POST" and self._read_only:
+            return _no(403, "this console was started with --read-only. Start it without")
+        return None
+
+    def _opened(self, token: str) -> Response:
+        """Exchange the token, which is worth nothing from then on, for a cookie."""
+        if self.token is None or not hmac.compare_digest(token.encode(), self.token.encode()):
+            return _no(403, "this link was used before, or is wrong. Start 'ambid console' again for another")
+        self.token = None
+        return self._session()
+
+    def login(self, password: str) -> Response:
+        """Open a session by password; each wrong one makes the next wait longer."""
+        if self._password is None or self._wrong >= 50:
+            return _no(403, "no further attempts. Start 'ambid console' again")
+        if not hmac.compare_digest(password.encode(), self._password.encode()):
+            self._wrong += 1
+            return _no(403, "wrong password")
+        self._wrong = 0
+        return self._session()
+
+    def _session(self) -> Response:
+        session = secrets.token_urlsafe(32)
+        self._sessions.add(session)
+        answer = RedirectResponse("/", status_code=303)
+        answer.set_cookie(COOKIE, session, httponly=True, samesite="strict", secure=self._scheme == "https", path="/")
+        return answer
+
+    def _known(self, headers: MutableMapping[bytes, bytes]) -> bool:
+        try:
+            found = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1")).get(COOKIE)
+        except CookieError:
+            return False
+        given = "" if found is None else found.value
+        return any(hmac.compare_digest(given.encode(), s.encode()) for s in self._sessions)
+
+
+_LOGIN = (
+    "<!doctype html><meta charset=utf-8><title>ambid console</title><link rel=stylesheet href=/static/console.css>"
+    "<form method=post action=/login><label>Password <input type=password name=password autofocus></label>"
+    "<button>Open</button></form>"
+)
+
+
+def _headers(scope: Scope) -> MutableMapping[bytes, bytes]:
+    """Return the headers; of those that occur twice, where that changes who is asked, none."""
+    found: dict[bytes, bytes] = {}
+    for name, value in scope["headers"]:
+        found[name] = b"" if name in found and name in (b"host", b"origin", b"cookie") else value
+    return found
+
+
+def _no(status: int, why: str) -> Response:
+    return PlainTextResponse(f"ambid: {why}\n", status_code=status)
+
+
+def _protect(message: Message, *, sandboxed: bool) -> None:
+    """Add what a browser has to know about a page of this console."""
+    message["headers"] = [
+        *message["headers"],
+        (b"content-security-policy", (_REPORT_POLICY if sandboxed else _POLICY).encode()),
+        (b"x-content-type-options", b"nosniff"),
+        (b"referrer-policy", b"no-referrer"),
+        (b"cross-origin-opener-policy", b"same-origin"),
+        (b"cross-origin-resource-policy", b"same-origin"),
+        (b"cache-control", b"no-store"),
+    ]
+
+
+def _limited(receive: Receive) -> Receive:
+    """Cut off a body that is longer than it may be."""
+    came = 0
+
+    async def taken() -> Message:
+        nonlocal came
+        message: Any = await receive()
+        came += len(message.get("body", b""))
+        return {"type": "http.disconnect"} if came > MOST_BYTES else message
+
+    return taken

@@ -1,0 +1,153 @@
+"""Runs: what a console has started in a folder, each a process of its own with a folder of its own.
+
+``FOLDER/.ambid/runs/ID/``: ``spec.json`` (what is wanted), ``process.json`` (who does it), ``control.jsonl`` (what the
+operator said), the feed, and ``log.txt``. A console that starts anew finds them there.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import secrets
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ambid.errors import AmbidError
+
+_ID = re.compile(r"[0-9]{10}-[0-9a-f]{6}")
+_KEPT = 200  # runs that are over; older ones are removed when one begins
+
+
+class Run:
+    """One run of a folder.
+
+    `place`: its folder.
+    """
+
+    def __init__(self, place: Path) -> None:
+        self.place = place
+        self.id = place.name
+
+    @property
+    def spec(self) -> dict[str, Any]:
+        """What is wanted."""
+        found: dict[str, Any] = _read(self.place / "spec.json")
+        return found
+
+    @property
+    def alive(self) -> bool:
+        """Whether its process works."""
+        about = _read(self.place / "process.json")
+        return bool(about) and process_began(int(about["pid"])) == about["began"]
+
+    def say(self, word: str, **more: Any) -> None:
+        """Tell the process something; it is appended, and read within 20 ms."""
+        line = json.dumps({"word": word, **more})
+        fd = os.open(self.place / "control.jsonl", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        try:
+            os.write(fd, (line + "\n").encode())
+        finally:
+            os.close(fd)
+
+    def claim(self) -> None:
+        """Note that this process does it."""
+        _write(self.place / "process.json", {"pid": os.getpid(), "began": process_began(os.getpid())})
+
+
+class Heard:
+    """Reads what the operator says to a run, as it comes."""
+
+    def __init__(self, run: Run) -> None:
+        self._path, self._at = run.place / "control.jsonl", 0
+
+    def __iter__(self) -> Iterator[dict[str, Any]]:
+        try:
+            if self._path.stat().st_size <= self._at:
+                return
+            data = self._path.read_bytes()[self._at :]
+        except FileNotFoundError:
+            return
+        whole = data.rpartition(b"\n")[0]
+        self._at += len(whole) + bool(whole)
+        for line in whole.splitlines():
+            yield json.loads(line)
+
+
+class Runs:
+    """The runs of a folder."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._place = folder / ".ambid" / "runs"
+
+    def start(self, spec: Mapping[str, Any]) -> Run:
+        """Begin a run in a process that outlives this one."""
+        self._place.mkdir(parents=True, exist_ok=True)
+        for old in self.all()[_KEPT:]:
+            if not old.alive:
+                for path in old.place.iterdir():
+                    path.unlink()
+                old.place.rmdir()
+        place = self._place / f"{int(time.time()):010d}-{secrets.token_hex(3)}"
+        place.mkdir(mode=0o700)
+        _write(place / "spec.json", {**spec, "folder": str(self.folder)})
+        with (place / "log.txt").open("wb") as log:
+            process = subprocess.Popen(
+                [sys.executable, "-m", "ambid.console.worker", str(place)],
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, cwd=self.folder,
+            )  # fmt: skip
+        _write(place / "process.json", {"pid": process.pid, "began": process_began(process.pid)})
+        _CHILDREN.append(process)
+        return Run(place)
+
+    def all(self) -> list[Run]:
+        """Return all runs, the newest first."""
+        for child in list(_CHILDREN):
+            if child.poll() is not None:
+                _CHILDREN.remove(child)
+        found = self._place.iterdir() if self._place.is_dir() else ()
+        return [Run(p) for p in sorted(found, reverse=True) if _ID.fullmatch(p.name) and not p.is_symlink()]
+
+    def one(self, name: str) -> Run:
+        """Return the run of a name."""
+        if not _ID.fullmatch(name) or not (self._place / name).is_dir():
+            raise AmbidError("there is no such run in the folder. Reload the page")
+        return Run(self._place / name)
+
+
+_CHILDREN: list[subprocess.Popen[bytes]] = []  # of this process: asked for their end, so that none stays a zombie
+
+
+def process_began(pid: int) -> float | None:
+    """Return what identifies a process beside its number, its start; None where it does not run."""
+    try:
+        stat = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        pass
+    else:
+        return None if stat[0] in "ZX" else float(stat[19])
+    if Path("/proc/self/stat").exists():
+        return None
+    try:
+        os.kill(pid, 0)
+    except OSError:
+        return None
+    return 0.0
+
+
+def _read(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return {}
+
+
+def _write(path: Path, content: Mapping[str, Any]) -> None:
+    beside = path.with_name(f".{path.name}-{os.getpid()}")
+    beside.write_text(json.dumps(content, allow_nan=False), encoding="utf-8")
+    os.replace(beside, path)

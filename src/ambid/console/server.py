@@ -1,0 +1,354 @@
+"""The server of a console: pages, the list of files and runs, feeds. It acquires and computes nothing.
+
+Starlette and uvicorn (extra ``[console]``). Everything comes through `ambid.console.guard`.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import time
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import uvicorn
+from starlette.applications import Starlette
+from starlette.concurrency import run_in_threadpool
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.routing import Route, WebSocketRoute
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+
+from ambid.console.feed import FeedReader, json_frames
+from ambid.console.folder import Folder
+from ambid.console.guard import Guard
+from ambid.console.runs import Run, Runs
+from ambid.errors import AmbidError
+
+MOVING = ("live", "commission")
+"""Jobs that may move the machine: one client at a time orders them."""
+
+_POLL_S = 0.01  # between two looks at a feed
+_VIEWERS = 16  # feeds that are watched at once
+_BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
+_PATIENCE_S = 20.0  # with a viewer that takes nothing
+_STATIC = {
+    "console.js": ("console/static", "text/javascript"), "console.css": ("console/static", "text/css"),
+    "uPlot.iife.min.js": ("data", "text/javascript"), "uPlot.min.css": ("data", "text/css"),
+}  # fmt: skip
+_WORDS = ("stop", "go", "no", "track", "hold", "accept", "revert")
+# of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
+_FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
+    "preview": ({"record": "record"}, {"rate_hz": float}, ""),
+    "rig": ({}, {"text": str}, ".toml"),
+    "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
+    "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
+    "export": ({"record": "record"}, {"from_s": float, "to_s": float}, ".h5"),
+    "live": (
+        {"rig": "rig", "estimate": "result"},
+        {"port": str, "seconds": float, "excitation": str, "amplitude": float, "pace": str}, ".h5",
+    ),
+    "commission": (
+        {"rig": "rig"}, {"port": str, "seconds": float, "track_seconds": float, "pace": str, "redesign": bool}, "/",
+    ),
+}  # fmt: skip
+_NEEDED = {"preview": ("record",), "identify": ("record", "rig"), "margins": ("rig",), "live": ("rig", "port"),
+           "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
+
+
+class Console:
+    """What the pages of one folder ask for."""
+
+    def __init__(self, folder: Path, *, read_only: bool = False) -> None:
+        self.files, self.runs, self._read_only = Folder(folder), Runs(folder), read_only
+        self._driver: str | None = None  # the page that orders what moves the machine
+        self._viewers = 0
+        self.guard: Guard | None = None
+
+    def routes(self) -> list[Any]:
+        """Return what can be asked for."""
+        return [
+            Route("/", self._page),
+            Route("/login", self._login, methods=["POST"]),
+            Route("/static/{name}", self._static),
+            Route("/api/state", self._state),
+            Route("/api/rigs/{number:int}", self._rig_text),
+            Route("/api/runs", self._start, methods=["POST"]),
+            Route("/api/runs/{name}/say", self._say, methods=["POST"]),
+            Route("/api/drive", self._drive, methods=["POST"]),
+            Route("/reports/{number:int}", self._report),
+            WebSocketRoute("/api/runs/{name}/feed", self._feed),
+        ]
+
+    async def _page(self, _: Request) -> Response:
+        return Response(_resource("console/static", "console.html"), media_type="text/html")
+
+    async def _static(self, request: Request) -> Response:
+        place = _STATIC.get(request.path_params["name"])
+        if place is None:
+            return Response(status_code=404)
+        return Response(_resource(place[0], request.path_params["name"]), media_type=place[1])
+
+    async def _login(self, request: Request) -> Response:
+        assert self.guard is not None
+        await asyncio.sleep(0.5)
+        form = (await request.body()).decode("utf-8", "replace")
+        from urllib.parse import parse_qs
+
+        return self.guard.login(parse_qs(form).get("password", [""])[0])
+
+    async def _state(self, request: Request) -> Response:
+        entries = await run_in_threadpool(self.files.entries)
+        runs = await run_in_threadpool(lambda: [_about(r) for r in self.runs.all()[:40]])
+        return JSONResponse(
+            {
+                "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
+                "read_only": self._read_only, "driver": _of(self._driver, request), "now": time.time(),
+            }
+        )  # fmt: skip
+
+    async def _rig_text(self, request: Request) -> Response:
+        return await _answer(
+            lambda: {"text": self.files.path_of(request.path_params["number"], "rig").read_text(encoding="utf-8")}
+        )
+
+    async def _report(self, request: Request) -> Response:
+        try:
+            path = self.files.path_of(request.path_params["number"], "report")
+        except AmbidError as refusal:
+            return JSONResponse({"error": str(refusal)}, status_code=404)
+        return FileResponse(path, media_type="text/html")
+
+    async def _start(self, request: Request) -> Response:
+        asked = await _json(request)
+
+        def start() -> Mapping[str, Any]:
+            spec = self._spec(asked)
+            if spec["job"] in MOVING:
+                self._take_wheel(request)
+                if any(r.alive and r.spec.get("job") in MOVING for r in self.runs.all()):
+                    raise AmbidError("a run that moves the machine is under way. Stop it first")
+            return {"id": self.runs.start(spec).id}
+
+        return await _answer(start)
+
+    async def _say(self, request: Request) -> Response:
+        asked = await _json(request)
+
+        def say() -> Mapping[str, Any]:
+            run, word = self.runs.one(request.path_params["name"]), asked.get("word")
+            if word not in _WORDS:
+                raise AmbidError(f"the word {str(word)[:20]!r} is unknown; known: {', '.join(_WORDS)}")
+            if word != "stop" and run.spec.get("job") in MOVING:  # everybody may stop a machine
+                self._take_wheel(request)
+            run.say(str(word))
+            return {}
+
+        return await _answer(say)
+
+    async def _drive(self, request: Request) -> Response:
+        self._driver = _client(request)
+        return JSONResponse({})
+
+    def _take_wheel(self, request: Request) -> None:
+        """Refuse what another page orders."""
+        if self._driver is None:
+            self._driver = _client(request)
+        if self._driver != _client(request):
+            raise AmbidError("another page has the machine. Take over first, or stop only")
+
+    def _spec(self, asked: Mapping[str, Any]) -> dict[str, Any]:
+        """Return what a run is told, from what a page asks for: files by number, nothing that is not known."""
+        job = asked.get("job")
+        if not isinstance(job, str) or job not in _FIELDS:
+            raise AmbidError(f"the job {str(job)[:20]!r} is unknown; known: {', '.join(_FIELDS)}")
+        kinds, others, ending = _FIELDS[job]
+        spec: dict[str, Any] = {"job": job}
+        for name, value in asked.items():
+            if name in ("job", "out") or value is None or value == "":
+                continue
+            if name in kinds:
+                spec[name] = str(self.files.path_of(value, kinds[name]).relative_to(self.files.path))
+            elif name in others:
+                spec[name] = _typed(name, value, others[name])
+            else:
+                raise AmbidError(f"{job} takes no {str(name)[:20]!r}. Reload the page")
+        missing = [name for name in _NEEDED.get(job, ()) if name not in spec]
+        if missing:
+            raise AmbidError(f"{job} needs {missing[0]}. Choose one")
+        if ending:
+            name = self.files.new(asked.get("out", ""), "" if ending == "/" else ending).name
+            spec["out"] = name.removesuffix(".json")
+        return spec
+
+    async def _feed(self, socket: WebSocket) -> None:
+        try:
+            run = self.runs.one(socket.path_params["name"])
+        except AmbidError:
+            await socket.close(1008)
+            return
+        if self._viewers >= _VIEWERS:
+            await socket.close(1013)
+            return
+        self._viewers += 1
+        listening = None
+        try:
+            await socket.accept()
+            listening = asyncio.create_task(_until_gone(socket))
+            await self._send(socket, run, listening)
+        except (WebSocketDisconnect, TimeoutError, RuntimeError):
+            pass  # it is gone, or takes nothing
+        finally:
+            self._viewers -= 1
+            if listening is not None:
+                listening.cancel()
+            if socket.application_state == WebSocketState.CONNECTED:
+                with suppress(RuntimeError, TimeoutError):
+                    await asyncio.wait_for(socket.close(), 1.0)
+
+    async def _send(self, socket: WebSocket, run: Run, listening: asyncio.Task[None]) -> None:
+        """Pass a feed on until its end; a viewer that is slow misses signals, not what was told."""
+        reader, looked, alive = FeedReader(run.place), 0.0, True
+        while not listening.done():
+            data = reader.read()
+            if not data:
+                if not alive:
+                    break
+                if time.perf_counter() - looked > 0.5:
+                    looked, alive = time.perf_counter(), run.alive
+                await asyncio.sleep(_POLL_S)
+                continue
+            if reader.behind > _BACKLOG:
+                told = json_frames(data)
+                if told:
+                    await asyncio.wait_for(socket.send_text(json.dumps(told)), _PATIENCE_S)
+            else:
+                await asyncio.wait_for(socket.send_bytes(data), _PATIENCE_S)
+
+
+async def _until_gone(socket: WebSocket) -> None:
+    """Wait until a viewer goes; what it says is nothing to us."""
+    while (await socket.receive())["type"] != "websocket.disconnect":
+        pass
+
+
+def _about(run: Run) -> dict[str, Any]:
+    spec = run.spec
+    shown = {k: v for k, v in spec.items() if k not in ("folder", "text")}
+    return {"id": run.id, "alive": run.alive, "spec": shown, "began": int(run.id.partition("-")[0])}
+
+
+def _typed(name: str, value: Any, kind: Any) -> Any:
+    """Return a value of the type that a field has."""
+    if kind is float:
+        if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
+            raise AmbidError(f"{name} is {str(value)[:20]!r}; it must be a number. Correct it")
+        return float(value)
+    if not isinstance(value, kind) or (kind is str and len(value) > 50_000):
+        raise AmbidError(f"{name} is {str(value)[:20]!r}; it must be {'a text' if kind is str else 'true or false'}")
+    return value
+
+
+def _client(request: Request) -> str:
+    return request.headers.get("x-ambid", "")[:64]
+
+
+def _of(driver: str | None, request: Request) -> str:
+    return "nobody" if driver is None else "you" if driver == _client(request) else "another page"
+
+
+async def _json(request: Request) -> dict[str, Any]:
+    try:
+        found = json.loads(await request.body())
+    except (ValueError, RecursionError, ClientDisconnect):
+        return {}
+    return found if isinstance(found, dict) else {}
+
+
+async def _answer(make: Callable[[], Mapping[str, Any]]) -> Response:
+    try:
+        return JSONResponse(await run_in_threadpool(make))
+    except (AmbidError, OSError, UnicodeError) as refusal:
+        return JSONResponse({"error": str(refusal)}, status_code=400)
+
+
+def _resource(place: str, name: str) -> bytes:
+    return files("ambid").joinpath(*place.split("/"), name).read_bytes()
+
+
+def serve(
+    folder: str | Path,
+    *,
+    port: int = 0,
+    read_only: bool = False,
+    listen: str = "127.0.0.1",
+    tls: tuple[Path, Path] | None = None,
+    password: str | None = None,
+    on_ready: Callable[[str], object] = print,
+) -> None:
+    """Serve the console of a folder until Ctrl-C.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Records, rigs, results and reports that are shown; runs are kept in its folder ``.ambid``.
+    port : int
+        Of the page; 0: any that is free.
+    read_only : bool
+        Refuse what changes something.
+    listen : str
+        Address; another than the loopback's needs `tls` and `password`.
+    tls : (Path, Path), optional
+        Certificate and key.
+    password : str, optional
+        Opens the page beside the link.
+    on_ready : callable
+        Given the link, which opens the page once, when the server listens.
+
+    Raises
+    ------
+    AmbidError
+        If the folder is none, the address cannot be had, or another address than the loopback's is not protected.
+    """
+    place = Path(folder).resolve()
+    if not place.is_dir():
+        raise AmbidError(f"{folder} is no folder; a console shows one. Name it")
+    local = listen in ("127.0.0.1", "localhost", "::1")
+    if not local and (tls is None or not password):
+        raise AmbidError(
+            f"--listen {listen} lets others on the network in; it needs --certificate, --key and a password. Give them"
+        )
+    try:
+        family = socket.AF_INET6 if ":" in listen else socket.AF_INET
+        listening = socket.create_server((listen, port), family=family)
+    except (OSError, OverflowError) as failure:
+        why = getattr(failure, "strerror", None) or failure
+        raise AmbidError(f"--port {port} at {listen} cannot be had: {why}. Choose another one") from None
+    number = listening.getsockname()[1]
+    shown = f"[{listen}]" if ":" in listen else listen
+    names = {shown, "localhost", "127.0.0.1"} if local else {shown}
+    console, scheme = Console(place, read_only=read_only), "http" if tls is None else "https"
+    guard = Guard(
+        Starlette(routes=console.routes()), hosts={f"{n}:{number}" for n in names}, scheme=scheme,
+        password=password, read_only=read_only,
+    )  # fmt: skip
+    console.guard = guard
+    config = uvicorn.Config(
+        guard, log_level="critical", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_max_queue=4,
+        limit_concurrency=64, timeout_keep_alive=15, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=16_384,
+        server_header=False, lifespan="off", proxy_headers=False,
+        ssl_certfile=None if tls is None else tls[0], ssl_keyfile=None if tls is None else str(tls[1]),
+    )  # fmt: skip
+    server = uvicorn.Server(config)
+    on_ready(f"{scheme}://{shown}:{number}/?token={guard.token}")
+    try:
+        server.run(sockets=[listening])
+    except KeyboardInterrupt:
+        pass
+    finally:
+        listening.close()

@@ -1,0 +1,505 @@
+// The page of the console: plain JavaScript, no build step. All text from files goes in as text, never as HTML.
+"use strict";
+
+const $ = (id) => document.getElementById(id);
+const CLIENT = sessionStorage.client ??= Array.from(crypto.getRandomValues(new Uint8Array(9)), (b) => b.toString(16).padStart(2, "0")).join("");
+const MOVING = ["live", "commission"], LATE_S = 0.2, OLD_S = 2.0, SLOTS = 2000;
+let state = { files: [], runs: [] };
+
+function el(tag, props = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(props)) {
+    if (name.startsWith("on")) made.addEventListener(name.slice(2), value);
+    else if (name in made && name !== "list") made[name] = value;
+    else made.setAttribute(name, value);
+  }
+  made.append(...children.filter((c) => c !== null && c !== undefined));
+  return made;
+}
+
+// Numbers with a prefix and digits that their uncertainty carries.
+const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"], [1e-12, "p"]];
+function prefix(size) {
+  return size > 0 ? PREFIXES.find(([p]) => size >= 0.9995 * p) ?? PREFIXES.at(-1) : [1, ""];
+}
+function unitOf(unit, size) {
+  if (unit === "kg") { const [p, s] = prefix(size * 1e3); return s === "k" ? [1, "kg"] : [p / 1e3, `${s}g`]; }
+  if (!unit || unit === "1" || /[²^]/.test(unit)) return [1, unit === "1" ? "" : unit ?? ""];
+  const [p, s] = prefix(size);
+  return [p, s + unit.replace("ohm", "Ω")];
+}
+function shown(value, unit, sd) {
+  if (value === null || value === undefined || !isFinite(value)) return "unknown";
+  const [p, u] = unitOf(unit, Math.abs(value));
+  const v = value / p, s = sd > 0 ? sd / p : 0;
+  const digits = s ? Math.min(9, Math.max(0, 1 - Math.floor(Math.log10(s)))) : Math.max(0, 3 - Math.floor(Math.log10(Math.abs(v) || 1)));
+  return (s ? `${v.toFixed(digits)} ± ${s.toFixed(digits)}` : v.toFixed(Math.min(9, digits))) + (u ? ` ${u}` : "");
+}
+const seconds = (s) => s < 1 ? `${(1000 * s).toFixed(s < 0.01 ? 1 : 0)} ms` : s < 120 ? `${s.toFixed(1)} s` : `${(s / 60).toFixed(1)} min`;
+
+// Asking the server.
+async function ask(path, body) {
+  const how = body === undefined ? {} : { method: "POST", body: JSON.stringify(body), headers: { "content-type": "application/json" } };
+  let answer;
+  try {
+    answer = await fetch(path, { ...how, headers: { ...how.headers, "x-ambid": CLIENT } });
+  } catch { banner("OLD: the console does not answer. Runs go on; start 'ambid console' again"); throw new Error("no answer"); }
+  const found = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : { error: (await answer.text()).trim() };
+  if (!answer.ok) throw new Error(found.error ?? answer.statusText);
+  return found;
+}
+function banner(text, kind = "") {
+  $("banner").textContent = text; $("banner").className = kind; $("banner").hidden = !text;
+}
+const trouble = (error) => banner(error.message, "note");
+function confirmed(question, yes = "Yes") {
+  const dialog = $("ask");
+  if (dialog.open) dialog.close("no");
+  $("question").textContent = question;
+  dialog.querySelector("[value=go]").textContent = yes;
+  dialog.returnValue = "no";
+  dialog.showModal();
+  return new Promise((done) => dialog.addEventListener("close", () => done(dialog.returnValue === "go"), { once: true }));
+}
+
+// Tabs.
+function open(tab) {
+  for (const section of document.querySelectorAll(".tab")) section.hidden = section.id !== tab;
+  for (const button of $("tabs").children) button.setAttribute("aria-selected", button.dataset.tab === tab);
+  location.hash = tab;
+  dispatchEvent(new Event("resize"));
+}
+$("tabs").addEventListener("click", (e) => e.target.dataset.tab && open(e.target.dataset.tab));
+$("tabs").addEventListener("keydown", (e) => {
+  const step = { ArrowRight: 1, ArrowLeft: -1 }[e.key];
+  if (!step) return;
+  const tabs = [...$("tabs").children], at = tabs.indexOf(document.activeElement);
+  tabs.at((at + step) % tabs.length).focus();
+});
+
+// Files and runs.
+async function refresh() {
+  state = await ask("/api/state");
+  $("where").textContent = state.folder + (state.read_only ? " (read only)" : "");
+  const others = state.driver === "another page";
+  $("driver").replaceChildren(...(others ? ["another page has the machine ", el("button", { onclick: takeOver }, "Take over")] : state.driver === "you" ? ["this page has the machine"] : []));
+  fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict]);
+  fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : "over"], watch, (r) => [r.id, r.alive]);
+  for (const form of ["live-form", "commission-form"]) {
+    choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig"));
+    for (const field of $(form).elements) field.disabled = state.read_only;
+  }
+  choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
+  $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
+  const moving = state.runs.find((r) => r.alive && MOVING.includes(r.spec.job));
+  if (moving && feed?.id !== moving.id && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
+}
+const attached = new Set();
+const when = (s) => { const d = new Date(1000 * s); return d.toDateString() === new Date().toDateString() ? d.toTimeString().slice(0, 8) : d.toISOString().slice(0, 10); };
+function fill(body, things, cells, chosen, key) {
+  const text = JSON.stringify(things.map(key));
+  if (body.dataset.key === text) return;
+  body.dataset.key = text;
+  body.replaceChildren(...things.map((thing) => {
+    const pick = () => chosen(thing);
+    const row = el("tr", { tabIndex: 0, onclick: pick, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
+    row.append(...cells(thing).map((c, k) => el("td", { className: k ? (c === thing.verdict ? thing.verdict : "") : "name" }, String(c))));
+    return row;
+  }));
+}
+function choices(select, files, none) {
+  const text = JSON.stringify(files.map((f) => f.number));
+  if (select.dataset.key === text) return;
+  const before = select.value;
+  select.dataset.key = text;
+  select.replaceChildren(...(none ? [el("option", { value: "" }, none)] : []), ...files.map((f) => el("option", { value: f.number }, f.name)));
+  if ([...select.options].some((o) => o.value === before)) select.value = before;
+}
+async function takeOver() {
+  if (await confirmed("Another page orders the machine. Take over?", "Take over")) ask("/api/drive", {}).then(refresh).catch(trouble);
+}
+const stamp = () => new Date().toISOString().slice(0, 19).replace(/[-:]/g, "").replace("T", "-");
+const stem = (name) => name.split("/").pop().replace(/\.(csv|csv\.gz|h5|hdf5|mat|json|toml|html)$/i, "");
+
+function choose(file) {
+  const detail = $("detail");
+  if (file.kind === "report") { window.open(`/reports/${file.number}`, "_blank", "noopener"); return; }
+  detail.replaceChildren(el("h2", {}, file.name));
+  if (file.kind === "result") {
+    const report = state.files.find((f) => f.kind === "report" && stem(f.name) === stem(file.name));
+    detail.append(el("p", { className: file.verdict }, file.verdict || "no verdict"), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."));
+  } else if (file.kind === "rig") {
+    ask(`/api/rigs/${file.number}`).then((r) => detail.append(el("pre", {}, r.text))).catch(trouble);
+  } else preview(file, detail);
+}
+const link = (report) => el("p", {}, el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`));
+
+// A job that computes: progress, cancel, and what it found.
+async function job(spec, host, told) {
+  const bar = el("progress", { max: 1 }), words = el("span", {}, "starting");
+  const cancel = el("button", {}, "Cancel");
+  const line = el("p", { className: "bar", role: "status" }, bar, words, cancel);
+  host.append(line);
+  bar.removeAttribute("value");
+  try {
+    const { id } = await ask("/api/runs", spec);
+    cancel.onclick = () => ask(`/api/runs/${id}/say`, { word: "stop" }).catch(trouble);
+    return await new Promise((done, fail) => listen(id, (m) => {
+      if (m.kind === "progress") {
+        if (m.done === null) bar.removeAttribute("value"); else bar.value = m.done;
+        const left = m.done > 0.05 ? `, about ${seconds(m.seconds * (1 / m.done - 1))} left` : "";
+        words.textContent = `${m.stage}: ${seconds(m.seconds)}${left}`;
+      } else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why));
+      else told(m);
+    }));
+  } finally { line.remove(); refresh().catch(() => {}); }
+}
+function wrong(host) { return (error) => host.append(el("p", { className: "refused", role: "alert" }, error.message)); }
+
+function preview(file, detail) {
+  const host = el("div"), next = el("div");
+  detail.append(host, next);
+  job({ job: "preview", record: file.number }, host, (m) => {
+    if (m.kind === "note") host.append(el("p", { className: "caution" }, m.text));
+    if (m.kind !== "preview") return;
+    for (const c of m.channels) host.append(strip(`${c.name} [${c.unit}]`, m.t, c.low, c.high, 92).box);
+    host.append(el("pre", {}, m.text));
+    identifyForm(file, { ...m, file: file.name }, next);
+  }).catch(wrong(host));
+}
+function identifyForm(file, m, host) {
+  const rigs = state.files.filter((f) => f.kind === "rig");
+  const rig = el("select", { name: "rig" }, el("option", { value: "" }, "draft one from this record"), ...rigs.map((f) => el("option", { value: f.number }, f.name)));
+  const draft = rigForm(m);
+  const out = el("input", { value: `${stem(file.name)}-estimate`, size: 24 });
+  const result = el("div");
+  rig.onchange = () => { draft.box.hidden = rig.value !== ""; };
+  const go = el("button", { className: "go", disabled: state.read_only, onclick: async () => {
+    result.replaceChildren();
+    go.disabled = true;
+    try {
+      let number = Number(rig.value);
+      if (!number) {
+        let name = "";
+        await job({ job: "rig", text: draft.text.value, out: draft.name.value }, result, (x) => { if (x.kind === "rig") name = x.name; });
+        await refresh();
+        number = state.files.find((f) => f.name === name)?.number;
+        rig.append(el("option", { value: number }, name)); rig.value = number; draft.box.hidden = true;
+      }
+      await job({ job: "identify", record: file.number, rig: number, out: out.value }, result, (x) => x.kind === "result" && results(x, result));
+    } catch (error) { wrong(result)(error); } finally { go.disabled = state.read_only; }
+  } }, "Identify");
+  host.replaceChildren(el("h2", {}, "Identify"), el("div", { className: "bar" }, el("label", {}, "Rig ", rig), el("label", {}, "Result ", out), go), draft.box, result);
+}
+async function results(m, host) {
+  await refresh();
+  const report = state.files.find((f) => f.name === m.report);
+  const words = { usable: "Usable", caution: "Usable with caution", unusable: "Do not use" };
+  host.replaceChildren(el("h2", { className: m.verdict }, words[m.verdict] ?? m.verdict), ...m.reasons.map((r) => el("p", {}, r)), el("pre", {}, m.text), report ? link(report) : null);
+}
+
+// A rig: channels and parameters as a form over the text that is checked and written.
+function rigForm(m) {
+  const text = el("textarea", { value: m.draft, spellcheck: false, "aria-label": "rig file" });
+  const name = el("input", { value: `${stem(m.file)}-rig`, size: 24 });
+  const fields = el("div", { className: "fields" });
+  const rows = () => {
+    fields.replaceChildren(...["", "value", "unit", "role", "sd"].map((h) => el("span", { className: "hint" }, h)));
+    for (const [whole, column] of text.value.matchAll(/^\[channels\.(\w+)\]/gm)) {
+      const at = new RegExp(`(\\[channels\\.${column}\\][\\s\\S]*?^column\\s*=\\s*)"([^"]*)"`, "m"), found = text.value.match(at);
+      if (!found) continue;
+      const pick = el("select", {}, ...m.channels.map((c) => el("option", { selected: c.name === found[2] }, c.name)));
+      pick.onchange = () => { text.value = text.value.replace(at, (_, a) => `${a}"${pick.value}"`); };
+      fields.append(el("label", { title: whole }, column), pick, el("span", { className: "hint" }, m.channels.find((c) => c.name === found[2])?.unit ?? ""), el("span"), el("span"));
+    }
+    for (const [line, key, body] of text.value.matchAll(/^([\w.]+)\s*=\s*\{([^}\n]*)\}/gm)) {
+      if (!/unit\s*=/.test(body)) continue;
+      const get = (k) => body.match(new RegExp(`\\b${k}\\s*=\\s*"?([^",}]*)"?`))?.[1]?.trim() ?? "";
+      const value = el("input", { value: get("value"), inputMode: "decimal" }), unit = el("input", { value: get("unit") });
+      const sd = el("input", { value: get("sd"), inputMode: "decimal" }), role = el("select", {}, ...["free", "fixed", "prior"].map((r) => el("option", { selected: r === (get("role") || "free") }, r)));
+      const write = () => {
+        const parts = [value.value && `value = ${value.value}`, `unit = "${unit.value}"`, role.value !== "free" && `role = "${role.value}"`, role.value === "prior" && sd.value && `sd = ${sd.value}`].filter(Boolean);
+        text.value = text.value.split("\n").map((l) => l.match(/^([\w.]+)\s*=\s*\{/)?.[1] === key ? l.replace(/\{[^}]*\}/, `{ ${parts.join(", ")} }`) : l).join("\n");
+      };
+      for (const x of [value, unit, role, sd]) x.onchange = write;
+      fields.append(el("label", { title: line }, key), value, unit, role, sd);
+    }
+  };
+  rows();
+  text.onchange = rows;
+  const box = el("div", {}, el("p", { className: "hint" }, "A draft of the rig: columns and parameters. free: identified; fixed: known; prior: known with a standard deviation."), fields, el("label", {}, "Name ", name), el("details", {}, el("summary", {}, "The file itself"), text));
+  return { box, text, name };
+}
+
+// Feeds: frames of a run, JSON ("J") and envelopes ("E").
+function listen(id, told, envelope = () => {}, gone = () => {}) {
+  let left = false;
+  const socket = new WebSocket(`${location.protocol === "https:" ? "wss" : "ws"}://${location.host}/api/runs/${id}/feed`);
+  const decoder = new TextDecoder();
+  let ended = false;
+  socket.binaryType = "arraybuffer";
+  socket.onmessage = ({ data }) => {
+    if (typeof data === "string") { for (const m of JSON.parse(data)) { ended ||= m.kind === "end"; told(m); } return; }
+    const view = new DataView(data);
+    for (let at = 0; at + 5 <= data.byteLength;) {
+      const length = view.getUint32(at, true), kind = view.getUint8(at + 4);
+      if (kind === 69) envelope(data, at + 5);
+      else { const m = JSON.parse(decoder.decode(new Uint8Array(data, at + 5, length))); ended ||= m.kind === "end"; told(m); }
+      at += 5 + length;
+    }
+  };
+  socket.onclose = () => { if (!ended && !left) { gone(); told({ kind: "end", how: "lost", why: "the run ended without a word, or the console is gone" }); } };
+  return { close() { left = true; socket.onmessage = null; socket.close(); } };
+}
+
+// Charts.
+const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+function axes(unit, more = {}) {
+  const ink = css("--dim"), grid = { stroke: css("--grid"), width: 1 };
+  const label = (u, splits) => {
+    const size = Math.max(...splits.map(Math.abs).filter(isFinite), 0), [p, name] = unitOf(unit, size);
+    const gap = splits.length > 1 ? Math.abs(splits[1] - splits[0]) / p : 1, digits = Math.min(8, Math.max(0, -Math.floor(Math.log10(gap) + 1e-9)));
+    return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
+  };
+  return [{ stroke: ink, grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
+          { stroke: ink, grid, ticks: grid, size: 74, space: 20, values: label, ...(more.yaxis ?? {}) }];
+}
+function chart(title, height, series, unit, more = {}) {
+  const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
+  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
+  const plot = new uPlot(opts, [[], ...series.map(() => [])], host);
+  new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1 && plot.setSize({ width: host.clientWidth, height })).observe(host);
+  return { box, plot, value };
+}
+const line = (color, more = {}) => ({ stroke: color, width: 1.2, points: { show: false }, ...more });
+const BAND = () => [line(css("--accent"), { width: 1 }), line(css("--accent"), { width: 1 })];
+function strip(title, t, low, high, height = 110, unit = title.match(/\[(.*)\]/)?.[1] ?? "") {
+  const made = chart(title, height, BAND(), unit, { bands: [{ series: [2, 1], fill: css("--accent") + "66" }], zoom: true });
+  made.plot.setData([t, low, high]);
+  return made;
+}
+
+// The live view.
+let feed = null;
+class Live {
+  constructor(id) {
+    Object.assign(this, { id, signals: null, header: null, strips: [], parameters: {}, frozen: false, marked: null, last: performance.now(), over: false, record: null });
+    this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
+    $("live-view").hidden = false;
+    for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
+    $("summary").hidden = true;
+    this.socket = listen(id, (m) => this.tell(m), (data, at) => this.envelope(data, at));
+    this.draw = this.draw.bind(this);
+    requestAnimationFrame(this.draw);
+  }
+  tell(m) {
+    this.last = performance.now();
+    const how = { signals: () => this.begin(m), header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
+      event: () => this.event(m.t, m.what, m.why), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
+      progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
+      summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
+      recorded: () => { this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
+      end: () => { this.over = true; $("state").textContent = m.how === "done" ? "over" : m.how; $("state").className = `badge ${m.how}`; if (m.why) this.event(null, m.how, m.why); refresh().catch(() => {}); } }[m.kind];
+    how?.();
+  }
+  begin(m) {
+    if (this.signals) return;
+    this.signals = m;
+    this.low = m.names.map(() => []); this.high = m.names.map(() => []);
+    this.strips = m.names.map((name, k) => {
+      const made = chart(name, 118, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: css("--accent") + "66" }], hooks: { setSelect: [(u) => this.mark(u)] } });
+      $("strips").append(made.box);
+      return made;
+    });
+    const made = chart("spectrum", 140, m.names.map((_, k) => line([css("--accent"), css("--doubt"), css("--good"), css("--bad")][k % 4])), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
+    made.box.querySelector("h3").firstChild.textContent = `spectrum, peak: ${m.names.map((n, k) => `${n} ${m.units[k]}`).join(", ")}`;
+    $("spectrum").append(made.box);
+    this.lines4 = made;
+    const two = m.names.map((n, k) => [n, k]).filter(([n]) => n.endsWith("position"));
+    if (two.length > 1) this.orbitOf = two.slice(0, 2).map(([, k]) => k);
+  }
+  envelope(data, at) {
+    if (!this.signals) return;
+    const view = new DataView(data), n = view.getUint32(at + 16, true), channels = view.getUint16(at + 20, true), group = view.getUint16(at + 22, true);
+    const end = view.getFloat64(at + 24, true), wall = view.getFloat64(at + 32, true), lost = Number(view.getBigUint64(at + 8, true));
+    const step = group / this.signals.rate_hz, begin = end - n * step;
+    const values = new Float32Array(data.slice(at + 40, at + 40 + 8 * n * channels));
+    if (this.t.length && begin - this.t.at(-1) > 1.5 * step) { this.t.push(begin - step / 2); for (let c = 0; c < channels; c++) { this.low[c].push(null); this.high[c].push(null); } }
+    for (let k = 0; k < n; k++) {
+      this.t.push(begin + (k + 0.5) * step);
+      for (let c = 0; c < channels; c++) { this.low[c].push(values[2 * (k * channels + c)]); this.high[c].push(values[2 * (k * channels + c) + 1]); }
+    }
+    const most = 130_000;
+    if (this.t.length > most) { const cut = this.t.length - 100_000; this.t.splice(0, cut); for (const a of [...this.low, ...this.high]) a.splice(0, cut); }
+    this.fresh = wall; this.last = performance.now(); this.dirty = true;
+    this.samples = Number(view.getBigUint64(at, true)) + n * group; this.lost = lost;
+  }
+  start(m) {
+    if (this.header) return;
+    this.header = m;
+    for (const [name, v] of Object.entries(m.start)) {
+      const made = chart(name, 92, [line("transparent"), line("transparent"), line(css("--accent"), { width: 1.6 }), line(css("--dim"), { dash: [4, 4] })], m.units[name], { bands: [{ series: [2, 1], fill: css("--accent") + "33" }] });
+      $("parameters").append(made.box);
+      this.parameters[name] = { ...made, start: v.value, unit: m.units[name], band: [[], [], []] };
+    }
+    const error = chart("model error, limit dashed", 92, [line(css("--accent"), { width: 1.6 }), line(css("--bad"), { dash: [4, 4] })], "");
+    $("error").append(error.box);
+    this.error = error;
+    for (const w of m.warnings) this.event(null, "start", w);
+  }
+  take(m) {
+    this.lines.push(m);
+    if (this.lines.length > 12_000) this.lines.splice(0, 2000);
+    $("state").textContent = m.state; $("state").className = `badge ${m.state}`;
+    $("lag").textContent = `lag ${seconds(m.lag_s)}`; $("lag").className = m.lag_s > LATE_S ? "late" : "";
+    this.dirtyLines = true;
+  }
+  event(t, what, why) {
+    $("events").prepend(el("li", { className: what === "change" || what === "fault" ? "refused" : "" }, `${t === null || t === undefined ? "" : `${t.toFixed(2)} s `}${what}: ${why}`));
+    while ($("events").children.length > 200) $("events").lastChild.remove();
+  }
+  mark(u) {
+    const a = u.posToVal(u.select.left, "x"), b = u.posToVal(u.select.left + u.select.width, "x");
+    this.marked = b - a > 1e-3 ? [a, b] : null;
+    $("export").disabled = !this.marked;
+    $("export").textContent = this.marked ? `Export ${a.toFixed(2)} to ${b.toFixed(2)} s` : "Export marked stretch";
+  }
+  draw() {
+    if (feed !== this) return;
+    const age = (performance.now() - this.last) / 1000;
+    if (!this.over && this.header && age > OLD_S) banner(`OLD: nothing came for ${age.toFixed(0)} s. What is shown is not now`);
+    else if ($("banner").textContent.startsWith("OLD: nothing")) banner("");
+    if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
+      const span = Number($("span").value), end = this.t.at(-1) ?? 0, from = Math.max(this.t[0] ?? 0, end - span);
+      if (this.dirty) this.drawStrips(from, end);
+      if (this.dirtyLines) this.drawLines();
+      this.dirty = this.dirtyLines = false;
+    }
+    requestAnimationFrame(this.draw);
+  }
+  drawStrips(from, end) {
+    let a = this.t.length - 1;
+    while (a > 0 && this.t[a - 1] >= from) a--;
+    const n = this.t.length - a, step = Math.max(1, Math.ceil(n / SLOTS));
+    const t = step === 1 ? this.t.slice(a) : pick(this.t, a, step, (x) => x[0]);
+    this.strips.forEach((s, k) => {
+      const low = step === 1 ? this.low[k].slice(a) : pick(this.low[k], a, step, (x) => Math.min(...x)), high = step === 1 ? this.high[k].slice(a) : pick(this.high[k], a, step, (x) => Math.max(...x));
+      s.plot.batch(() => { s.plot.setData([t, low, high], false); s.plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
+      s.value.textContent = `${shown(this.low[k].at(-1), this.signals.units[k])} to ${shown(this.high[k].at(-1), this.signals.units[k])}`;
+    });
+    if (this.spectrum) { const floor = (a) => a.map((v) => v > 0 ? v : null); this.lines4.plot.setData([this.spectrum.hz, ...this.spectrum.amplitudes.map(floor)]); this.spectrum = null; }
+    if (this.orbitOf) this.drawOrbit(a);
+    $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples`;
+    $("lost").textContent = this.lost ? `${this.lost} samples LOST` : "0 lost"; $("lost").className = this.lost ? "late" : "";
+    this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
+    this.updates = (this.updates ?? 0) + 1;
+  }
+  drawOrbit(a) {
+    const [x, y] = this.orbitOf.map((k) => this.low[k].slice(Math.max(a, this.t.length - 400)).map((v, i) => (v + this.high[k][Math.max(a, this.t.length - 400) + i]) / 2));
+    const canvas = $("orbit").firstChild ?? $("orbit").appendChild(el("canvas", { width: 240, height: 240 })), g = canvas.getContext("2d");
+    const size = Math.max(...x.map(Math.abs), ...y.map(Math.abs), 1e-12);
+    g.clearRect(0, 0, 240, 240); g.strokeStyle = css("--accent"); g.beginPath();
+    x.forEach((v, k) => g.lineTo(120 + 110 * v / size, 120 - 110 * y[k] / size)); g.stroke();
+    g.fillStyle = css("--dim"); g.fillText(`orbit, ±${shown(size, "m")}`, 6, 12);
+  }
+  drawLines() {
+    const t = this.lines.map((l) => l.t), last = this.lines.at(-1);
+    for (const [name, p] of Object.entries(this.parameters)) {
+      const v = this.lines.map((l) => l.values[name]?.[0] ?? null), s = this.lines.map((l) => l.values[name]?.[1] ?? null);
+      p.plot.setData([t, v.map((x, k) => x === null ? null : x - 1.96 * s[k]), v.map((x, k) => x === null ? null : x + 1.96 * s[k]), v, t.map(() => p.start)]);
+      const [value, sd, stale] = last.values[name] ?? [];
+      p.value.textContent = shown(value, p.unit, sd) + (stale ? " (frozen)" : "");
+    }
+    this.error?.plot.setData([t, this.lines.map((l) => l.error), t.map(() => this.header.limit)]);
+    if (this.error) this.error.value.textContent = last.error === null ? "unknown" : last.error.toFixed(2);
+  }
+}
+function pick(values, a, step, of) {
+  const found = [];
+  for (let k = a; k < values.length; k += step) { const part = values.slice(k, k + step).filter((x) => x !== null); found.push(part.length ? of(part) : null); }
+  return found;
+}
+
+async function begin(form, spec) {
+  for (const [name, field] of Object.entries(Object.fromEntries([...form.elements].filter((f) => f.name).map((f) => [f.name, f])))) {
+    if (field.type === "checkbox") spec[name] = field.checked;
+    else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate"].includes(name) ? Number(field.value) : field.value;
+  }
+  const moves = !["simulated"].includes(spec.port);
+  if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
+  try { const { id } = await ask("/api/runs", spec); banner(""); attached.add(id); await refresh(); watch({ id, spec, alive: true }); } catch (error) { trouble(error); }
+}
+$("live-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "live", pace: "real-time" }); });
+$("commission-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "commission" }); });
+$("live-form").elements.out.value = `run-${stamp()}`;
+$("commission-form").elements.out.value = `commission-${stamp()}`;
+
+function watch(run) {
+  attached.add(run.id);
+  if (run.spec.job === "live") { feed?.socket?.close(); feed = null; feed = new Live(run.id); open("live"); }
+  else if (run.spec.job === "commission") { feed?.socket?.close(); feed = new Steps(run.id); open("commission"); }
+}
+const word = (w) => feed && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(trouble);
+for (const button of document.querySelectorAll("[data-say]")) {
+  button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
+}
+$("freeze").onclick = () => { feed.frozen = !feed.frozen; $("freeze").setAttribute("aria-pressed", feed.frozen); $("freeze").textContent = feed.frozen ? "Go on" : "Freeze"; if (feed.frozen) for (const s of feed.strips) s.plot.setData(thin(feed, feed.strips.indexOf(s))); };
+function thin(live, k) { return [live.t.slice(), live.low[k].slice(), live.high[k].slice()]; }
+$("export").onclick = async () => {
+  const file = state.files.find((f) => f.name === feed.record);
+  if (!file) { banner("The record can be cut when the run is over", "note"); return; }
+  const host = el("div");
+  $("events").prepend(host);
+  const [from_s, to_s] = feed.marked;
+  await job({ job: "export", record: file.number, from_s, to_s, out: `${stem(file.name)}-${from_s.toFixed(2)}-${to_s.toFixed(2)}` }, host, (m) => m.kind === "exported" && feed.event(null, "exported", `${m.name}, ${m.samples} samples`)).catch(wrong(host));
+};
+async function stopAll() {
+  for (const run of state.runs.filter((r) => r.alive && MOVING.includes(r.spec.job))) ask(`/api/runs/${run.id}/say`, { word: "stop" }).catch(trouble);
+}
+$("stop").onclick = stopAll;
+let escaped = 0;
+addEventListener("keydown", (e) => {
+  if (e.ctrlKey && e.key === ".") stopAll();
+  if (e.key === "Escape") { if (performance.now() - escaped < 600) stopAll(); escaped = performance.now(); }
+});
+
+// Commissioning.
+class Steps {
+  constructor(id) {
+    this.id = id; this.items = {}; this.over = false;
+    $("steps").replaceChildren();
+    this.socket = listen(id, (m) => this.tell(m));
+  }
+  item(name) {
+    return this.items[name] ??= $("steps").appendChild(el("li", {}, el("strong", {}, name), " ", el("span", { className: "hint" }, "waits")));
+  }
+  note(name, text) { this.item(name).querySelector("span").textContent = text; }
+  tell(m) {
+    const how = {
+      plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
+      progress: () => this.at && !this.done?.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
+      step: () => this.step(m), note: () => this.last(el("p", { className: "hint" }, m.text)), ask: () => this.question(m),
+      commissioned: () => { const words = m.passed ? "Commissioned: every step is good enough." : "Ended early."; this.last(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.last(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.last(link(f)); }).catch(() => {}); },
+      end: () => { this.over = true; if (m.why) this.last(el("p", { className: m.how, role: "alert" }, m.why)); refresh().catch(() => {}); },
+    }[m.kind];
+    how?.();
+  }
+  last(node) { $("steps").append(el("div", {}, node)); }
+  step(m) {
+    (this.done ??= new Set()).add(m.name);
+    const pictures = el("div", { className: "pictures" }, ...m.pictures.map((p) => el("figure", {}, el("img", { src: `data:image/png;base64,${p.png}`, alt: p.title, loading: "lazy" }), el("figcaption", { className: "caption" }, p.caption))));
+    this.item(m.name).replaceChildren(el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
+      ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
+      m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
+  }
+  async question(m) {
+    if (!m.what || this.over) { if ($("ask").open) $("ask").close("no"); return; }
+    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Go");
+    word(yes ? "go" : "no");
+  }
+}
+
+if (["files", "live", "commission"].includes(location.hash.slice(1))) open(location.hash.slice(1));
+refresh().catch(trouble);
+setInterval(() => { if (!document.hidden) refresh().then(() => $("banner").textContent.startsWith("OLD: the console") && banner("")).catch(() => {}); }, 2000);
+window.ambidConsole = { get feed() { return feed; } };  // for tests and the curious

@@ -1,0 +1,384 @@
+"""What a run's process does: one job, told through its feed, led by what the operator says.
+
+``python -m ambid.console.worker RUN`` is started by `ambid.console.runs`; it needs no console from then on. A run that
+acquires writes the journal of every acquisition.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import signal
+import sys
+import threading
+import time
+import traceback
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambid.console.envelope import EnvelopeTap, rounded, throttled
+from ambid.console.feed import FeedWriter
+from ambid.console.runs import Heard, Run
+from ambid.errors import AmbidError
+
+_LISTEN_S = 0.02
+_LINE_S = 0.1  # between two lines of parameters that are shown
+_FLAGS = ("track", "hold", "accept", "revert")
+_PREVIEW = 800  # envelopes of a channel in a preview
+_LONGEST_S = 86_400.0
+
+
+class Worker:
+    """One run at work."""
+
+    def __init__(self, run: Run) -> None:
+        self.run, self.spec = run, run.spec
+        self.feed = FeedWriter(run.place)
+        self.folder = Path(self.spec["folder"])
+        self.wished = threading.Event()  # the operator wants the end
+        self.flags: deque[str] = deque()
+        self._answers: deque[str] = deque()
+        self._began = time.perf_counter()
+        self._progress = throttled(_LINE_S, self._tell_progress)
+
+    def work(self) -> int:
+        """Do the job, and tell how it ended; the exit code."""
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: self.wished.set())
+        self.run.claim()
+        threading.Thread(target=self._listen, name="operator", daemon=True).start()
+        self.feed.tell("begin", {"job": self.spec["job"], "wall": time.time()}, sticky="begin")
+        try:
+            JOBS[self.spec["job"]](self)
+            self.end("done", "")
+        except AmbidError as refusal:
+            self.end("refused", str(refusal))
+        except KeyboardInterrupt:
+            self.end("cancelled", "cancelled before a result was there")
+        except BaseException as defect:
+            traceback.print_exc()
+            self.end("failed", f"a defect of the program: {type(defect).__name__}: {defect}. {self.run.place}/log.txt")
+            return 1
+        finally:
+            self.feed.close()
+        return 0
+
+    def end(self, how: str, why: str) -> None:
+        """Tell the end."""
+        self.feed.tell("end", {"how": how, "why": why, "wall": time.time()}, sticky="end")
+
+    def tick(self, stage: str, done: float | None = None, /) -> None:
+        """Take progress of a job; a job that is to be cancelled is interrupted here, and keeps its best."""
+        if self.wished.is_set():
+            raise KeyboardInterrupt
+        self._progress(stage, done)
+
+    def note(self, line: str) -> None:
+        """Tell a remark."""
+        self.feed.tell("note", {"text": line})
+
+    def stopped(self) -> bool:
+        """Whether the operator wants the end."""
+        return self.wished.is_set()
+
+    def agreed(self, what: str) -> bool:
+        """Ask the operator, and wait for the answer."""
+        self._answers.clear()
+        self.feed.tell("ask", {"what": what}, sticky="ask")
+        while not self._answers and not self.wished.is_set():
+            time.sleep(_LISTEN_S)
+        answer = self._answers.popleft() if self._answers else "no"
+        self.feed.tell("ask", {"what": "", "answer": answer}, sticky="ask")
+        return answer == "go"
+
+    def path(self, key: str) -> Path | None:
+        """Return a file that the spec names; None where it names none."""
+        name = self.spec.get(key)
+        return None if name is None else self.folder / str(name)
+
+    def give(self, result: Any, name: str, record: object = None) -> None:
+        """Write a result and its report beside each other, and tell them."""
+        from ambid.job.presentation import text
+
+        self._tell_progress("report", None)
+        report = self.folder / f"{name}.html"
+        for path in (self.folder / f"{name}.json", report):
+            if path.exists() or path.is_symlink():
+                raise AmbidError(f"{path.name} exists already. Choose another name")
+        result.save(self.folder / f"{name}.json")
+        result.report(report, record)
+        verdict = result.verdict
+        self.feed.tell(
+            "result",
+            {"name": name, "verdict": verdict.word, "reasons": [r.text for r in verdict.reasons],
+             "text": text(result, width=110), "report": report.name},
+            sticky="result",
+        )  # fmt: skip
+
+    def _tell_progress(self, stage: str, done: float | None) -> None:
+        taken = time.perf_counter() - self._began
+        self.feed.tell("progress", {"stage": stage, "done": done, "seconds": round(taken, 2)}, sticky="progress")
+
+    def _listen(self) -> None:
+        heard = Heard(self.run)
+        while True:
+            for said in heard:
+                word = said.get("word")
+                if word == "stop":
+                    self.wished.set()
+                elif word in _FLAGS:
+                    self.flags.append(word)
+                elif word in ("go", "no"):
+                    self._answers.append(word)
+            time.sleep(_LISTEN_S)
+
+
+def _preview(worker: Worker) -> None:
+    """Tell what a record holds, and draft its rig."""
+    from ambid.job.presentation import text
+    from ambid.record import read_record
+    from ambid.rig import draft_rig
+    from ambid.validation.inspection import inspect
+
+    path = worker.path("record")
+    assert path is not None
+    record = read_record(path, rate_hz=worker.spec.get("rate_hz"))
+    worker.tick("channels")
+    step = max(1, -(-record.n_samples // _PREVIEW))
+    starts = np.arange(0, record.n_samples, step)
+    channels = [
+        {"name": c.name, "unit": c.unit, "low": rounded(np.minimum.reduceat(c.values, starts)),
+         "high": rounded(np.maximum.reduceat(c.values, starts))}
+        for c in record.channels
+    ]  # fmt: skip
+    worker.tick("diagnostics")
+    try:
+        draft = draft_rig(record)
+    except AmbidError as refusal:
+        draft = ""
+        worker.note(str(refusal))
+    worker.feed.tell(
+        "preview",
+        {"channels": channels, "t": rounded(record.start_s + starts / record.rate_hz), "rate_hz": record.rate_hz,
+         "samples": record.n_samples, "draft": draft, "text": text(inspect(record), width=110)},
+        sticky="preview",
+    )  # fmt: skip
+
+
+def _rig(worker: Worker) -> None:
+    """Check a rig's text by the schema, and write it."""
+    from ambid.rig import rig_from_text
+
+    path = worker.folder / str(worker.spec["out"])
+    rig_from_text(str(worker.spec["text"]), path)
+    with path.open("x", encoding="utf-8") as file:
+        file.write(str(worker.spec["text"]))
+    worker.feed.tell("rig", {"name": path.name}, sticky="rig")
+
+
+def _identify(worker: Worker) -> None:
+    from ambid.job import identify
+
+    record = worker.path("record")
+    found = identify(record, worker.path("rig"), tick=worker.tick)  # type: ignore[arg-type]
+    worker.give(found, str(worker.spec["out"]), record)
+
+
+def _margins(worker: Worker) -> None:
+    from ambid.job import margins
+
+    found = margins(worker.path("record") or worker.path("estimate"), worker.path("rig"))  # type: ignore[arg-type]
+    worker.give(found, str(worker.spec["out"]))
+
+
+def _export(worker: Worker) -> None:
+    """Write a stretch of a record as a record."""
+    from ambid.record import read_record, write_record
+    from ambid.record.record import cut
+
+    path, out = worker.path("record"), worker.folder / str(worker.spec["out"])
+    assert path is not None
+    record = cut(read_record(path, gaps="interpolate"), float(worker.spec["from_s"]), float(worker.spec["to_s"]))
+    if out.exists():
+        raise AmbidError(f"{out.name} exists already. Choose another name")
+    write_record(record, out)
+    worker.feed.tell("exported", {"name": out.name, "samples": record.n_samples}, sticky="exported")
+
+
+def _live(worker: Worker) -> None:
+    """Record and track what a device samples."""
+    from ambid.acquisition.recording import recording
+    from ambid.acquisition.view import BenchView
+    from ambid.job.acquiring import Request, ready
+    from ambid.job.results import read_linear_estimate
+    from ambid.job.track_live import track_live
+    from ambid.physics.linear_model import model
+    from ambid.rig import load_rig
+
+    spec, rig_path, start = worker.spec, worker.path("rig"), worker.path("estimate")
+    assert rig_path is not None
+    rig, out = load_rig(rig_path), worker.folder / str(spec["out"])
+    known = None if start is None else read_linear_estimate(start, f"{start.name} is no linear estimate. Choose one")
+    wanted = Request(
+        seconds=min(float(spec.get("seconds", 60.0)), _LONGEST_S), excitation=spec.get("excitation") or None,
+        amplitude=spec.get("amplitude"), seed=0, stopped=worker.stopped,
+    )  # fmt: skip
+    plant, runs = model(rig.model), list[Any]()
+    opening = ready(
+        str(spec["port"]), rig, wanted, bench=None, pace=spec.get("pace", "real-time"), force=False, note=worker.note,
+        tick=worker.tick,
+    )  # fmt: skip
+    with opening as (device, course):
+        view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
+        picture = EnvelopeTap(worker.feed, view)
+        told = _Lines(worker)
+        with recording(device, rig, out, course, force=False, on_trouble=lambda e: worker.note(str(e))) as tap:
+
+            def event(what: Any) -> None:
+                tap.tell(what)
+                worker.feed.tell("device", {"what": what.kind, "text": what.what, "sample": what.sample})
+
+            try:
+                made = track_live(
+                    device, rig, course, start=known, taps=[tap, picture], on_event=event, on_run=runs.append,
+                    on_trouble=lambda e: worker.note(f"tracking ended, recording continues: {e}"),
+                    on_header=told.header, on_line=told.line, on_lag=told.lag, keep=False, stopped=worker.stopped,
+                    every_s=0.02,
+                )  # fmt: skip
+                worker.feed.tell("summary", _summary(made), sticky="summary")
+            except AmbidError as refusal:
+                if not runs:
+                    raise
+                worker.note(str(refusal))
+        done = tap.acquired(runs[0])
+        fault = done.run.fault
+        worker.feed.tell(
+            "recorded",
+            {"name": out.name, "samples": done.run.samples, "lost": done.run.lost, "not_stored": done.not_stored,
+             "fault": None if fault is None else fault.what},
+            sticky="recorded",
+        )  # fmt: skip
+
+
+class _Lines:
+    """Tells the lines of a track at a pace that eyes can follow; events at once."""
+
+    def __init__(self, worker: Worker) -> None:
+        self._worker, self._lag, self._last = worker, 0.0, float("-inf")
+
+    def header(self, header: Any) -> None:
+        start = {n: {"value": _number(v.value), "sd": _number(v.sd)} for n, v in header.start.items()}
+        self._worker.feed.tell(
+            "header",
+            {"model": header.model, "method": header.method, "limit": header.limit, "units": dict(header.units),
+             "start": start, "warnings": list(header.warnings)},
+            sticky="header",
+        )  # fmt: skip
+
+    def lag(self, lag_s: float) -> None:
+        self._lag = max(lag_s, self._lag)
+
+    def line(self, line: Any) -> Sequence[Any] | None:
+        from ambid.tracking.lines_file import event_json
+
+        feed, now = self._worker.feed, time.perf_counter()
+        for event in line.events:
+            feed.tell("event", {**event_json(event), "what": event.kind})
+        if now - self._last >= _LINE_S:
+            self._last = now
+            values = {n: [_number(v.value), _number(v.sd), v.stale] for n, v in line.parameters.items()}
+            feed.tell(
+                "line",
+                {"t": round(line.t, 4), "values": values, "error": _number(line.error), "state": line.state,
+                 "lag_s": round(self._lag, 5)},
+                sticky="line",
+            )  # fmt: skip
+            self._lag = 0.0
+        flags = self._worker.flags
+        return [flags.popleft() for _ in range(len(flags))] if flags else None
+
+
+def _number(x: float) -> float | None:
+    return float(x) if np.isfinite(x) else None
+
+
+def _summary(made: Any) -> Mapping[str, Any]:
+    from ambid.job.presentation import text
+
+    latency = made.track.totals.latency
+    return {
+        "verdict": made.track.verdict.word, "text": text(made.track, width=110), "overruns": made.overruns,
+        "latency": None if latency is None else {"median": latency.median, "p99": latency.p99, "late": latency.late},
+    }  # fmt: skip
+
+
+def _commission(worker: Worker) -> None:
+    """Commission a bench; the operator agrees before the output is switched on."""
+    from ambid.acquisition.recording import Progress
+    from ambid.job import commission
+    from ambid.job.acquiring import opened
+    from ambid.job.commissioning_steps import Plan
+    from ambid.rig import load_rig
+
+    spec, rig_path = worker.spec, worker.path("rig")
+    assert rig_path is not None
+    rig, folder = load_rig(rig_path), worker.folder / str(spec["out"])
+    seconds = float(spec.get("seconds", 20.0))
+    plan = Plan(
+        record_s=seconds, second_s=max(0.4 * seconds, min(seconds, 4.0)), track_s=float(spec.get("track_seconds", 5.0)),
+        redesign=bool(spec.get("redesign", False)),
+    )  # fmt: skip
+    worker.feed.tell("plan", {"steps": list(plan.steps)}, sticky="plan")
+    done = list[str]()
+
+    def step(found: Any) -> None:
+        done.append(found.name)
+        content = {
+            "name": found.name, "passed": found.passed, "findings": list(found.findings),
+            "reasons": list(found.reasons), "cautions": list(found.cautions), "text": found.text,
+            "pictures": [{"title": p.title, "caption": p.caption, "png": _png(p.block)} for p in found.pictures],
+        }  # fmt: skip
+        worker.feed.tell("step", content, sticky=f"step {found.name}")
+
+    def progress(now: Progress) -> None:
+        worker.tick("record", now.samples / max(now.wanted, 1))
+
+    opening = opened(
+        str(spec["port"]), rig, bench=None, pace=spec.get("pace", "fastest"), seed=0, closes=True, note=worker.note
+    )
+    with opening as device:
+        folder.mkdir()
+        found = commission(
+            device, rig, folder, plan=plan, confirm=lambda name: worker.agreed(f"{name}"), stopped=worker.stopped,
+            on_begin=lambda name: worker.feed.tell("beginning", {"name": name}, sticky="beginning"),
+            on_step=step, on_progress=progress, tick=worker.tick,
+        )  # fmt: skip
+    worker.feed.tell(
+        "commissioned",
+        {"passed": found.passed, "verdict": found.verdict.word, "reasons": [r.text for r in found.verdict.reasons],
+         "report": f"{folder.name}/report.html"},
+        sticky="commissioned",
+    )  # fmt: skip
+
+
+def _png(block: Any) -> str:
+    """Return a picture for the page, in base 64."""
+    from ambid.report.drawing import save, single
+
+    buffer = io.BytesIO()
+    save(single(block), buffer, kind="png")
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+JOBS: Mapping[str, Callable[[Worker], None]] = {
+    "preview": _preview, "rig": _rig, "identify": _identify, "margins": _margins, "export": _export, "live": _live,
+    "commission": _commission,
+}  # fmt: skip
+
+
+if __name__ == "__main__":
+    raise SystemExit(Worker(Run(Path(sys.argv[1]))).work())

@@ -1,0 +1,95 @@
+"""A console as its user starts it, and clients that speak HTTP and websockets with it by hand."""
+
+import http.client
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from contextlib import contextmanager
+
+from tests.job.benches import PROTOTYPE_FILE
+
+PAGE = "page-1"
+
+
+class Started:
+    def __init__(self, process, link):
+        self.process, self.link = process, link
+        self.host, self.token = re.fullmatch(r"http://([^/]+)/\?token=(\S+)", link).groups()
+        self.cookie = ""
+
+    def open(self):
+        answer = self.ask("GET", f"/?token={self.token}", cookie="")
+        self.cookie = answer.headers["set-cookie"].partition(";")[0]
+        return self
+
+    def ask(self, method, path, body=None, *, cookie=None, headers=(), host=None):
+        line = http.client.HTTPConnection(self.host, timeout=20)
+        line.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+        line.putheader("Host", host or self.host)
+        if cookie is None or cookie:
+            line.putheader("Cookie", cookie or self.cookie)
+        data = b"" if body is None else body if isinstance(body, bytes) else json.dumps(body).encode()
+        own = {"X-Ambid": PAGE, "Content-Type": "application/json"} if method == "POST" else {}
+        for name, value in {**own, **dict(headers)}.items():
+            if value is not None:
+                line.putheader(name, value)
+        if data:
+            line.putheader("Content-Length", str(len(data)))
+        line.endheaders(data or None)
+        answer = line.getresponse()
+        answer.body = answer.read()
+        line.close()
+        return answer
+
+    def json(self, method, path, body=None, **more):
+        return json.loads(self.ask(method, path, body, **more).body)
+
+    def state(self):
+        return self.json("GET", "/api/state")
+
+    def number(self, name):
+        return next(f["number"] for f in self.state()["files"] if f["name"] == name)
+
+    def feed(self, name, **more):
+        from websockets.sync.client import connect
+
+        headers, origin = {"Cookie": self.cookie, **more.pop("headers", {})}, more.pop("origin", f"http://{self.host}")
+        where = f"ws://{self.host}/api/runs/{name}/feed"
+        return connect(where, additional_headers=headers, compression=None, origin=origin, **more)
+
+
+@contextmanager
+def console(folder, *words):
+    process = subprocess.Popen(
+        [sys.executable, "-m", "ambid", "console", str(folder), "--no-browser", *words],
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=os.environ,
+    )  # fmt: skip
+    try:
+        yield Started(process, re.search(r"http\S+", process.stdout.readline())[0])
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+        process.stderr.close()
+
+
+def told(frames, kind):
+    return [m for m in frames if m["kind"] == kind]
+
+
+def until(run, kind="end", seconds=120.0):
+    """The JSON frames of a run up to one of a kind, from its feed."""
+    from ambid.console.feed import FeedReader, json_frames
+
+    reader, found, end = FeedReader(run.place, parts=99), [], time.monotonic() + seconds
+    while time.monotonic() < end and not told(found, kind):
+        found += json_frames(reader.read())
+        time.sleep(0.02)
+    return found
+
+
+def prototype_rig(folder):
+    (folder / "rig.toml").write_text(PROTOTYPE_FILE.read_text(encoding="utf-8"), encoding="utf-8")
