@@ -81,7 +81,7 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
         seen = until(Runs(tmp_path).one(page.json("POST", "/api/runs", wish)["id"]))
         assert told(seen, "result")[0]["verdict"] == load(tmp_path / "found.json").verdict.word
         assert {"found.json", "found.html"} <= {f["name"] for f in page.state()["files"]}
-        assert page.json("POST", "/api/runs", wish)["error"].startswith("found.json exists")
+        assert page.json("POST", "/api/runs", wish)["error"].startswith("found.json already exists")
         wrong = {"job": "rig", "text": 'schema = "ambid.rig/1"\nmodle = "x"', "out": "wrong"}
         end = told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wrong)["id"])), "end")[0]
         assert end["how"] == "refused"

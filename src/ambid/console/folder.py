@@ -61,7 +61,7 @@ class Folder:
             )
         path = self.path / (base + ending)
         if path.exists() or path.is_symlink():
-            raise AmbidError(f"{path.name} exists already. Choose another name")
+            raise AmbidError(f"{path.name} already exists. Choose another name")
         return path
 
     def _files(self) -> list[Path]:

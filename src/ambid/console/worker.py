@@ -108,7 +108,7 @@ class Worker:
         report = self.folder / f"{name}.html"
         for path in (self.folder / f"{name}.json", report):
             if path.exists() or path.is_symlink():
-                raise AmbidError(f"{path.name} exists already. Choose another name")
+                raise AmbidError(f"{path.name} already exists. Choose another name")
         result.save(self.folder / f"{name}.json")
         result.report(report, record)
         verdict = result.verdict
@@ -204,7 +204,7 @@ def _export(worker: Worker) -> None:
     assert path is not None
     record = cut(read_record(path, gaps="interpolate"), float(worker.spec["from_s"]), float(worker.spec["to_s"]))
     if out.exists():
-        raise AmbidError(f"{out.name} exists already. Choose another name")
+        raise AmbidError(f"{out.name} already exists. Choose another name")
     write_record(record, out)
     worker.feed.tell("exported", {"name": out.name, "samples": record.n_samples}, sticky="exported")
 
