@@ -24,6 +24,8 @@ from ambid.report.estimate_text import (
 )
 from ambid.report.figures import BearingEvidence, Evidence
 from ambid.report.page import Page, Section, check_table
+from ambid.report.signal_panels import Traces
+from ambid.report.strips import strips_of
 from ambid.report.text import checks_of, other_warnings, parameter_rows
 
 if TYPE_CHECKING:
@@ -32,8 +34,8 @@ if TYPE_CHECKING:
 _CAPTIONS = {
     "signals": (
         "Measured and predicted",
-        "Each sample predicted from all samples before it. Shaded: the stretch shown close. Long records are drawn by "
-        "the extremes of short stretches.",
+        "Each sample predicted from all samples before it. Shaded: the stretch with the largest errors. Long records "
+        "are drawn by the extremes of short stretches.",
     ),
     "residuals": (
         "Residuals",
@@ -93,7 +95,10 @@ def estimate_page(evidence: Evidence | BearingEvidence) -> Page:
         Section(title="Checks", tables=[check_table(e.checks)]),
         *([] if e.validation is None else [second_section(e.validation)]),
         *(
-            Section(title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=partial(single, block))
+            Section(
+                title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=partial(single, block),
+                signals=[strips_of(t) for t in _traces(evidence)] if name in ("signals", "records") else (),
+            )
             for name, block in evidence.drawings().items()
         ),
         Section(title="Rig", text=str(e.rig.get("text") or ""), folded=True),
@@ -108,6 +113,10 @@ def estimate_page(evidence: Evidence | BearingEvidence) -> Page:
         sections=[s for s in sections if s.tables or s.text or s.figure],
         provenance=provenance,
     )
+
+
+def _traces(evidence: Evidence | BearingEvidence) -> Sequence[Traces]:
+    return evidence.traces if isinstance(evidence, BearingEvidence) else (evidence.traces,)
 
 
 def _parameters(e: Any) -> Section:

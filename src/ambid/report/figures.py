@@ -94,6 +94,7 @@ class Evidence:
             sd=np.sqrt(np.diag(self.estimate.noise.innovation_covariance)),
             inputs=problem.u[problem.skip :],
             input_names=plant.inputs,
+            input_units=tuple(plant.units[role] for role in plant.inputs),
         )
 
     def traces_ahead(self) -> Traces:

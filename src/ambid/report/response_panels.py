@@ -331,7 +331,7 @@ def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[
         size_of_text = 7.0 if axes.figure.figure.get_figwidth() > NARROW else min(7.0, 85.0 / len(names))
         for k, row in enumerate(rho):
             for m, x in enumerate(row):
-                color = "white" if abs(x) > 0.75 else "#1a1a1a"
+                color = "#fefefe" if abs(x) > 0.75 else "#1b1b1b"  # of no name: cells stay as they are in the dark
                 if not small or abs(x) > _TOLD:
                     said = f"{x:.1f}" if small else f"{x:.2f}"
                     axes.text(m, k, said, ha="center", va="center", color=color, fontsize=size_of_text)

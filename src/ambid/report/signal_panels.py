@@ -74,6 +74,7 @@ class Traces:
     ahead: Mapping[int, Array] = field(default_factory=dict)  # by steps, such predictions, NaN before the first
     inputs: Array | None = None  # (n_samples, n_inputs)
     input_names: tuple[str, ...] = ()
+    input_units: tuple[str, ...] = ()
     title: str = ""  # which record it is, where several are drawn
     second: bool = False  # whether the fit has not seen it
 
