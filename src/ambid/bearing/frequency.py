@@ -252,8 +252,6 @@ def frequency_estimate(
     warnings = [*frf.warnings, *(f"{k}: {c.detail}" for k, c in checks.items() if not c.passed)]
     if not converged:
         warnings.insert(0, "the search did not converge: treat the values as a first guess")
-    total = problem.delay_at(v)
-    space = problem.model.matrices(theta)
     return FrequencyEstimate(
         status="converged" if converged else "stalled",
         model=problem.model.name,
@@ -261,19 +259,8 @@ def frequency_estimate(
         covariance_names=names,
         covariance=covariance,
         covariance_method="information" if check.passed else "robust",
-        delay=Delay(
-            samples=int(np.floor(total)),
-            fraction=total - float(np.floor(total)),
-            sd=float(np.sqrt(whole[-1, -1])) if problem.fractional else None,
-            how=how,
-        ),
-        continuous=Continuous(
-            states=problem.model.states,
-            A=space.A,
-            B=space.B,
-            C=space.C,
-            poles=np.linalg.eigvals(space.A).astype(np.complex128),
-        ),
+        delay=Delay.of(problem.delay_at(v), float(np.sqrt(whole[-1, -1])) if problem.fractional else None, how),
+        continuous=Continuous.of(problem.model, theta),
         checks=checks,
         warnings=tuple(warnings),
         information={

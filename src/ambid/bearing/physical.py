@@ -154,19 +154,14 @@ def _result(
     hidden = [k for k, r in zip(names, relative, strict=True) if not r < WEAK**2]
     if hidden:
         warnings.append(f"not identifiable from the {fit.structure} model (sd above {WEAK:.0%}): {', '.join(hidden)}")
-    samples = found.delay / fit.dt
-    steps = int(np.floor(samples + 1e-9))
     return PhysicalFit(
         model=model.name,
         structure=fit.structure,
         parameters=tuple(EstimatedParameter.of(p, theta, sd, seen) for p in _ordered(model, parameters)),
         covariance_names=names,
         covariance=whole[:n, :n],
-        delay=Delay(
-            samples=steps,
-            fraction=max(0.0, samples - steps),
-            sd=float(np.sqrt(whole[-1, -1])) / fit.dt if found.delay_free else None,
-            how=delay_how,
+        delay=Delay.of(
+            found.delay / fit.dt, float(np.sqrt(whole[-1, -1])) / fit.dt if found.delay_free else None, delay_how
         ),
         misfit=check,
         band_hz=target.band_hz,

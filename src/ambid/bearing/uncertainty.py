@@ -285,10 +285,7 @@ def estimate_of(
     settled = fit.status == "converged"  # of a search that has not ended nothing is certain
     seen = {k: settled and ok for k, ok in zip(known.names, known.identifiable_at(robust=robust), strict=True)}
     alone = dict(zip(known.names, known.data_only_sd.tolist(), strict=True))
-    space = problem.model.matrices(theta)
-    total = problem.delay_samples(fit.vector)
-    whole = int(np.floor(total))
-    inputs_delay = Delay(samples=whole, fraction=total - whole, sd=known.delay_sd, how=delay_how)
+    delay = Delay.of(problem.delay_samples(fit.vector), known.delay_sd, delay_how)
     return Estimate(
         status=fit.status,
         model=problem.model.name,
@@ -297,14 +294,8 @@ def estimate_of(
         covariance_names=known.names,
         covariance=known.covariance(robust=robust),
         covariance_method="robust" if robust else "information",
-        delay=dict.fromkeys(problem.model.inputs, inputs_delay),
-        continuous=Continuous(
-            states=problem.model.states,
-            A=space.A,
-            B=space.B,
-            C=space.C,
-            poles=np.linalg.eigvals(space.A).astype(complex),
-        ),
+        delay=dict.fromkeys(problem.model.inputs, delay),
+        continuous=Continuous.of(problem.model, theta),
         noise=_noise(fit),
         operating_point=means,
         fit={

@@ -25,9 +25,10 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.estimation.result import Linear, Predicting, Reason, Result, Simulating
-from ambid.physics.linear_model import Parameter, model
+from ambid.physics.linear_model import LinearModel, Parameter, model
 
 _NORMAL_95 = 1.959963984540054
+_ROUNDING = 1e-9  # samples
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
 
@@ -87,6 +88,12 @@ class Delay:
     fraction: float  # 0 <= fraction < 1
     sd: float | None  # standard deviation of samples + fraction, where it was estimated as a real number
     how: Literal["estimated", "given"]
+
+    @classmethod
+    def of(cls, total: float, sd: float | None, how: Literal["estimated", "given"]) -> Delay:
+        """Return a delay of `total` samples; a whole one less the rounding of its sum stays whole."""
+        whole = math.floor(total + _ROUNDING)
+        return cls(samples=whole, fraction=max(float(total) - whole, 0.0), sd=sd, how=how)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -495,6 +502,13 @@ class Continuous:
     B: Array  # (n_states, n_inputs)
     C: Array  # (n_outputs, n_states)
     poles: NDArray[np.complex128]  # (n_states,), complex, rad/s
+
+    @classmethod
+    def of(cls, plant: LinearModel, theta: Mapping[str, float]) -> Continuous:
+        """Return the plant of a model with its numbers."""
+        at = plant.matrices(theta)
+        poles = np.linalg.eigvals(at.A).astype(np.complex128)
+        return cls(states=plant.states, A=at.A, B=at.B, C=at.C, poles=poles)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

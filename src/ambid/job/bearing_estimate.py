@@ -62,19 +62,15 @@ def judge_bearing(
 
 
 def _delays(fit: BearingFit, known: BearingUncertainty, *, given: bool) -> dict[str, Delay]:
-
-    found = {}
-    for rate in fit.problem.delays:
-        total = fit.problem.delay_at(fit.vector, rate)
-        whole = math.floor(total)
-        found[f"{rate:g} Hz"] = Delay(
-            samples=whole, fraction=total - whole, sd=known.delay_sd.get(rate), how="given" if given else "estimated"
+    return {
+        f"{rate:g} Hz": Delay.of(
+            fit.problem.delay_at(fit.vector, rate), known.delay_sd.get(rate), "given" if given else "estimated"
         )
-    return found
+        for rate in fit.problem.delays
+    }
 
 
 def _fits(fit: BearingFit, tests: Sequence[WhitenessTest], names: Sequence[str]) -> dict[str, dict[str, OutputFit]]:
-
     found: dict[str, dict[str, OutputFit]] = {}
     for name, record, test in zip(names, fit.problem.records, tests, strict=True):
         spread = record.kept.std(axis=0).tolist()

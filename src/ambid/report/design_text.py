@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
-from ambid.control.design import FIGURES, Design, Situation
-from ambid.control.margins import Opening
+from ambid.control.design import FIGURES, Design
+from ambid.report.margins_text import opening_cells
 from ambid.report.numbers import sized
 from ambid.report.text import (
     WIDTH,
     Paint,
-    check_lines,
     columns,
+    ending,
     joined,
-    other_warnings,
     plain,
-    timing_lines,
-    title_line,
-    warning_lines,
+    record_line,
     wrapped,
 )
 from ambid.report.verification import verification_lines
@@ -34,9 +29,7 @@ NAMES = {
 
 def design_text(found: Design, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a design, below its verdict."""
-    record = found.record
-    samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
-    head = title_line(record.get("file"), f"controller for model {found.model}", samples, rate, found.status, paint)
+    head = record_line(found, f"controller for model {found.model}", paint)
     return joined(
         [
             [head, *wrapped([_goals(found)], width, "  ")],
@@ -46,9 +39,7 @@ def design_text(found: Design, *, width: int = WIDTH, paint: Paint = plain) -> s
             _simulated(found, width, paint),
             _plants(found, width, paint),
             _loop(found, paint),
-            check_lines(found.checks, width=width, paint=paint, above=True),
-            warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
-            timing_lines(found.timing_s, width=width, paint=paint),
+            *ending(found, width=width, paint=paint),
         ]
     )
 
@@ -96,19 +87,15 @@ def _margins(found: Design, paint: Paint) -> list[str]:
     for axis in found.after.margins:
         for place in ("position", "command"):
             for words, s in (("before", found.before), ("after", found.after)):
-                rows.append((axis, place.replace("command", "input"), words, *_opening(s, axis, place)))
+                rows.append(
+                    (
+                        axis,
+                        place.replace("command", "input"),
+                        words,
+                        *opening_cells(getattr(s.margins[axis], place))[:4],
+                    )
+                )
     return [paint("margins on the estimate, one loop opened", "strong"), *columns(rows)]
-
-
-def _opening(s: Situation, axis: str, place: str) -> Sequence[str]:
-    of: Opening = getattr(s.margins[axis], place)
-    phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
-    disk = _NONE if of.disk is None else f"{_gains(of.disk.gain_down, of.disk.gain_up)}, {of.disk.phase_deg:.0f}°"
-    return _gains(of.gain_down, of.gain_up), phase, _NONE if of.delay_s is None else sized(of.delay_s, "s"), disk
-
-
-def _gains(down: float | None, up: float | None) -> str:
-    return " … ".join("any" if x is None else f"{x:.2g}" for x in (down, up))
 
 
 def _simulated(found: Design, width: int, paint: Paint) -> list[str]:

@@ -29,9 +29,9 @@ from ambid.report.text import (
     parameter_lines,
     plain,
     pure,
+    record_line,
     status_words,
     timing_lines,
-    title_line,
     warning_lines,
 )
 
@@ -71,9 +71,7 @@ def estimate_text(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = p
 def header_lines(estimate: AnyEstimate, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Say what was identified from what, and whether the search converged; of several records their names."""
     if isinstance(estimate, Estimate):
-        samples, rate = int(str(estimate.record["samples"])), float(str(estimate.record["rate_hz"]))
-        name, what = estimate.record.get("file"), f"model {estimate.model}"
-        return [title_line(name, what, samples, rate, estimate.status, paint)]
+        return [record_line(estimate, f"model {estimate.model}", paint)]
     names = list(estimate.noise)
     law = ", ".join([str(estimate.law), *(["eddy pole"] * estimate.eddy), *(["drift"] * estimate.drift)])
     verdict = status_words(estimate.status, paint)

@@ -7,13 +7,10 @@ from ambid.report.numbers import quantity, sized
 from ambid.report.text import (
     WIDTH,
     Paint,
-    check_lines,
     columns,
+    ending,
     joined,
-    other_warnings,
     plain,
-    timing_lines,
-    warning_lines,
     wrapped,
 )
 
@@ -28,9 +25,7 @@ def experiment_text(found: Experiment, *, width: int = WIDTH, paint: Paint = pla
             _head(found, width, paint),
             _expected(found, width, paint),
             _signals(found, paint),
-            check_lines(found.checks, width=width, paint=paint, above=True),
-            warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
-            timing_lines(found.timing_s, width=width, paint=paint),
+            *ending(found, width=width, paint=paint),
         ]
     )
 

@@ -26,9 +26,9 @@ from ambid.report.text import (
     coefficient_text,
     columns,
     criteria_lines,
+    ending,
     fit_rows,
     joined,
-    other_warnings,
     plain,
     pole_table,
     status_words,
@@ -76,9 +76,7 @@ def fit_text(fit: BlackBoxFit | NonlinearFit, *, width: int = WIDTH, paint: Pain
             second,
             criteria_lines(fit.criteria, fit.n_estimated, width),
             trainings,
-            check_lines(fit.checks, width=width, paint=paint, above=True),
-            warning_lines(other_warnings(fit.checks, fit.warnings), width=width, paint=paint),
-            timing_lines(fit.timing_s, width=width, paint=paint),
+            *ending(fit, width=width, paint=paint),
             *([derived_text(x, width=width, paint=paint)] for x in getattr(fit, "derived", {}).values()),
         ]
     )

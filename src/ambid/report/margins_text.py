@@ -10,15 +10,12 @@ from ambid.report.numbers import sized
 from ambid.report.text import (
     WIDTH,
     Paint,
-    check_lines,
     columns,
+    ending,
     joined,
-    other_warnings,
     plain,
     pure,
-    timing_lines,
-    title_line,
-    warning_lines,
+    record_line,
 )
 from ambid.simulation.margins import STANDARD
 
@@ -28,16 +25,7 @@ _NONE = "–"
 
 def margins_text(found: Margins, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write the margins of a loop, below their verdict."""
-    record = found.record
-    samples, rate = int(str(record["samples"])), float(str(record["rate_hz"]))
-    head = title_line(
-        record.get("file"),
-        f"loop of {'a record' if found.of == 'record' else 'an estimate'}",
-        samples,
-        rate,
-        found.status,
-        paint,
-    )
+    head = record_line(found, f"loop of {'a record' if found.of == 'record' else 'an estimate'}", paint)
     return joined(
         [
             [head, _whence(found)],
@@ -45,9 +33,7 @@ def margins_text(found: Margins, *, width: int = WIDTH, paint: Paint = plain) ->
             _openings(found, paint),
             _compliance(found, paint),
             _room(found, paint),
-            check_lines(found.checks, width=width, paint=paint, above=True),
-            warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
-            timing_lines(found.timing_s, width=width, paint=paint),
+            *ending(found, width=width, paint=paint),
         ]
     )
 
@@ -89,11 +75,12 @@ def _measured(s: AxisSensitivity) -> str:
 def _openings(found: Margins, paint: Paint) -> list[str]:
     rows: list[tuple[str, ...]] = [("axis", "opened at", "gain", "phase", "delay", "disk margin", "peak")]
     for axis, of in found.margins.items():
-        rows += [(axis, "position", *_opening(of.position)), ("", "input", *_opening(of.command))]
+        rows += [(axis, "position", *opening_cells(of.position)), ("", "input", *opening_cells(of.command))]
     return [paint("margins, one loop opened, the others closed", "strong"), *columns(rows)]
 
 
-def _opening(of: Opening) -> tuple[str, ...]:
+def opening_cells(of: Opening) -> tuple[str, ...]:
+    """Write gain, phase, delay, disk margin and peak of a loop that is opened."""
     gain = f"{_number(of.gain_down)} … {_number(of.gain_up)}"
     phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
     delay = _NONE if of.delay_s is None else sized(of.delay_s, "s")

@@ -57,6 +57,12 @@ def title_line(name: object, what: str, samples: int, rate_hz: float, status: st
     )
 
 
+def record_line(found: Any, what: str, paint: Paint = plain) -> str:
+    """State what was made of the record that a result remembers, and whether the search converged."""
+    of = found.record
+    return title_line(of.get("file"), what, int(str(of["samples"])), float(str(of["rate_hz"])), found.status, paint)
+
+
 SPREAD = "± is one standard deviation; intervals and bands are 95 %"
 """The one convention, which every result states once where it has a ±, and every figure and page."""
 
@@ -279,6 +285,15 @@ def other_warnings(checks: Mapping[str, Check], warnings: Sequence[str]) -> list
     """Return the warnings that say more than the detail of a failed check, which stands with the checks."""
     said = {c.detail for c in checks.values()}
     return [warning for warning in warnings if warning not in said]
+
+
+def ending(found: Any, *, width: int = WIDTH, paint: Paint = plain) -> list[list[str]]:
+    """Return what a result ends with: its checks, the warnings that say more than they do, and how long it took."""
+    return [
+        check_lines(found.checks, width=width, paint=paint, above=True),
+        warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
+        timing_lines(found.timing_s, width=width, paint=paint),
+    ]
 
 
 def timing_lines(timing_s: Mapping[str, float], *, width: int = 10 * WIDTH, paint: Paint = plain) -> list[str]:

@@ -98,7 +98,6 @@ def conclude(
     checks = {**evidence.checks, "identifiable": _identifiable(found, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)
     turned = model.at_speed(speed)
-    space = turned.matrices(numbers.theta)
     modes, above = _modes(model, numbers, fit.band_hz)
     checks |= _mode_checks(modes, above)
     return RotorEstimate(
@@ -113,10 +112,7 @@ def conclude(
         covariance_names=numbers.names,
         covariance=numbers.covariance,
         delay=_delays(model, fit.point.delays, numbers, delay_how),
-        continuous=Continuous(
-            states=turned.states, A=space.A, B=space.B, C=space.C,
-            poles=np.linalg.eigvals(space.A).astype(np.complex128),
-        ),
+        continuous=Continuous.of(turned, numbers.theta),
         noise=evidence.noise,
         fit=evidence.fit,
         checks=checks,
@@ -141,15 +137,12 @@ def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Num
 
 
 def _delays(model: RotorModel, delays: Array, numbers: Numbers, how: Sequence[str]) -> dict[str, Delay]:
-    found: dict[str, Delay] = {}
-    for k, role in enumerate(model.inputs):
-        whole = float(np.floor(delays[k] + 1e-9))
-        sd = numbers.sd(f"{role}.delay")
-        found[role] = Delay(
-            samples=int(whole), fraction=max(float(delays[k] - whole), 0.0), sd=sd or None,
-            how="given" if how[k] == "given" else "estimated",
-        )  # fmt: skip
-    return found
+    return {
+        role: Delay.of(
+            float(delays[k]), numbers.sd(f"{role}.delay") or None, "given" if how[k] == "given" else "estimated"
+        )
+        for k, role in enumerate(model.inputs)
+    }
 
 
 def _modes(model: RotorModel, numbers: Numbers, band: tuple[float, float]) -> tuple[tuple[Mode, ...], tuple[int, ...]]:
