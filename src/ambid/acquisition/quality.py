@@ -36,7 +36,6 @@ _STILL_S = 0.5
 _SNR_DB = 10.0
 _RATE = 0.01
 _SURE = 5.0  # standard deviations
-_DEAD = "dead"  # a channel that shows nothing: what is recorded is not to be used
 
 
 class Moments:
@@ -348,32 +347,28 @@ def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
     `report`: all but its verdict; `info`: of the device. Returns empty where all is well, or where there are too few
     samples to tell.
     """
-    found = [Reason(check=name, text=text) for name, text in _stream(report, info)]
+    found = list(_stream(report, info))
     if report.samples >= _FEWEST:
         for column in report.columns:
             if not math.isfinite(column.rms):
-                found.append(Reason(check="size", text=_absurd(column), grave=True))
+                text = (
+                    f"{column.name} ranges from {column.least:.4g} to {column.most:.4g}, which is too large for a mean "
+                    "and standard deviation. Check its source"
+                )
+                found.append(Reason(check="size", text=text, grave=True))
                 continue
             sensed = column.role in MEASURED
-            said = [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
-            found += [Reason(check=name, text=text, grave=name == _DEAD) for name, text in said]
+            found += [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
     return tuple(found)
 
 
-def _absurd(column: ColumnQuality) -> str:
-    return (
-        f"{column.name} ranges from {column.least:.4g} to {column.most:.4g}, which is too large for a mean and "
-        "standard deviation. Check its source"
-    )
-
-
-def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[tuple[str, str]]:
+def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[Reason]:
     replay = info.kind == "replay"  # what was is over: nothing of it is mended at a line or a device
     if report.lost:
         share = report.lost / (report.lost + report.samples)
-        yield (
-            "lost",
-            f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): "
+        yield Reason(
+            check="lost",
+            text=f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): "
             + (
                 "they are missing in the replayed record. Read it with --gaps"
                 if replay
@@ -381,9 +376,9 @@ def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[tuple[str, str]
             ),
         )
     if report.repeated:
-        yield (
-            "repeated",
-            f"{counted(report.repeated, 'sample')} came twice and were omitted: "
+        yield Reason(
+            check="repeated",
+            text=f"{counted(report.repeated, 'sample')} came twice and were omitted: "
             + (
                 "the time of the replayed record runs backwards. Check its time column"
                 if replay
@@ -392,78 +387,74 @@ def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[tuple[str, str]
         )
     if report.damaged:
         where = "replayed record" if replay else "device"
-        yield (
-            "damaged",
-            f"{counted(report.damaged, 'sample')} with a value that is not a number omitted. Check the {where}",
+        yield Reason(
+            check="damaged",
+            text=f"{counted(report.damaged, 'sample')} with a value that is not a number omitted. Check the {where}",
         )
     off = abs(report.measured_hz - report.rate_hz)
     # only hardware keeps the time of this world; NaN compares false
     if info.kind == "serial" and off > _RATE * report.rate_hz and off > _SURE * report.measured_sd:
-        yield (
-            "rate",
-            (
-                f"{report.measured_hz:.6g} samples arrive per second instead of {report.rate_hz:g}: the controller "
-                "clock is wrong. Check its crystal, or the firmware build"
-            ),
+        yield Reason(
+            check="rate",
+            text=f"{report.measured_hz:.6g} samples arrive per second instead of {report.rate_hz:g}: the controller "
+            "clock is wrong. Check its crystal, or the firmware build",
         )
 
 
-def _range(column: ColumnQuality) -> Iterator[tuple[str, str]]:
+def _range(column: ColumnQuality) -> Iterator[Reason]:
     """Judge how a sensor fills its converter."""
     if column.saturated > _SATURATED:
-        yield (
-            "saturation",
-            (
-                f"{column.name} is at an end of the converter range in {column.saturated:.2%} of the samples, where it "
-                "is not measured. Reduce the sensor gain, shift its offset, or excite less"
-            ),
+        yield Reason(
+            check="saturation",
+            text=f"{column.name} is at an end of the converter range in {column.saturated:.2%} of the samples, where "
+            "it is not measured. Reduce the sensor gain, shift its offset, or excite less",
         )
     elif column.used is not None and 0.0 < column.used < _USED:
-        yield (
-            "range",
-            (
-                f"{column.name} uses {column.used:.1%} of the converter range, so its resolution is coarse. Raise the "
-                "sensor gain, or excite more"
-            ),
+        yield Reason(
+            check="range",
+            text=f"{column.name} uses {column.used:.1%} of the converter range, so its resolution is coarse. Raise the "
+            "sensor gain, or excite more",
         )
 
 
-def _ordered(column: ColumnQuality, excited: bool) -> Iterator[tuple[str, str]]:
+def _ordered(column: ColumnQuality, excited: bool) -> Iterator[Reason]:
     """Judge what the controller orders."""
     if column.role != "voltage":
         return
     if column.saturated > _LIMITED:
-        yield (
-            "limit",
-            (
-                f"{column.name} is saturated in {column.saturated:.1%} of the samples: the loop is not linear there. "
-                "Excite less, or widen daq.duty"
-            ),
+        yield Reason(
+            check="limit",
+            text=f"{column.name} is saturated in {column.saturated:.1%} of the samples: the loop is not linear there. "
+            "Excite less, or widen daq.duty",
         )
     if excited and column.sd == 0.0:
-        yield "still", f"{column.name} is constant although an excitation was requested. Drive or levitate to play it"
+        yield Reason(
+            check="still",
+            text=f"{column.name} is constant although an excitation was requested. Drive or levitate to play it",
+        )
 
 
-def _content(column: ColumnQuality, report: QualityReport) -> Iterator[tuple[str, str]]:
+def _content(column: ColumnQuality, report: QualityReport) -> Iterator[Reason]:
     """Judge what is in a sensor's signal."""
     if column.sd == 0.0:
-        yield _DEAD, f"{column.name} is constant at {column.mean:.6g}: no sensor there? Check its cable and supply"
+        yield Reason(
+            check="dead",
+            grave=True,  # what is recorded is not to be used
+            text=f"{column.name} is constant at {column.mean:.6g}: no sensor there? Check its cable and supply",
+        )
         return
     if report.excited and column.still_s > _STILL_S:
-        yield (
-            "still",
-            (
-                f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
-                "stop, or a cable is loose. Check both"
-            ),
+        yield Reason(
+            check="still",
+            text=f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
+            "stop, or a cable is loose. Check both",
         )
     told = report.excited and column.noise_by == "periods" and column.role != "extra"
     if told and column.snr_db is not None and column.snr_db < _SNR_DB:
         rest = 1.0 / (1.0 + 10.0 ** (column.snr_db / 10.0))
-        yield (
-            "snr",
-            (
-                f"{column.name}: the signal-to-noise ratio is {column.snr_db:.0f} dB (limit {_SNR_DB:.0f}): {rest:.0%} "
-                "of its power does not come from the excitation. Excite more, or in a band that the plant follows"
-            ),
+        yield Reason(
+            check="snr",
+            text=f"{column.name}: the signal-to-noise ratio is {column.snr_db:.0f} dB (limit {_SNR_DB:.0f}): "
+            f"{rest:.0%} of its power does not come from the excitation. Excite more, or in a band that the plant "
+            "follows",
         )
