@@ -38,7 +38,6 @@ def greybox(
     tick: Callable[[], None] | None = None,
     evaluations: int = EVALUATIONS,
     seed: int = 0,
-    workers: int = 1,
 ) -> Fit:
     """Estimate the physical parameters of `model` from one record.
 
@@ -62,9 +61,6 @@ def greybox(
         makes a plant, no search converges, or a linear regression on the past explains much of what the best leaves.
     seed : int, optional
         Of the global search: equal seeds give equal results.
-    workers : int, optional
-        Threads of the global search; the result does not depend on them, and the time hardly (most of an evaluation is
-        a small Riccati equation, which does not leave Python's lock).
 
     Returns
     -------
@@ -79,7 +75,7 @@ def greybox(
     """
     _check(model, signals, parameters, delay)
     with one_thread():
-        how = Rescue(evaluations=evaluations, seed=seed, workers=workers)
+        how = Rescue(evaluations=evaluations, seed=seed)
         return _greybox(model, signals, parameters, delay, noise, tick, how)
 
 

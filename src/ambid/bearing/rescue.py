@@ -12,7 +12,6 @@ that of the first sample; the searches that follow free all of them.
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from time import perf_counter
@@ -222,7 +221,6 @@ class Rescue:
 
     evaluations: int  # at most; 0: none
     seed: int
-    workers: int  # threads
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -252,8 +250,7 @@ class LikelihoodCost:
     coordinates: tuple[Coordinate, ...]
     delay: float  # samples, where it is not searched
     scales: Scales  # of order one where the parameters' are; disturbances of 1
-    _own: threading.local = field(default_factory=threading.local)
-    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _work: dict[int, Workspace] = field(default_factory=dict)  # by delay
     _best: dict[int, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # by delay: cost and coordinates
 
     def __call__(self, z: Array) -> float:
@@ -265,8 +262,7 @@ class LikelihoodCost:
         if candidate is None:
             return np.inf
         value, delay = candidate.criterion / candidate.problem.n_used, candidate.problem.delay
-        with self._lock:
-            self._best[delay] = min(self._best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
+        self._best[delay] = min(self._best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
         return value
 
     def best_of_each_delay(self) -> list[Array]:
@@ -279,7 +275,7 @@ class LikelihoodCost:
     def candidate(self, z: Array, *, shared: bool = False) -> Candidate | None:
         """Return the place to search from at a vector.
 
-        `z`: (n_coordinates,); `shared`: reuse this thread's workspace of that delay. Returns none where there is no
+        `z`: (n_coordinates,); `shared`: reuse the workspace of that delay. Returns none where there is no
         predictor.
         """
         at = {c.name: c.value(float(x)) for c, x in zip(self.coordinates, z, strict=True)}
@@ -325,11 +321,10 @@ class LikelihoodCost:
         return size["current"] / size["position"]
 
     def _workspace(self, problem: PredictorProblem) -> Workspace:
-        """Return this thread's workspace of a delay."""
-        kept: dict[int, Workspace] = self._own.__dict__.setdefault("kept", {})
-        if problem.delay not in kept:
-            kept[problem.delay] = Workspace(problem)
-        return kept[problem.delay]
+        """Return the workspace of a delay."""
+        if problem.delay not in self._work:
+            self._work[problem.delay] = Workspace(problem)
+        return self._work[problem.delay]
 
 
 def likelihood_cost(
@@ -410,8 +405,8 @@ def global_candidates(
     """
     low = np.array([-1.0 if c.signed else 0.0 for c in cost.coordinates])
     found = global_search(
-        cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, workers=how.workers, tick=tick,
-        stage=STAGE, keep=keep,
+        cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick, stage=STAGE,
+        keep=keep,
     )  # fmt: skip
     return candidates_at(cost, signals, (found.vector, *cost.best_of_each_delay(), *found.best[: _TRIED // 5]))[:_TRIED]
 

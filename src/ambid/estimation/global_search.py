@@ -1,17 +1,14 @@
 """Global search by differential evolution (Storn and Price 1997), a start for fits whose ordinary starts fail.
 
 Numbers are searched for between bounds, scaled to 0 .. 1; SciPy's `differential_evolution` does it, strategy best1bin
-with dithered mutation, from a Sobol sequence. A generation is drawn as a whole before it is evaluated, so that the
-result depends on the seed alone and not on the number of workers. Local refinement is the caller's.
+with dithered mutation, from a Sobol sequence; the result depends on the seed alone. Local refinement is the caller's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -46,7 +43,6 @@ def global_search(
     *,
     seed: int | Sequence[int],
     evaluations: int,
-    workers: int = 1,
     tick: Tick = silent,
     stage: str = STAGE,
     keep: Callable[[Array, float], None] | None = None,
@@ -54,20 +50,14 @@ def global_search(
     """Search for the least cost between bounds.
 
     `low`, `high`: (n,), finite, low below high. Scale what spans decades before (logarithm, inverse hyperbolic sine);
-    `seed`: equal seeds give equal results, with any number of workers; `evaluations`: of `cost`, at most; `workers`:
-    threads: they help where `cost` leaves Python's lock (compiled loops, linear algebra).
+    `seed`: equal seeds give equal results; `evaluations`: of `cost`, at most.
     """
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if low.shape != high.shape or not np.all(np.isfinite(low) & np.isfinite(high)) or not np.all(low < high):
         raise ValueError("bounds of a global search must be finite, and each lower one below its upper one")
     began = perf_counter()
     run = _Run(cost=cost, low=low, span=high - low, budget=evaluations, tick=tick, stage=stage, keep=keep)
-    first = _first_generation(low.size, evaluations, seed)
-    if workers > 1:
-        with ThreadPoolExecutor(workers) as pool:
-            last = _evolved(run, first, seed, pool.map)
-    else:
-        last = _evolved(run, first, seed, map)
+    last = _evolved(run, _first_generation(low.size, evaluations, seed), seed)
     return GlobalFound(
         vector=run.vector,
         cost=run.least,
@@ -78,7 +68,7 @@ def global_search(
 
 
 class _Run:
-    """What a search has seen so far; written by one thread, in the order of the members."""
+    """What a search has seen so far, in the order of the members."""
 
     def __init__(
         self, *, cost: Callable[[Array], float], low: Array, span: Array, budget: int, tick: Tick, stage: str,
@@ -89,18 +79,17 @@ class _Run:
         self.done, self.least, self.vector = 0, np.inf, low + 0.5 * span
 
     def value(self, z: Array) -> float:
+        """Return the cost of a member; infinite beyond the budget."""
+        if self.done >= self.budget:
+            return np.inf
         found = float(self.cost(self.low + z * self.span))
+        self.done += 1
+        if found < self.least:
+            self.least, self.vector = found, self.low + z * self.span
+            if self.keep is not None:
+                self.keep(self.vector, found)
+        self.tick(self.stage, min(self.done / self.budget, 1.0))
         return found if np.isfinite(found) else np.inf
-
-    def told(self, members: Iterable[Array], values: Iterable[float]) -> Iterator[float]:
-        for z, value in zip(members, values, strict=True):
-            self.done += 1
-            if value < self.least:
-                self.least, self.vector = value, self.low + np.asarray(z) * self.span
-                if self.keep is not None:
-                    self.keep(self.vector, value)
-            self.tick(self.stage, min(self.done / self.budget, 1.0))
-            yield value
 
 
 def _first_generation(n: int, budget: int, seed: int | Sequence[int]) -> Array:
@@ -112,19 +101,14 @@ def _first_generation(n: int, budget: int, seed: int | Sequence[int]) -> Array:
     return np.asarray(qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(power), dtype=np.float64)[:size]
 
 
-def _evolved(run: _Run, first: Array, seed: int | Sequence[int], share: Callable[..., Iterable[Any]]) -> Array:
+def _evolved(run: _Run, first: Array, seed: int | Sequence[int]) -> Array:
     """Members of the last generation, best first."""
     from scipy.optimize import differential_evolution
-
-    def evaluated(_: Callable[..., float], members: Iterable[Array]) -> list[float]:
-        whole = list(members)  # SciPy draws a whole generation before it asks for the first value
-        open_ = whole[: max(run.budget - run.done, 0)]
-        return [*run.told(open_, share(run.value, open_)), *[np.inf] * (len(whole) - len(open_))]
 
     found = differential_evolution(
         run.value, [(0.0, 1.0)] * first.shape[1], strategy="best1bin", init=first, mutation=_MUTATION,
         recombination=_RECOMBINATION, maxiter=max(run.budget // first.shape[0] - 1, 1), tol=_TOLERANCE, polish=False,
-        updating="deferred", workers=evaluated, seed=np.random.default_rng(seed),
+        updating="deferred", seed=np.random.default_rng(seed),
     )  # fmt: skip
     order = np.argsort(found.population_energies, kind="stable")
     return np.asarray(found.population, dtype=np.float64)[order]
