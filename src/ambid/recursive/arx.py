@@ -6,16 +6,15 @@ squares needs white v; instruments leave v free.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import RecursiveEstimator, as_blocks, kernels
+from ambid.recursive.estimator import Copied, RecursiveEstimator, as_blocks, kernels
 from ambid.recursive.regression import RecursiveInstrumentalVariables
 
 Instruments = Literal["reference", "auxiliary model"]
@@ -24,7 +23,7 @@ _REFRESH = 64  # samples with one auxiliary model
 _NO_MODEL = np.zeros(0)
 
 
-class _OnSignals:
+class _OnSignals(Copied):
     """Names, estimate and counts are those of the estimator that is fed with regressors."""
 
     _estimator: RecursiveEstimator
@@ -53,10 +52,6 @@ class _OnSignals:
     def n_rejected(self) -> int:
         """Samples that were not: not finite, or in need of past signals that are unknown."""
         return self._estimator.n_rejected
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state."""
-        return copy.deepcopy(self)
 
 
 class RecursiveArx(_OnSignals):

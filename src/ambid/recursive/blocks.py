@@ -13,10 +13,8 @@ come from them.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from copy import deepcopy
 from dataclasses import dataclass, replace
 from math import ceil, exp, expm1, isfinite
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,7 +23,7 @@ from ambid.arrays import Array
 from ambid.bearing.blocks import ThreeBlocks, blocks_of, three_blocks
 from ambid.errors import EstimationError
 from ambid.estimation.uncertainty import p_text
-from ambid.recursive.estimator import check_channels, kernels
+from ambid.recursive.estimator import Copied, check_channels, kernels
 from ambid.recursive.streaming import ScalarKalman, StreamingFilter
 
 _WARM_UP = 4000  # samples, from which scales, means and the start are found
@@ -52,7 +50,7 @@ _CURVED = 0.1  # standard deviations by which curvature may move a pole before w
 _UNUSED_BATCHES = 2  # at the start, whose errors are those of the start
 
 
-class OnlineThreeBlocks:
+class OnlineThreeBlocks(Copied):
     """The three blocks of `ambid.bearing.blocks.three_blocks`, sample by sample or in blocks of samples.
 
     The first samples (`warm_up`) are kept: they give means, scales and, without `start`, the off-line estimate from
@@ -208,15 +206,6 @@ class OnlineThreeBlocks:
             safe=self._safe,
             remarks=self._remarks(fit),
         )
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state.
-
-        Returns
-        -------
-        OnlineThreeBlocks
-        """
-        return deepcopy(self)
 
     def _remarks(self, fit: Mapping[str, float]) -> tuple[str, ...]:
         out = []

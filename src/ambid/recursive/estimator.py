@@ -5,6 +5,7 @@ And how what a caller gives is brought into the one form that the compiled recur
 
 from __future__ import annotations
 
+from copy import deepcopy
 from functools import cache
 from importlib import import_module
 from math import isfinite
@@ -78,6 +79,14 @@ class RecursiveEstimator(Protocol):
         RecursiveEstimator
         """
         ...
+
+
+class Copied:
+    """What may be copied as it stands."""
+
+    def copy(self) -> Self:
+        """Return an independent one in the same state."""
+        return deepcopy(self)
 
 
 @cache

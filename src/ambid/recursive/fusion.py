@@ -10,17 +10,16 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Sequence
-from copy import deepcopy
 from dataclasses import dataclass
 from math import erf, inf, isfinite, log, sqrt
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_block, check_channels, kernels
+from ambid.recursive.estimator import Copied, as_block, check_channels, kernels
 from ambid.recursive.kalman import constant_velocity
 from ambid.recursive.lines import Event, EventKind
 from ambid.recursive.square_root import covariance_of, root_of
@@ -109,7 +108,7 @@ def still_samples(sensor: FusedSensor, rate_hz: float, quiet_samples: float) -> 
     return float(n) if n <= _SECONDS * rate_hz else 0.0
 
 
-class SensorFusion:
+class SensorFusion(Copied):
     """Kalman filter of several position sensors with detection and exclusion of faulty ones.
 
     **What cannot be seen.** If the position rises and all sensors' readings of it fall by the same, nothing changes:
@@ -463,15 +462,6 @@ class SensorFusion:
             if self._first > self._n:
                 h[self._n] = float(self._H[: self._m, self._n][at_work].mean())
         return float(np.sqrt(h @ self.covariance @ h))
-
-    def copy(self) -> Self:
-        """Return an independent fusion in the same state.
-
-        Returns
-        -------
-        SensorFusion
-        """
-        return deepcopy(self)
 
 
 def _check(

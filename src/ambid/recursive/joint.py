@@ -9,7 +9,6 @@ second-order terms (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self
 
@@ -21,7 +20,7 @@ from ambid.errors import EstimationError, nearest
 from ambid.estimation.predictor import scales_for
 from ambid.physics.linear_model import DiscreteSpace, LinearModel, StateSpace, discretise
 from ambid.physics.linear_model import model as model_named
-from ambid.recursive.estimator import as_blocks, kernels
+from ambid.recursive.estimator import Copied, as_blocks, kernels
 from ambid.recursive.square_root import covariance_of, factors_of
 
 if TYPE_CHECKING:
@@ -172,7 +171,7 @@ def parameter_scales(start: JointStart) -> Array:
     )
 
 
-class JointFilter:
+class JointFilter(Copied):
     """A Kalman filter of plant states, parameters and offsets at once, in square-root form; see its two kinds.
 
     Parameters that must be positive are carried as logarithms: they cannot leave, and no step has to be refused.
@@ -345,10 +344,6 @@ class JointFilter:
 
     def _run(self, u: Array, y: Array, e: Array) -> None:
         raise NotImplementedError
-
-    def copy(self) -> Self:
-        """Return an independent filter in the same state."""
-        return deepcopy(self)
 
 
 class JointEkf(JointFilter):

@@ -6,16 +6,14 @@ construction however long it runs.
 
 from __future__ import annotations
 
-from copy import deepcopy
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_block, check_channels, kernels
+from ambid.recursive.estimator import Copied, as_block, check_channels, kernels
 from ambid.recursive.square_root import covariance_of, factors_of, root_of
 
 
@@ -115,7 +113,7 @@ def constant_velocity(rate_hz: float, *, q: float, r: float) -> LinearState:
     )
 
 
-class KalmanFilter:
+class KalmanFilter(Copied):
     """Kalman filter of a `LinearState`.
 
     Without a start covariance it begins in the stationary one (Riccati equation), and its gain is constant as long as
@@ -213,15 +211,6 @@ class KalmanFilter:
     def n_missing(self) -> int:
         """Single measured values that were missing."""
         return int(self._tally[1])
-
-    def copy(self) -> Self:
-        """Return an independent filter in the same state.
-
-        Returns
-        -------
-        KalmanFilter
-        """
-        return deepcopy(self)
 
     def _inputs(self, inputs: ArrayLike | None, n: int) -> Array:
         if self._n_u == 0 and inputs is None:

@@ -8,7 +8,6 @@ counts once.
 
 from __future__ import annotations
 
-from copy import deepcopy
 from typing import Any, Self
 
 import numpy as np
@@ -21,7 +20,7 @@ from ambid.blackbox.fit import structure as structure_named
 from ambid.blackbox.model import PolynomialModel
 from ambid.blackbox.polynomial_predictor import compact_orders, read_orders
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_blocks, kernels
+from ambid.recursive.estimator import Copied, as_blocks, kernels
 from ambid.recursive.polynomial_state import (
     COUNTED,
     Identity,
@@ -40,7 +39,7 @@ _FEW = 20  # samples of memory for each coefficient, below which gradients of C,
 _NUMBERS = (float, np.float64)
 
 
-class RecursivePolynomial:
+class RecursivePolynomial(Copied):
     """Recursive prediction error estimator of one output, any structure of thesis table 3.1, any number of inputs.
 
     The covariance is that of the error of the estimate if the coefficients stand still and the structure holds the
@@ -347,15 +346,6 @@ class RecursivePolynomial:
         full = self._start.copy()
         full[self._who.layout.free] = self.estimate
         return PolynomialModel(outputs=(self._who.layout.polynomials(full),), dt=self._who.dt)
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state.
-
-        Returns
-        -------
-        RecursivePolynomial
-        """
-        return deepcopy(self)
 
 
 class _Window:

@@ -13,15 +13,14 @@ squared and no unsymmetric P, which can pass through infinity, is carried (Söde
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
-from typing import Any, Literal, Self
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_blocks, count, forgetting_factor, kernels, numbers, positive, prior_of
+from ambid.recursive.estimator import Copied, as_blocks, count, forgetting_factor, kernels, numbers, positive, prior_of
 from ambid.recursive.square_root import covariance_of, factors_of, root_of, root_of_factors
 
 Forgetting = Literal["none", "exponential", "directional"]
@@ -37,7 +36,7 @@ _FAR = 1e12  # variance of the start's error in units of step or of 1 / small, w
 _FLOAT = np.dtype(np.float64)
 
 
-class Recursion:
+class Recursion(Copied):
     """State and interface of a recursion; its compiled loop is the only thing that differs."""
 
     def __init__(
@@ -114,10 +113,6 @@ class Recursion:
 
     def _run(self, rows: Array, y: Array, out: Array) -> None:
         kernels("regression").regress(self._s, rows, y, out)
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state."""
-        return deepcopy(self)
 
 
 class _Factored(Recursion):

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import as_block, check_channels, kernels
+from ambid.recursive.estimator import Copied, as_block, check_channels, kernels
 from ambid.recursive.square_root import covariance_of
 
 _START = 1e6  # variance of each state of the notch before the first sample, over that of the noise
@@ -27,7 +27,7 @@ _LONGEST = 4 * _BATCHES  # batches over which that is averaged
 _ANY = pi / sqrt(3.0)  # standard deviation of a phase of which nothing is known
 
 
-class StreamingFilter:
+class StreamingFilter(Copied):
     """A first-order filter x⁺ = decay x + forward y that runs on each of several channels alone.
 
     Splitting a stream into samples and blocks in another way does not change any number. A value that is not finite is
@@ -87,10 +87,6 @@ class StreamingFilter:
         other.channels, other.n_samples, other.n_missing = channels, 0, 0
         other._state = np.full(channels, self._begun)
         return other
-
-    def copy(self) -> Self:
-        """Return an independent filter in the same state."""
-        return deepcopy(self)
 
 
 def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float = 60.0, r: float = 1.0) -> float:
@@ -238,7 +234,7 @@ class Sinusoid:
     phase_sd: float
 
 
-class SynchronousFilter:
+class SynchronousFilter(Copied):
     """Known-frequency regressor and notch.
 
     Cosine and sine parts and the offset are followed with a memory that is fixed in time, so that the notch is
@@ -364,12 +360,3 @@ class SynchronousFilter:
             phase=float(np.arctan2(-b, a)),
             phase_sd=float(min(np.sqrt(across @ P @ across) / size, _ANY)),
         )
-
-    def copy(self) -> Self:
-        """Return an independent filter in the same state.
-
-        Returns
-        -------
-        SynchronousFilter
-        """
-        return deepcopy(self)
