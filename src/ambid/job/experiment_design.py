@@ -458,7 +458,7 @@ def _told(
         phase={name: np.angle(c) for name, c in by_input.items()},
         excitation=dict(zip(of.inputs, wave.T, strict=True)), table=table,
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
-gap=found.gap, drawn=len(task.loops) - 1,
+        gap=found.gap, drawn=len(task.loops) - 1,
         checks=_checks(used, expected, unstable) | ({} if curved is None else {"curvature": curved}),
         warnings=_cautions(bench.rig, task, lines, power, information),
         shown=Shown(
