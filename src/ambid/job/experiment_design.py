@@ -470,7 +470,7 @@ def _told(
 
 
 def _cautions(rig: Rig, task: Task, lines: Lines, power: Array, known: Information) -> tuple[str, ...]:
-    """Say what is promised of a rotor with modes, but hangs on numbers that the record shows too weakly.
+    """Say what is promised of a rotor with modes, but depends on numbers that the record shows too weakly.
 
     A rotor that turns trades frequencies at rest for gyroscopic terms: at an estimate, which scatters by what is
     promised, the information is another than at the numbers that are designed for.
