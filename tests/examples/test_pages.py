@@ -124,6 +124,8 @@ def test_the_commands_of_the_readme_run_one_by_one(tmp_path, monkeypatch, capsys
     from ambid.cli.app import run_verb
 
     monkeypatch.chdir(tmp_path)
+    # thirty figures, three quarters of the time of a commissioning: tests/job/test_commission.py looks at that page
+    monkeypatch.setattr("ambid.job.commissioning.page", lambda found: "<html></html>")
     said: dict[str, str] = {}  # by command
     for piece in blocks(ROOT / "README.md", "sh"):
         for line in piece.splitlines():
