@@ -338,7 +338,7 @@ def _result(
     bench = replace(of.bench, noise=of.bench.noise or of.rig.noise)  # with its resolutions
     tried = hardest(of.judging.plants, seen)
     todo, both = (
-        Trials(run_up=bool(loop.laws)),
+        Trials(run_up=True, speed=of.speeds[1]) if loop.laws and of.speeds else Trials(),
         {name: x for name, (x, _) in zip(("before", "after"), loops, strict=True)},
     )
     trials = {
