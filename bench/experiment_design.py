@@ -136,9 +136,10 @@ def rotor(name: str) -> tuple[str, ...]:
         part, peak = used(found, records["designed"]), 1.0
         settings = {"duration": found.seconds, "periods": found.periods, "seed": seed}
         still = used(found, ambid.simulate(rig, **settings, amplitude=1e-3))
-        for _ in range(4):
+        for _ in range(6):
             records["zippered"] = ambid.simulate(rig, **settings, amplitude=peak)
-            peak *= (part - still) / (used(found, records["zippered"]) - still)
+            grown = (part - still) / max(used(found, records["zippered"]) - still, 1e-9)
+            peak *= float(np.clip(grown, 0.25, 4.0))
         for kind, record in records.items():
             estimate = ambid.identify(record, rig)
             sd = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))

@@ -92,5 +92,8 @@ def test_what_cannot_be_promised_is_refused(rig, designed):
     for changed, said in (({"limits": None}, "no limits"), ({"noise": Noise()}, "noise"), ({"loop": None}, "unstable")):
         with pytest.raises(AmbidError, match=said):
             ambid.design_experiment(replace(rig, **changed), seconds=0.4, lines=8)
+    for how in ({"lines": 12}, {"seconds": 0.1, "period": 0.1}, {"band": (100.0, 200.0)}):
+        with pytest.raises(AmbidError, match="20 lines and 2 periods"):
+            ambid.design_experiment(rig, **{"seconds": 0.4, "lines": 40, **how})
     with pytest.raises(AmbidError, match="xL_voltage"):
         ambid.simulate("prototype", excitation=designed)

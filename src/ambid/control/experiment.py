@@ -268,11 +268,6 @@ class Task:
         every = every[
             ~beside_harmonics(self.frequency_hz(every), self.speed / (2.0 * np.pi), self.rate_hz / self.period)
         ]
-        if every.size < self.loops[0].e.shape[1]:
-            raise EstimationError(
-                f"the band has {every.size} lines that no harmonic of the speed is beside, fewer than inputs. Widen "
-                "the band, or make the period longer"
-            )
         if every.size <= _CANDIDATES:
             return every
         half = _CANDIDATES // 2

@@ -48,6 +48,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.estimate import RotorEstimate
+from ambid.rotor.spectra import LEAST_LINES, LEAST_PERIODS
 from ambid.signals.excitations import schroeder_phases
 from ambid.simulation.plant import LinearPlant
 from ambid.simulation.rig_bench import Bench, loop_of_rig
@@ -270,6 +271,13 @@ def _designed(known: Known | None, bench: AnyBench, wanted: Wanted, say: Tick) -
     task = _task(
         bench, loops, lambda of: _innovation(known, bench, of), (low + spare, high - spare), wanted, prior_sd
     )  # fmt: skip
+    if isinstance(bench, RotorBench) and (
+        min(wanted.lines, task.candidates().size) < LEAST_LINES or task.periods < LEAST_PERIODS
+    ):
+        raise AmbidError(
+            f"{min(wanted.lines, task.candidates().size)} lines in {task.periods} periods; a rotor is identified from "
+            f"{LEAST_LINES} lines and {LEAST_PERIODS} periods at least. Change --lines, --band, --period or --seconds"
+        )
     say("design")
     found = design(task, tick=lambda: say("design"))
     return _told(bench, task, found, (low, high, spare), wanted, unstable)

@@ -23,10 +23,12 @@ from ambid.record import Record, cut
 from ambid.signals.periodic_response import excited_lines, find_period, transient_ratio
 
 _TRANSIENT = 5.0  # standard deviations by which a first period may differ from the others
-_LEAST_PERIODS = 2
+LEAST_PERIODS = 2
+"""Whole periods of a record whose spectra are used."""
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
 _FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
-_LEAST_LINES = 20  # that are excited
+LEAST_LINES = 20
+"""Lines of a rotor's record that are excited, at least."""
 _MOST_LINES = 1200
 _MOST_WINDOWS = 4000  # in which noise is looked at
 _LINES_PER_UNKNOWN = 3
@@ -175,11 +177,11 @@ def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
         return None
     n = record.n_samples
     count = n // period
-    if count < _LEAST_PERIODS or period < 64:
+    if count < LEAST_PERIODS or period < 64:
         return None
     first = n - count * period
     y = np.column_stack([record[role].values for role in (*model.inputs, *model.outputs)])
-    while count > _LEAST_PERIODS:
+    while count > LEAST_PERIODS:
         parts = y[first:].reshape(count, period, -1)
         if transient_ratio(parts) <= _TRANSIENT:
             break
@@ -198,12 +200,12 @@ def experiments_of(record: Record, model: LinearModel) -> tuple[Record, ...]:
     except EstimationError:
         return (record,)
     count = record.n_samples // period
-    if count <= 2 * _LEAST_PERIODS:
+    if count <= 2 * LEAST_PERIODS:
         return (record,)
     parts = np.column_stack(signals)[: count * period].reshape(count, period, -1)
     moved = np.mean((parts[1:] - parts[:-1]) ** 2, axis=(1, 2)) > _OTHER**2 * np.mean(parts**2)
     edges = [0, *(np.flatnonzero(moved) + 1).tolist(), count]
-    if len(edges) == 2 or min(np.diff(edges)) <= _LEAST_PERIODS:  # one period more, for its transient
+    if len(edges) == 2 or min(np.diff(edges)) <= LEAST_PERIODS:  # one period more, for its transient
         return (record,)
     at = [*(record.start_s + edge * period / record.rate_hz for edge in edges[:-1]), None]
     return tuple(cut(record, first, last) for first, last in pairwise(at))
@@ -235,10 +237,10 @@ def period_spectra(record: Record, model: LinearModel, found: Excitation, speed:
     within = slice(1, (n + 1) // 2)
     clean = (R if logged else U.mean(axis=0))[None, within]
     scatter = None if logged else np.var(U, axis=0, ddof=1)[within].sum(axis=1) / found.count
-    lines = excited_lines(clean, scatter, least=_LEAST_LINES)[0] + 1
+    lines = excited_lines(clean, scatter, least=LEAST_LINES)[0] + 1
     frequency: Array = np.asarray(lines * (rate / n), dtype=np.float64)
     near = beside_harmonics(frequency, speed / (2.0 * np.pi), rate / n)
-    if np.count_nonzero(~near) < _LEAST_LINES:
+    if np.count_nonzero(~near) < LEAST_LINES:
         raise EstimationError(
             f"the excitation of the record has {lines.size} lines, {np.count_nonzero(near)} of them beside harmonics "
             "of the speed; a rotor needs 20 others. Excite more lines: a multisine with whole periods"
@@ -279,7 +281,7 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     seen[:_FIRST_LINE] = False
     seen &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
     lines = np.flatnonzero(seen)
-    if lines.size < _LEAST_LINES:
+    if lines.size < LEAST_LINES:
         raise EstimationError(
             f"the record shows motion above its noise at {lines.size} lines; a rotor needs 20. Excite more, and more "
             "frequencies, or record longer"
