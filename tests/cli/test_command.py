@@ -57,7 +57,7 @@ OUTPUTS = {
     "the second record": (["--json", "second.csv", "--validate", "second.csv"], "is also an input"),
     "twice": (["--plot", "a.png", "--report", "a.html", "--json", "./a.png"], "two options"),
     "no picture": (["--plot", "a.jpeg"], "must end in .png or .svg or .pdf"),
-    "no page": (["--report", "a.pdf"], "must end in .html"),
+    "no page": (["--report", "a.png"], "must end in .html or .htm or .pdf"),
 }
 
 

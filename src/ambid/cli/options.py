@@ -53,7 +53,9 @@ TrackFile = Annotated[
     str | None, option("--json FILE", "Write the track as lines of JSON as it is computed; - for standard output.")
 ]
 Plot = Annotated[Path | None, option("--plot FILE.png", "Draw the result.")]
-Report = Annotated[Path | None, option("--report FILE.html", "Write a report in one self-contained file.")]
+Report = Annotated[
+    Path | None, option("--report FILE.html", "Write a report in one self-contained file, .html or .pdf.")
+]
 Strict = Annotated[bool, switch("--strict", "End with exit code 3 unless the verdict is usable.")]
 Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeatable.")]
 OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeatable.")]

@@ -56,7 +56,7 @@ class Outputs(Files):
 
         self.draw(self._plot, result.plot, tick)
         if self._report is not None:
-            self.stage_text(self._report, presentation.page(result))
+            presentation.stage_page(self, self._report, result)
         self._document = presentation.document(result)
         path = json_path(self._json)
         if path is not None:

@@ -116,7 +116,7 @@ class Result:
         Parameters
         ----------
         path : str or Path
-            Ends in ``.html``; a page that exists is replaced.
+            Ends in ``.html`` or ``.pdf``; a page that exists is replaced.
         record : object, optional
             As `plot`.
         """

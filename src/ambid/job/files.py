@@ -12,13 +12,13 @@ from typing import Self
 from ambid.errors import AmbidError
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
-PAGE_ENDINGS = (".html", ".htm")
+PAGE_ENDINGS = (".html", ".htm", ".pdf")
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
 EXPORT_ENDINGS = (".mat", ".py")
 LAW_ENDINGS = (*EXPORT_ENDINGS, ".c")
 _BEGINNINGS = {
-    FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<",), EXPORT_ENDINGS: (b"MATLAB 5.0", b'"""'),
+    FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<", b"%PDF"), EXPORT_ENDINGS: (b"MATLAB 5.0", b'"""'),
     LAW_ENDINGS: (b"MATLAB 5.0", b'"""The law of ', b"/* The law of "),
 }  # fmt: skip
 _STREAMED = ("--json",)  # options that take - for standard output

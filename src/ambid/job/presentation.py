@@ -64,17 +64,36 @@ def figure(result: Result, record: Any = None) -> Figure:
 
 def page(result: Result, record: Any = None) -> str:
     """Return a page with a result and its figures as HTML."""
-    from ambid.report.page import Page, Section, page_html
+    from ambid.report.page import page_html
+
+    return page_html(_page(result, record), result.verdict, made=_now())
+
+
+def stage_page(files: Files, path: Path, result: Result, record: Any = None) -> None:
+    """Write a page with a result and its figures, as HTML or PDF by the ending of `path`."""
+    if path.name.lower().endswith(".pdf"):
+        from ambid.report.book import page_pdf
+
+        book = page_pdf(_page(result, record), result.verdict, made=_now())
+        files.stage(path, lambda beside: beside.write_bytes(book))
+    else:
+        files.stage_text(path, page(result, record))
+
+
+def _now() -> str:
+    return datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC")
+
+
+def _page(result: Result, record: Any) -> Page:
+    from ambid.report.page import Page, Section
 
     known, used = view(result), _beside(result, record)
     if known.page is None:
         title = known.title(result)
         said = Section(title="Result", text=known.text(result, width=WIDTH, paint=plain))
         drawn = Section(title="Figures", figure=lambda width: known.figure(result, used, width))
-        made = Page(title=title, sections=[said, drawn])
-    else:
-        made = _with_loop(result, used, known.page(result, used))
-    return page_html(made, result.verdict, made=datetime.now(UTC).strftime("%Y-%m-%d %H:%M UTC"))
+        return Page(title=title, sections=[said, drawn])
+    return _with_loop(result, used, known.page(result, used))
 
 
 def _with_loop(result: Any, used: Any, made: Page) -> Page:
@@ -132,7 +151,7 @@ def write_page(result: Result, path: str | Path, record: Any = None) -> None:
     """Write the page of a result."""
     with Files() as files:
         files.claim(Path(path), "path", PAGE_ENDINGS)
-        files.stage_text(Path(path), page(result, record))
+        stage_page(files, Path(path), result, record)
 
 
 def write_document(result: Result, path: str | Path) -> None:

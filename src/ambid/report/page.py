@@ -76,6 +76,12 @@ def check_table(checks: Mapping[str, Check]) -> Table:
     return rows
 
 
+def origin(page: Page, made: str) -> list[tuple[str, str]]:
+    """Return where a page comes from, as names and values; `made`: its date, left out where empty."""
+    versions = ", ".join(f"{name} {version(name)}" for name in _LIBRARIES)
+    return [*page.provenance, *([("made", made)] if made else []), ("versions", versions)]
+
+
 def page_html(page: Page, verdict: Verdict, *, made: str = "") -> str:
     """Return a page as HTML with its figures inside; `made` is its date, left out where empty."""
     from jinja2 import Environment, StrictUndefined
@@ -88,8 +94,6 @@ def page_html(page: Page, verdict: Verdict, *, made: str = "") -> str:
     sheet = "\n".join(data(name) for name in ("uPlot.min.css", "report.css")[not interactive :])
     script = "\n".join(data(name) for name in ("uPlot.iife.min.js", "report.js")[not interactive :])
     template = Environment(autoescape=True, undefined=StrictUndefined).from_string(data("report.html.j2"))
-    last = [("made", made)] if made else []
-    last += [("versions", ", ".join(f"{name} {version(name)}" for name in _LIBRARIES))]
     words, style = WORDS[verdict.word]
     return template.render(
         page=page,
@@ -97,7 +101,7 @@ def page_html(page: Page, verdict: Verdict, *, made: str = "") -> str:
         spread=SPREAD,
         style=style,
         reasons=verdict.reasons,
-        provenance=[*page.provenance, *last],
+        provenance=origin(page, made),
         sheet=Markup(sheet),
         script=Markup(script),
         style_hash=_hash(sheet),

@@ -24,6 +24,7 @@ _NAMED = {"#ffffff": "paper", "#000000": "ink", "#1a1a1a": "ink", "#4d4d4d": "me
 # fmt: on
 _LONG = 40  # lines of a path from which tenths of a point are enough
 _CLOSE = 0.1  # points by which a long path may leave what it draws
+_READ = 1600  # points of a line, of which a pointer reads no more: they lie closer than it can be placed
 _BORDERS = ("border of stability",)  # lines without values
 _LARGEST = 400_000  # letters of an SVG, from which a PNG is smaller
 
@@ -86,14 +87,13 @@ def _small(text: str, prefix: str) -> str:
 
 
 def _merged(text: str) -> str:
-    """Return an SVG with lines that look alike, one after the other, as one path: bars and stems."""
-    alike = r'<path d="[^"]*"([^>]* fill="none"[^>]*)/>(?:<path d="[^"]*"\1/>)+'
-
-    def one(found: re.Match[str]) -> str:
-        paths = "".join(re.findall(' d="([^"]*)', found[0]))
-        return f'<path d="{paths}"{found[1]}/>'
-
-    return re.sub(alike, one, text)
+    """Return an SVG with neighbours that look alike put together: bars and stems as one path, marks as one group."""
+    for _ in range(2):
+        text = re.sub(r"<g>(<[^/][^>]*/>)</g>", r"\1", text)
+    lines = r'<path d="[^"]*"([^>]* fill="none"[^>]*)/>(?:<path d="[^"]*"\1/>)+'
+    text = re.sub(lines, lambda m: f"""<path d="{"".join(re.findall(' d="([^"]*)', m[0]))}"{m[1]}/>""", text)
+    marks = r'<use href="([^"]*)" x="[^"]*" y="[^"]*"([^>]*)/>(?:<use href="\1" x="[^"]*" y="[^"]*"\2/>)+'
+    return re.sub(marks, lambda m: f"<g{m[2]}>{m[0].replace(m[2], '')}</g>" if m[2] else m[0], text)
 
 
 def _attributes(style: str) -> str:
@@ -172,9 +172,13 @@ def _points(axes: Axes) -> Iterator[tuple[str, Array, Array]]:
     named = {c[0]: str(c.get_label()) for c in bars}
     for line in axes.lines:
         label, (x, y) = named.get(line, str(line.get_label())), (np.asarray(v, dtype=float) for v in line.get_data())
-        free = all(line.get_transform().contains_branch_seperately(axes.transData))
+        aside = label[:1] == "_" and any(
+            str(x.get_label())[:1] != "_" for x in axes.lines
+        )  # belongs to one with a name
+        free = not aside and all(line.get_transform().contains_branch_seperately(axes.transData))
         if free and x.size and label not in _BORDERS:
-            yield label if label[:1] != "_" else "", x, y
+            some = slice(None, None, -(-x.size // _READ))
+            yield label if label[:1] != "_" else "", x[some], y[some]
     for stems in (c for c in axes.collections if isinstance(c, LineCollection) and all(c not in b[2] for b in bars)):
         ends = np.array([max(s, key=lambda end: abs(end[1])) for s in stems.get_segments()])
         if ends.size:
