@@ -1,7 +1,11 @@
 """What a console refuses: each attack is answered by a refusal, changes nothing, and the page goes on."""
 
 import json
+import os
 import socket
+import time
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack, suppress
 
 import pytest
 
@@ -10,20 +14,29 @@ pytest.importorskip("starlette", reason="the extra [console] is not installed")
 
 from websockets.exceptions import InvalidStatus, WebSocketException
 
-from tests.console.pages import PAGE, console
+from ambid.console.folder import Folder, open_plain
+from ambid.console.runs import Heard, Run, Runs
+from ambid.errors import AmbidError
+from tests.console.pages import PAGE, console, told, until
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     made = tmp_path_factory.mktemp("bench")
     (made / "outside").mkdir()
-    (made / "shown" / "sub").mkdir(parents=True)
+    (made / "shown" / "named.toml").mkdir(parents=True)
+    (made / "shown" / "sub").mkdir()
     secret = made / "outside" / "secret.toml"
     secret.write_text('schema = "ambid.rig/1"\nname = "secret"\n', encoding="utf-8")
     shown = made / "shown"
     (shown / "linked.toml").symlink_to(secret)
     (shown / "linked").symlink_to(made / "outside")
     (shown / "rig.toml").write_text('schema = "ambid.rig/1"\nname = "mine"\n', encoding="utf-8")
+    os.mkfifo(shown / "pipe.csv")
+    os.mkfifo(shown / "pipe.json")
+    (shown / "device.csv").symlink_to("/dev/zero")
+    (shown / "deep.json").write_text("[" * 100_000, encoding="utf-8")
+    (shown / os.fsdecode(b"no\xfftext.csv")).write_text("a\n1\n", encoding="utf-8")
     planted = "<img src=x onerror=alert(1)>.html"
     (shown / planted).write_text("<script>document.title='planted'</script>", encoding="utf-8")
     return shown
@@ -56,10 +69,14 @@ def test_without_the_cookie_nothing_is_shown(page, path):
 
 
 @pytest.mark.parametrize(
-    "cookie", ["ambid_console=", "ambid_console=x", "ambid_console=\xe4", "ambid_console=a; ambid_console=b"]
+    "cookie",
+    ["ambid_console=", "ambid_console_{p}=x", "ambid_console_{p}=\xe4", "ambid_console_{p}=a; ambid_console_{p}=b"],
 )
 def test_a_wrong_cookie_opens_nothing(page, cookie):
-    assert page.ask("GET", "/api/state", cookie=cookie).status == 403
+    name = cookie.format(p=page.host.rpartition(":")[2])
+    assert page.ask("GET", "/api/state", cookie=name).status == 403
+    assert page.ask("GET", "/api/state", cookie=page.cookie[:-1]).status == 403
+    assert page.ask("GET", "/api/state", cookie=page.cookie.replace("=", "1=")).status == 403  # of another port
 
 
 HOSTS = ["evil.example", "127.0.0.1", "127.0.0.1:1", "localhost.evil.example", "[::1]", "0.0.0.0:80"]
@@ -106,7 +123,33 @@ def test_no_path_leads_out_of_the_folder(page, path):
 def test_links_are_not_followed(page):
     names = [f["name"] for f in page.state()["files"]]
     assert "rig.toml" in names
-    assert not [n for n in names if "linked" in n]
+    assert not [n for n in names if "linked" in n or "pipe" in n or "device" in n or "named" in n]
+    assert any("text.csv" in n for n in names)  # whose name is no text
+
+
+def test_a_file_exchanged_for_a_link_is_not_opened(folder, monkeypatch):
+    files = Folder(folder)
+    number = next(e.number for e in files.entries() if e.name == "rig.toml")
+    secret, rig = folder.parent / "outside" / "secret.toml", folder / "rig.toml"
+    assert b"mine" in files.read(number, "rig", 1000)
+    with pytest.raises(AmbidError, match="is longer"):
+        files.read(number, "rig", 10)
+    for opened in (lambda path: open_plain(secret), lambda path: open_plain(folder / "linked.toml")):
+        monkeypatch.setattr("ambid.console.folder.open_plain", opened)
+        with pytest.raises((AmbidError, OSError)):
+            files.read(number, "rig", 1000)
+    with pytest.raises(OSError, match="no plain file"):
+        open_plain(folder / "pipe.csv")
+    assert rig.read_text(encoding="utf-8").endswith('"mine"\n')
+
+
+def test_a_folder_of_ten_thousand_files_is_listed_soon(tmp_path):
+    for k in range(10_000):
+        (tmp_path / f"{k}.csv").touch()
+    files, begin = Folder(tmp_path), time.process_time()
+    assert len(files.entries()) == 2000
+    assert files.left_out == 8000
+    assert time.process_time() - begin < 2.0
 
 
 BODIES = [
@@ -120,6 +163,13 @@ BODIES = [
     json.dumps({"job": "rig", "text": 'schema = "ambid.rig/1"', "out": "rig"}).encode(),
     json.dumps({"job": "rig", "text": "x" * 60_000, "out": "long"}).encode(),
     json.dumps({"job": "live", "rig": 1, "port": ["simulated"], "out": "x"}).encode(),
+    *(
+        json.dumps({"job": "live", "port": port, "out": "x"}).encode()
+        for port in ("replay:/etc/passwd", "replay:../outside/secret.toml", "replay:linked/secret.toml", "/dev/mem",
+                     "/dev/tty/../mem", "socket://evil.example:1", "/dev/watchdog", "hwgrep://x", " simulated")
+    ),
+    json.dumps({"job": "live", "port": "simulated", "excitation": "/etc/passwd", "out": "x"}).encode(),
+    json.dumps({"job": "live", "port": "simulated", "pace": "../fast", "out": "x"}).encode(),
     json.dumps({"job": "live", "rig": 1, "port": "simulated", "seconds": True, "out": "x"}).encode(),
     b'{"job": "export", "record": 1, "from_s": NaN, "to_s": 1e999, "out": "x"}',
 ]  # fmt: skip
@@ -131,6 +181,7 @@ def test_a_wrong_wish_starts_nothing(page, folder, body):
     answer = page.ask("POST", "/api/runs", body)
     assert answer.status == 400
     assert "error" in json.loads(answer.body)
+    assert b"root:" not in answer.body
     assert sorted(p.name for p in folder.rglob("*")) == before
 
 
@@ -183,6 +234,110 @@ def test_read_only_changes_nothing(folder):
         assert started.state()["read_only"] is True
 
 
+HEADS = [
+    "GET / HTTP/1.0\r\n\r\n", "GET / HTTP/1.1\r\n\r\n", "GET http://evil.example/ HTTP/1.1\r\nHost: {host}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: {host}\r\nHost: evil.example\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: user@{host}\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: {host}.\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost : {host}\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: evil.example\r\nX-Forwarded-Host: {host}\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: {host}\r\nCookie: x=1\r\nCookie: {cookie}\r\n\r\n",
+    "GET /api/state HTTP/1.1\r\nHost: {host}\r\nOrigin: http://{host}\r\nOrigin: null\r\nX:1\r\n\r\n",
+    "CONNECT evil.example:80 HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n",
+    "TRACE / HTTP/1.1\r\nHost: {host}\r\nCookie: {cookie}\r\n\r\n",
+    "OPTIONS /api/runs HTTP/1.1\r\nHost: {host}\r\nOrigin: http://evil.example\r\n\r\n",
+    "GET /api/state\r\n HTTP/1.1\r\nHost: {host}\r\n\r\n", "\x00\x16\x03\x01" * 9 + "\r\n\r\n",
+    "POST /api/drive HTTP/1.1\r\n{ours}Content-Length: 5\r\nContent-Length: 6\r\n\r\nGET / ",
+    "POST /api/drive HTTP/1.1\r\n{ours}Content-Length: -1\r\n\r\n",
+    "POST /api/drive HTTP/1.1\r\n{ours}Content-Length: 99999999999999999999999999\r\n\r\n",
+    "POST /api/drive HTTP/1.1\r\n{ours}Transfer-Encoding: chunked, identity\r\n\r\n0\r\n\r\n",
+    "POST /api/drive HTTP/1.1\r\n{ours}Transfer-Encoding: chunked\r\n\r\nfffffffffffffffffffff\r\n",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("head", HEADS, ids=range(len(HEADS)))
+def test_a_head_that_is_none_of_ours_is_refused(page, head):
+    ours = f"Host: {page.host}\r\nCookie: {page.cookie}\r\nX-Ambid: {PAGE}\r\nContent-Type: application/json\r\n"
+    with socket.create_connection(page.host.rsplit(":", 1), timeout=5) as line:
+        line.sendall(head.format(host=page.host, cookie=page.cookie, ours=ours).encode("latin-1"))
+        answer = line.recv(4096)
+    assert answer.partition(b"\r\n")[0].split(b" ")[1][:1] == b"4", answer
+    assert page.state()
+
+
+def test_of_many_that_race_for_the_link_one_gets_in(folder):
+    with console(folder) as started, ThreadPoolExecutor(20) as clients:
+        path = f"/?token={started.token}"
+        found = [a.status for a in clients.map(lambda _: started.ask("GET", path, cookie=""), range(20))]
+    assert sorted(found) == [303, *[403] * 19]
+
+
+def test_what_is_planted_among_the_runs_harms_nothing(tmp_path):
+    runs, outside = tmp_path / "shown" / ".ambid" / "runs", tmp_path / "outside"
+    outside.mkdir()
+    runs.mkdir(parents=True)
+    planted = [
+        "[]",
+        "null",
+        "{",
+        '{"pid": "x"}',
+        '{"pid": 1e400, "began": NaN}',
+        '{"job": NaN, "rig": [[]]}',
+        "[" * 99_999,
+    ]
+    for k, text in enumerate(planted):
+        place = runs / f"{k:010d}-{k:06x}"
+        place.mkdir()
+        for name in ("spec.json", "process.json", "control.jsonl", "feed-000000.bin", "feed-x.bin"):
+            (place / name).write_text(text + "\n", encoding="utf-8")
+    (runs / "0000000099-00000a").symlink_to(outside)
+    place = runs / "0000000000-000000"
+    for name in ("feed-000001.bin", "pipe"):
+        os.mkfifo(place / name)
+    (place / "control.jsonl").write_text('[]\n{\n"x"\n{"word": "stop"}\n', encoding="utf-8")
+    assert list(Heard(Run(place))) == [{"word": "stop"}]
+    (place / "control.jsonl").unlink()
+    (place / "control.jsonl").symlink_to(outside / "made")
+    with console(tmp_path / "shown") as page:
+        page.open()
+        found = page.state()["runs"]
+        assert len(found) == len(planted)
+        assert not any(r["alive"] for r in found)
+        for run in found:
+            with page.feed(run["id"]) as feed:
+                assert list(feed) == []  # and closed
+        page.ask("POST", "/api/runs/0000000000-000000/say", {"word": "stop"})
+        page.ask("POST", "/api/runs/0000000099-00000a/say", {"word": "stop"})
+        assert not list(outside.iterdir())
+        runs.rename(tmp_path / "moved")
+        runs.symlink_to(outside)
+        wish = {"job": "rig", "text": "x", "out": "new"}
+        assert "is a link" in page.json("POST", "/api/runs", wish)["error"]
+        assert page.state()["runs"] == []
+    assert not list(outside.iterdir())
+
+
+def test_a_program_in_the_folder_is_not_run(tmp_path):
+    for name in ("numpy.py", "json.py", "ambid.py", "sitecustomize.py"):
+        (tmp_path / name).write_text(f"open({str(tmp_path / 'ran')!r}, 'w')\n", encoding="utf-8")
+    run = Runs(tmp_path).start({"job": "rig", "text": "no rig", "out": "new.toml"})
+    assert told(until(run), "end")[0]["how"] == "refused"
+    assert not (tmp_path / "ran").exists()
+
+
+def test_many_viewers_are_refused_and_one_that_takes_nothing_stays_alone(folder, page):
+    run = Runs(folder).start({"job": "rig", "text": "no rig", "out": "new.toml"})
+    until(run)
+    with ExitStack() as all_of_them:
+        seen = 0
+        for _ in range(40):
+            with suppress(WebSocketException, OSError):
+                all_of_them.enter_context(page.feed(run.id, max_queue=1))
+                seen += 1
+        assert page.state()
+    assert seen
+
+
 def test_many_clients_are_refused_and_the_page_goes_on(page):
     lines = []
     try:
@@ -190,6 +345,7 @@ def test_many_clients_are_refused_and_the_page_goes_on(page):
             line = socket.create_connection(page.host.rsplit(":", 1), timeout=5)
             line.sendall(f"GET /api/state HTTP/1.1\r\nHost: {page.host}\r\n".encode())  # never ends
             lines.append(line)
+        assert page.state()["folder"] == "shown"  # while all of them wait
     finally:
         for line in lines:
             line.close()

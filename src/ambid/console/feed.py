@@ -7,16 +7,22 @@ begins with the frames that a reader has to know (`sticky`), so that any part ca
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import struct
 import threading
 from collections.abc import Mapping
+from io import FileIO
 from pathlib import Path
 from typing import Any
+
+from ambid.console.folder import open_plain
 
 _HEAD = struct.Struct("<Ic")
 _PART = 2 << 20  # bytes after which a new part begins: 2.7 minutes of eight signals at 200 envelopes a second
 _KEPT = 24  # parts: about an hour
+_LONGEST = 1 << 26  # bytes of a frame; what claims more is damaged
 
 
 class FeedWriter:
@@ -30,7 +36,8 @@ class FeedWriter:
         self._lock = threading.Lock()
         self._sticky: dict[str, bytes] = {}
         self._number = next_part(folder)
-        self._file = part(folder, self._number).open("ab", buffering=0)
+        self._file: FileIO | None = None
+        self._missed, self._closed = 0, False
 
     def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None) -> None:
         """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part."""
@@ -49,18 +56,40 @@ class FeedWriter:
     def close(self) -> None:
         """End the feed."""
         with self._lock:
-            self._file.close()
+            self._closed = True
+            if self._file is not None:
+                self._file.close()
 
     def _append(self, frame: bytes) -> None:
-        if self._file.closed:
+        """Write a frame whole or not at all: a full disk stops no run, and is told once it takes again."""
+        if self._closed:
             return
-        if self._file.tell() + len(frame) > self._size:
+        try:
+            file = self._room(len(frame))
+            at = file.tell()
+            if self._missed:
+                note = {"kind": "note", "text": f"{self._missed} messages of this view are missing: the disk took none"}
+                frame = _framed(b"J", json.dumps(note).encode()) + frame
+            if not at:
+                frame = b"".join((*(f for f in self._sticky.values() if not frame.endswith(f)), frame))
+            if file.write(frame) < len(frame):
+                file.truncate(at)
+                raise OSError(errno.ENOSPC, "no space left")
+            self._missed = 0
+        except OSError:
+            self._missed += 1
+
+    def _room(self, length: int) -> FileIO:
+        """Return the part that takes so many bytes more."""
+        if self._file is not None and self._file.tell() + length <= self._size:
+            return self._file
+        number = self._number + (self._file is not None)
+        file = FileIO(part(self._folder, number), "ab")
+        if self._file is not None:
             self._file.close()
-            self._number += 1
-            self._file = part(self._folder, self._number).open("ab", buffering=0)
-            part(self._folder, self._number - self._kept).unlink(missing_ok=True)
-            frame = b"".join((*self._sticky.values(), frame))
-        self._file.write(frame)
+        self._number, self._file = number, file
+        part(self._folder, number - self._kept).unlink(missing_ok=True)
+        return file
 
 
 class FeedReader:
@@ -73,24 +102,31 @@ class FeedReader:
         self._folder = folder
         last = next_part(folder) - 1
         self._number = max(first_part(folder), last - parts + 1)
+        self._file: FileIO | None = None
+        self._over = False
         self._at, self.behind = 0, 0  # `behind`: bytes of this part that were not read yet, after the last read
 
     def read(self, most: int = 1 << 18) -> bytes:
         """Return whole frames, `most` bytes of them or the next one; empty where there is nothing new."""
-        path = part(self._folder, self._number)
+        data = b""
         try:
-            with path.open("rb") as file:
-                file.seek(self._at)
-                data = file.read(most)
-                self.behind = max(0, path.stat().st_size - self._at - len(data))
-        except FileNotFoundError:
-            data = b""
+            if self._file is None:
+                self._file = open_plain(part(self._folder, self._number))
+            self._file.seek(self._at)
+            data = self._file.read(most)
+        except OSError:  # not yet there, or gone
+            pass
         whole = whole_frames(data)
-        if data and not whole and len(data) == most:
+        if data and not whole and len(data) == most and most < _LONGEST:
             return self.read(4 * most)
         self._at += whole
-        if not data and part(self._folder, self._number + 1).exists():
-            self._number, self._at = max(self._number + 1, first_part(self._folder)), 0
+        if self._file is not None and whole:
+            self.behind = max(0, os.fstat(self._file.fileno()).st_size - self._at)
+        if not whole and part(self._folder, self._number + 1).exists():
+            if self._over:
+                self._number, self._at = max(self._number + 1, first_part(self._folder)), 0
+                self._file = None
+            self._over = not self._over  # what came between the read and the next part is read first
             return self.read(most)
         return data[:whole]
 
@@ -133,7 +169,7 @@ def next_part(folder: Path) -> int:
 
 
 def _numbers(folder: Path) -> list[int]:
-    return [int(p.stem.removeprefix("feed-")) for p in folder.glob("feed-*.bin")]
+    return [int(p.stem.removeprefix("feed-")) for p in folder.glob("feed-[0-9]*.bin") if p.stem[5:].isdecimal()]
 
 
 def _framed(kind: bytes, payload: bytes) -> bytes:

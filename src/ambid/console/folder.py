@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import stat
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
+from io import FileIO
 from pathlib import Path
 from typing import Any
 
 from ambid.errors import AmbidError
 
 _RECORDS = (".csv", ".csv.gz", ".h5", ".hdf5", ".mat")
-_MOST = 2000  # files that are listed
+_MOST = 2000  # files that are listed, the newest
+_WALKED = 50_000  # files that are looked at
 _DEPTH = 2
-_HEAD = 200_000  # bytes of a result in which its verdict is looked for
+_LONGEST = 12_800_000  # bytes of a result whose verdict is looked for
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,22 +39,37 @@ class Folder:
 
     def __init__(self, folder: Path) -> None:
         self.path = folder
+        self.left_out = 0
         self._numbers: dict[str, int] = {}
         self._seen: dict[str, tuple[float, int, str, str]] = {}
 
     def entries(self) -> list[Entry]:
-        """Return records, rigs, results and reports, the newest first."""
-        found = [entry for path in self._files() if (entry := self._entry(path)) is not None]
-        return sorted(found, key=lambda e: -e.changed)
+        """Return records, rigs, results and reports, the newest first; `left_out` tells how many are not listed."""
+        found = sorted(self._files(), key=lambda f: -f[1].st_mtime)
+        self.left_out = max(0, len(found) - _MOST)
+        return [entry for path, about in found[:_MOST] if (entry := self._entry(path, about)) is not None]
 
     def path_of(self, number: object, kind: str) -> Path:
         """Return the file of a number, which must be of a kind."""
         name = next((n for n, k in self._numbers.items() if k == number and not isinstance(number, bool)), None)
         path = None if name is None else self.path / name
-        entry = None if path is None or not _plain(path, self.path) else self._entry(path)
-        if entry is None or entry.kind != kind:
+        about = None if path is None else plain(path, self.path)
+        entry = None if path is None or about is None else self._entry(path, about)
+        if path is None or entry is None or entry.kind != kind:
             raise AmbidError(f"there is no {kind} of this number in the folder. Reload the list")
-        return self.path / entry.name
+        return path
+
+    def read(self, number: object, kind: str, most: int) -> bytes:
+        """Return what is in the file of a number: of a file that was exchanged for a link meanwhile, nothing."""
+        path = self.path_of(number, kind)
+        with open_plain(path) as file:
+            about = plain(path, self.path)
+            if about is None or not os.path.samestat(about, os.fstat(file.fileno())):
+                raise AmbidError(f"the {kind} was exchanged while it was opened. Reload the list")
+            data = file.read(most + 1)
+        if len(data) > most:
+            raise AmbidError(f"the {kind} is longer than {most >> 20} MiB. Open it without the console")
+        return data
 
     def new(self, name: object, ending: str) -> Path:
         """Return the place of a file that is to be made; its name is that of a plain new file."""
@@ -64,31 +84,31 @@ class Folder:
             raise AmbidError(f"{path.name} already exists. Choose another name")
         return path
 
-    def _files(self) -> list[Path]:
-        found: list[Path] = []
-        for root, folders, names in os.walk(self.path, followlinks=False):
-            here = Path(root)
-            depth = len(here.relative_to(self.path).parts)
-            folders[:] = [] if depth >= _DEPTH else [f for f in folders if not f.startswith(".")]
-            found += [here / n for n in names if not n.startswith(".")]
-            if len(found) > _MOST:
-                break
-        return [p for p in found[:_MOST] if _plain(p, self.path)]
+    def _files(self) -> Iterator[tuple[Path, os.stat_result]]:
+        """Yield plain files with an ending that is known; links are not followed."""
+        waiting, looked = [(str(self.path), 0)], 0
+        for folder, depth in waiting:  # grows
+            try:
+                inside = list(os.scandir(folder))
+            except OSError:
+                continue
+            for item in inside:
+                looked += 1
+                if item.name.startswith(".") or looked > _WALKED:
+                    continue
+                if item.is_dir(follow_symlinks=False):
+                    waiting += [(item.path, depth + 1)] if depth < _DEPTH else []
+                elif _kind(item.name) and item.is_file(follow_symlinks=False):
+                    with suppress(OSError):
+                        yield Path(item.path), item.stat(follow_symlinks=False)
 
-    def _entry(self, path: Path) -> Entry | None:
-        name, lower = str(path.relative_to(self.path)), path.name.lower()
-        kind = "record" if lower.endswith(_RECORDS) else _KINDS.get(path.suffix.lower(), "")
-        if not kind:
-            return None
-        try:
-            about = path.stat()
-        except OSError:
-            return None
+    def _entry(self, path: Path, about: os.stat_result) -> Entry | None:
+        name, kind = str(path.relative_to(self.path)), _kind(path.name)
         known = self._seen.get(name)
         if known is None or known[:2] != (about.st_mtime, about.st_size):
             schema, verdict = _said(path, kind)
             self._seen[name] = known = (about.st_mtime, about.st_size, schema, verdict)
-        if kind in ("rig", "result") and not known[2]:
+        if not kind or (kind in ("rig", "result") and not known[2]):
             return None
         number = self._numbers.setdefault(name, len(self._numbers) + 1)
         return Entry(
@@ -100,27 +120,44 @@ class Folder:
 _KINDS = {".toml": "rig", ".json": "result", ".html": "report"}
 
 
-def _plain(path: Path, folder: Path) -> bool:
-    """Whether a path is a plain file of the folder, reached through no link."""
+def _kind(name: str) -> str:
+    lower = name.lower()
+    return "record" if lower.endswith(_RECORDS) else _KINDS.get(Path(lower).suffix, "")
+
+
+def plain(path: Path, folder: Path) -> os.stat_result | None:
+    """Return what is known of a plain file of the folder; None where it is none, or a link leads to it."""
     try:
-        return path.is_file() and not path.is_symlink() and path.resolve().is_relative_to(folder.resolve())
-    except OSError:
-        return False
+        about = path.lstat()
+        return (
+            about
+            if stat.S_ISREG(about.st_mode) and path.resolve() == folder.resolve() / path.relative_to(folder)
+            else None
+        )
+    except (OSError, ValueError):
+        return None
+
+
+def open_plain(path: Path) -> FileIO:
+    """Open a plain file for reading: what is a link, a pipe or a device raises `OSError` and is not waited for."""
+    how = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NOFOLLOW", "O_NONBLOCK", "O_BINARY"))
+    file = FileIO(os.open(path, how))
+    if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        file.close()
+        raise OSError(f"{path.name} is no plain file")
+    return file
 
 
 def _said(path: Path, kind: str) -> tuple[str, str]:
     """Return schema and verdict of a rig or a result."""
-    if kind == "rig":
-        try:
-            with path.open(encoding="utf-8") as file:
-                text = file.read(4000)
-        except (OSError, UnicodeError):
-            return "", ""
-        return ("ambid.rig/1" if '"ambid.rig/1"' in text else ""), ""
-    if kind != "result" or path.stat().st_size > 64 * _HEAD:
+    if kind not in ("rig", "result"):
         return "", ""
     try:
-        document: Any = json.loads(path.read_text(encoding="utf-8"))
+        with open_plain(path) as file:
+            data = file.read(4000 if kind == "rig" else _LONGEST + 1)
+        if kind == "rig":
+            return ("ambid.rig/1" if b'"ambid.rig/1"' in data else ""), ""
+        document: Any = json.loads(data) if len(data) <= _LONGEST else None
     except (OSError, ValueError, RecursionError):
         return "", ""
     if not isinstance(document, dict) or not str(document.get("schema", "")).startswith("ambid."):

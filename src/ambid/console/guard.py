@@ -7,6 +7,7 @@ the loopback address later, reaches it; what changes something needs a header th
 
 from __future__ import annotations
 
+import asyncio
 import hmac
 import secrets
 from collections.abc import Iterable, MutableMapping
@@ -20,6 +21,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 COOKIE = "ambid_console"
 HEADER = b"x-ambid"
 MOST_BYTES = 1 << 16  # of the body of a request
+BODY_S = 10.0  # in which it has to come
 MOST_HEADERS = 1 << 14
 _SANDBOXED = "/reports/"
 _POLICY = (
@@ -44,6 +46,7 @@ class Guard:
         read_only: bool = False,
     ) -> None:  # fmt: skip
         self._app, self._hosts, self._scheme = app, frozenset(hosts), scheme
+        self.cookie = f"{COOKIE}_{next(iter(self._hosts)).rpartition(':')[2]}"  # ports of an address share cookies
         self._password, self._read_only = password, read_only
         self.token: str | None = secrets.token_urlsafe(32)
         self._sessions: set[str] = set()
@@ -90,7 +93,8 @@ class Guard:
                 return None
             if HEADER not in headers or not headers.get(b"content-type", b"").startswith(b"application/json"):
                 return _no(403, "a change needs the header X-Ambid and JSON")
-            if int(headers.get(b"content-length", b"0") or 0) > MOST_BYTES:
+            length = headers.get(b"content-length", b"0")
+            if not length.isdigit() or int(length[:20]) > MOST_BYTES:
                 return _no(413, "the request is too long")
         elif scope["method"] not in ("GET", "HEAD"):
             return _no(405, "GET and POST only")
@@ -125,12 +129,14 @@ class Guard:
         session = secrets.token_urlsafe(32)
         self._sessions.add(session)
         answer = RedirectResponse("/", status_code=303)
-        answer.set_cookie(COOKIE, session, httponly=True, samesite="strict", secure=self._scheme == "https", path="/")
+        answer.set_cookie(
+            self.cookie, session, httponly=True, samesite="strict", secure=self._scheme == "https", path="/"
+        )
         return answer
 
     def _known(self, headers: MutableMapping[bytes, bytes]) -> bool:
         try:
-            found = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1")).get(COOKIE)
+            found = SimpleCookie(headers.get(b"cookie", b"").decode("latin-1")).get(self.cookie)
         except CookieError:
             return False
         given = "" if found is None else found.value
@@ -170,13 +176,18 @@ def _protect(message: Message, *, sandboxed: bool) -> None:
 
 
 def _limited(receive: Receive) -> Receive:
-    """Cut off a body that is longer than it may be."""
-    came = 0
+    """Cut off a body that is longer, or takes longer, than it may."""
+    came, whole, end = 0, False, asyncio.get_running_loop().time() + BODY_S
 
     async def taken() -> Message:
-        nonlocal came
-        message: Any = await receive()
+        nonlocal came, whole
+        try:
+            async with asyncio.timeout_at(None if whole else end):
+                message: Any = await receive()
+        except TimeoutError:
+            return {"type": "http.disconnect"}
         came += len(message.get("body", b""))
+        whole = whole or not message.get("more_body", False)
         return {"type": "http.disconnect"} if came > MOST_BYTES else message
 
     return taken

@@ -10,13 +10,17 @@ import json
 import os
 import re
 import secrets
+import shutil
+import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from ambid.console.folder import open_plain
 from ambid.errors import AmbidError
 
 _ID = re.compile(r"[0-9]{10}-[0-9a-f]{6}")
@@ -36,23 +40,29 @@ class Run:
     @property
     def spec(self) -> dict[str, Any]:
         """What is wanted."""
-        found: dict[str, Any] = _read(self.place / "spec.json")
-        return found
+        return _read(self.place / "spec.json")
 
     @property
     def alive(self) -> bool:
         """Whether its process works."""
         about = _read(self.place / "process.json")
-        return bool(about) and process_began(int(about["pid"])) == about["began"]
+        pid, began = about.get("pid"), about.get("began")
+        return isinstance(pid, int) and isinstance(began, float) and 0 < pid < 1 << 31 and process_began(pid) == began
 
     def say(self, word: str, **more: Any) -> None:
-        """Tell the process something; it is appended, and read within 20 ms."""
+        """Tell the process something; it is appended, and read within 20 ms. A full disk hinders no stop."""
         line = json.dumps({"word": word, **more})
-        fd = os.open(self.place / "control.jsonl", os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o600)
+        how = os.O_WRONLY | os.O_APPEND | os.O_CREAT | getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
         try:
-            os.write(fd, (line + "\n").encode())
-        finally:
-            os.close(fd)
+            fd = os.open(self.place / "control.jsonl", how, 0o600)
+            try:
+                os.write(fd, (line + "\n").encode())
+            finally:
+                os.close(fd)
+        except OSError:
+            if word != "stop" or not self.alive:
+                raise
+            os.kill(_read(self.place / "process.json")["pid"], signal.SIGTERM)
 
     def claim(self) -> None:
         """Note that this process does it."""
@@ -69,13 +79,18 @@ class Heard:
         try:
             if self._path.stat().st_size <= self._at:
                 return
-            data = self._path.read_bytes()[self._at :]
-        except FileNotFoundError:
+            with open_plain(self._path) as file:
+                file.seek(self._at)
+                data = file.read(1 << 16)
+        except OSError:
             return
         whole = data.rpartition(b"\n")[0]
-        self._at += len(whole) + bool(whole)
+        self._at += len(whole) + bool(whole) if len(data) < 1 << 16 or whole else len(data)
         for line in whole.splitlines():
-            yield json.loads(line)
+            with suppress(ValueError, RecursionError):  # what is no word of a console is nothing
+                said = json.loads(line)
+                if isinstance(said, dict):
+                    yield said
 
 
 class Runs:
@@ -87,19 +102,20 @@ class Runs:
 
     def start(self, spec: Mapping[str, Any]) -> Run:
         """Begin a run in a process that outlives this one."""
+        if not self._own:
+            raise AmbidError("the folder .ambid is a link; runs are kept in the folder itself. Remove it")
         self._place.mkdir(parents=True, exist_ok=True)
         for old in self.all()[_KEPT:]:
             if not old.alive:
-                for path in old.place.iterdir():
-                    path.unlink()
-                old.place.rmdir()
+                shutil.rmtree(old.place, ignore_errors=True)
         place = self._place / f"{int(time.time()):010d}-{secrets.token_hex(3)}"
         place.mkdir(mode=0o700)
         _write(place / "spec.json", {**spec, "folder": str(self.folder)})
         with (place / "log.txt").open("wb") as log:
             process = subprocess.Popen(
                 [sys.executable, "-m", "ambid.console.worker", str(place)],
-                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True, cwd=self.folder,
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, start_new_session=True,
+                cwd=place,  # never the folder: Python would run a numpy.py that is in it
             )  # fmt: skip
         _write(place / "process.json", {"pid": process.pid, "began": process_began(process.pid)})
         _CHILDREN.append(process)
@@ -110,14 +126,20 @@ class Runs:
         for child in list(_CHILDREN):
             if child.poll() is not None:
                 _CHILDREN.remove(child)
-        found = self._place.iterdir() if self._place.is_dir() else ()
+        found = self._place.iterdir() if self._own and self._place.is_dir() else ()
         return [Run(p) for p in sorted(found, reverse=True) if _ID.fullmatch(p.name) and not p.is_symlink()]
 
     def one(self, name: str) -> Run:
         """Return the run of a name."""
-        if not _ID.fullmatch(name) or not (self._place / name).is_dir():
+        place = self._place / name
+        if not _ID.fullmatch(name) or not self._own or place.is_symlink() or not place.is_dir():
             raise AmbidError("there is no such run in the folder. Reload the page")
-        return Run(self._place / name)
+        return Run(place)
+
+    @property
+    def _own(self) -> bool:
+        """Whether runs are kept in the folder, and no link leads elsewhere."""
+        return not self._place.is_symlink() and not self._place.parent.is_symlink()
 
 
 _CHILDREN: list[subprocess.Popen[bytes]] = []  # of this process: asked for their end, so that none stays a zombie
@@ -140,11 +162,13 @@ def process_began(pid: int) -> float | None:
     return 0.0
 
 
-def _read(path: Path) -> Any:
+def _read(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError):
+        with open_plain(path) as file:
+            found = json.loads(file.read(1 << 20))
+    except (OSError, ValueError, RecursionError):
         return {}
+    return found if isinstance(found, dict) else {}
 
 
 def _write(path: Path, content: Mapping[str, Any]) -> None:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import math
+import re
 import socket
 import time
 from collections.abc import Callable, Mapping
@@ -20,9 +22,10 @@ import uvicorn
 from starlette.applications import Starlette
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import ClientDisconnect, Request
-from starlette.responses import FileResponse, JSONResponse, Response
+from starlette.responses import Response
 from starlette.routing import Route, WebSocketRoute
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
+from uvicorn.protocols.http.h11_impl import H11Protocol
 
 from ambid.console.feed import FeedReader, json_frames
 from ambid.console.folder import Folder
@@ -37,6 +40,10 @@ _POLL_S = 0.01  # between two looks at a feed
 _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing
+_CONNECTIONS = 48  # before those that ask nothing give way
+_HEAD_S = 15.0  # in which a connection has to say what it asks
+_REPORT_BYTES = 1 << 26
+_SERIAL = re.compile(r"(/dev/(tty|cu|serial/by-(id|path)/)[\w.:+-]+|COM[0-9]{1,3})", re.ASCII)
 _STATIC = {
     "console.js": ("console/static", "text/javascript"), "console.css": ("console/static", "text/css"),
     "uPlot.iife.min.js": ("data", "text/javascript"), "uPlot.min.css": ("data", "text/css"),
@@ -57,6 +64,8 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
         {"rig": "rig"}, {"port": str, "seconds": float, "track_seconds": float, "pace": str, "redesign": bool}, "/",
     ),
 }  # fmt: skip
+_FILES = ("record", "rig", "estimate")
+_CHOICES = {"pace": ("real-time", "fastest"), "excitation": ("multisine", "schroeder", "prbs", "steps")}
 _NEEDED = {"preview": ("record",), "identify": ("record", "rig"), "margins": ("rig",), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
 
@@ -97,7 +106,10 @@ class Console:
     async def _login(self, request: Request) -> Response:
         assert self.guard is not None
         await asyncio.sleep(0.5)
-        form = (await request.body()).decode("utf-8", "replace")
+        try:
+            form = (await request.body()).decode("utf-8", "replace")
+        except ClientDisconnect:
+            form = ""
         from urllib.parse import parse_qs
 
         return self.guard.login(parse_qs(form).get("password", [""])[0])
@@ -105,24 +117,25 @@ class Console:
     async def _state(self, request: Request) -> Response:
         entries = await run_in_threadpool(self.files.entries)
         runs = await run_in_threadpool(lambda: [_about(r) for r in self.runs.all()[:40]])
-        return JSONResponse(
+        return _reply(
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
-                "read_only": self._read_only, "driver": _of(self._driver, request), "now": time.time(),
+                "left_out": self.files.left_out, "read_only": self._read_only,
+                "driver": _of(self._driver, request), "now": time.time(),
             }
         )  # fmt: skip
 
     async def _rig_text(self, request: Request) -> Response:
-        return await _answer(
-            lambda: {"text": self.files.path_of(request.path_params["number"], "rig").read_text(encoding="utf-8")}
-        )
+        number = request.path_params["number"]
+        return await _answer(lambda: {"text": self.files.read(number, "rig", 1 << 20).decode("utf-8")})
 
     async def _report(self, request: Request) -> Response:
+        number = request.path_params["number"]
         try:
-            path = self.files.path_of(request.path_params["number"], "report")
-        except AmbidError as refusal:
-            return JSONResponse({"error": str(refusal)}, status_code=404)
-        return FileResponse(path, media_type="text/html")
+            page = await run_in_threadpool(lambda: self.files.read(number, "report", _REPORT_BYTES))
+        except (AmbidError, OSError) as refusal:
+            return _reply({"error": str(refusal)}, 404)
+        return Response(page, media_type="text/html")
 
     async def _start(self, request: Request) -> Response:
         asked = await _json(request)
@@ -153,7 +166,7 @@ class Console:
 
     async def _drive(self, request: Request) -> Response:
         self._driver = _client(request)
-        return JSONResponse({})
+        return _reply({})
 
     def _take_wheel(self, request: Request) -> None:
         """Refuse what another page orders."""
@@ -175,7 +188,7 @@ class Console:
             if name in kinds:
                 spec[name] = str(self.files.path_of(value, kinds[name]).relative_to(self.files.path))
             elif name in others:
-                spec[name] = _typed(name, value, others[name])
+                spec[name] = self._port(value) if name == "port" else _typed(name, value, others[name])
             else:
                 raise AmbidError(f"{job} takes no {str(name)[:20]!r}. Reload the page")
         missing = [name for name in _NEEDED.get(job, ()) if name not in spec]
@@ -185,6 +198,19 @@ class Console:
             name = self.files.new(asked.get("out", ""), "" if ending == "/" else ending).name
             spec["out"] = name.removesuffix(".json")
         return spec
+
+    def _port(self, value: object) -> str:
+        """Return a port: no page names another file than a record of the folder."""
+        name = str(value)
+        records = {e.name for e in self.files.entries() if e.kind == "record"} if name.startswith("replay:") else set()
+        if name.startswith("replay:") and name[7:] in records:
+            return f"replay:{self.files.path / name[7:]}"
+        if name in ("simulated", "emulated") or _SERIAL.fullmatch(name):
+            return name
+        raise AmbidError(
+            f"the port {name[:60]!r} is none: simulated, emulated, replay:NAME with a record of the folder, or a "
+            "serial port such as /dev/ttyACM0. Correct it"
+        )
 
     async def _feed(self, socket: WebSocket) -> None:
         try:
@@ -238,9 +264,13 @@ async def _until_gone(socket: WebSocket) -> None:
 
 
 def _about(run: Run) -> dict[str, Any]:
-    spec = run.spec
-    shown = {k: v for k, v in spec.items() if k not in ("folder", "text")}
-    return {"id": run.id, "alive": run.alive, "spec": shown, "began": int(run.id.partition("-")[0])}
+    said = {k: run.spec.get(k) for k in ("job", "out", "seconds", "port", *_FILES)}
+    shown = {k: v[:200] if isinstance(v, str) else v for k, v in said.items() if isinstance(v, str) or _finite(v)}
+    return {"id": run.id, "alive": run.alive, "spec": {"job": "", **shown}, "began": int(run.id.partition("-")[0])}
+
+
+def _finite(value: object) -> bool:
+    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _typed(name: str, value: Any, kind: Any) -> Any:
@@ -249,6 +279,8 @@ def _typed(name: str, value: Any, kind: Any) -> Any:
         if isinstance(value, bool) or not isinstance(value, (int, float)) or not abs(value) < 1e9:
             raise AmbidError(f"{name} is {str(value)[:20]!r}; it must be a number. Correct it")
         return float(value)
+    if name in _CHOICES and value not in _CHOICES[name]:
+        raise AmbidError(f"{name} is {str(value)[:20]!r}; known: {', '.join(_CHOICES[name])}. Choose one")
     if not isinstance(value, kind) or (kind is str and len(value) > 50_000):
         raise AmbidError(f"{name} is {str(value)[:20]!r}; it must be {'a text' if kind is str else 'true or false'}")
     return value
@@ -272,13 +304,50 @@ async def _json(request: Request) -> dict[str, Any]:
 
 async def _answer(make: Callable[[], Mapping[str, Any]]) -> Response:
     try:
-        return JSONResponse(await run_in_threadpool(make))
+        return _reply(await run_in_threadpool(make))
     except (AmbidError, OSError, UnicodeError) as refusal:
-        return JSONResponse({"error": str(refusal)}, status_code=400)
+        return _reply({"error": str(refusal)}, 400)
+
+
+def _reply(content: Mapping[str, Any], status: int = 200) -> Response:
+    """Answer in JSON of ASCII, as a file's name may be no text."""
+    return Response(json.dumps(content, allow_nan=False), status, media_type="application/json")
 
 
 def _resource(place: str, name: str) -> bytes:
     return files("ambid").joinpath(*place.split("/"), name).read_bytes()
+
+
+class _Line(H11Protocol):
+    """A connection: one that asks nothing is cut off after a while, or at once where others need its place."""
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        self.since = self.loop.time()
+        idle = [c for c in self.connections if isinstance(c, _Line) and c is not self and not c.asks]
+        if len(self.connections) > _CONNECTIONS and idle:
+            min(idle, key=lambda c: c.since).cut()
+        self._look()
+
+    @property
+    def asks(self) -> bool:
+        """Whether an answer is under way."""
+        return self.cycle is not None and not self.cycle.response_complete
+
+    def cut(self) -> None:
+        """End it."""
+        self.connections.discard(self)
+        self.transport.abort()
+
+    def _look(self) -> None:
+        now = self.loop.time()
+        if self.transport.is_closing() or self.transport.get_protocol() is not self:  # gone, or a websocket
+            return
+        self.since = now if self.asks else self.since
+        if now - self.since > _HEAD_S:
+            self.cut()
+        else:
+            self.loop.call_later(1.0, self._look)
 
 
 def serve(
@@ -339,9 +408,9 @@ def serve(
     )  # fmt: skip
     console.guard = guard
     config = uvicorn.Config(
-        guard, log_level="critical", access_log=False, ws="websockets-sansio", ws_max_size=4096, ws_max_queue=4,
-        limit_concurrency=64, timeout_keep_alive=15, timeout_graceful_shutdown=1, h11_max_incomplete_event_size=16_384,
-        server_header=False, lifespan="off", proxy_headers=False,
+        guard, http=_Line, ws="websockets-sansio", ws_max_size=4096, ws_max_queue=4, log_level="critical",
+        access_log=False, limit_concurrency=64, timeout_keep_alive=15, timeout_graceful_shutdown=1,
+        h11_max_incomplete_event_size=16_384, server_header=False, lifespan="off", proxy_headers=False,
         ssl_certfile=None if tls is None else tls[0], ssl_keyfile=None if tls is None else str(tls[1]),
     )  # fmt: skip
     server = uvicorn.Server(config)

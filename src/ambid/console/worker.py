@@ -15,6 +15,7 @@ import time
 import traceback
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +23,7 @@ import numpy as np
 
 from ambid.console.envelope import EnvelopeTap, rounded, throttled
 from ambid.console.feed import FeedWriter
+from ambid.console.folder import plain
 from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
 
@@ -60,7 +62,8 @@ class Worker:
         except KeyboardInterrupt:
             self.end("cancelled", "cancelled before a result was there")
         except BaseException as defect:
-            traceback.print_exc()
+            with suppress(OSError):  # of a full disk
+                traceback.print_exc()
             self.end("failed", f"a defect of the program: {type(defect).__name__}: {defect}. {self.run.place}/log.txt")
             return 1
         finally:
@@ -98,7 +101,10 @@ class Worker:
     def path(self, key: str) -> Path | None:
         """Return a file that the spec names; None where it names none."""
         name = self.spec.get(key)
-        return None if name is None else self.folder / str(name)
+        found = None if name is None else self.folder / str(name)
+        if found is not None and plain(found, self.folder) is None:
+            raise AmbidError(f"{name} is no plain file of the folder any more. Choose another one")
+        return found
 
     def give(self, result: Any, name: str, record: object = None) -> None:
         """Write a result and its report beside each other, and tell them."""
