@@ -11,7 +11,7 @@ import ambid
 from ambid.errors import EstimationError, RigError
 from ambid.job.fits import physics
 from ambid.job.rotor import replays_of
-from ambid.report.drawing import NARROW, single
+from ambid.report.drawing import single
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
 from ambid.report.rotor_page import rotor_page
 from ambid.rig import draft_rig, rig_from_text
@@ -98,7 +98,7 @@ def test_poles_of_a_rotor_are_those_of_its_plant_with_a_spread() -> None:
 
 def test_figure_and_page_of_a_rotor_show_its_record() -> None:
     e = estimate()
-    figure = rotor_overview(evidence(), NARROW)
+    figure = rotor_overview(evidence())
     heads = {a.get_title(loc="left") for a in figure.axes}
     for pair in ("ax_voltage → ax_position", "by_voltage → ay_position", "bx_voltage → bx_current"):
         assert pair in heads

@@ -46,6 +46,8 @@ class View:
     page: Callable[[Any, Any], Page] | None = None  # as `figure`, of any width; default: text and figure
     # what is drawn of a record that is given beside the result; default: as its model takes it
     beside: Callable[[Any, Any], Any] | None = None
+    # records beside their predictions, where a page without a form of its own shows them down to the samples
+    traces: Callable[[Any, Any], Sequence[Traces]] | None = None
 
 
 def text(result: Result, *, width: int = WIDTH, paint: Paint = plain) -> str:
@@ -86,13 +88,16 @@ def _now() -> str:
 
 def _page(result: Result, record: Any) -> Page:
     from ambid.report.page import Page, Section
+    from ambid.report.strips import CLOSE, strips_of
 
     known, used = view(result), _beside(result, record)
     if known.page is None:
         title = known.title(result)
         said = Section(title="Result", text=known.text(result, width=WIDTH, paint=plain))
         drawn = Section(title="Figures", figure=lambda width: known.figure(result, used, width))
-        return Page(title=title, sections=[said, drawn])
+        traces = () if known.traces is None else known.traces(result, used)
+        close = [Section(title="Signals", caption=CLOSE, signals=[strips_of(t) for t in traces])] if traces else []
+        return Page(title=title, sections=[said, *close, drawn])
     return _with_loop(result, used, known.page(result, used))
 
 
@@ -249,16 +254,21 @@ def _fit() -> View:
     from ambid.blackbox.fit import BlackBoxFit
     from ambid.blackbox.fit_file import fit_text as linear_document
     from ambid.nonlinear.fit_file import nonlinear_fit_text
-    from ambid.report.fit_figures import fit_overview
+    from ambid.report.fit_figures import fit_overview, traces_of
     from ambid.report.fit_text import fit_text
 
-    def drawn(f: Any, used: Any, width: float) -> Figure:
-        records, second = used if isinstance(used, tuple) else (() if used is None else (used,), None)
-        return fit_overview(f, records, second, width)
+    def records(used: Any) -> tuple[Any, Any]:
+        return used if isinstance(used, tuple) else (() if used is None else (used,), None)
+
+    def traces(f: Any, used: Any) -> Sequence[Traces]:
+        first, second = records(used)
+        own = [traces_of(f, x, title=f"record {k}" if len(first) > 1 else "") for k, x in enumerate(first, 1)]
+        return own + ([] if second is None else [traces_of(f, second, second=True, title="second record")])
 
     return View(
         text=fit_text,
-        figure=drawn,
+        figure=lambda f, used, width: fit_overview(f, *records(used), width),
+        traces=traces,
         document=lambda f: linear_document(f) if isinstance(f, BlackBoxFit) else nonlinear_fit_text(f),
         table=lambda f: parameter_columns(f.parameters),
         title=lambda f: f"{', '.join(f.inputs)}{' → ' if f.inputs else ''}{', '.join(f.outputs)}, {f.structure}",
@@ -287,14 +297,17 @@ def _validation() -> View:
             return bearing_evidence(known, [(data.record, data.start_s)]).traces
         return (traces_of(known, data, second=True),)
 
+    def traces(_: Any, used: Any) -> Sequence[Traces]:
+        return () if used is None or isinstance(used[0], RotorEstimate) else beside(*used)
+
     def drawn(v: Any, used: Any, width: float) -> Figure:
-        if used is not None and isinstance(used[0], RotorEstimate):
-            return validation_figure(v, (), width, more=[residuals_block(run) for run in replays_of(*used)])
-        return validation_figure(v, () if used is None else beside(*used), width)
+        turned = replays_of(*used) if used is not None and isinstance(used[0], RotorEstimate) else ()
+        return validation_figure(v, traces(v, used), width, more=[residuals_block(run) for run in turned])
 
     return View(
         text=validation_text,
         figure=drawn,
+        traces=traces,
         document=_fields_of("ambid.validation/1"),
         table=lambda v: ("output", {"output": list(v.fit), **_numbers_of(list(v.fit.values()))}),
         title=lambda v: f"{v.record or 'record'} tested with {v.estimate or 'an estimate'}, {v.model}",

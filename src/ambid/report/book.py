@@ -45,6 +45,8 @@ def page_pdf(page: Page, verdict: Verdict, *, made: str = "") -> bytes:
     with PdfPages(kept, metadata={"Title": page.title, "Creator": "ambid", "CreationDate": None}) as book:
         for section in page.sections:
             drawn = section.figure is not None
+            if section.signals and not drawn:  # their figure stands in another section
+                continue
             if not drawn or section.tables or section.text:
                 lines += _section(section)
             if drawn:

@@ -37,7 +37,7 @@ def loops_block(found: Design) -> Block:
     """Return panels of both loops: sensitivity, compliance and force step."""
     axes = list(found.after.sensitivity)
     columns = [[panel(draw, found, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
-    return Block(columns=columns, widths=(4.0, 3.0, 3.0), by_row=True, shared=False)
+    return Block(columns=columns, widths=(4.0, 3.0, 3.0), shared=False)
 
 
 def _sensitivity(axes: Axes, found: Design, axis: str) -> None:

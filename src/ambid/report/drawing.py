@@ -29,9 +29,8 @@ CYCLE = (PREDICTED, ORANGE, GREEN, PURPLE, SKY, BOUND, MEASURED)
 NORMAL_95 = 1.959963984540054
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
-WIDE, NARROW = 11.0, 4.6  # inches: a page, and the screen of a telephone
+WIDE = 11.0  # inches of a page
 _DPI = 130  # of a PNG
-_WHOLE = 9.0  # inches from which verdict and convention stand on one line
 PIXELS = 800  # stretches of which a long curve shows the extremes, about one for each column of pixels
 _LETTERS = 13.7  # of a legend on an inch
 _LOGARITHMIC = 5.0  # ratio of limits from which an axis is
@@ -69,30 +68,28 @@ class Panel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Block:
-    """Panels that belong together: columns side by side on a wide page, one below the other on a narrow one."""
+    """Panels that belong together: columns side by side."""
 
     columns: Sequence[Sequence[Panel]]  # of each, its panels from top to bottom
     widths: tuple[float, ...] = ()  # of the columns, beside each other
     title: str = ""
     shared: bool = True  # whether the panels of a column have one horizontal axis
-    by_row: bool = False  # whether a narrow page goes through the panels row by row
     legend: Sequence[Any] = ()  # entries beside those that the panels' artists make
 
-    def height(self, width: float) -> float:
-        """Return what the block needs on a page of some width, inches."""
-        heights = [sum(p.height for p in column) for column in self.columns]
-        return 0.55 + (max(heights) if width > NARROW else sum(heights))
+    @property
+    def height(self) -> float:
+        """What the block needs, inches."""
+        return 0.55 + max(sum(p.height for p in column) for column in self.columns)
 
     def draw(self, place: Figure | SubFigure, width: float) -> None:
         """Draw the block, with one legend below it, where it covers nothing."""
-        order = zip(*self.columns, strict=True) if self.by_row else self.columns
-        columns = self.columns if width > NARROW else [[p for part in order for p in part]]
+        columns = self.columns
         rows = max(len(column) for column in columns)
         tallest = [max((c[k].height for c in columns if k < len(c)), default=1.0) for k in range(rows)]
         axes = place.subplots(
             rows, len(columns), squeeze=False, height_ratios=tallest,
             width_ratios=self.widths or None if len(columns) > 1 else None,
-            sharex="col" if self.shared and width > NARROW else False,
+            sharex="col" if self.shared else False,
         )  # fmt: skip
         for column, below in zip(columns, axes.T, strict=True):
             for k, a in enumerate(below):
@@ -100,7 +97,7 @@ class Block:
                     a.axis("off")
                     continue
                 column[k].draw(a)
-                if self.shared and width > NARROW and k + 1 < len(column):
+                if self.shared and k + 1 < len(column):
                     a.set_xlabel("")
         named = {label: h for a in place.axes for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
         named |= {h.get_label(): h for h in self.legend}
@@ -117,7 +114,7 @@ def stacked(title: str, blocks: Sequence[Block], width: float = WIDE) -> Figure:
     import matplotlib
     from matplotlib.figure import Figure
 
-    heights = [block.height(width) for block in blocks]
+    heights = [block.height for block in blocks]
     with matplotlib.rc_context(_STYLE):
         page = Figure(figsize=(width, sum(heights) + 0.5 * bool(title)), layout="constrained")
         if title:
@@ -133,8 +130,7 @@ def judged(figure: Figure, found: Verdict) -> Figure:
     from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
     words, style = WORDS[found.word]
-    wide = figure.get_figwidth() > _WHOLE
-    letters = int(11 * figure.get_figwidth()) - (75 if wide else 28)  # what there is room for
+    letters = int(11 * figure.get_figwidth()) - 75  # what there is room for
     names = textwrap.shorten(", ".join(r.check for r in found.reasons), max(letters, 12), placeholder=" …")
     parts = [
         ("verdict: ", {}),
@@ -147,10 +143,9 @@ def judged(figure: Figure, found: Verdict) -> Figure:
     )
     box.set_in_layout(False)
     figure.add_artist(box)
-    figure.suptitle(f"{'' if wide else chr(10)}\n{figure.get_suptitle()}", fontsize=12)  # empty lines are their place
-    down = 0.05 if wide else 0.3  # inches from the top
-    at = (0.995, 1.0 - down / figure.get_figheight()) if wide else (0.01, 1.0 - down / figure.get_figheight())
-    said = figure.text(*at, SPREAD, ha="right" if wide else "left", va="top", size=8, color="#555555")
+    figure.suptitle(f"\n{figure.get_suptitle()}", fontsize=12)  # the empty line is their place
+    at = (0.995, 1.0 - 0.05 / figure.get_figheight())
+    said = figure.text(*at, SPREAD, ha="right", va="top", size=8, color="#555555")
     said.set_in_layout(False)
     return figure
 
@@ -162,9 +157,7 @@ def single(block: Block, width: float = WIDE) -> Figure:
 
 def head(axes: Axes, text: str, *, good: bool = True) -> None:
     """Write what a panel shows above it: in the colour of a warning where it speaks against the result."""
-    width: float = axes.figure.figure.get_figwidth()
-    said = text if good else f"✗ {text}"
-    axes.set_title(said if width > NARROW else textwrap.fill(said, 48), color="#1a1a1a" if good else BOUND)
+    axes.set_title(text if good else f"✗ {text}", color="#1a1a1a" if good else BOUND)
 
 
 def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = None) -> None:

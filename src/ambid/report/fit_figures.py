@@ -222,6 +222,7 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
         sd=np.sqrt(np.maximum(np.diag(fit.noise_covariance), 0.0)),
         inputs=data.u[first:],
         input_names=data.inputs,
+        input_units=tuple(fit.units.get(i, "") for i in data.inputs),
     )
 
 

@@ -31,7 +31,6 @@ def margins_figure(found: Margins, title: str, width: float) -> Figure:
             [panel(_compliance, found, axis, height=2.2) for axis in axes],
         ],
         widths=(3.0, 2.0),
-        by_row=True,
     )
     blocks, curves = [block], found.curves
     if curves.stiffness:

@@ -108,9 +108,7 @@ def orbit_blocks(estimate: RotorEstimate) -> list[Block]:
         ]
         said = estimate.records[r["record"]].get("file") or "record"
         if sides:
-            found.append(
-                Block(columns=sides, title=f"{said}: orbits at {r['speed'] * _RPM:.6g} rpm", shared=False, by_row=True)
-            )
+            found.append(Block(columns=sides, title=f"{said}: orbits at {r['speed'] * _RPM:.6g} rpm", shared=False))
     return found
 
 

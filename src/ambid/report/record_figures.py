@@ -54,7 +54,7 @@ def record_figure(record: Record | None, title: str, looks: Sequence[Any] = (), 
     else:
         views: Sequence[Callable[..., object]] = (_whole, _close, _spectrum)
         columns = [[panel(view, record, name, height=_ROW) for name in shown] for view in views]
-        block = Block(columns=columns, widths=(4, 3, 3), by_row=True)
+        block = Block(columns=columns, widths=(4, 3, 3))
     return stacked(f"{title}{hidden}", [block], width)
 
 

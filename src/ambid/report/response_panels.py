@@ -16,7 +16,6 @@ from ambid.report.drawing import (
     BAND,
     BOUND,
     MEASURED,
-    NARROW,
     NORMAL_95,
     PREDICTED,
     Block,
@@ -264,7 +263,7 @@ def poles_panel(
 
     def words(axes: Axes) -> None:
         room, lines = 4.9, text.splitlines()
-        if crowd or axes.figure.figure.get_figwidth() <= NARROW:
+        if crowd:
             room, lines = 3.5, [x for line in lines for x in textwrap.wrap(line, 58, subsequent_indent="    ")]
         longest = max(map(len, lines), default=1)
         axes.axis("off")
@@ -328,13 +327,12 @@ def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[
     def matrix(axes: Axes) -> None:
         axes.imshow(rho, cmap="PuOr_r", vmin=-1.0, vmax=1.0, aspect="auto")
         small = len(names) > 8
-        size_of_text = 7.0 if axes.figure.figure.get_figwidth() > NARROW else min(7.0, 85.0 / len(names))
         for k, row in enumerate(rho):
             for m, x in enumerate(row):
                 color = "#fefefe" if abs(x) > 0.75 else "#1b1b1b"  # of no name: cells stay as they are in the dark
                 if not small or abs(x) > _TOLD:
                     said = f"{x:.1f}" if small else f"{x:.2f}"
-                    axes.text(m, k, said, ha="center", va="center", color=color, fontsize=size_of_text)
+                    axes.text(m, k, said, ha="center", va="center", color=color, fontsize=7.0)
         axes.set_xticks(range(len(names)), names, rotation=45 if small else 0)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)

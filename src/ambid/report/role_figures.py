@@ -55,4 +55,4 @@ def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], widt
         [panel(coherence, x, height=1.6) for x, _ in rows],
     ]
     title = f"{record.provenance.get('file', 'record')}: which column is which"
-    return stacked(title, [Block(columns=columns, widths=(3, 2), by_row=True)] if rows else [], width)
+    return stacked(title, [Block(columns=columns, widths=(3, 2))] if rows else [], width)

@@ -246,7 +246,7 @@ def residuals_block(run: RotorReplay) -> Block:
     columns = [[panel(_residual, run, k, height=1.7) for k in row] for row in rows]
     empty = Panel(draw=lambda axes: axes.axis("off"), height=1.7)
     columns = [[*column, *([empty] * (most - len(column)))] for column in columns]
-    return Block(columns=columns, title="residuals at the excited lines beside the noise", by_row=True)
+    return Block(columns=columns, title="residuals at the excited lines beside the noise")
 
 
 def _residual(axes: Axes, run: RotorReplay, k: int) -> None:

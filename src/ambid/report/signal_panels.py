@@ -209,7 +209,7 @@ def records_panel(found: Sequence[Traces]) -> Block:
 
     n_y = len(found[0].names)
     columns = [[panel(draw, x, j, height=1.6) for x in found] for draw in (outputs, errors) for j in range(n_y)]
-    return Block(columns=columns, widths=(3,) * n_y + (2,) * n_y, shared=False, by_row=True)
+    return Block(columns=columns, widths=(3,) * n_y + (2,) * n_y, shared=False)
 
 
 def _outputs(axes: Axes, traces: Traces, j: int, *, simulation: bool = True) -> None:

@@ -14,6 +14,7 @@ from ambid.report.numbers import prefixed
 from ambid.report.picture import Arrays
 from ambid.report.signal_panels import Traces, worst_stretch
 
+CLOSE = "Each sample predicted from all samples before it. Shaded: the stretch with the largest errors."
 EVERY_SAMPLE = 50_000  # samples of a record, to which a page holds all of them
 _STRETCHES = 5_000  # of a longer record, extremes of as many stretches are held
 _CLOSE = 5_000  # and as many samples around its largest errors

@@ -5,7 +5,6 @@ Below them the model error against its limit, and the supervisor's state. Long t
 
 from __future__ import annotations
 
-import textwrap
 from array import array
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -20,7 +19,6 @@ from ambid.report.drawing import (
     BOUND,
     GREEN,
     MEASURED,
-    NARROW,
     NORMAL_95,
     PIXELS,
     PREDICTED,
@@ -143,7 +141,6 @@ def track_figure(
 
     def parameter(axes: Axes, name: str) -> None:
         _parameter_panel(axes, history, name, truth.get(name))
-        _stack_titles(axes, width)
         _event_marks(axes, marks, name, history, width)
         bottom(axes)
 
@@ -222,14 +219,6 @@ def _say_change(axes: Axes, history: TrackHistory, name: str, last: float) -> No
     begin = history.header.start.get(name)
     if begin is not None and begin.value and np.isfinite(last / begin.value):
         _say(axes, f"{100 * (last / begin.value - 1):+.3g} % from start", "left")
-
-
-def _stack_titles(axes: Axes, width: float) -> None:
-    """Put what stands at the left and at the right above a panel below each other where there is no room."""
-    left, right = axes.get_title(loc="left"), axes.get_title(loc="right")
-    if width <= NARROW and left and right:
-        _say(axes, "", "right")
-        _say(axes, f"{left}\n{textwrap.fill(right, 50)}", "left")
 
 
 def truth_words(t: Array, value: Array, sd: Array, stale: NDArray[np.bool_], truth: tuple[Array, Array]) -> str:
