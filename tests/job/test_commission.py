@@ -168,7 +168,7 @@ def test_the_report_shows_what_each_step_saw(finished):
     assert len(done.steps) == len(STEPS)
     seen = {s.name: len(s.pictures) for s in done.steps}
     assert seen == dict.fromkeys(STEPS, 1) | {"self-test": 0, "excite": 2, "record": 2, "validate": 0, "track": 0}
-    assert text.count("data:image/png") > sum(seen.values()) + 4  # those of the estimate and the track too
+    assert text.count("<svg ") > sum(seen.values()) + 4  # those of the estimate and the track too
     assert text.index("verdict: <") < text.index("1. self-test")
     assert "sensitivity peak" in text
     assert done.verdict.word == json.loads((folder / "commission.json").read_text())["verdict"]["word"]
@@ -318,7 +318,7 @@ def test_one_that_ended_early_has_its_page_with_reason_and_picture(tmp_path, mon
     done = ran(tmp_path, SimulatedDevice(rig), rig=rig)
     text = (tmp_path / "report.html").read_text()
     assert "✗ 3. polarity" in text
-    assert text.count("data:image/png") == 4  # rest, and the pulses, each for a wide and a narrow screen
+    assert text.count("<svg ") == 2  # rest, and the pulses
     assert "channels.position.gain" in text[: text.index("<h2>Steps")]  # the verdict says why
     assert text.count("not reached") == len(STEPS) - 3
     assert (done.verdict.word, done.verdict.reasons[0].check) == ("unusable", "polarity")
