@@ -52,7 +52,7 @@ def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
     assert target.read_text() == MEASURED
 
 
-@pytest.mark.parametrize("words", [("--plot", "a.png"), ("--report", "a.html")])
+@pytest.mark.parametrize("words", [("--plot", "a.png"), ("--report", "a.html"), ("--report", "a.pdf")])
 def test_a_record_behind_a_link_or_under_another_name_is_not_drawn_over(made, ambid, monkeypatch, words):
     monkeypatch.chdir(made)
     target, name = made / "measured.csv", made / words[1]

@@ -66,6 +66,14 @@ def test_identify_draws_and_reports(bench, ambid):
     assert sorted(p.name for p in bench.iterdir()) == ["a.html", "a.png", "record.csv", "rig.toml"]
 
 
+def test_a_report_may_be_a_pdf_and_is_drawn_again(bench, ambid):
+    for said in ("", "a.pdf is replaced\n"):
+        found = ambid("info", "record.csv", "--report", "a.pdf")
+        assert (found.code, found.err) == (0, said)
+        assert (bench / "a.pdf").read_bytes().startswith(b"%PDF")
+    assert sorted(p.name for p in bench.iterdir()) == ["a.pdf", "record.csv", "rig.toml"]
+
+
 def test_a_second_record_is_judged_and_counts_under_strict(bench, ambid, record_text):
     lines = record_text.splitlines()
     (bench / "first.csv").write_text("\n".join(lines[:2402]) + "\n")

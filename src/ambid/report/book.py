@@ -69,7 +69,7 @@ def _section(section: Section) -> Iterator[Said]:
     for table in section.tables:
         yield from _table(table)
     for line in section.text.splitlines():
-        yield from _wrapped(line, _PLAIN)
+        yield from _wrapped(line or " ", _PLAIN)
     yield from _wrapped(section.note, _DIM)
 
 
@@ -97,7 +97,7 @@ def _write(book: Any, lines: Sequence[Said]) -> None:
     leaf, left = None, 0.0
     for text, how in lines:
         high = _STEP * how["size"] / 72
-        if leaf is None or left < high + _FOOT:
+        if leaf is None or left < high + _FOOT + 0.8 * ("weight" in how):  # no title at the foot
             if leaf is not None:
                 book.savefig(leaf)
             leaf, left = Figure(figsize=_LEAF), _LEAF[1] - _FOOT

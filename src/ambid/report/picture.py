@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 _NAMED = {"#ffffff": "paper", "#000000": "ink", "#1a1a1a": "ink", "#4d4d4d": "measured", "#777777": "edge",
           "#e4e4e4": "grid", "#fbf7ee": "second", "#a9d1ec": "band", "#0072b2": "predicted", "#555555": "edge"}
 # fmt: on
+_FIXED = ("#1b1b1b", "#fefefe")  # on coloured cells
 _LONG = 40  # lines of a path from which tenths of a point are enough
 _CLOSE = 0.1  # points by which a long path may leave what it draws
 _READ = 1600  # points of a line, of which a pointer reads no more: they lie closer than it can be placed
@@ -106,9 +107,17 @@ def _attributes(style: str) -> str:
         if name == "font-family" or value.endswith("Mono"):
             found += ['font-family="monospace"'] if "Mono" in value else []
         if name != "font-family":
-            colour = _NAMED.get(value.lower())
+            colour = _NAMED.get(value.lower(), _grey(value.lower()))
             found.append(f'{name}="{value.removesuffix("Mono") if colour is None else f"var(--{colour})"}"')
     return "".join(f" {x}" for x in found)
+
+
+def _grey(value: str) -> str | None:
+    """Return the nearest named colour of a grey; None for other colours, and for those that stay in the dark."""
+    found = re.fullmatch(r"#([0-9a-f]{2})\1\1", value)
+    if found is None or value in _FIXED:
+        return None
+    return "ink" if found[1] < "60" else "edge" if found[1] < "b0" else "rule"
 
 
 def _path(d: str) -> str:
