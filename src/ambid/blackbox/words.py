@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, by_name
 
 if TYPE_CHECKING:
     from ambid.blackbox.data import Orders
@@ -18,7 +18,7 @@ Candidate = str | tuple[str, "Orders | str | None"]
 def orders_of(given: Orders | str | None) -> Orders | None:
     """Return orders by name; None where all are to be chosen."""
     if not isinstance(given, str):
-        return given
+        return given and by_name(given, "--orders")
     if given.strip() == "auto":
         return None
     where, remedy = f"--orders {given!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
@@ -46,7 +46,7 @@ def candidates_of(given: Sequence[Candidate]) -> list[tuple[str, Orders | None]]
 def settings_of(given: Mapping[str, Any] | str | None) -> dict[str, Any]:
     """Return settings by name; what is ``auto`` is left to the method."""
     if given is None or not isinstance(given, str):
-        return dict(given or {})
+        return dict(by_name(given, "--settings"))
     if given.strip() in ("auto", ""):
         return {}
     where = f"--settings {given!r}"

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from ambid.cli.completion import values_of
-from ambid.errors import AmbidError
+from ambid.errors import AmbidError, check_band
 from ambid.errors import check_positive as check_positive
 
 if TYPE_CHECKING:
@@ -105,11 +105,7 @@ def band_of(text: str | None) -> tuple[float, float] | None:
         found = (float(low), float(high))
     except ValueError:
         found = (0.0, 0.0)
-    if not 0.0 <= found[0] < found[1] < float("inf"):
-        raise AmbidError(
-            f"--band is {text!r}; it must be two frequencies in Hz with a colon between. Give --band 1:2000, for "
-            "example"
-        )
+    check_band(found, text)
     return found
 
 

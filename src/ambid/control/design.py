@@ -103,6 +103,8 @@ class Goals:
     @classmethod
     def of(cls, minimise: Sequence[str], limits: Mapping[str, float], before: Figures) -> Goals:
         """Return the goals of a design; no figure, goal or not, must become worse where nothing limits it."""
+        if isinstance(minimise, str) or not isinstance(minimise, Sequence):
+            raise ModelError(f"goals are {minimise!r}; give them as a list, such as ('peak', 'noise')")
         for name in (*minimise, *limits):
             if name not in FIGURES:
                 known = f"{', '.join(FIGURES)}.{nearest(name, list(FIGURES))}"

@@ -16,7 +16,7 @@ from ambid.control.closed import Plant
 from ambid.control.excited import ExcitedLoop, begin_at, from_rest
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import Limited, Lines, joint_design, spread_power
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, check_positive, check_whole
 from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import beside_harmonics
@@ -171,6 +171,8 @@ class Experiment(Judged):
         EstimationError
             If it was designed for another rate.
         """
+        check_whole({"samples": samples})
+        check_positive({"rate_hz": rate_hz or 0})
         if abs(rate_hz / self.rate_hz - 1.0) > _SAME_RATE:
             raise EstimationError(
                 f"the experiment is designed for {self.rate_hz:g} Hz, the bench samples at {rate_hz:g} Hz. Design it "

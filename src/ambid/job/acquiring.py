@@ -18,7 +18,16 @@ from ambid.acquisition.review import refuse_unstable, review
 from ambid.acquisition.session import Course
 from ambid.acquisition.settings import controller_settings, law_trial
 from ambid.control.experiment import Experiment
-from ambid.errors import LARGEST, AmbidError, DeviceError, check_positive, counted, refuse_given
+from ambid.errors import (
+    LARGEST,
+    AmbidError,
+    DeviceError,
+    check_band,
+    check_positive,
+    check_whole,
+    counted,
+    refuse_given,
+)
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
 from ambid.job.results import experiment_of
@@ -58,6 +67,8 @@ class Request:
         check_positive({"--seconds": self.seconds, "--amplitude": self.amplitude})
         if not 0 <= settle_s <= LARGEST:
             raise AmbidError(f"--settle is {settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
+        check_whole({"--seed": self.seed})
+        check_band(self.band)
         named = {"--amplitude": self.amplitude, "--band": self.band}
         _check_excitation(port, mode, self.excitation, named)
         if (experiment := experiment_of(self.excitation)) is not None:

@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import partial
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -38,7 +39,7 @@ from ambid.control.design import (
 from ambid.control.drawn import Draws, Spread, draw_plants, over_speeds
 from ambid.control.gain_sets import FORMS
 from ambid.control.verification import Trials, checks_of_verifications, verify_all
-from ambid.errors import EstimationError, nearest
+from ambid.errors import EstimationError, by_name, check_whole, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, part_of, silent
@@ -162,14 +163,13 @@ def design_controller(
     known, bench = given(estimate, rig)
     asked, sources = _ratios(limits), _spread(spread)
     Goals.of(goals, asked, UNSTABLE)  # refuses what it does not know, before anything is drawn
-    if method not in METHODS:
+    if str(method) not in METHODS:
         names = f"{', '.join(METHODS)}.{nearest(method, list(METHODS))}"
         raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
-    for name, x, least in (("plants", plants, 1), ("judges", judges, 1)):
-        if x < least:
-            raise EstimationError(f"{name} is {x}; it must be at least {least}. Correct it")
+    check_whole({"--plants": plants, "--judges": judges, "--schedule": schedule}, 1)
+    check_whole({"--seed": seed, "--filters": filters})
     design = _method(method, form, filters)
     speeds = _speeds(known, bench, speeds_rpm)
     if schedule > 1:
@@ -210,12 +210,10 @@ def _method(name: str, form: str, filters: int) -> Method:
         if form != "axes" or filters:
             raise EstimationError(f"form and filters are of a PID, not of {name}. Omit them, or give method pid")
         return METHODS[name]()
-    if form not in FORMS:
+    if str(form) not in FORMS:
         raise EstimationError(
             f"form {form!r} of gains is unknown: {', '.join(FORMS)}.{nearest(form, list(FORMS))} Give one of them"
         )
-    if filters < 0:
-        raise EstimationError(f"filters is {filters}; it must be zero or positive. Correct it")
     return partial(METHODS[name](), form=form, filters=filters)
 
 
@@ -242,7 +240,7 @@ def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> In
     if given is not None:
         if not isinstance(known, RotorEstimate):
             raise EstimationError("speeds are of a rotor on many axes; the estimate is of one axis. Omit them")
-        if not (0.0 <= given[0] <= given[1] and math.isfinite(given[1])):
+        if not (len(given) == 2 and 0.0 <= given[0] <= given[1] and math.isfinite(given[1])):
             raise EstimationError(f"speeds are {given} rpm; they are zero or positive, the lower first. Correct them")
         return given[0] * math.pi / 30.0, given[1] * math.pi / 30.0
     if not isinstance(known, RotorEstimate) or bench.rotor is None:
@@ -394,12 +392,15 @@ def at_rate(plant: Plant, rate_hz: float) -> Plant:
 
 def _ratios(limits: Mapping[str, float] | None) -> dict[str, float]:
     """Return limits with that of the peak as a ratio."""
+    for name, x in by_name(limits, "limits").items():
+        if not isinstance(x, Real):
+            raise EstimationError(f"limit {name} is {x!r}; it must be a number. Correct it")
     return {name: 10.0 ** (x / 20.0) if name == "peak" else x for name, x in (limits or {}).items()}
 
 
 def _spread(given: Mapping[str, Any] | None) -> Spread:
     names = [f.name for f in fields(Spread)]
-    for name in given or {}:
+    for name in by_name(given, "spread"):
         if name not in names:
             known = f"{', '.join(names)}.{nearest(name, names)}"
             raise EstimationError(f"source {name!r} of spread is unknown; known: {known} Give one of them")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypedDict, Unpack
@@ -176,7 +176,10 @@ class Columns(TypedDict, total=False):
 
 def names_of(said: Names | None) -> tuple[str, ...]:
     """Return the names of one channel, several or none."""
-    return () if said is None else (said,) if isinstance(said, str) else tuple(said)
+    names = () if said is None else (said,) if isinstance(said, str) or not isinstance(said, Iterable) else tuple(said)
+    if not all(isinstance(name, str) for name in names):
+        raise EstimationError(f"{said!r:.40} names no channels. Give the name of a column, or several in a list")
+    return names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,7 +33,7 @@ from ambid.control.experiment import (
 )
 from ambid.control.information import Information, Innovation, reported
 from ambid.control.waves import Lines
-from ambid.errors import AmbidError, check_positive, nearest
+from ambid.errors import AmbidError, check_band, check_positive, check_share, check_switch, check_whole, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -175,12 +175,23 @@ def design_experiment(
     True
     """
     say, clock = tick or silent, Clock()
-    check_positive({"--seconds": seconds, "--period": period, "--target": target, "--slew": slew, "--rate": rate_hz})
-    if not 0.0 < use <= 1.0 or not 0.0 <= spread < 1.0 or not 2 <= lines <= _MOST // 2:
-        raise AmbidError(
-            f"--use {use:g}, --spread {spread:g}, --lines {lines}; --use must be above 0 and at most 1, --spread 0 to "
-            f"below 1, --lines 2 to {_MOST // 2}. Correct it"
-        )
+    check_positive(
+        {
+            "--seconds": seconds,
+            "--period": period,
+            "--slew": slew,
+            "--rate": rate_hz,
+            "--target": target or 0,
+            "--use": use or 0,
+        }
+    )
+    if use > 1.0:
+        raise AmbidError(f"--use is {use:g}; it must be at most 1. Lower it")
+    check_share({"--spread": spread})
+    check_whole({"--lines": lines}, 2, _MOST // 2)
+    check_whole({"--seed": seed})
+    check_band(band)
+    check_switch({"closed": closed})
     wanted = Wanted(
         seconds=seconds, period_s=period, band=band, lines=lines, criterion=criterion, target=target, use=use,
         slew=slew, spread=spread, seed=seed,

@@ -21,7 +21,7 @@ from ambid.blackbox.model import Offsets
 from ambid.blackbox.modes import find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.blackbox.words import orders_of
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, check_band
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import Modal, plant_modes
 from ambid.estimation.progress import Tick, silent
@@ -119,6 +119,7 @@ def frf(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
         rig=rig,
     )  # fmt: skip
+    check_band(band)
     bench, wanted = channels.rig, orders_of(orders)
     if bench is not None and bench.rotor is not None:
         raise EstimationError(

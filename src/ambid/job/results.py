@@ -12,7 +12,7 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_j
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json
 from ambid.control.experiment import Experiment
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import AmbidError, EstimationError, path_of
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
 from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
@@ -58,7 +58,7 @@ def load(path: str | Path) -> Any:
     EstimationError
         If the file cannot be read, or is not a complete result.
     """
-    path = Path(path)
+    path = path_of(path, "result")
     text = _text(path, "estimate")
     if f'"{TRACK}"' in text[:_BEGIN]:
         return read_track(path)

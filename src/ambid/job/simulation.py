@@ -11,7 +11,16 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.control.experiment import Experiment
-from ambid.errors import AmbidError, nearest, refuse_given
+from ambid.errors import (
+    AmbidError,
+    check_band,
+    check_number,
+    check_positive,
+    check_switch,
+    check_whole,
+    nearest,
+    refuse_given,
+)
 from ambid.estimation.estimate import Estimate
 from ambid.job.results import experiment_of, read_linear_estimate, rig_of
 from ambid.physics.loop import Loop
@@ -143,6 +152,11 @@ def simulate_used(
     force: bool = False,
 ) -> tuple[Simulation, Excited]:
     """Return what `simulate` does with what happened, and the excitation."""
+    check_positive({"--duration": duration, "--rate": rate_hz, "--amplitude": amplitude})
+    check_whole({"--seed": seed} | {n: x for n, x in (("--periods", periods), ("--settle", settle)) if x is not None})
+    check_band(band)
+    check_number({"--position": position})
+    check_switch({"closed": closed})
     bench, experiment = _bench(source, rate_hz, closed, nonlinear, position), experiment_of(excitation)
     if duration is None:
         duration = 1.0 if experiment is None else experiment.seconds
@@ -247,7 +261,7 @@ def bench_of_source(source: BenchSource) -> Rig | Preset:
         source = read_linear_estimate(source, f"{source} is no linear estimate; a simulation needs one. Give a rig")
     if isinstance(source, Estimate):
         return _rig_of_estimate(source)
-    return source if isinstance(source, (Rig, Preset)) else load_rig(Path(source))
+    return source if isinstance(source, (Rig, Preset)) else load_rig(source)
 
 
 def _bench(

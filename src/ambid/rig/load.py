@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
+from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest, path_of
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
@@ -64,7 +64,7 @@ def load_rig(path: str | Path) -> Rig:
     """
     from ambid.rig.schema import read_rig_file
 
-    path = Path(path)
+    path = path_of(path, "rig")
     return _build(read_rig_file(path), path)
 
 
