@@ -78,7 +78,7 @@ LARGEST = 1e9
 
 
 def check_positive(given: Mapping[str, object]) -> None:
-    """Refuse by option what is no number, not positive, not finite or absurd; None was not given."""
+    """Refuse by option what is not a number, not positive, not finite or absurd; None was not given."""
     _check(given, Real, lambda x: 0 < x <= LARGEST, f"a positive number, up to {LARGEST:g}")
 
 
@@ -94,7 +94,7 @@ def check_number(given: Mapping[str, object]) -> None:
 
 
 def check_share(given: Mapping[str, object]) -> None:
-    """Refuse by option what is no number from 0 to below 1."""
+    """Refuse by option what is not a number from 0 to below 1."""
     _check(given, Real, lambda x: 0 <= x < 1, "a number, 0 to below 1", required=True)
 
 

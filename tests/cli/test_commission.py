@@ -128,6 +128,7 @@ def test_the_folder_of_an_earlier_one_is_refused_before_the_bench_is_opened(comm
         (("--band", "9"), {}, "--band is '9'"),
         (("--seconds", "0.5"), {}, "the record: a multisine from 2 Hz needs 2 s"),
         (("--band", "2:1200"), {}, "a trial of the amplitude: "),
+        (("--band", "2:900"), {}, "designed up to 800 Hz"),
         ((), {"port": "replay:o.h5"}, "nothing can be levitated"),
         ((), {"port": "/dev/ttyNONE"}, "no terminal to ask"),
         (("--yes",), {"port": "/dev/ttyNONE"}, "does not exist"),

@@ -123,6 +123,8 @@ def test_texts_fit_and_name_what_is_shown(designed):
         (("simulate", "thesis", "--excitation", "cut.json", "-o", "x.csv"), "experiment cut.json, row 1: not JSON"),
         (("simulate", "thesis", "--excitation", "e.json", "-o", "x.csv"), "is no experiment"),
         (("simulate", "thesis", "--excitation", "d.json", "-o", "x.csv"), "designed for 2000 Hz"),
+        (("simulate", "prototype", "--rate", "2000", "--loop", "open", "--excitation", "d.json", "-o", "x.csv"),
+         "designed for the closed loop, here the loop is open"),
         (("simulate", "prototype", "--excitation", "d.json", "--amplitude", "1", "-o", "x.csv"), "--amplitude"),
         (("identify", "r.csv", "--rig", "rig.toml", "--experiment", "e.json"), "is no experiment"),
         (("acquire", "--port", "simulated", "--rig", "rig.toml", "--excitation", "d.json", "--amplitude", "1", "-o",

@@ -153,7 +153,7 @@ class Experiment(Judged):
         """Length of the record."""
         return self.periods * self.period / self.rate_hz
 
-    def played(self, samples: int, rate_hz: float) -> Array:
+    def played(self, samples: int, rate_hz: float, *, closed: bool | None = None) -> Array:
         """Return the excitation of the inputs, from the beginning of a period.
 
         Parameters
@@ -161,6 +161,8 @@ class Experiment(Judged):
         samples : int
         rate_hz : float
             At which it is to be played.
+        closed : bool, optional
+            Whether it is to be played in the closed loop: its limits hold for the loop that it is designed for alone.
 
         Returns
         -------
@@ -169,7 +171,7 @@ class Experiment(Judged):
         Raises
         ------
         EstimationError
-            If it was designed for another rate.
+            If it was designed for another rate, or with another loop.
         """
         check_whole({"samples": samples})
         check_positive({"rate_hz": rate_hz or 0})
@@ -177,6 +179,12 @@ class Experiment(Judged):
             raise EstimationError(
                 f"the experiment is designed for {self.rate_hz:g} Hz, the bench samples at {rate_hz:g} Hz. Design it "
                 "with --rate, or correct the rate"
+            )
+        if closed not in (None, self.closed):
+            of, now = ("closed", "open") if self.closed else ("open", "closed")
+            raise EstimationError(
+                f"the experiment is designed for the {of} loop, here the loop is {now}: it may pass limits. Design it "
+                f"with --loop {now}, or play it with the {of} loop"
             )
         waves = np.column_stack(list(self.excitation.values()))
         return np.asarray(np.resize(waves, (samples, waves.shape[1])))

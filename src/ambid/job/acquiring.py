@@ -99,7 +99,7 @@ class Request:
         if self.excitation is None:
             return Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s)
         if (experiment := experiment_of(self.excitation)) is not None:
-            experiment.played(0, rate_hz)
+            experiment.played(0, rate_hz, closed=trial.mode == "levitate")
             return Course(
                 mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s, program=experiment.program
             )  # fmt: skip

@@ -70,7 +70,7 @@ def refuse_unstable(loop: ClosedLoop, rig: Rig) -> None:
     pole = float(np.abs(closed_loop_poles(plant.theta, late, plant.rate_hz, of=plant.model)[0]))
     if pole > 1.0 + 1e-6:
         raise EstimationError(
-            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.4f}), but the loop of a "
+            f"the rig's [loop] does not hold the estimated plant (largest pole {pole:.5g}), but the loop of a "
             "levitated rotor does: it is another controller. Correct [loop], or log the excitation as reference"
         )
 

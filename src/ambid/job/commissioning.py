@@ -31,7 +31,7 @@ from ambid.estimation.result import Reason, Result
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning_steps import STEPS, Plan, StepName
 from ambid.job.controller_design import design_controller
-from ambid.job.experiment_design import design_experiment
+from ambid.job.experiment_design import HIGHEST, design_experiment
 from ambid.job.identification import identify_axis
 from ambid.job.loop_margins import margins
 from ambid.job.presentation import page
@@ -270,6 +270,12 @@ class _Guide:
                 self._course(1.0, seconds, 0)
             except AmbidError as failure:
                 raise AmbidError(f"{what}: {failure}") from None
+        top = HIGHEST * rate_hz
+        if plan.band_hz and plan.band_hz[1] > top and (plan.amplitude_v is None or plan.redesign):
+            raise AmbidError(
+                f"--band goes up to {plan.band_hz[1]:g} Hz; an experiment is designed up to {top:g} Hz, {HIGHEST:g} of "
+                "the rate. Lower it"
+            )
 
     def steps(self, confirm: Callable[[StepName], bool]) -> Iterator[tuple[StepName, Callable[[], Step]]]:
         """Yield one step after the other; whoever iterates does it, and stops at one that is not passed."""

@@ -58,6 +58,8 @@ SPREAD = 0.1
 """Part of their values within which free parameters of a rig lie, two standard deviations, for the drawn plants."""
 TARGET = 0.01
 """Relative standard deviation for which the length of the record is told."""
+HIGHEST = 0.4
+"""Part of the rate up to which lines may be."""
 _PLANTS = 200  # drawn
 _SCATTER = Spread(delay=0.0, position=0.0, current=0.0, eddy=0.0, warm_k=(0.0, 0.0), frequency=0.0, damping=0.0)
 _RESERVE = 4.0  # standard deviations of noise that are kept free
@@ -268,7 +270,7 @@ def _designed(known: Known | None, bench: AnyBench, wanted: Wanted, say: Tick) -
         bench.refuse_unstable()
     elif loop.pole > _KEPT:
         raise AmbidError(
-            f"the plant is unstable (largest pole {loop.pole:.4f}) and has no loop; no excitation keeps it within "
+            f"the plant is unstable (largest pole {loop.pole:.5g}) and has no loop; no excitation keeps it within "
             "limits. Give [loop] in the rig"
         )
     noise = _innovation(known, bench, plant)
@@ -419,14 +421,17 @@ def _task(
         period = round(wanted.period_s * rate)
     if bench.rig.daq is not None and bench.rig.rotor is None:
         if wanted.period_s is None:
-            period = TABLE_LENGTH if wanted.band is None else int(np.ceil(rate / wanted.band[0] - 1e-9))
+            low = wanted.band[0] if wanted.band else 0.0
+            period = int(np.ceil(rate / low - 1e-9)) if low else TABLE_LENGTH
         hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
         period -= period % hold
     if not 4 <= period <= _MOST:
         raise AmbidError(f"the period has {period} samples; it must be 4 to {_MOST}. Correct --period or --band")
-    band, highest = wanted.band or (rate / period, rate / 5.0), 0.4 * rate
+    band, highest = wanted.band or (rate / period, rate / 5.0), HIGHEST * rate
     if band[1] > highest:
-        raise AmbidError(f"--band goes up to {band[1]:g} Hz; it may go to {highest:g} Hz, 0.4 of the rate. Lower it")
+        raise AmbidError(
+            f"--band goes up to {band[1]:g} Hz; it may go to {highest:g} Hz, {HIGHEST:g} of the rate. Lower it"
+        )
     periods = max(1, round(seconds * rate / period))
     return Task(
         loops=loops, noise=noise, low=ends[0], high=ends[1], period=period, periods=periods,
@@ -479,12 +484,21 @@ def _told(
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
         gap=found.gap, drawn=len(task.loops) - 1,
         checks=_checks(used, expected, unstable) | ({} if curved is None else {"curvature": curved}),
-        warnings=_cautions(bench.rig, task, lines, power, information),
+        warnings=(*_lowered(task, wanted), *_cautions(bench.rig, task, lines, power, information)),
         shown=Shown(
             waves={name: rounded(x) for name, x in waves.items()},
             seconds=_LENGTHS * (task.samples / task.rate_hz),
             by_length=curves[0], levels=_LEVELS, by_level=curves[1],
         ),
+    )  # fmt: skip
+
+
+def _lowered(task: Task, wanted: Wanted) -> tuple[str, ...]:
+    """Say where the controller's table, which holds each element for some samples, cannot play the band."""
+    asked, top = (0.0, 0.0) if wanted.band is None else wanted.band, task.band_hz[1]
+    return () if asked[1] <= top else (
+        f"--band goes up to {asked[1]:g} Hz; the controller's table holds each of its elements for {task.hold} samples "
+        f"and plays up to {top:.4g} Hz. Shorten --period, or raise the lower end of the band",
     )  # fmt: skip
 
 

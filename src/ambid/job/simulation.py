@@ -174,13 +174,13 @@ def simulate_used(
             if log_excitation:
                 raise AmbidError(_NO_LOG)
             sets_in = experiment.period * (1 if settle is None else settle)
-            waves = experiment.played(sets_in + n, bench.rate_hz)
+            waves = experiment.played(sets_in + n, bench.rate_hz, closed=bench.loop.closed)
             excited = Excited(
                 kind="experiment", peak=float(np.max(np.abs(waves))), unit=bench.model.units[moved[0]]
             )  # fmt: skip
             return bench.simulate(waves, seed=seed, settle=sets_in), excited
         refuse_given({"--settle": settle}, "--excitation is an experiment, which takes no {}. Omit {}")
-        wave = experiment.played(n, bench.rate_hz)[:, 0]
+        wave = experiment.played(n, bench.rate_hz, closed=bench.loop.closed)[:, 0]
         return _with_excitation(bench.simulate(wave, seed=seed), wave if log_excitation else None), Excited(
             kind="experiment", peak=float(np.max(np.abs(wave)))
         )

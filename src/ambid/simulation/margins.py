@@ -125,7 +125,7 @@ class LoopMargins(OpenLoop):
     def words(self) -> str:
         """Say how stable the loop is, on one line."""
         if not self.stable or self.gain is None:
-            return f"unstable, largest pole {self.largest_pole:.4f}"
+            return f"unstable, largest pole {self.largest_pole:.5g}"
         low = f"less than {1 / _REACH:g}" if self.gain[0] <= 1 / _REACH else f"{self.gain[0]:.2g}"
         high = f"more than {_REACH:g}" if self.gain[1] >= _REACH else f"{self.gain[1]:.2g}"
         phase = "" if self.phase_deg is None else f", phase margin {self.phase_deg:.0f}°"
@@ -150,7 +150,7 @@ class LoopMargins(OpenLoop):
         else:
             far = f"it is stable for {self.gain[0]:.2g} to {self.gain[1]:.2g} times its gains"
         raise ModelError(
-            f"the loop is unstable on {where}: largest pole {self.largest_pole:.4f}; {far}. {remedy}, or go on with"
+            f"the loop is unstable on {where}: largest pole {self.largest_pole:.5g}; {far}. {remedy}, or go on with"
             " --force"
         )
 

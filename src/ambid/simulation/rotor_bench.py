@@ -140,7 +140,7 @@ class RotorBench:
         if self.loop.closed and self.largest_pole > 1.0 + 1e-9:
             raise ModelError(
                 f"the loop is unstable on {self.rig.name!r} at {self.rate_hz:g} Hz with a delay of "
-                f"{self.loop.delay:.2g} samples: largest pole {self.largest_pole:.4f}. Correct [loop] or the "
+                f"{self.loop.delay:.2g} samples: largest pole {self.largest_pole:.5g}. Correct [loop] or the "
                 "parameters, or go on with --force"
             )
 
