@@ -1,0 +1,159 @@
+"""The console at real pace: what worker and server take, how soon a sample is a pixel, and whether anything grows.
+
+``PYTHONPATH=. python bench/console.py [SECONDS]``: a record of an unstable bearing at 20 kHz is replayed, recorded and
+tracked with its three signals, then eight signals are shown without tracking; where Chromium and Playwright are
+installed, a page watches. Figures are printed; none is asserted.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+
+from ambid.console.envelope import EnvelopeTap
+from ambid.console.feed import FeedReader, FeedWriter, json_frames
+from ambid.console.runs import Run, Runs
+from ambid.physics.presets import preset
+from ambid.record import write_record
+from ambid.rig import write_rig
+from ambid.rig.preset_rig import rig_of_preset
+from ambid.tracking.blocks import Block, Frame
+from tests.console.pages import Started, console
+from tracking_benches import RATE, preset_bench, record_of
+
+SIGNALS = 8
+BLOCK = 100
+CHROMIUM = "/usr/bin/chromium"
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def main(seconds: float) -> None:
+    with tempfile.TemporaryDirectory() as made:
+        folder = Path(made)
+        write_record(record_of(preset_bench().samples("change", 1, seconds, 0.6 * seconds)), folder / "played.h5")
+        write_rig(rig_of_preset(preset("unstable-bearing")), folder / "rig.toml")
+        before = time.perf_counter()
+        with console(folder) as page:
+            page.open().ask("GET", "/")
+            print(f"command to page: {time.perf_counter() - before:.2f} s")
+            wish = {"job": "live", "rig": page.number("rig.toml"), "port": "replay:played.h5", "seconds": seconds}
+            run = Runs(folder).one(page.json("POST", "/api/runs", {**wish, "pace": "real-time", "out": "run"})["id"])
+            pid = json.loads((run.place / "process.json").read_text())["pid"]
+            watched("20 kHz, 3 strips, tracked", page, run, pid, seconds)
+            words = [said for said in told_by(run) if said["kind"] in ("summary", "recorded")]
+            for said in words:
+                print("  ", said.get("latency") or {k: said.get(k) for k in ("samples", "lost", "not_stored", "fault")})
+            place = folder / ".ambid/runs" / f"{int(time.time()):010d}-000001"
+            place.mkdir()
+            (place / "spec.json").write_text('{"job": "live"}')
+            writer = subprocess.Popen([sys.executable, __file__, "--write", str(place), str(min(seconds, 60.0))])
+            time.sleep(1.0)
+            watched(f"20 kHz, {SIGNALS} strips, envelopes alone", page, Run(place), writer.pid, min(seconds, 60.0))
+            writer.wait()
+
+
+def write(place: Path, seconds: float) -> None:
+    """Stand for a worker: eight signals at 20 kHz as envelopes, at real pace."""
+    Run(place).claim()
+    view = SimpleNamespace(units={f"signal {k}": "V" for k in range(SIGNALS)}, rate_hz=RATE, block=lambda block: block)
+    tap, wave = EnvelopeTap(FeedWriter(place), view), np.random.default_rng(1).normal(size=(BLOCK, SIGNALS))  # type: ignore[arg-type]
+    begin, n = time.perf_counter(), 0
+    while n < seconds * RATE:
+        time.sleep(max(0.0, begin + (n + BLOCK) / RATE - time.perf_counter()))
+        block = Block(first=n, time_s=n / RATE, values=wave + np.sin(n / RATE))
+        tap.take(Frame(block=block, arrived_s=begin + (n + BLOCK) / RATE))
+        n += BLOCK
+
+
+def watched(name: str, page: Started, run: Run, pid: int, seconds: float) -> None:
+    """Print what a run takes while it is watched."""
+    with viewer(page, run) as view:
+        rows, begin = [], time.perf_counter()
+        while time.perf_counter() - begin < seconds and run.alive:
+            time.sleep(min(seconds / 8, 60.0))
+            with suppress(OSError, IndexError):  # over
+                rows.append(
+                    (
+                        time.perf_counter(),
+                        *used(pid),
+                        *used(page.process.pid),
+                        sum(f.stat().st_size for f in run.place.glob("feed-*")),
+                    )
+                )
+        seen = view()
+    print(f"{name}: {rows[-1][0] - rows[0][0]:.0f} s, load average {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores")
+    at = np.array(rows)
+    for label, k in (("worker", 1), ("server", 3)):
+        load, size = np.diff(at[:, k]) / np.diff(at[:, 0]), at[:, k + 1] / 2**20
+        print(
+            f"  {label}: {np.median(load):.3f} of a core (most {load.max():.3f}), {size[0]:.1f} to {size[-1]:.1f} MiB"
+        )
+    print(
+        f"  feed: {at[-1, 5] / 2**20:.1f} MiB in {len(list(run.place.glob('feed-*')))} parts; page: {seen}", flush=True
+    )
+
+
+def used(pid: int) -> tuple[float, float]:
+    """CPU time of a process, s, and its memory, bytes."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS, int(fields[21]) * os.sysconf("SC_PAGE_SIZE")
+
+
+def told_by(run: Run) -> Iterator[dict[str, Any]]:
+    reader, end = FeedReader(run.place), time.monotonic() + 60.0
+    while time.monotonic() < end:
+        for said in json_frames(reader.read()):
+            yield said
+            if said["kind"] == "end":
+                return
+        time.sleep(0.02)
+
+
+@contextmanager
+def viewer(page: Started, run: Run) -> Iterator[Any]:
+    """Watch in Chromium, or by a client that takes everything and draws nothing."""
+    try:
+        from playwright.sync_api import sync_playwright
+    except ModuleNotFoundError:
+        with page.feed(run.id):
+            yield lambda: "none: Playwright is not installed"
+        return
+    with sync_playwright() as playwright:
+        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        sheet = browser.new_context(viewport={"width": 1366, "height": 768})
+        name, _, value = page.cookie.partition("=")
+        sheet.add_cookies([{"name": name, "value": value, "url": f"http://{page.host}"}])
+        shown = sheet.new_page()
+        shown.goto(f"http://{page.host}/")
+        while not shown.evaluate(
+            "window.ambidConsole?.feed?.updates > 0"
+        ):  # the page forbids to wait for an expression
+            time.sleep(0.1)
+        first = shown.evaluate("[ambidConsole.feed.updates, performance.now()]")
+
+        def seen() -> str:
+            last = shown.evaluate("[ambidConsole.feed.updates, performance.now(), ambidConsole.feed.lags]")
+            rate, lags = (last[0] - first[0]) / (last[1] - first[1]) * 1e3, 1e3 * np.array(last[2])
+            low, high = np.percentile(lags, [50, 95])
+            return f"{rate:.1f} updates/s, sample to pixel median {low:.0f} ms, 95 % {high:.0f} ms"
+
+        yield seen
+        browser.close()
+
+
+if __name__ == "__main__":
+    if sys.argv[1:2] == ["--write"]:
+        write(Path(sys.argv[2]), float(sys.argv[3]))
+    else:
+        main(float(sys.argv[1]) if sys.argv[1:] else 60.0)
