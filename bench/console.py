@@ -25,11 +25,11 @@ from ambid.console.envelope import EnvelopeTap
 from ambid.console.feed import FeedReader, FeedWriter, json_frames
 from ambid.console.runs import Run, Runs
 from ambid.physics.presets import preset
-from ambid.record import write_record
+from ambid.record import read_record, write_record
 from ambid.rig import write_rig
 from ambid.rig.preset_rig import rig_of_preset
 from ambid.tracking.blocks import Block, Frame
-from tests.console.pages import Started, console
+from tests.console.pages import Started, console, prototype_rig
 from tracking_benches import RATE, preset_bench, record_of
 
 SIGNALS = 8
@@ -61,6 +61,32 @@ def main(seconds: float) -> None:
             time.sleep(1.0)
             watched(f"20 kHz, {SIGNALS} strips, envelopes alone", page, Run(place), writer.pid, min(seconds, 60.0))
             writer.wait()
+    with tempfile.TemporaryDirectory() as made:
+        killed(Path(made), 20)
+
+
+def killed(folder: Path, times: int) -> None:
+    """Kill the console again and again while a simulated bench is recorded: is the run found again, and whole?"""
+    wish = {"job": "live", "port": "simulated", "seconds": 3600.0, "amplitude": 1.4, "excitation": "multisine"}
+    prototype_rig(folder)
+    run, found = None, 0
+    for _ in range(times):
+        with console(folder) as page:
+            page.open()
+            if run is None:
+                wish |= {"rig": page.number("rig.toml"), "out": "killed", "pace": "real-time"}
+                run = Runs(folder).one(page.json("POST", "/api/runs", wish)["id"])
+            with page.feed(run.id) as feed:
+                begins = json_frames(feed.recv(timeout=20.0))[0]["kind"] == "begin"
+            found += begins and next(r["alive"] for r in page.state()["runs"] if r["id"] == run.id)
+    assert run is not None
+    run.say("stop")
+    kept = next(said for said in told_by(run) if said["kind"] == "recorded")
+    samples = read_record(folder / "killed.h5").n_samples
+    print(
+        f"console killed {times} times: found again alive {found} times; {samples} of {round(3000 * times)} samples in"
+    )
+    print(f"  the record, {kept['lost']} lost, {kept['not_stored']} not stored", flush=True)
 
 
 def write(place: Path, seconds: float) -> None:

@@ -1,7 +1,13 @@
 """Runs of a console: jobs of one record, a live bench that no dying console disturbs, and who orders it."""
 
+import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
 import time
+from io import FileIO
 
 import numpy as np
 import pytest
@@ -52,6 +58,56 @@ def test_a_spectrum_shows_the_peak_of_a_sine():
     assert amplitude.max() == pytest.approx(3.0, rel=1e-3)
     assert hz[np.argmax(amplitude)] == pytest.approx(125.0, abs=1.0)
     assert other.max() == 0.0
+
+
+def test_a_disk_that_takes_nothing_stops_no_run_and_is_told(tmp_path, monkeypatch):
+    whole, frames = FileIO.write, []
+
+    class Full(FileIO):
+        def write(self, data):
+            return whole(self, data if room[0] else data[:3])
+
+    room = [True]
+    monkeypatch.setattr("ambid.console.feed.FileIO", Full)
+    feed, reader = FeedWriter(tmp_path, part_bytes=400), FeedReader(tmp_path)
+    feed.tell("head", {}, sticky="head")
+    for k in range(30):
+        room[0] = k % 10 < 5
+        feed.tell("n", {"k": k})
+        frames += json_frames(reader.read())
+    assert [m["k"] for m in told(frames, "n")] == [k for k in range(30) if k % 10 < 5]
+    assert [m["text"][:11] for m in told(frames, "note")] == ["5 messages ", "5 messages "]
+    shutil.rmtree(tmp_path)
+    for k in range(50):  # parts cannot be opened any more
+        feed.tell("n", {"k": k})
+
+
+def test_a_worker_that_dies_or_whose_folder_goes_is_told(tmp_path):
+    prototype_rig(tmp_path)
+    wish = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine",
+            "rig": "rig.toml", "pace": "real-time"}  # fmt: skip
+    gone = Runs(tmp_path).start({**wish, "out": "gone.h5"})
+    with console(tmp_path) as page:
+        page.open()
+        run = Runs(tmp_path).one(page.json("POST", "/api/runs", {"job": "rig", "text": "x", "out": "x"})["id"])
+        until(run)
+        killed = Runs(tmp_path).start({**wish, "out": "killed.h5"})
+        until(killed, "spectrum")
+        with page.feed(killed.id) as feed:
+            os.kill(json.loads((killed.place / "process.json").read_text(encoding="utf-8"))["pid"], signal.SIGKILL)
+            seen = [m for data in feed for m in json_frames(data)]  # to its end
+        assert told(seen, "spectrum")
+        assert not told(seen, "end")
+    assert not killed.alive
+    words = [sys.executable, "-m", "ambid", "recover", tmp_path / "killed.h5.journal"]
+    assert subprocess.run(words, check=False, capture_output=True).returncode == 0
+    assert read_record(tmp_path / "killed.h5").n_samples > 1900
+    until(gone, "spectrum")
+    shutil.rmtree(gone.place)
+    end = time.monotonic() + 20.0
+    while not (tmp_path / "gone.h5").exists() and time.monotonic() < end:
+        time.sleep(0.05)
+    assert read_record(tmp_path / "gone.h5").n_samples > 1900
 
 
 @pytest.fixture(scope="module")

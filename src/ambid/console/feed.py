@@ -73,7 +73,7 @@ class FeedWriter:
             if not at:
                 frame = b"".join((*(f for f in self._sticky.values() if not frame.endswith(f)), frame))
             if file.write(frame) < len(frame):
-                file.truncate(at)
+                file.truncate(file.seek(at))
                 raise OSError(errno.ENOSPC, "no space left")
             self._missed = 0
         except OSError:

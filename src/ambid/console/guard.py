@@ -144,7 +144,7 @@ class Guard:
 
 
 _LOGIN = (
-    "<!doctype html><meta charset=utf-8><title>ambid console</title><link rel=stylesheet href=/static/console.css>"
+    "<!doctype html><meta charset=utf-8><title>ambid console</title>"
     "<form method=post action=/login><label>Password <input type=password name=password autofocus></label>"
     "<button>Open</button></form>"
 )

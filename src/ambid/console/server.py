@@ -413,9 +413,14 @@ def serve(
         h11_max_incomplete_event_size=16_384, server_header=False, lifespan="off", proxy_headers=False,
         ssl_certfile=None if tls is None else tls[0], ssl_keyfile=None if tls is None else str(tls[1]),
     )  # fmt: skip
-    server = uvicorn.Server(config)
-    on_ready(f"{scheme}://{shown}:{number}/?token={guard.token}")
     try:
+        config.load()
+    except OSError as failure:  # also one of TLS
+        listening.close()
+        raise AmbidError(f"--certificate and --key cannot be used: {failure}. Give PEM files of one pair") from None
+    server = uvicorn.Server(config)
+    try:
+        on_ready(f"{scheme}://{shown}:{number}/?token={guard.token}")
         server.run(sockets=[listening])
     except KeyboardInterrupt:
         pass

@@ -140,6 +140,8 @@ class Worker:
                     self.flags.append(word)
                 elif word in ("go", "no"):
                     self._answers.append(word)
+            if not self.run.place.exists():  # nobody can stop it from now on
+                self.wished.set()
             time.sleep(_LISTEN_S)
 
 
