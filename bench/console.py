@@ -83,9 +83,7 @@ def killed(folder: Path, times: int) -> None:
     run.say("stop")
     kept = next(said for said in told_by(run) if said["kind"] == "recorded")
     samples = read_record(folder / "killed.h5").n_samples
-    print(
-        f"console killed {times} times: found again alive {found} times; {samples} of {round(3000 * times)} samples in"
-    )
+    print(f"console killed {times} times: found again alive {found} times; {samples} of {kept['samples']} samples in")
     print(f"  the record, {kept['lost']} lost, {kept['not_stored']} not stored", flush=True)
 
 

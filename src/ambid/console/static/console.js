@@ -80,7 +80,7 @@ $("tabs").addEventListener("keydown", (e) => {
 // Files and runs.
 async function refresh() {
   state = await ask("/api/state");
-  $("where").textContent = state.folder + (state.read_only ? " (read only)" : "");
+  $("where").textContent = state.folder + (state.read_only ? " (read only)" : "") + (state.left_out ? `, ${state.left_out} older files not shown` : "");
   const others = state.driver === "another page";
   $("driver").replaceChildren(...(others ? ["another page has the machine ", el("button", { onclick: takeOver }, "Take over")] : state.driver === "you" ? ["this page has the machine"] : []));
   fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict]);
