@@ -1,6 +1,7 @@
 """State-space laws from a rig to the controller's words and back, and what refuses them."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from ambid.acquisition.settings import controller_settings, law_trial, realised
 from ambid.errors import DeviceError, RigError
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Loop
+from ambid.physics.presets import preset
+from ambid.rig import rig_of_preset
 from tests.bars.host import prototype
 
 RIG = prototype()
@@ -72,3 +75,10 @@ def test_the_simulated_controller_levitates_with_a_law_and_tries_none():
         assert np.abs(position[-500:] - 512).max() < 30
         with pytest.raises(DeviceError, match="only the firmware tries a law"):
             device.arm(law_trial(RIG, RIG))
+
+
+def test_neither_a_rotors_loop_nor_a_law_of_another_rate_is_tried():
+    with pytest.raises(RigError, match="rotor on many axes; the controller closes one loop"):
+        law_trial(RIG, rig_of_preset(preset("rmit")))
+    with pytest.raises(RigError, match=r"rig other.toml: the law of \[loop\] is for 1000 Hz"):
+        law_trial(RIG, replace(with_law(replace(PID, rate_hz=1000.0)), source=Path("other.toml")))

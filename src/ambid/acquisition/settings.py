@@ -144,9 +144,11 @@ def law_trial(rig: Rig, new: Rig) -> LawTrial:
     """
     if new.loop is None or not new.loop.closed:
         raise RigError(f"{who(new)} has no [loop] with a gain; there is nothing to arm. Give it one")
+    if new.rotor is not None:
+        raise RigError(f"{who(new)} is of a rotor on many axes; the controller closes one loop. Arm a rig of one axis")
     old = controller_settings(rig)
     law = new.loop.as_law(old.rate_hz)
-    settings = controller_settings(replace(rig, loop=replace(new.loop.opened(), law=law)))
+    settings = controller_settings(replace(rig, loop=replace(new.loop.opened(), law=law), source=new.source))
     assert settings.law is not None
     return LawTrial(
         law=settings.law,

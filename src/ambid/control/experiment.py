@@ -153,6 +153,11 @@ class Experiment(Judged):
         """Length of the record."""
         return self.periods * self.period / self.rate_hz
 
+    def __post_init__(self) -> None:
+        """Refuse an experiment without an excitation, as a damaged file may hold."""
+        if not self.excitation:
+            raise EstimationError("an experiment holds no excitation. Design it again")
+
     def played(self, samples: int, rate_hz: float, *, closed: bool | None = None) -> Array:
         """Return the excitation of the inputs, from the beginning of a period.
 

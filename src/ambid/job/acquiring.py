@@ -240,6 +240,8 @@ def ready(
     closes = trial.mode == "levitate" and not force
     if wanted.arm is not None and trial.mode != "levitate":
         raise AmbidError(f"--arm tries a loop while the rotor levitates, and the mode is {trial.mode}. Omit --arm")
+    if wanted.arm is not None and port == "simulated":
+        raise AmbidError("--arm is tried by the firmware alone. Give --port emulated, or a serial port")
     with opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note) as device:
         course = wanted.course(device, rig, trial, note=note, tick=say)
         if wanted.arm is not None:
