@@ -75,3 +75,19 @@ def test_a_design_says_what_its_record_will_be_off_by(experiment, bent):
 def test_a_design_of_little_motion_is_not_cautioned():
     found = ambid.design_experiment("prototype", seconds=1.0, lines=20, use=0.1)
     assert found.checks["curvature"].passed
+
+
+def test_a_record_away_from_the_rest_of_the_rig_is_judged_where_it_is():
+    rig = rig_of_preset(preset("levitated-ball"))
+    wave = ambid.design_experiment("levitated-ball", seconds=2.0, lines=10, use=0.1)
+    record = ambid.simulate("levitated-ball", duration=2.0, nonlinear=True, position=0.012, excitation=wave)
+    found = ambid.identify(record, rig)
+    of = Plant(model=rig.plant, theta=found.values, delays=np.zeros(1), rate_hz=2000.0)
+    law, check = laws_of(of, rig, found.operating_point)[0][""], found.checks["curvature"]
+    assert law.rest[0] == pytest.approx(0.012, abs=1e-4)
+    truth = dict(zip(("k_x", "k_i", "L"), law.numbers(*law.rest), strict=True))
+    seen = {n: (found[n].value - x) / found[n].sd for n, x in truth.items()}
+    assert seen["k_i"] > 4.0
+    assert all(abs(check.values[n] - x) < 3.0 for n, x in seen.items()), (seen, check.values)
+    moved = laws_of(of, rig, {"position": 0.0, "current": 0.0})[0][""]  # of a record of deviations
+    assert moved.rest == pytest.approx((0.01, 0.95))

@@ -96,7 +96,8 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
     """Check that curvature moves no number by more than its standard deviation allows; None where no law is known.
 
     `e`: as for `seen_shift`; `at`: operating point; `sd`: (n_physical,), SI. The law of a rig counts unless the record
-    contradicts it; one with an assumed gap only as far as the record shows it.
+    contradicts it; one with an assumed gap only as far as the record shows it. What a record shows beyond all of a
+    rig's law is of second order in the shift, and no larger one.
     """
     theta = fit.problem.parameters(fit.vector)
     plant = Plant(model=fit.problem.model, theta=theta, delays=np.zeros(1), rate_hz=fit.problem.rate_hz)
@@ -106,7 +107,7 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
     shift, part, part_sd = seen_shift(fit, e, laws[""])
     if not np.all(np.isfinite([*shift, part, part_sd])):  # a gap that the motion would close
         return None
-    counted = max(part, 0.0)
+    counted = float(np.clip(part, 0.0, 1.0 if laws[""].known else np.inf))
     if part_sd > _TOLD:
         counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
     names = fit.problem.estimated

@@ -307,10 +307,12 @@ def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, 
         try:
             known = plant_of_rig(rig)
             rest = rest_of_rig(rig, known)
+            x, i = at.get("position", rest.position), at.get("current", rest.current)
+            if not (travel[0] < x < travel[1] and most[0] < i < most[1]):  # a record of deviations from rest
+                x, i = rest.position, rest.current
             law = Law(
-                energy=known.magnet.coenergy, rest=(rest.position, rest.current),
-                position=_ways(rest.position, travel), current=_ways(rest.current, most), known=True,
-            )  # fmt: skip
+                energy=known.magnet.coenergy, rest=(x, i), position=_ways(x, travel), current=_ways(i, most), known=True
+            )
             return {"": law}, ("the law of the magnet is the rig's [magnet]",)
         except (RigError, ModelError):  # some numbers are to be found by an identification
             pass
