@@ -7,9 +7,10 @@ import pytest
 
 import ambid
 from ambid.acquisition.settings import law_trial
+from ambid.control.design import UNSTABLE, Examined, Figures, Goals, worst_of
 from ambid.errors import EstimationError
 from ambid.job import controller_design as room
-from ambid.job.controller_design import design_controller, held_by
+from ambid.job.controller_design import _refuse_worse, design_controller, held_by
 from ambid.physics.loop import Loop
 from ambid.rig.preset_rig import rig_of_preset
 from tests.job.benches import prototype
@@ -46,3 +47,25 @@ def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
     given(lambda loop: replace(loop, kd=0.0))
     with pytest.raises(EstimationError, match=r"does not hold 3 of the 3 plants that judge, the present one loses 0"):
         design_controller(known, rig, plants=3, judges=3)
+
+
+def test_a_rotors_loop_with_a_higher_peak_is_refused_too(monkeypatch):
+    rig = rig_of_preset(ambid.preset("rmit"))
+    known = ambid.identify(ambid.simulate("rmit", duration=1.0, seed=1), rig)
+    worse = replace(rig.loop, kd=0.7 * rig.loop.kd)
+    monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: worse)
+    with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or --limit peak="):
+        design_controller(known, rig, plants=2, judges=2)
+
+
+def test_a_loop_that_holds_more_plants_and_is_better_on_the_others_is_not_refused():
+    def seen(*peaks):
+        rest = {"compliance": 1e-6, "noise": 0.1, "settling": 0.1}
+        return [Examined(figures=Figures(peak=x, pole=5.0, **rest) if x else UNSTABLE) for x in peaks]
+
+    before = seen(2.0, 3.0, None)
+    goals = Goals.of(("peak",), {}, worst_of([x.figures for x in before]))
+    _refuse_worse(goals, before, seen(1.9, 2.9, 5.0))
+    for worse in (seen(1.9, 3.1, 2.0), seen(1.9, None, None)):
+        with pytest.raises(EstimationError, match="none is offered"):
+            _refuse_worse(goals, before, worse)

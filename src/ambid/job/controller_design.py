@@ -307,7 +307,10 @@ def _designed(
 
 
 def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Examined]) -> None:
-    """Refuse a loop that loses more of the plants that judge than the present one, or whose peak passes its limit."""
+    """Refuse a loop that loses more of the plants that judge than the present one, or whose peak passes its limit.
+
+    The peak counts on plants that the present loop holds: one that is held for the first time is none that got worse.
+    """
     from ambid.control.tuning import option, said
 
     lost = [sum(not x.figures.stable for x in seen) for seen in (before, after)]
@@ -316,7 +319,8 @@ def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Exam
             f"the best loop found does not hold {lost[1]} of the {len(after)} plants that judge, the present one loses "
             f"{lost[0]}; none is offered. Tune over more plants, lower the spread, or give other goals"
         )
-    peak, most = worst_of([x.figures for x in after]).peak, goals.limits["peak"]
+    both = [new.figures for old, new in zip(before, after, strict=True) if old.figures.stable]
+    peak, most = worst_of(both).peak, goals.limits["peak"]
     if peak > SAME * most or zone_of(peak) > zone_of(most):
         raise EstimationError(
             f"the best loop found has {said('peak', peak)} (zone {zone_of(peak)}) on the plants that judge, above the "
