@@ -140,3 +140,7 @@ def test_a_loop_goes_on_where_it_stopped_and_another_law_takes_over_without_a_bu
     assert np.abs(running.z - states).max() > 0.0
     running.hand_over(other, y)
     np.testing.assert_allclose(other.C @ running.z + other.D @ y, wanted, rtol=1e-9)
+    states, turn = running.z, np.diag(2.0 ** np.arange(law.order))  # the same law counts in other states
+    back = np.linalg.inv(turn)
+    running.hand_over(replace(other, A=turn @ other.A @ back, B=turn @ other.B, C=other.C @ back), y)
+    np.testing.assert_allclose(back @ running.z, states, rtol=1e-6)

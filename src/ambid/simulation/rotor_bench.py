@@ -57,14 +57,27 @@ class Running:
     law: StateLaw | None
 
     def hand_over(self, law: StateLaw, y: Array) -> None:
-        """Go on with another law, whose states are those of the last one but for what keeps the command where it is.
+        """Go on with another law, whose states order of themselves what those of the last one would.
 
-        z+ = z + C⁺ (w - C z - D y), of another order from z = 0; w: what the last law would order.
+        By least squares over samples; then z+ = z + C⁺ (w - C z - D y), w what the last law would order.
         """
         assert self.law is not None
-        wanted = self.law.C @ self.z + self.law.D @ y
-        z = self.z if self.z.size == law.order else np.zeros(law.order)
+        wanted, n = self.law.C @ self.z + self.law.D @ y, 2 * max(self.law.order, law.order)
+        old, new = _free(self.law, n), _free(law, n)
+        size = np.maximum(np.linalg.norm(new, axis=0), 1e-300)
+        z = np.linalg.lstsq(new / size, old @ self.z, rcond=_TOLD)[0] / size
         self.z, self.law = z + np.linalg.pinv(law.C) @ (wanted - law.C @ z - law.D @ y), law
+
+
+_TOLD = 1e-6  # of the largest singular value, from which commands tell of states
+
+
+def _free(law: StateLaw, n: int) -> Array:
+    """Return what `n` samples of a law's commands are of its states alone, (n * n_u, order)."""
+    rows = [law.C]
+    for _ in range(n - 1):
+        rows.append(rows[-1] @ law.A)
+    return np.vstack(rows)
 
 
 @dataclass(frozen=True, kw_only=True)
