@@ -3,14 +3,3 @@
 The server (`server.py`) acquires nothing. Whatever computes or acquires is a process of its own (`worker.py`) that
 appends what it finds to a feed, a file (`feed.py`); the server passes feeds on, and finds running workers again.
 """
-
-from __future__ import annotations
-
-from typing import TYPE_CHECKING
-
-from ambid.lazy import exports
-
-if TYPE_CHECKING:
-    from ambid.console.server import serve as serve
-
-__getattr__, __dir__, __all__ = exports(__name__)

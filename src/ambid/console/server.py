@@ -55,18 +55,24 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "rig": ({}, {"text": str}, ".toml"),
     "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
     "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
+    "design": ({"rig": "rig", "estimate": "result"}, {"method": str}, ".json"),
     "export": ({"record": "record"}, {"from_s": float, "to_s": float}, ".h5"),
     "live": (
-        {"rig": "rig", "estimate": "result"},
+        {"rig": "rig", "estimate": "result", "arm": "rig"},
         {"port": str, "seconds": float, "excitation": str, "amplitude": float, "pace": str}, ".h5",
     ),
     "commission": (
         {"rig": "rig"}, {"port": str, "seconds": float, "track_seconds": float, "pace": str, "redesign": bool}, "/",
     ),
 }  # fmt: skip
-_FILES = ("record", "rig", "estimate")
-_CHOICES = {"pace": ("real-time", "fastest"), "excitation": ("multisine", "schroeder", "prbs", "steps")}
-_NEEDED = {"preview": ("record",), "identify": ("record", "rig"), "margins": ("rig",), "live": ("rig", "port"),
+_FILES = ("record", "rig", "estimate", "arm")
+_CHOICES = {
+    "pace": ("real-time", "fastest"),
+    "excitation": ("multisine", "schroeder", "prbs", "steps"),
+    "method": ("pid", "lqg"),
+}
+_NEEDED = {"preview": ("record",), "identify": ("record", "rig"), "margins": ("rig",),
+           "design": ("rig", "estimate"), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
 
 
@@ -77,6 +83,7 @@ class Console:
         self.files, self.runs, self._read_only = Folder(folder), Runs(folder), read_only
         self._driver: str | None = None  # the page that orders what moves the machine
         self._viewers = 0
+        self._over: dict[str, dict[str, Any]] = {}  # runs that are over, as they are shown
         self.guard: Guard | None = None
 
     def routes(self) -> list[Any]:
@@ -116,7 +123,7 @@ class Console:
 
     async def _state(self, request: Request) -> Response:
         entries = await run_in_threadpool(self.files.entries)
-        runs = await run_in_threadpool(lambda: [_about(r) for r in self.runs.all()[:40]])
+        runs = await run_in_threadpool(lambda: [self._about(r) for r in self.runs.all()[:40]])
         return _reply(
             {
                 "folder": self.files.path.name, "files": [asdict(e) for e in entries], "runs": runs,
@@ -124,6 +131,17 @@ class Console:
                 "driver": _of(self._driver, request), "now": time.time(),
             }
         )  # fmt: skip
+
+    def _about(self, run: Run) -> dict[str, Any]:
+        """Return what is shown of a run; one that is over is looked at once."""
+        if run.id in self._over:
+            return self._over[run.id]
+        if run.alive:
+            return {**_about(run), "alive": True, "end": ""}
+        ends = [m for m in json_frames(FeedReader(run.place, parts=1).read(1 << 24)) if m.get("kind") == "end"]
+        found = {**_about(run), "alive": False, "end": str(ends[-1].get("how"))[:20] if ends else "broke off"}
+        self._over[run.id] = found
+        return found
 
     async def _rig_text(self, request: Request) -> Response:
         number = request.path_params["number"]
@@ -266,7 +284,7 @@ async def _until_gone(socket: WebSocket) -> None:
 def _about(run: Run) -> dict[str, Any]:
     said = {k: run.spec.get(k) for k in ("job", "out", "seconds", "port", *_FILES)}
     shown = {k: v[:200] if isinstance(v, str) else v for k, v in said.items() if isinstance(v, str) or _finite(v)}
-    return {"id": run.id, "alive": run.alive, "spec": {"job": "", **shown}, "began": int(run.id.partition("-")[0])}
+    return {"id": run.id, "spec": {"job": "", **shown}, "began": int(run.id.partition("-")[0])}
 
 
 def _finite(value: object) -> bool:

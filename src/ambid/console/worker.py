@@ -203,6 +203,19 @@ def _margins(worker: Worker) -> None:
     worker.give(found, str(worker.spec["out"]))
 
 
+def _design(worker: Worker) -> None:
+    """Design a better loop, and write the rig that has it."""
+    from ambid.job import design_controller
+    from ambid.rig import rig_text
+
+    name, estimate = str(worker.spec["out"]), worker.path("estimate")
+    assert estimate is not None
+    found = design_controller(estimate, worker.path("rig"), method=worker.spec.get("method", "pid"), tick=worker.tick)
+    worker.give(found, name)
+    with (worker.folder / f"{name}.toml").open("x", encoding="utf-8") as file:
+        file.write(rig_text(found.new_rig, worker.folder))
+
+
 def _export(worker: Worker) -> None:
     """Write a stretch of a record as a record."""
     from ambid.record import read_record, write_record
@@ -227,13 +240,13 @@ def _live(worker: Worker) -> None:
     from ambid.physics.linear_model import model
     from ambid.rig import load_rig
 
-    spec, rig_path, start = worker.spec, worker.path("rig"), worker.path("estimate")
+    spec, rig_path, start, arm = worker.spec, worker.path("rig"), worker.path("estimate"), worker.path("arm")
     assert rig_path is not None
     rig, out = load_rig(rig_path), worker.folder / str(spec["out"])
     known = None if start is None else read_linear_estimate(start, f"{start.name} is no linear estimate. Choose one")
     wanted = Request(
         seconds=min(float(spec.get("seconds", 60.0)), _LONGEST_S), excitation=spec.get("excitation") or None,
-        amplitude=spec.get("amplitude"), seed=0, stopped=worker.stopped,
+        amplitude=spec.get("amplitude"), seed=0, stopped=worker.stopped, arm=None if arm is None else load_rig(arm),
     )  # fmt: skip
     plant, runs = model(rig.model), list[Any]()
     opening = ready(
@@ -383,8 +396,8 @@ def _png(block: Any) -> str:
 
 
 JOBS: Mapping[str, Callable[[Worker], None]] = {
-    "preview": _preview, "rig": _rig, "identify": _identify, "margins": _margins, "export": _export, "live": _live,
-    "commission": _commission,
+    "preview": _preview, "rig": _rig, "identify": _identify, "margins": _margins, "design": _design,
+    "export": _export, "live": _live, "commission": _commission,
 }  # fmt: skip
 
 

@@ -16,6 +16,7 @@ function el(tag, props = {}, ...children) {
   made.append(...children.filter((c) => c !== null && c !== undefined));
   return made;
 }
+const put = (host, ...nodes) => host.replaceChildren(...nodes.filter((n) => n !== null && n !== undefined));
 
 // Numbers with a prefix and digits that their uncertainty carries.
 const PREFIXES = [[1e9, "G"], [1e6, "M"], [1e3, "k"], [1, ""], [1e-3, "m"], [1e-6, "µ"], [1e-9, "n"], [1e-12, "p"]];
@@ -84,11 +85,12 @@ async function refresh() {
   const others = state.driver === "another page";
   $("driver").replaceChildren(...(others ? ["another page has the machine ", el("button", { onclick: takeOver }, "Take over")] : state.driver === "you" ? ["this page has the machine"] : []));
   fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict]);
-  fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : "over"], watch, (r) => [r.id, r.alive]);
+  fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
     choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig"));
     for (const field of $(form).elements) field.disabled = state.read_only;
   }
+  choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig"), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
   const moving = state.runs.find((r) => r.alive && MOVING.includes(r.spec.job));
@@ -128,9 +130,25 @@ function choose(file) {
   if (file.kind === "result") {
     const report = state.files.find((f) => f.kind === "report" && stem(f.name) === stem(file.name));
     detail.append(el("p", { className: file.verdict }, file.verdict || "no verdict"), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."));
+    if (file.schema.startsWith("ambid.estimate")) loopForm(file, detail);
   } else if (file.kind === "rig") {
     ask(`/api/rigs/${file.number}`).then((r) => detail.append(el("pre", {}, r.text))).catch(trouble);
   } else preview(file, detail);
+}
+// The loop of an estimate: margins as it is, and a better one.
+function loopForm(file, detail) {
+  const rigs = state.files.filter((f) => f.kind === "rig"), host = el("div");
+  const rig = el("select", {}, ...rigs.map((f) => el("option", { value: f.number }, f.name)));
+  const method = el("select", {}, el("option", { value: "pid" }, "PID, tuned"), el("option", { value: "lqg" }, "LQG"));
+  const run = (name) => async () => {
+    const spec = { job: name, estimate: file.number, rig: Number(rig.value), out: `${stem(file.name)}-${name}-${stamp()}` };
+    host.replaceChildren();
+    await job(name === "design" ? { ...spec, method: method.value } : spec, host, (m) => m.kind === "result" && results(m, host)).catch(wrong(host));
+  };
+  detail.append(el("h2", {}, "Its loop"), el("div", { className: "bar" }, el("label", {}, "Rig with [loop] ", rig),
+    el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("margins") }, "Margins"),
+    el("label", {}, "Method ", method), el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("design") }, "Design a better loop")),
+    el("p", { className: "hint" }, "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'."), host);
 }
 const link = (report) => el("p", {}, el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`));
 
@@ -195,7 +213,7 @@ async function results(m, host) {
   await refresh();
   const report = state.files.find((f) => f.name === m.report);
   const words = { usable: "Usable", caution: "Usable with caution", unusable: "Do not use" };
-  host.replaceChildren(el("h2", { className: m.verdict }, words[m.verdict] ?? m.verdict), ...m.reasons.map((r) => el("p", {}, r)), el("pre", {}, m.text), report ? link(report) : null);
+  put(host, el("h2", { className: m.verdict }, words[m.verdict] ?? m.verdict), ...m.reasons.map((r) => el("p", {}, r)), el("pre", {}, m.text), report ? link(report) : null);
 }
 
 // A rig: channels and parameters as a form over the text that is checked and written.
@@ -258,7 +276,9 @@ function axes(unit, more = {}) {
   const ink = css("--dim"), grid = { stroke: css("--grid"), width: 1 };
   const label = (u, splits) => {
     const size = Math.max(...splits.map(Math.abs).filter(isFinite), 0), [p, name] = unitOf(unit, size);
-    const gap = splits.length > 1 ? Math.abs(splits[1] - splits[0]) / p : 1, digits = Math.min(8, Math.max(0, -Math.floor(Math.log10(gap) + 1e-9)));
+    const gap = splits.length > 1 ? Math.abs(splits[1] - splits[0]) : size || 1;
+    let digits = 0;  // as many as tell each tick exactly
+    while (digits < 9 && splits.some((s) => Math.abs(+(s / p).toFixed(digits) * p - s) > 1e-3 * gap)) digits++;
     return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
   };
   return [{ stroke: ink, grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
@@ -370,25 +390,31 @@ class Live {
     if (!this.over && this.header && age > OLD_S) banner(`OLD: nothing came for ${age.toFixed(0)} s. What is shown is not now`);
     else if ($("banner").textContent.startsWith("OLD: nothing")) banner("");
     if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
-      const span = Number($("span").value), end = this.t.at(-1) ?? 0, from = Math.max(this.t[0] ?? 0, end - span);
-      if (this.dirty) this.drawStrips(from, end);
+      if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines();
       this.dirty = this.dirtyLines = false;
     }
     requestAnimationFrame(this.draw);
   }
+  window() {  // the stretch that is shown: the last one, or further back while the picture is frozen
+    const span = Number($("span").value), first = this.t[0] ?? 0, last = this.t.at(-1) ?? 0;
+    const end = this.frozen ? Math.min(last, first + span + (Number($("back").value) / Number($("back").max)) * Math.max(0, last - first - span)) : last;
+    return [Math.max(first, end - span), end];
+  }
   drawStrips(from, end) {
-    let a = this.t.length - 1;
+    let a = this.t.length - 1, z = this.t.length;
     while (a > 0 && this.t[a - 1] >= from) a--;
-    const n = this.t.length - a, step = Math.max(1, Math.ceil(n / SLOTS));
-    const t = step === 1 ? this.t.slice(a) : pick(this.t, a, step, (x) => x[0]);
+    while (z > a + 2 && this.t[z - 1] > end) z--;
+    const n = z - a, step = Math.max(1, Math.ceil(n / SLOTS));
+    const t = step === 1 ? this.t.slice(a, z) : pick(this.t, a, z, step, (x) => x[0]);
     this.strips.forEach((s, k) => {
-      const low = step === 1 ? this.low[k].slice(a) : pick(this.low[k], a, step, (x) => Math.min(...x)), high = step === 1 ? this.high[k].slice(a) : pick(this.high[k], a, step, (x) => Math.max(...x));
+      const low = step === 1 ? this.low[k].slice(a, z) : pick(this.low[k], a, z, step, (x) => Math.min(...x)), high = step === 1 ? this.high[k].slice(a, z) : pick(this.high[k], a, z, step, (x) => Math.max(...x));
       s.plot.batch(() => { s.plot.setData([t, low, high], false); s.plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
       s.value.textContent = `${shown(this.low[k].at(-1), this.signals.units[k])} to ${shown(this.high[k].at(-1), this.signals.units[k])}`;
     });
     if (this.spectrum) { const floor = (a) => a.map((v) => v > 0 ? v : null); this.lines4.plot.setData([this.spectrum.hz, ...this.spectrum.amplitudes.map(floor)]); this.spectrum = null; }
     if (this.orbitOf) this.drawOrbit(a);
+    if (this.frozen) return;
     $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples`;
     $("lost").textContent = this.lost ? `${this.lost} samples LOST` : "0 lost"; $("lost").className = this.lost ? "late" : "";
     this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
@@ -414,19 +440,20 @@ class Live {
     if (this.error) this.error.value.textContent = last.error === null ? "unknown" : last.error.toFixed(2);
   }
 }
-function pick(values, a, step, of) {
+function pick(values, a, z, step, of) {
   const found = [];
-  for (let k = a; k < values.length; k += step) { const part = values.slice(k, k + step).filter((x) => x !== null); found.push(part.length ? of(part) : null); }
+  for (let k = a; k < z; k += step) { const part = values.slice(k, Math.min(z, k + step)).filter((x) => x !== null); found.push(part.length ? of(part) : null); }
   return found;
 }
 
 async function begin(form, spec) {
   for (const [name, field] of Object.entries(Object.fromEntries([...form.elements].filter((f) => f.name).map((f) => [f.name, f])))) {
     if (field.type === "checkbox") spec[name] = field.checked;
-    else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate"].includes(name) ? Number(field.value) : field.value;
+    else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate", "arm"].includes(name) ? Number(field.value) : field.value;
   }
   const moves = !["simulated"].includes(spec.port);
   if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
+  if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
   try { const { id } = await ask("/api/runs", spec); banner(""); attached.add(id); await refresh(); watch({ id, spec, alive: true }); } catch (error) { trouble(error); }
 }
 $("live-form").addEventListener("submit", (e) => { e.preventDefault(); begin(e.target, { job: "live", pace: "real-time" }); });
@@ -438,13 +465,31 @@ function watch(run) {
   attached.add(run.id);
   if (run.spec.job === "live") { feed?.socket?.close(); feed = null; feed = new Live(run.id); open("live"); }
   else if (run.spec.job === "commission") { feed?.socket?.close(); feed = new Steps(run.id); open("commission"); }
+  else past(run);
+}
+function past(run) {
+  const detail = $("detail"), host = el("div");
+  detail.replaceChildren(el("h2", {}, `${run.spec.job} of ${run.spec.record ?? run.spec.estimate ?? run.spec.out ?? ""}`), host);
+  open("files");
+  let found = false;
+  const socket = listen(run.id, (m) => {
+    if (m.kind === "result") { found = true; results(m, host); }
+    else if (m.kind === "preview") { found = true; put(host, el("pre", {}, m.text)); }
+    else if (m.kind === "end") { if (!found || m.why) host.append(el("p", { className: m.how }, m.why || m.how)); socket.close(); }
+  });
 }
 const word = (w) => feed && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(trouble);
 for (const button of document.querySelectorAll("[data-say]")) {
   button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
 }
-$("freeze").onclick = () => { feed.frozen = !feed.frozen; $("freeze").setAttribute("aria-pressed", feed.frozen); $("freeze").textContent = feed.frozen ? "Go on" : "Freeze"; if (feed.frozen) for (const s of feed.strips) s.plot.setData(thin(feed, feed.strips.indexOf(s))); };
-function thin(live, k) { return [live.t.slice(), live.low[k].slice(), live.high[k].slice()]; }
+$("freeze").onclick = () => {
+  feed.frozen = !feed.frozen;
+  $("freeze").setAttribute("aria-pressed", feed.frozen);
+  $("freeze").textContent = feed.frozen ? "Go on" : "Freeze";
+  $("back").hidden = !feed.frozen;
+  $("back").value = $("back").max;
+};
+$("back").oninput = $("span").onchange = () => { if (feed?.t?.length) feed.drawStrips(...feed.window()); };
 $("export").onclick = async () => {
   const file = state.files.find((f) => f.name === feed.record);
   if (!file) { banner("The record can be cut when the run is over", "note"); return; }
@@ -488,13 +533,13 @@ class Steps {
   step(m) {
     (this.done ??= new Set()).add(m.name);
     const pictures = el("div", { className: "pictures" }, ...m.pictures.map((p) => el("figure", {}, el("img", { src: `data:image/png;base64,${p.png}`, alt: p.title, loading: "lazy" }), el("figcaption", { className: "caption" }, p.caption))));
-    this.item(m.name).replaceChildren(el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
+    put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
       ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
       m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
   }
   async question(m) {
     if (!m.what || this.over) { if ($("ask").open) $("ask").close("no"); return; }
-    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Go");
+    const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go");
     word(yes ? "go" : "no");
   }
 }

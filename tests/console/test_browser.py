@@ -1,0 +1,105 @@
+"""The whole way in a browser, headless Chromium: a record, its rig, identification; a live bench; commissioning."""
+
+import os
+import shutil
+import time
+
+import pytest
+
+from ambid.job import load
+from tests.console.pages import console, prototype_rig
+
+pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
+playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser")
+pytestmark = [
+    pytest.mark.skipif(CHROMIUM is None, reason="Chromium is not installed"),
+    pytest.mark.skipif(os.environ.get("CI") == "true", reason="browsers are for machines of people"),
+]
+LONG_MS = 120_000
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    from ambid import simulate
+    from ambid.record import write_record
+
+    made = tmp_path_factory.mktemp("page")
+    prototype_rig(made)
+    write_record(simulate("thesis", duration=0.5, seed=1), made / "rec.csv")
+    return made
+
+
+@pytest.fixture(scope="module")
+def page(folder):
+    with playwright.sync_playwright() as started, console(folder) as served:
+        browser = started.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
+        opened = browser.new_context(viewport={"width": 1366, "height": 768}).new_page()
+        opened.wrong = []
+        opened.on("pageerror", lambda error: opened.wrong.append(str(error)))
+        opened.on("console", lambda said: said.type == "error" and opened.wrong.append(said.text))
+        opened.set_default_timeout(LONG_MS)
+        opened.goto(served.link)
+        yield opened
+        assert opened.wrong == []
+        browser.close()
+
+
+def until(page, holds):
+    """Wait for something to hold; the page's policy forbids the browser's own way of it."""
+    end = time.monotonic() + LONG_MS / 1000
+    while not page.evaluate(holds):
+        assert time.monotonic() < end, holds
+        time.sleep(0.1)
+
+
+def wide(page):
+    """By how much the page is wider than its window, px."""
+    return page.evaluate("document.documentElement.scrollWidth - document.documentElement.clientWidth")
+
+
+def test_a_record_becomes_an_estimate(page, folder):
+    page.click("#list tr:has-text('rec.csv')")
+    page.click("button:text-is('Identify')")
+    page.wait_for_selector("#detail h2.usable, #detail h2.caution, #detail h2.unusable")
+    assert page.locator(f"#detail h2.{load(folder / 'rec-estimate.json').verdict.word}").count() == 1
+    assert (folder / "rec-rig.toml").exists()
+    assert page.locator("#detail a:has-text('rec-estimate.html')").count() == 1
+    assert wide(page) == 0
+
+
+def test_a_live_bench_is_watched_held_frozen_and_stopped(page, folder):
+    page.click("[data-tab=live]")
+    page.select_option("#live-form [name=rig]", label="rig.toml")
+    page.fill("#live-form [name=amplitude]", "1.4")
+    page.fill("#live-form [name=out]", "watched")
+    page.click("#live-form button.go")
+    page.wait_for_selector("#parameters .chart:nth-child(5)")
+    until(page, "ambidConsole.feed.lines.length > 3")
+    page.click("[data-say=hold]")
+    page.wait_for_selector("#state:text-is('hold')")
+    page.click("[data-say=accept]")
+    page.click("dialog button[value=no]")
+    page.click("#freeze")
+    page.evaluate("(() => { const back = document.getElementById('back'); back.value = 300; back.oninput(); })()")
+    assert page.evaluate("ambidConsole.feed.window()[1] <= ambidConsole.feed.t.at(-1)")
+    page.keyboard.press("Control+.")
+    until(page, "ambidConsole.feed.over")
+    assert (folder / "watched.h5").exists()
+    assert page.inner_text("#lost") == "0 lost"
+    assert wide(page) == 0
+
+
+def test_commissioning_asks_and_ends_with_its_report(page, folder):
+    until(page, "!state.runs.some((r) => r.alive)")
+    page.click("[data-tab=commission]")
+    page.select_option("#commission-form [name=rig]", label="rig.toml")
+    page.fill("#commission-form [name=seconds]", "4")
+    page.fill("#commission-form [name=out]", "first")
+    page.click("#commission-form button.go")
+    page.click("dialog[open] button[value=go]")
+    page.wait_for_selector("#steps a:has-text('report.html')")
+    assert page.locator("#steps > li .usable").count() >= 7
+    assert "null" not in page.inner_text("#steps")
+    assert (folder / "first" / "report.html").exists()
