@@ -380,27 +380,8 @@ def serve(
 ) -> None:
     """Serve the console of a folder until Ctrl-C.
 
-    Parameters
-    ----------
-    folder : str or Path
-        Records, rigs, results and reports that are shown; runs are kept in its folder ``.ambid``.
-    port : int
-        Of the page; 0: any that is free.
-    read_only : bool
-        Refuse what changes something.
-    listen : str
-        Address; another than the loopback's needs `tls` and `password`.
-    tls : (Path, Path), optional
-        Certificate and key.
-    password : str, optional
-        Opens the page beside the link.
-    on_ready : callable
-        Given the link, which opens the page once, when the server listens.
-
-    Raises
-    ------
-    AmbidError
-        If the folder is none, the address cannot be had, or another address than the loopback's is not protected.
+    `port`: 0: any that is free; `listen`: another address than the loopback's needs `tls` (certificate and key) and
+    `password`; `on_ready`: given the link, which opens the page once.
     """
     place = Path(folder).resolve()
     if not place.is_dir():
