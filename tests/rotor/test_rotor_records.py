@@ -69,3 +69,16 @@ def test_what_cannot_be_one_machine_is_refused(apart: tuple[Any, Record, Record]
     for words, said in refused:
         with pytest.raises(AmbidError, match=said):
             ambid.identify(rig=rig, **words)
+
+
+def test_an_estimate_without_a_finite_response_leaves_unbalance_out_and_says_so(
+    apart: tuple[Any, Record, Record], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fails(*_args: object, **_more: object) -> None:
+        raise np.linalg.LinAlgError("SVD did not converge")
+
+    monkeypatch.setattr("ambid.rotor.balance.balance_rotor", fails)
+    bench, still, turning = apart
+    found = ambid.identify([still, turning], free_rig(bench))
+    assert not found.synchronous
+    assert any("unbalance was not worked out" in line for line in found.warnings)

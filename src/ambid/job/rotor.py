@@ -85,7 +85,11 @@ def identify_rotor(
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], found.seen[fastest], estimate.speed)
-        synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
+        try:
+            synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
+        except np.linalg.LinAlgError:  # an estimate far from a rotor, such as one that did not converge
+            synchronous = {}
+            said = (*said, "unbalance was not worked out: the estimated rotor has no finite response at the speed")
     clock.lap("checks")
     return replace(
         estimate, sensitivity=sensitivity, synchronous=synchronous, warnings=(*estimate.warnings, *said),
