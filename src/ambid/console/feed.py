@@ -41,6 +41,7 @@ class FeedWriter:
 
     def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None) -> None:
         """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part."""
+        assert "kind" not in content
         text = json.dumps({"kind": kind, **content}, ensure_ascii=False, allow_nan=False, default=str)
         frame = _framed(b"J", text.encode())
         with self._lock:

@@ -308,7 +308,7 @@ class _Lines:
 
         feed, now = self._worker.feed, time.perf_counter()
         for event in line.events:
-            feed.tell("event", {**event_json(event), "what": event.kind})
+            feed.tell("event", {"what" if k == "kind" else k: x for k, x in event_json(event).items()})
         if now - self._last >= _LINE_S:
             self._last = now
             values = {n: [_number(v.value), _number(v.sd), v.stale] for n, v in line.parameters.items()}
