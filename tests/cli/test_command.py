@@ -28,7 +28,7 @@ USAGE = {
         "excitation 'sinus' is unknown",
     ),
     "band that is none": (["simulate", "thesis", "-o", "x.csv", "--band", "5"], "two frequencies in Hz with a colon"),
-    "no duration": (["simulate", "thesis", "-o", "x.csv", "--duration", "0"], "must be 1 to 1e8"),
+    "no duration": (["simulate", "thesis", "-o", "x.csv", "--duration", "0"], "must be a positive number"),
     "nonlinear rig": (
         ["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--nonlinear"],
         "has no [magnet]; a nonlinear simulation needs one",
