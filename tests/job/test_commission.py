@@ -13,6 +13,7 @@ from ambid.acquisition.device import SelfTest
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, EstimationError, ModelError
+from ambid.estimation.result import Reason, Verdict
 from ambid.job import commissioning as room
 from ambid.job import commissioning_steps as judge
 from ambid.job.commissioning import FILES, REDESIGNED, Declined, check_folder, commission
@@ -127,6 +128,19 @@ def test_where_no_better_loop_is_found_the_present_one_stays(tmp_path, monkeypat
     step = next(s for s in done.steps if s.name == "redesign")
     assert step.cautions == ("the present loop stays: no loop keeps the noise. Raise the limit noise",)
     assert not files(tmp_path) & set(REDESIGNED)
+
+
+@pytest.mark.parametrize(("cautions", "better"), [(["curvature"], 1.0), (["curvature", "residuals_white"], 0.0)])
+def test_curvature_alone_does_not_keep_a_better_loop_from_being_loaded(cautions, better, monkeypatch):
+    monkeypatch.setattr(judge, "design_picture", lambda _: None)
+    figures = SimpleNamespace(peak=2.0, compliance=1e-4, noise=0.1, settling=0.1)
+    loops = SimpleNamespace(worst=figures, figures=figures)
+    told = Verdict.of((Reason(check="estimate", text=f"of the plant: {'; '.join(cautions)}"),))
+    design = SimpleNamespace(before=loops, after=loops, verdict=told, passed=False)
+    estimate = SimpleNamespace(verdict=Verdict.of(tuple(Reason(check=c, text="") for c in cautions)))
+    step = judge.redesign(design, estimate)
+    assert step.numbers["better"] == better
+    assert bool(step.cautions) == (better == 0.0)
 
 
 def test_a_loop_is_tried_by_the_firmware_alone(tmp_path):

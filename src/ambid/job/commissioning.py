@@ -416,7 +416,7 @@ class _Guide:
         except EstimationError as failure:
             return Step(name="redesign", cautions=(f"the present loop stays: {failure}",))
         design.save(self._place / "design.json")
-        step = judge.redesign(design)
+        step = judge.redesign(design, self.estimate)
         if step.numbers["better"]:
             self._design = design
             write_text(self._place / "redesigned.toml", rig_text(design.new_rig, self._place))
