@@ -112,7 +112,6 @@ def test_a_change_is_found_and_accepted(page, folder):
     page.fill("#live-form [name=port]", "replay:change.h5")
     page.fill("#live-form [name=out]", "followed")
     page.click("#live-form button.go")
-    page.click("dialog[open] button[value=go]")
     page.wait_for_selector("#events li:has-text('change: k_i changed')")
     page.wait_for_selector("#events li:has-text('accepted: k_i')")
     until(page, "ambidConsole.feed.over")

@@ -282,7 +282,7 @@ function axes(unit, more = {}) {
     return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
   };
   return [{ stroke: ink, grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
-          { stroke: ink, grid, ticks: grid, size: 74, space: 20, values: label, ...(more.yaxis ?? {}) }];
+          { stroke: ink, grid, ticks: grid, size: 74, space: 15, values: label, ...(more.yaxis ?? {}) }];
 }
 function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
@@ -308,6 +308,9 @@ class Live {
     $("live-view").hidden = false;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
     $("summary").hidden = true;
+    for (const host of ["lag", "count", "lost"]) put($(host));  // nothing of the run before stands as this one's
+    freeze(this, false);
+    this.unmark();
     this.socket = listen(id, (m) => this.tell(m), (data, at) => this.envelope(data, at));
     this.draw = this.draw.bind(this);
     requestAnimationFrame(this.draw);
@@ -380,14 +383,20 @@ class Live {
   }
   mark(u) {
     const a = u.posToVal(u.select.left, "x"), b = u.posToVal(u.select.left + u.select.width, "x");
-    this.marked = b - a > 1e-3 ? [a, b] : null;
-    $("export").disabled = !this.marked;
-    $("export").textContent = this.marked ? `Export ${a.toFixed(2)} to ${b.toFixed(2)} s` : "Export marked stretch";
+    if (!(b - a > 1e-3)) return this.unmark();
+    this.marked = [a, b];
+    $("export").disabled = false;
+    $("export").textContent = `Export ${a.toFixed(2)} to ${b.toFixed(2)} s`;
+  }
+  unmark() {
+    this.marked = null;
+    $("export").disabled = true;
+    $("export").textContent = "Export marked stretch";
   }
   draw() {
     if (feed !== this) return;
     const age = (performance.now() - this.last) / 1000;
-    if (!this.over && this.header && age > OLD_S) banner(`OLD: nothing came for ${age.toFixed(0)} s. What is shown is not now`);
+    if (!this.over && this.signals && age > OLD_S) banner(`OLD: nothing came for ${age.toFixed(0)} s. What is shown is not now`);
     else if ($("banner").textContent.startsWith("OLD: nothing")) banner("");
     if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
       if (this.dirty) this.drawStrips(...this.window());
@@ -451,7 +460,7 @@ async function begin(form, spec) {
     if (field.type === "checkbox") spec[name] = field.checked;
     else if (field.value !== "") spec[name] = field.type === "number" || ["rig", "estimate", "arm"].includes(name) ? Number(field.value) : field.value;
   }
-  const moves = !["simulated"].includes(spec.port);
+  const moves = spec.port !== "simulated" && !spec.port.startsWith("replay:");
   if (moves && !await confirmed(`${spec.port}: the controller will switch its output on and lift the rotor. Is the bench clear, and the emergency stop within reach?`, "Start")) return;
   if (spec.arm && !await confirmed("The controller will try the loop of the other rig while the rotor levitates, and return to its own where the rotor moves too far. Load it?", "Load")) return;
   try { const { id } = await ask("/api/runs", spec); banner(""); attached.add(id); await refresh(); watch({ id, spec, alive: true }); } catch (error) { trouble(error); }
@@ -482,13 +491,14 @@ const word = (w) => feed && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(t
 for (const button of document.querySelectorAll("[data-say]")) {
   button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
 }
-$("freeze").onclick = () => {
-  feed.frozen = !feed.frozen;
-  $("freeze").setAttribute("aria-pressed", feed.frozen);
-  $("freeze").textContent = feed.frozen ? "Go on" : "Freeze";
-  $("back").hidden = !feed.frozen;
+function freeze(live, frozen) {
+  live.frozen = frozen;
+  $("freeze").setAttribute("aria-pressed", frozen);
+  $("freeze").textContent = frozen ? "Go on" : "Freeze";
+  $("back").hidden = !frozen;
   $("back").value = $("back").max;
-};
+}
+$("freeze").onclick = () => freeze(feed, !feed.frozen);
 $("back").oninput = $("span").onchange = () => { if (feed?.t?.length) feed.drawStrips(...feed.window()); };
 $("export").onclick = async () => {
   const file = state.files.find((f) => f.name === feed.record);
