@@ -11,6 +11,7 @@ TIERS: tuple[tuple[str, ...], ...] = (
     ("console", "fleet"),
     ("job",),
     ("report",),
+    ("ledger",),
     ("control",),
     ("acquisition",),
     ("tracking",),
