@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.acquisition.settings import law_trial
+from ambid.acquisition.settings import held_by, law_trial
 from ambid.control.design import UNSTABLE, Examined, Figures, Goals, worst_of
 from ambid.errors import EstimationError
 from ambid.job import controller_design as room
-from ambid.job.controller_design import _refuse_worse, design_controller, held_by
+from ambid.job.controller_design import _refuse_worse, design_controller
 from ambid.physics.loop import Loop
 from ambid.rig.preset_rig import rig_of_preset
 from tests.job.benches import prototype

@@ -182,6 +182,19 @@ def realised(settings: ControllerSettings, rig: Rig) -> Loop:
     )
 
 
+def held_by(rig: Rig, loop: Loop) -> Loop:
+    """Return a loop, gains or law, as the rig's controller holds it in fixed point; RigError where it does not fit.
+
+    As it is where there is no ``[daq]``, and of a rotor: the controller drives one axis.
+    """
+    if rig.daq is None or rig.rotor is not None:
+        return loop
+    from ambid.acquisition.default_daq import with_default_daq
+
+    full = replace(with_default_daq(rig), loop=loop)
+    return replace(realised(controller_settings(full), full), delay=loop.delay)
+
+
 def rest_of(rig: Rig) -> dict[str, float]:
     """Return the point about which the controller works.
 

@@ -13,12 +13,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
 from ambid.acquisition.law_words import LAW_STATES
+from ambid.acquisition.settings import held_by
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.design import Goals, closed_loop_of, examine, mean_over, noise_of, worst_of
@@ -26,7 +28,7 @@ from ambid.control.hinf import hinf
 from ambid.control.lqg import SampledPlant, Weights, lqg
 from ambid.control.reduction import reduced
 from ambid.control.tuning import option, said
-from ambid.errors import EstimationError
+from ambid.errors import EstimationError, ModelError, RigError
 from ambid.estimation.progress import Tick
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Loop, Noise
@@ -259,12 +261,17 @@ def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of:
     def make(knobs: Knobs) -> StateLaw:
         weights = Weights.of(limits, knobs[2])
         law = law_of(plants[0], weights, noise, knobs[0], knobs[1])
-        if rig.daq is None or law.order <= LAW_STATES:
+        if rig.daq is None:
             return law
         each = [weights.position, weights.current if math.isfinite(weights.current) else 1.0]
         axes = law.D.shape[0]
         sizes = np.tile(each[: law.D.shape[1] // axes], axes)
-        return reduced(law, LAW_STATES, sizes, weights.command)[0]  # what the controller has room for
+        for order in range(min(law.order, LAW_STATES), 1, -1):  # modes that nearly cancel do not fit in its words
+            with suppress(ModelError, RigError):
+                less = reduced(law, order, sizes, weights.command)[0]
+                held_by(rig, Loop(law=less))
+                return less
+        raise EstimationError(f"no {name} law of these weights fits in the words of the rig's controller")
 
     return design_by_knobs(make, grid, plants, rig, goals, tick, name)
 

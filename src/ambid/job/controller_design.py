@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from ambid.acquisition.settings import held_by
 from ambid.control.closed import Plant
 from ambid.control.design import (
     GOALS,
@@ -260,6 +261,7 @@ def _problem(
                     current_resolution=0.0)  # fmt: skip
     rate, speed = float(str(known.record["rate_hz"])), known.speed if isinstance(known, RotorEstimate) else 0.0
     plant = at_rate(plant_of(known, rate, speed), bench.daq.rate_hz if bench.daq else rate)
+    assert bench.loop is not None
     rig = replace(bench, loop=held_by(bench, bench.loop), noise=white)
     point = known.operating_point if isinstance(known, Estimate) else None
     seeds = 2 * seed, 2 * seed + 1
@@ -372,21 +374,6 @@ def _result(
             "assumed": [*of.judging.assumed, of.assumed],
         },
     )  # fmt: skip
-
-
-def held_by(rig: Rig, loop: Loop | None) -> Loop:
-    """Return a loop, gains or law, as the rig's controller holds it in fixed point.
-
-    As it is where there is no ``[daq]``, and of a rotor: the controller drives one axis.
-    """
-    assert loop is not None
-    if rig.daq is None or rig.rotor is not None:
-        return loop
-    from ambid.acquisition.default_daq import with_default_daq
-    from ambid.acquisition.settings import controller_settings, realised
-
-    full = replace(with_default_daq(rig), loop=loop)
-    return replace(realised(controller_settings(full), full), delay=loop.delay)
 
 
 def at_rate(plant: Plant, rate_hz: float) -> Plant:
