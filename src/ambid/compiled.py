@@ -18,6 +18,9 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar, overload
 
+THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
+"""Variables of the environment that say how many threads linear algebra has, when it is first imported."""
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 _PACKAGE = Path(__file__).resolve().parent

@@ -13,6 +13,7 @@ from contextlib import suppress
 from typing import NoReturn, TextIO
 
 from ambid.cli.interrupts import INTERRUPTED, interrupts
+from ambid.compiled import THREADS
 
 BROKEN_PIPE = 141
 _GARBAGE = 100_000  # new objects after which garbage is collected
@@ -28,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """
     # Matrices here are small: threads of the linear algebra libraries only cost time. They look at this when they are
     # first imported, which is later.
-    for name in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"):
+    for name in THREADS:
         os.environ.setdefault(name, "1")
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "__all__")  # it would look for them in every installed package
     # The libraries make some hundred thousand objects that stay to the end: looking through them again and again for

@@ -155,7 +155,7 @@ class _Producer:
         context = get_context("spawn")
         self._ours, theirs = context.Pipe(duplex=False)
         self._process = context.Process(target=_child, args=(packed, ring.name, rate_hz, pace, theirs), daemon=True)
-        with _ignoring_interrupts():  # the child begins so, and one that comes before it runs does not end it
+        with ignoring_interrupts():  # the child begins so, and one that comes before it runs does not end it
             self._process.start()
         theirs.close()
 
@@ -181,7 +181,8 @@ class _Producer:
 
 
 @contextmanager
-def _ignoring_interrupts() -> Iterator[None]:
+def ignoring_interrupts() -> Iterator[None]:
+    """Let processes that are started meanwhile leave Ctrl-C to this one, from their first moment on."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
