@@ -1,0 +1,17 @@
+"""What is known of many records: estimates of bearings over time in SQLite or PostgreSQL, and their history."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.lazy import exports
+
+if TYPE_CHECKING:
+    from ambid.ledger.entry import Entry as Entry
+    from ambid.ledger.entry import entry_of as entry_of
+    from ambid.ledger.history import History as History
+    from ambid.ledger.history import Series as Series
+    from ambid.ledger.store import Ledger as Ledger
+    from ambid.ledger.store import open_ledger as open_ledger
+
+__getattr__, __dir__, __all__ = exports(__name__)

@@ -1,0 +1,516 @@
+"""The ledger itself: opened, written in whole batches, and asked; SQLite or PostgreSQL.
+
+One batch is one transaction: a writer that is killed, a full disk or a lost server leaves nothing of it. Two writers
+may write at once; an estimate that both have counts once.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+import zlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+from ambid.errors import AmbidError
+from ambid.ledger import schema
+from ambid.ledger.entry import Entry, key_of
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection, Engine
+
+    from ambid.ledger.history import History
+
+PATIENCE_S = 120.0  # for which a writer waits for another
+_TRY_S = 0.5  # of it, in which the program hears nothing
+_MANY = 5_000  # keys in one question
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A record that gave no estimate, and why."""
+
+    bearing: str
+    record: str  # name of its file
+    sha: str
+    rig_sha: str
+    settings: str
+    version: str
+    reason: str
+    failed_at: float = 0.0  # s since 1970, UTC; 0: now
+
+    @property
+    def key(self) -> str:
+        """As that of an `Entry`."""
+        return key_of(self.sha, self.rig_sha, self.settings, self.version)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownBearing:
+    """A bearing of a ledger: its name, rig, number of estimates, time of the first and last, s since 1970, UTC."""
+
+    name: str
+    plant: str
+    estimates: int
+    first: float
+    last: float
+
+
+class Ledger:
+    """A ledger that is open; `open_ledger` opens one. Use it in a ``with`` statement.
+
+    Parameters
+    ----------
+    engine : sqlalchemy.Engine
+    shown : str
+        Its name in messages, without a password.
+    """
+
+    def __init__(self, engine: Engine, shown: str) -> None:
+        """Hold the engine."""
+        self._engine, self.shown = engine, shown
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close it."""
+        self._engine.dispose()
+
+    def add(self, entries: Iterable[Entry]) -> frozenset[str]:
+        """Store estimates, all or none; one that is there already stays as it is.
+
+        Parameters
+        ----------
+        entries : iterable of Entry
+
+        Returns
+        -------
+        frozenset of str
+            Keys of those that were new.
+
+        Raises
+        ------
+        AmbidError
+            If the ledger cannot be written.
+        """
+        batch = {e.key: e for e in sorted(entries, key=lambda e: e.key)}  # in one order: two writers never wait in turn
+        if not batch:
+            return frozenset()
+        from sqlalchemy import delete
+
+        t = schema.tables().tables
+        with self._writing() as c:
+            bearings, now = self._bearings(c, batch.values()), time.time()
+            rigs = {e.rig_sha: {"sha": e.rig_sha, "name": e.rig_name, "text": _packed(e.rig)} for e in batch.values()}
+            self._insert(c, t["rig"], [rigs[sha] for sha in sorted(rigs)])
+            first = self._numbers(c, len(batch))
+            new = dict(zip(first, batch.values(), strict=True))
+            rows = [
+                {
+                    "id": number, "bearing": bearings[e.bearing], "key": key, "added_at": now,
+                    "failed": ",".join(e.failed),
+                    **{x: getattr(e, x) for x in _PLAIN},
+                }
+                for (key, e), number in zip(batch.items(), first, strict=True)
+            ]  # fmt: skip
+            self._insert(c, t["estimate"], rows)
+            there = self._there(c, batch)
+            new = {number: e for number, e in new.items() if there[e.key] == number}
+            self._copy(c, t["value"], [row for n, e in new.items() for row in _values(n, bearings[e.bearing], e)])
+            self._insert(
+                c, t["document"], [_document(n, e) for n, e in new.items() if e.document or e.covariance_names]
+            )
+            self._insert(
+                c, t["event"],
+                [
+                    {"bearing": bearings[e.bearing], "estimate": n, **{x: getattr(v, x) for x in v.__slots__}}
+                    for n, e in new.items() for v in e.events
+                ],
+            )  # fmt: skip
+            for keys in _chunks(list(batch)):
+                c.execute(delete(t["failure"]).where(t["failure"].c.key.in_(keys)))
+        return frozenset(e.key for e in new.values())
+
+    def fail(self, failures: Iterable[Failure]) -> None:
+        """Store what failed, and why; a later estimate of the same key takes it out again.
+
+        Parameters
+        ----------
+        failures : iterable of Failure
+        """
+        now = time.time()
+        rows = {
+            f.key: {"key": f.key, **{x: getattr(f, x) for x in f.__slots__}, "failed_at": f.failed_at or now}
+            for f in sorted(failures, key=lambda f: f.key)
+        }
+        from sqlalchemy import delete
+
+        t = schema.tables().tables["failure"]
+        with self._writing() as c:
+            for keys in _chunks(list(rows)):
+                c.execute(delete(t).where(t.c.key.in_(keys)))
+            self._insert(c, t, list(rows.values()))
+
+    def done(self, keys: Iterable[str]) -> frozenset[str]:
+        """Return those of the keys whose estimate is there.
+
+        Parameters
+        ----------
+        keys : iterable of str
+            `Entry.key`, or `key_of`.
+
+        Returns
+        -------
+        frozenset of str
+        """
+        with self._reading() as c:
+            return frozenset(self._there(c, list(keys)))
+
+    def failures(self) -> Mapping[str, Failure]:
+        """Return by key what failed and has no estimate since.
+
+        Returns
+        -------
+        Mapping of str to Failure
+        """
+        from sqlalchemy import select
+
+        t = schema.tables().tables["failure"]
+        with self._reading() as c:
+            return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in _mappings(c, select(t))}
+
+    def bearings(self) -> tuple[KnownBearing, ...]:
+        """Return the bearings of the ledger, by name.
+
+        Returns
+        -------
+        tuple of KnownBearing
+        """
+        from sqlalchemy import func, select
+
+        t = schema.tables().tables
+        b, e = t["bearing"].c, t["estimate"].c
+        asked = (
+            select(
+                b.name, b.plant, func.count(e.id).label("estimates"), func.min(e.taken_at).label("first"),
+                func.max(e.taken_at).label("last"),
+            )
+            .join_from(t["bearing"], t["estimate"]).group_by(b.id, b.name, b.plant).order_by(b.name)
+        )  # fmt: skip
+        with self._reading() as c:
+            return tuple(KnownBearing(**row) for row in _mappings(c, asked))
+
+    def history(self, bearing: str) -> History:
+        """Return what is known of one bearing over time.
+
+        Parameters
+        ----------
+        bearing : str
+            Its name.
+
+        Returns
+        -------
+        History
+
+        Raises
+        ------
+        AmbidError
+            If the ledger has no bearing of that name.
+        """
+        from ambid.ledger.history import history_of
+
+        with self._reading() as c:
+            return history_of(c, bearing, self.shown)
+
+    # --- inside -----------------------------------------------------------------------------------------------------
+
+    @contextmanager
+    def _writing(self) -> Iterator[Connection]:
+        with _told(self.shown), self._engine.begin() as c:
+            yield c
+
+    @contextmanager
+    def _reading(self) -> Iterator[Connection]:
+        with _told(self.shown), self._engine.connect().execution_options(reads=True) as c:
+            yield c
+
+    @property
+    def _postgres(self) -> bool:
+        return self._engine.dialect.name == "postgresql"
+
+    def _insert(self, c: Connection, table: Any, rows: Sequence[Mapping[str, Any]]) -> None:
+        """Insert rows, but those that are there."""
+        if self._postgres:
+            from sqlalchemy.dialects.postgresql import insert
+        else:
+            from sqlalchemy.dialects.sqlite import insert  # type: ignore[assignment]
+        if rows:
+            c.execute(insert(table).on_conflict_do_nothing(), [dict(row) for row in rows])
+
+    def _copy(self, c: Connection, table: Any, rows: Sequence[tuple[Any, ...]]) -> None:
+        """Insert rows of all columns, in their order, of which none is there; by COPY where there is one."""
+        if self._postgres:
+            names = ", ".join(column.name for column in table.columns)
+            driver: Any = c.connection.driver_connection
+            with driver.cursor() as cursor, cursor.copy(f"COPY {table.name} ({names}) FROM STDIN") as copy:
+                for row in rows:
+                    copy.write_row(row)
+        elif rows:
+            marks = ", ".join("?" * len(table.columns))
+            c.exec_driver_sql(f"INSERT INTO {table.name} VALUES ({marks})", list(rows))
+
+    def _numbers(self, c: Connection, n: int) -> Sequence[int]:
+        """Return numbers for n new estimates, which no other writer gets."""
+        if self._postgres:
+            asked = "SELECT nextval('estimate_id') FROM generate_series(1, %s)"
+            return [row[0] for row in c.exec_driver_sql(asked, (n,))]
+        last = c.exec_driver_sql("SELECT coalesce(max(id), 0) FROM estimate").scalar_one()
+        return range(last + 1, last + 1 + n)
+
+    def _bearings(self, c: Connection, entries: Iterable[Entry]) -> dict[str, int]:
+        """Return the numbers of bearings by name; one that is new is entered."""
+        from sqlalchemy import select
+
+        t = schema.tables().tables["bearing"]
+        plants = {e.bearing: e.rig_name for e in entries}
+        self._insert(c, t, [{"name": name, "plant": plants[name]} for name in sorted(plants)])
+        return {
+            row.name: row.id
+            for names in _chunks(list(plants))
+            for row in c.execute(select(t.c.name, t.c.id).where(t.c.name.in_(names)))
+        }
+
+    def _there(self, c: Connection, keys: Iterable[str]) -> dict[str, int]:
+        """Return the numbers of estimates that are there, by key."""
+        from sqlalchemy import select
+
+        t = schema.tables().tables["estimate"]
+        return {
+            row.key: row.id
+            for some in _chunks(list(keys))
+            for row in c.execute(select(t.c.key, t.c.id).where(t.c.key.in_(some)))
+        }
+
+
+_PLAIN = (
+    "taken_at", "sha", "rig_sha", "settings", "version", "job", "record", "status", "verdict", "model",
+)  # fmt: skip
+
+
+def _values(number: int, bearing: int, e: Entry) -> Iterator[tuple[Any, ...]]:
+    for p in e.parameters:
+        value, sd = (x if math.isfinite(x) else None for x in (p.value, p.sd))
+        seen = bool(p.identifiable) and None not in (value, sd)
+        yield bearing, p.name, e.taken_at, number, value, sd, seen, p.unit, p.role
+
+
+def _document(number: int, e: Entry) -> dict[str, Any]:
+    matrix = [] if e.covariance is None else e.covariance.tolist()
+    covariance = json.dumps({"names": list(e.covariance_names), "matrix": matrix})
+    return {"estimate": number, "json": _packed(e.document), "covariance": _packed(covariance)}
+
+
+def _packed(text: str) -> bytes:
+    return zlib.compress(text.encode())
+
+
+def _chunks(items: Sequence[str]) -> Iterator[Sequence[str]]:
+    return (items[k : k + _MANY] for k in range(0, len(items), _MANY))
+
+
+def _mappings(c: Connection, asked: Any) -> Sequence[Any]:
+    return c.execute(asked).mappings().all()
+
+
+# --- opening --------------------------------------------------------------------------------------------------------
+
+
+def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
+    """Open a ledger; for writing it is made where there is none, and brought to this version where it is older.
+
+    Parameters
+    ----------
+    where : str or Path
+        File of SQLite, or URL of PostgreSQL, ``postgresql://user@host/name``.
+    write : bool, optional
+        False: nothing is written, and a ledger that is not there is refused.
+
+    Returns
+    -------
+    Ledger
+
+    Raises
+    ------
+    AmbidError
+        If it cannot be opened, is no ledger, or one of a newer version; it is then left as it was.
+    """
+    try:
+        import sqlalchemy  # noqa: F401
+    except ImportError:
+        raise AmbidError("SQLAlchemy is not installed, and a ledger needs it. Install ambid[fleet]") from None
+    text = str(where)
+    engine, shown = _server(text) if "://" in text else _file(Path(text), write=write)
+    ledger = Ledger(engine, shown)
+    try:
+        with _told(shown):
+            _make_ready(engine, shown, write=write)
+    except BaseException:
+        ledger.close()
+        raise
+    return ledger
+
+
+def _server(url: str) -> tuple[Engine, str]:
+    """Return the engine of a server, and its URL without the password."""
+    from sqlalchemy import create_engine
+    from sqlalchemy.engine import make_url
+    from sqlalchemy.exc import ArgumentError
+
+    try:
+        found = make_url(url)
+    except (ArgumentError, ValueError):
+        raise AmbidError("the URL of the ledger cannot be read. Write postgresql://user@host/name") from None
+    if found.get_backend_name() != "postgresql":
+        raise AmbidError(
+            f"ledger {found.render_as_string()} is of {found.get_backend_name()!r}; it must be a file of SQLite or a "
+            "URL postgresql://user@host/name. Correct it"
+        )
+    try:
+        import psycopg  # noqa: F401
+    except ImportError:
+        raise AmbidError("psycopg is not installed, and PostgreSQL needs it. Install ambid[postgres]") from None
+    return create_engine(found.set(drivername="postgresql+psycopg")), found.render_as_string()
+
+
+def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
+    """Return the engine of a file of SQLite, and its name; refuse what is none, untouched."""
+    from sqlalchemy import create_engine, event
+    from sqlalchemy.pool import StaticPool
+
+    shown = str(path)
+    new = not path.exists() or path.stat().st_size == 0
+    if path.is_dir() or (path.exists() and not path.is_file()):
+        raise AmbidError(f"ledger {path} is no file. Name one, such as fleet.db")
+    if new and not write:
+        raise AmbidError(f"ledger {path} {'is empty' if path.exists() else 'does not exist'}. Check the path")
+    if new and not path.resolve().parent.is_dir():
+        raise AmbidError(f"ledger {path}: there is no folder {path.parent}. Make it first, or correct the path")
+    if not new:
+        _check_file(path)
+    how = "rwc" if write else "ro"
+
+    def connect() -> Any:
+        import sqlite3
+
+        found = sqlite3.connect(
+            f"{path.resolve().as_uri()}?mode={how}", uri=True, timeout=_TRY_S, isolation_level=None,
+            check_same_thread=False,
+        )  # fmt: skip
+        found.execute("PRAGMA foreign_keys = ON")
+        if write:
+            found.execute("PRAGMA journal_mode = WAL")
+        return found
+
+    engine = create_engine("sqlite://", creator=connect, poolclass=StaticPool)
+
+    @event.listens_for(engine, "begin")
+    def begin(c: Connection) -> None:
+        _patiently(lambda: c.exec_driver_sql("BEGIN" if c.get_execution_options().get("reads") else "BEGIN IMMEDIATE"))
+
+    return engine, shown
+
+
+def _patiently(do: Callable[[], object]) -> None:
+    """Do what another writer may hold up, again and again, so that Ctrl-C is heard between."""
+    from sqlalchemy.exc import OperationalError
+
+    end = time.monotonic() + PATIENCE_S
+    while True:
+        try:
+            do()
+            return
+        except OperationalError as failure:
+            if "locked" not in str(failure.orig) or time.monotonic() > end:
+                raise
+
+
+def _check_file(path: Path) -> None:
+    """Refuse a file that is no database, or that of another program, without touching it."""
+    import sqlite3
+
+    refusal = f"{path} is not a ledger of ambid. Give another file"
+    with path.open("rb") as file:
+        if file.read(16) != b"SQLite format 3\0":
+            raise AmbidError(refusal)
+    try:
+        found = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=PATIENCE_S)
+        try:
+            row = found.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
+        finally:
+            found.close()
+    except sqlite3.DatabaseError:
+        row = None
+    if row != (schema.SCHEMA,):
+        raise AmbidError(refusal)
+
+
+def _make_ready(engine: Engine, shown: str, *, write: bool) -> None:
+    """Make the tables where there are none; bring them to this version; refuse what is of another kind or newer."""
+    from sqlalchemy import insert, inspect, select, update
+
+    whole = schema.tables()
+    meta = whole.tables["meta"]
+    connection = engine.begin() if write else engine.connect().execution_options(reads=True)
+    with connection as c:
+        if write and engine.dialect.name == "postgresql":
+            c.exec_driver_sql("SELECT pg_advisory_xact_lock(7281001)")  # one writer at a time makes tables
+        there = set(inspect(c).get_table_names()) & set(whole.tables)
+        if not there and not write:
+            raise AmbidError(f"ledger {shown} holds no ledger yet. Check the URL")
+        if not there:
+            whole.create_all(c)
+            c.execute(insert(meta), [{"name": n, "value": v} for n, v in (("schema", schema.SCHEMA), ("version", "1"))])
+            c.execute(update(meta).where(meta.c.name == "version").values(value=str(schema.VERSION)))
+            return
+        if "meta" not in there:
+            raise AmbidError(f"{shown} is not a ledger of ambid: it has other tables of the same names. Give another")
+        found = {row.name: row.value for row in c.execute(select(meta.c.name, meta.c.value))}
+        version = int(found.get("version", "0"))
+        if version > schema.VERSION:
+            raise AmbidError(
+                f"ledger {shown} is of version {version}; this ambid reads {schema.VERSION}. Install a newer one"
+            )
+        if version < schema.VERSION and not write:
+            raise AmbidError(
+                f"ledger {shown} is of version {version}, and is read as {schema.VERSION}. Write to it once, which "
+                "brings it to that version"
+            )
+        for step in range(version, schema.VERSION):
+            for statement in schema.STEPS[step]:
+                c.exec_driver_sql(statement)
+        if version < schema.VERSION:
+            c.execute(update(meta).where(meta.c.name == "version").values(value=str(schema.VERSION)))
+
+
+@contextmanager
+def _told(shown: str) -> Iterator[None]:
+    """Put what the database says into one line."""
+    import sqlite3
+
+    from sqlalchemy.exc import DBAPIError
+
+    try:
+        yield
+    except (DBAPIError, sqlite3.Error) as failure:
+        said = str(getattr(failure, "orig", None) or failure).strip().splitlines()[0]
+        if "locked" in said:
+            said = f"another program has been writing to it for {PATIENCE_S:.0f} s"
+        raise AmbidError(f"ledger {shown}: {said}. Nothing of this was stored; check disk, rights and server") from None
