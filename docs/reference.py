@@ -89,12 +89,9 @@ def _room(room: str, what: str) -> Iterator[str]:
 
 def verbs() -> Iterator[tuple[str, Any]]:
     """Yield every verb with its command, those of a group one by one."""
-    import typer
+    from ambid.cli.app import parser
 
-    from ambid.cli.app import app
-
-    top: Any = typer.main.get_command(app)
-    for name, command in top.commands.items():
+    for name, command in parser().commands.items():
         inner = getattr(command, "commands", None)
         yield from ((name, command),) if inner is None else ((f"{name} {n}", c) for n, c in inner.items())
 

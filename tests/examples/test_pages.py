@@ -109,11 +109,9 @@ COMMANDS = [
 
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
 def test_commands_on_the_pages_have_known_verbs_and_options(words):
-    import typer
+    from ambid.cli.app import parser
 
-    from ambid.cli.app import app
-
-    top = typer.main.get_command(app)
+    top = parser()
     command = top if words[0].startswith("-") else top.commands[words[0]]
     command = getattr(command, "commands", {}).get(words[1], command) if words[1:] and command is not top else command
     known = {option for p in command.params for option in (*p.opts, *p.secondary_opts)}

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import Annotated
+from functools import cache
+from typing import Annotated, Any
 
 import typer
 
@@ -77,6 +78,12 @@ def _say_compiling() -> None:
     print("compiling the numerical kernels, once on this machine, some 5 s; later starts are faster", file=sys.stderr)
 
 
+@cache
+def parser() -> Any:
+    """Return the parser of the words: made once, as all signatures of the verbs are read for it (60 ms)."""
+    return typer.main.get_command(app)
+
+
 def run_verb(words: Sequence[str]) -> int:
     """Parse the words, run the verb and return its exit code.
 
@@ -87,7 +94,7 @@ def run_verb(words: Sequence[str]) -> int:
     plain_where_needed(sys.stdout)
     plain_where_needed(sys.stderr)
     compiled.announce = _say_compiling if sys.stderr.isatty() else None
-    command = typer.main.get_command(app)
+    command = parser()
     if "_AMBID_COMPLETE" in os.environ:  # the shell asks what may follow
         command.main(list(words), prog_name="ambid")
     try:
