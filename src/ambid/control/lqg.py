@@ -22,7 +22,7 @@ from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.errors import EstimationError, ModelError
 from ambid.physics.law import StateLaw
-from ambid.physics.linear_model import discretise
+from ambid.physics.linear_model import delayed
 from ambid.physics.loop import Limits, Noise
 from ambid.simulation.plant import fed_back, signals_fed_back
 
@@ -64,23 +64,8 @@ class SampledPlant:
     @classmethod
     def of(cls, plant: Plant) -> SampledPlant:
         """Return the plant with the delay of each input, whole and fraction."""
-        space, n = plant.space, plant.space.A.shape[0]
-        whole = np.floor(plant.delays).astype(int)
-        line = whole + (plant.delays > whole)
-        first = n + np.concatenate([[0], np.cumsum(line)])
-        A, B = np.zeros((first[-1], first[-1])), np.zeros((first[-1], whole.size))
-        for j in range(whole.size):
-            d, _ = discretise(space, 1.0 / plant.rate_hz, fraction=float(plant.delays[j] - whole[j]))
-            A[:n, :n] = d.A
-            history = [B[:, j], *(A[:, k] for k in range(first[j], first[j + 1]))]  # what u[k], u[k-1], ... act on
-            history[whole[j]][:n] += d.B[:, j]
-            if line[j] > whole[j]:
-                history[-1][:n] += d.B_late[:, j]
-            for k, column in enumerate(history[: line[j]]):
-                column[first[j] + k] = 1.0
-        E, C = np.zeros((A.shape[0], d.E.shape[1])), np.zeros((signals_fed_back(plant.model).size, A.shape[0]))
-        E[:n], C[:, :n] = d.E, space.C[signals_fed_back(plant.model)]
-        return cls(A=A, B=B, E=E, C=C, plant=plant)
+        d = delayed(plant.space, 1.0 / plant.rate_hz, plant.delays)
+        return cls(A=d.A, B=d.B, E=d.E, C=d.C[signals_fed_back(plant.model)], plant=plant)
 
     @cached_property
     def kinds(self) -> tuple[Array, Array]:

@@ -447,6 +447,29 @@ def discretise(
     return discrete, tuple(directional)
 
 
+def delayed(space: StateSpace, period_s: float, delays: Sequence[float] | Array) -> DiscreteSpace:
+    """Discretise exactly, each input late by its delay in samples, whole and fraction.
+
+    Returns the states followed by the inputs on their way; B_late is zero.
+    """
+    n, whole = space.A.shape[0], np.floor(delays).astype(int)
+    line = whole + (np.asarray(delays) > whole)
+    first = n + np.concatenate([[0], np.cumsum(line)])
+    A, B = np.zeros((first[-1], first[-1])), np.zeros((first[-1], whole.size))
+    for j in range(whole.size):
+        d, _ = discretise(space, period_s, fraction=float(delays[j] - whole[j]))
+        A[:n, :n] = d.A
+        history = [B[:, j], *(A[:, k] for k in range(first[j], first[j + 1]))]  # what u[k], u[k-1], ... act on
+        history[whole[j]][:n] += d.B[:, j]
+        if line[j] > whole[j]:
+            history[-1][:n] += d.B_late[:, j]
+        for k, column in enumerate(history[: line[j]]):
+            column[first[j] + k] = 1.0
+    E, C = np.zeros((A.shape[0], d.E.shape[1])), np.zeros((space.C.shape[0], A.shape[0]))
+    E[:n], C[:, :n] = d.E, space.C
+    return DiscreteSpace(A=A, B=B, B_late=np.zeros_like(B), E=E, C=C)
+
+
 _PADE = (17297280.0, 8648640.0, 1995840.0, 277200.0, 25200.0, 1512.0, 56.0, 1.0)  # of order 7
 _REACH = 0.95  # norm up to which it is right to rounding (Higham 2005)
 
