@@ -31,6 +31,7 @@ VERBS = {
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),
     "design controller": ("design", "controller", "e.json", "--rig", "rig.toml", "--out"),
+    "export": ("export", "e.json", "-o"),
     "fit": ("fit", "r.csv", "--input", "voltage", "--output", "current", "--structure", "arx", "--orders",
             "na=1,nb=1,nk=1", "--json"),
     "compare": ("compare", "r.csv", "arx:na=1,nb=1,nk=1", "--input", "voltage", "--output", "current", "--json"),
@@ -42,14 +43,15 @@ VERBS = {
 
 @pytest.mark.parametrize("verb", VERBS)
 def test_a_measured_record_is_not_written_over(made, ambid, monkeypatch, verb):
-    target = made / "measured.csv"
-    target.write_text(MEASURED)
+    target = made / ("measured.mat" if verb == "export" else "measured.csv")
+    content = "MATLAB 5.0 MAT-file of a Simulink run" if verb == "export" else MEASURED
+    target.write_text(content)
     monkeypatch.chdir(made)
-    done = ambid(*VERBS[verb], "measured.csv")
+    done = ambid(*VERBS[verb], target.name)
     assert done.code == 2, done.out
     assert len(done.err.splitlines()) == 1
-    assert "measured.csv exists" in done.err
-    assert target.read_text() == MEASURED
+    assert f"{target.name} exists" in done.err
+    assert target.read_text() == content
 
 
 @pytest.mark.parametrize("words", [("--plot", "a.png"), ("--report", "a.html"), ("--report", "a.pdf")])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.io import loadmat
 
 import ambid
 from ambid.errors import AmbidError, EstimationError
 from ambid.rotor.estimate import RotorEstimate
+from tests.job.exported import InC, needs_compiler
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -85,8 +88,6 @@ def test_an_estimate_without_its_record_knows_no_controller(
 
 
 def test_matlab_reads_the_plant_and_the_numbers(estimate: RotorEstimate, tmp_path: Path) -> None:
-    from scipy.io import loadmat
-
     estimate.export(tmp_path / "r.mat")
     found = loadmat(tmp_path / "r.mat", squeeze_me=True)
     np.testing.assert_array_equal(found["A"], estimate.continuous.A)
@@ -103,12 +104,44 @@ def test_python_control_gets_named_signals(estimate: RotorEstimate) -> None:
     assert plant.output_labels == list(estimate.plant.outputs)
 
 
+@needs_compiler
+def test_c_source_runs_the_rotor_at_its_speed(estimate: RotorEstimate, tmp_path: Path) -> None:
+    late = replace(estimate.delay["by_voltage"], samples=2, fraction=0.3)
+    estimate = replace(estimate, delay={**estimate.delay, "by_voltage": late})
+    period = 1.0 / float(str(estimate.record["rate_hz"]))
+    estimate.export(tmp_path / "r.mat")
+    read = loadmat(tmp_path / "r.mat", squeeze_me=True, simplify_cells=True)["sampled"]
+    plant, x, scale = InC(estimate, tmp_path), np.zeros(read["A"].shape[0]), np.abs(read["C"]).max()
+    u = np.random.default_rng(1).standard_normal((40, 4))
+    for row in u:
+        wanted = read["C"] @ x
+        found = plant.outputs()[: wanted.size]
+        np.testing.assert_allclose(found, wanted, rtol=1e-9, atol=1e-12 * scale * np.abs(x).max())
+        assert plant.step(row, period) == 0
+        x = read["A"] @ x + read["B"] @ row
+
+
+def test_a_rotor_is_an_fmu_and_a_script_for_python_control(estimate: RotorEstimate, tmp_path: Path) -> None:
+    fmpy = pytest.importorskip("fmpy")
+    pytest.importorskip("control")
+    estimate.export(tmp_path / "r.fmu")
+    validation = pytest.importorskip("fmpy.validation")
+    assert validation.validate_fmu(str(tmp_path / "r.fmu")) == []
+    told = fmpy.read_model_description(str(tmp_path / "r.fmu"))
+    assert [v.name for v in told.modelVariables if v.causality == "output"] == list(estimate.plant.outputs)
+    assert f"{estimate.speed:.6g} rad/s" in told.description
+    estimate.export(tmp_path / "r.py", to="control")
+    system = runpy.run_path(str(tmp_path / "r.py"))["plant"]()
+    np.testing.assert_array_equal(system.A, estimate.continuous.A)
+    assert system.input_labels == list(estimate.plant.inputs)
+
+
 def test_other_endings_and_results_are_refused(estimate: RotorEstimate, tmp_path: Path) -> None:
-    with pytest.raises(EstimationError, match=r"\.mat, \.py"):
+    with pytest.raises(AmbidError, match=r"\.mat or \.py"):
         estimate.export(tmp_path / "r.txt")
     axis = ambid.identify(ambid.simulate("thesis", duration=0.5, seed=1))
     with pytest.raises(EstimationError, match="holds a rotor"):
-        axis.export(tmp_path / "r.py")
+        axis.export(tmp_path / "r.py", to="ross")
     axis.export(tmp_path / "r.mat")
 
 

@@ -18,6 +18,7 @@ from ambid.cli import (
     console,
     demo,
     design,
+    export,
     fit,
     frf,
     identify,
@@ -49,6 +50,7 @@ app.command("console", short_help="watch, commission and judge a bearing in the 
 app.command("track", short_help="track parameters through a record, as on-line")(track.command)
 app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
 app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")
+app.command("export", short_help="write an identified plant for other programs")(export.command)
 app.command("recover", short_help="recover a recording that was cut off")(recover.command)
 app.command("init", short_help="draft a rig file from a record")(init.command)
 app.command("simulate", short_help="simulate a record from the physics")(simulate.command)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext
+from functools import partial
 from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -14,7 +15,7 @@ from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError, refuse_given
+from ambid.errors import AmbidError, EstimationError, refuse_given
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -93,7 +94,7 @@ def command(
     report: opt.Report = None,
     export: Annotated[
         Path | None,
-        option("--export FILE.mat", "Write the plant for other programs: .mat, or of a rotor .py, a script for ROSS."),
+        option("--export FILE", "Write the plant for other programs, as 'ambid export' does."),
     ] = None,
     strict: opt.Strict = False,
 ) -> None:
@@ -104,6 +105,7 @@ def command(
     of the rig. Ctrl-C then keeps the best so far (exit code 130).
     """
     from ambid.job import identification as job
+    from ambid.job.exchange import write_plant
     from ambid.job.files import EXPORT_ENDINGS
 
     stop, kept = Stop(), tuple(held or ())
@@ -130,9 +132,15 @@ def command(
             )
             stop.torn()
             outputs.give(estimate, show)
+            refused: AmbidError | None = None
             if export is not None:
-                outputs.stage(export, estimate.export)
+                try:
+                    outputs.stage(export, partial(write_plant, estimate, name=export.stem))
+                except EstimationError as error:  # the estimate is given all the same
+                    refused = error
     outputs.show(estimate)
+    if refused is not None:
+        raise refused
     search = getattr(estimate, "global_search", None)
     if stop.wished() or (search is not None and search["interrupted"]):
         raise typer.Exit(stop.code or INTERRUPTED)

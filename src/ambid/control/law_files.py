@@ -7,8 +7,10 @@ in SI with the sign included; given is what the output took of w: w itself unles
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from io import BytesIO
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,23 +19,32 @@ from ambid.errors import EstimationError
 from ambid.physics.law import StateLaw
 
 ENDINGS = (".mat", ".py", ".c")
+MAT_HEADER = b"MATLAB 5.0 MAT-file, written by ambid"
+"""With what ``.mat`` files begin that were written here, so that no other is written over."""
 
 
 def write_law(law: StateLaw, path: str | Path, name: str, signals: Sequence[str], commands: Sequence[str]) -> None:
     """Write a law by the ending of a file; `signals`: what it sees, `commands`: what it gives, `name`: of the rig."""
     path = Path(path)
     if path.suffix == ".mat":
-        from scipy.io import savemat
-
         names = {"signals": signals, "commands": commands}
         cells = {key: np.array(list(of), dtype=object) for key, of in names.items()}
-        savemat(path, {**_matrices(law), "rate_hz": law.rate_hz, **cells}, oned_as="column")
+        write_mat(path, {**_matrices(law), "rate_hz": law.rate_hz, **cells})
     elif path.suffix == ".py":
         path.write_text(python_of(law, name, signals, commands), encoding="utf-8")
     elif path.suffix == ".c":
         path.write_text(c_of(law, name, signals, commands), encoding="utf-8")
     else:
         raise EstimationError(f"{path.name} ends in none of {', '.join(ENDINGS)}. Give one of these endings")
+
+
+def write_mat(path: Path, content: Mapping[str, Any]) -> None:
+    """Write a ``.mat`` file, version 5, whose header says that it comes from here and not when."""
+    from scipy.io import savemat
+
+    written = BytesIO()
+    savemat(written, content, long_field_names=True, oned_as="column")
+    path.write_bytes(MAT_HEADER.ljust(116) + written.getvalue()[116:])
 
 
 def _matrices(law: StateLaw) -> dict[str, Array]:
@@ -43,7 +54,7 @@ def _matrices(law: StateLaw) -> dict[str, Array]:
 def python_of(law: StateLaw, name: str, signals: Sequence[str], commands: Sequence[str]) -> str:
     """Return a script that makes the law an object of python-control."""
     return "\n".join([
-        f'"""The law of {_plain(name)}, in SI, with sign: w = C z + D y, z+ = A z + B y + G (given - w)."""', "",
+        f'"""The law of {comment_text(name)}, in SI, with sign: w = C z + D y, z+ = A z + B y + G (given - w)."""', "",
         "import control", "import numpy as np", "", f"RATE_HZ = {law.rate_hz!r}", f"SIGNALS = {list(signals)}",
         f"COMMANDS = {list(commands)}",
         *(f"{x} = np.array({m.tolist()}).reshape{m.shape}" for x, m in _matrices(law).items()), "", "",
@@ -114,7 +125,7 @@ void law_next(struct law *law, const double *y, const double *w, const double *g
 def c_of(law: StateLaw, name: str, signals: Sequence[str], commands: Sequence[str]) -> str:
     """Return the law as C source that needs nothing else."""
     return _C.format(
-        name=_plain(name), signals=", ".join(signals), commands=", ".join(commands), rate=repr(law.rate_hz),
+        name=comment_text(name), signals=", ".join(signals), commands=", ".join(commands), rate=repr(law.rate_hz),
         n=law.order, n_y=law.D.shape[1], n_u=law.D.shape[0], room=max(law.order, 1),
         tables="\n".join(_table(x, m) for x, m in _matrices(law).items()),
     )  # fmt: skip
@@ -127,8 +138,7 @@ def _table(name: str, matrix: Array) -> str:
     return f"static const double law_{name}[{full.shape[0]}][{full.shape[1]}] = {{\n{rows},\n}};"
 
 
-def _plain(name: str) -> str:
-    """Return a name that ends no comment and no string."""
-    return (
-        "".join(c if c.isprintable() and c not in '"\\' else " " for c in name).replace("*/", "* /").strip() or "a rig"
-    )
+def comment_text(name: str) -> str:
+    """Return a text, such as a name that somebody gave, that begins and ends no comment and no string."""
+    kept = "".join(c if c.isprintable() and c not in '"\\' else " " for c in name)
+    return kept.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").strip() or "a rig"

@@ -232,14 +232,24 @@ class Linear:
         """
         return _predicted("to_control")(self)
 
-    def export(self, path: str | Path) -> None:
+    def export(self, path: str | Path, to: str | None = None, *, anyway: bool = False) -> None:
         """Write the plant for another program.
 
         Parameters
         ----------
         path : str or Path
-            Ending in ``.mat``: matrices, names, parameters with standard deviations. In ``.py``: of a rotor a script
-            that builds it for ROSS, its bearings at the synchronous frequency, the state space beside them. A file
-            that exists is replaced.
+            Ending in ``.mat``: matrices, names, parameters with covariance. In ``.py``: a script for python-control, or
+            of a rotor one that builds it for ROSS, its bearings at the synchronous frequency. Of an estimate also
+            ``.c`` or ``.h``: C source, or its declarations. ``.fmu``: FMI 2.0 for co-simulation. An export that exists
+            is replaced, anything else is refused.
+        to : {"control", "ross"}, optional
+            For which library a script is.
+        anyway : bool, optional
+            Also where the result is unusable or its record does not show a parameter; the file then says so.
+
+        Raises
+        ------
+        EstimationError
+            If the result should not be relied on, or there is no such file of it.
         """
-        _predicted("exported")(self, path)
+        _predicted("exported")(self, path, to, anyway=anyway)

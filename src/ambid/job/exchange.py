@@ -1,4 +1,4 @@
-"""Results for other programs: matrices and numbers as ``.mat``, a rotor as a script for ROSS.
+"""Results for other programs: ``.mat``, python-control, C source, FMU; a rotor as a script for ROSS.
 
 ROSS reads the stiffness of a bearing at the running speed only. A magnet under control has another one at every
 frequency, so that its bearings stand for the synchronous frequency alone; the whole plant is beside them.
@@ -7,6 +7,7 @@ frequency, so that its bearings stand for the synchronous frequency alone; the w
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib.metadata import version
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,17 @@ from ambid.arrays import Array, Complex
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import plant_form
-from ambid.errors import EstimationError
-from ambid.job.files import EXPORT_ENDINGS
-from ambid.physics.linear_model import model
+from ambid.control.law_files import comment_text, write_mat
+from ambid.errors import AmbidError, EstimationError, check_switch, nearest, path_of
+from ambid.job.files import EXPORT_ENDINGS, Files
+from ambid.job.results import rig_of
+from ambid.physics.linear_model import StateSpace, delayed, model
+from ambid.physics.loop import UNLIMITED
 from ambid.physics.shaft import Disc, Material, Shaft, Step
 from ambid.rotor.estimate import RotorEstimate
+
+SCRIPTS = ("control", "ross")
+"""For which library a script can be."""
 
 _STILL = 1.0  # Hz at which the bearings of a rotor at rest are read
 _STIFF, _LIGHT, _THICK = 1e14, 1e-3, 0.05  # E, rho and diameter of the shaft of a rotor without drawing
@@ -32,53 +39,136 @@ def plant_of(result: Any) -> Any:
     return result.plant if isinstance(result, RotorEstimate) else model(result.model)
 
 
-def export(result: Any, path: str | Path) -> None:
-    """Write a linear result for another program, by the ending of the file."""
-    path = Path(path)
-    if path.suffix == ".mat":
-        _save_mat(path, _matrices(result))
-    elif path.suffix == ".py":
-        if not isinstance(result, RotorEstimate):
-            raise EstimationError("a script for ROSS holds a rotor; this result is none. Give a file ending in .mat")
-        path.write_text(ross_script(result), encoding="utf-8")
+def export(result: Any, path: str | Path, to: str | None = None, *, anyway: bool = False) -> None:
+    """Write a plant, as `write_plant`; nothing is written over that was not made here."""
+    path = path_of(path, "path")
+    with Files() as written:
+        written.claim(path, "path", EXPORT_ENDINGS)
+        written.stage(path, lambda beside: write_plant(result, beside, path.stem, to, anyway=anyway))
+
+
+def write_plant(result: Any, path: Path, name: str, to: str | None = None, *, anyway: bool = False) -> None:
+    """Write a plant for another program, by the ending of the file.
+
+    `name`: of the plant in C and in an FMU; `to`: of `SCRIPTS`, for which library a script is; `anyway`: also where the
+    result should not be relied on, and then the file says so.
+    """
+    check_switch({"anyway": anyway})
+    ending = path.suffix.lower()
+    if to is not None and to not in SCRIPTS:
+        raise EstimationError(
+            f"to is {to!r:.40}; scripts are for {' or '.join(SCRIPTS)}.{nearest(to, SCRIPTS)} Correct it"
+        )
+    if to is not None and ending != ".py":
+        raise EstimationError(
+            f"'to' is for scripts, files ending in .py, and this one ends in {ending}. Omit it, or rename the file"
+        )
+    doubt = _doubt(result)
+    if doubt and not anyway:
+        raise EstimationError(f"{doubt}; its plant is not exported. Identify it better, or give --anyway (anyway=True)")
+    about = [*_about(result), *([f"NOT TO BE RELIED ON: {doubt}."] if doubt else [])]
+    ross = ending == ".py" and (isinstance(result, RotorEstimate) if to is None else to == "ross")
+    if ross and not isinstance(result, RotorEstimate):
+        raise EstimationError("a script for ROSS holds a rotor; this result is none. Export it for python-control")
+    if ending == ".mat":
+        write_mat(path, {**_matrices(result), "about": " ".join(about)})
+    elif ending == ".py":
+        path.write_text(ross_script(result, about) if ross else control_script(result, about), encoding="utf-8")
     else:
-        raise EstimationError(f"{path.name} ends in none of {', '.join(EXPORT_ENDINGS)}. Give one of these endings")
+        _write_source(result, path, name, about)
 
 
-def _save_mat(path: Path, content: dict[str, Any]) -> None:
-    from scipy.io import savemat
+def _write_source(result: Any, path: Path, name: str, about: list[str]) -> None:
+    from ambid.job.fmu import write_fmu
+    from ambid.job.plant_source import c_source, declarations, prefixed, source_of
 
-    savemat(path, content, long_field_names=True, oned_as="column")
+    try:
+        limits = None if isinstance(result, BlackBoxFit) else rig_of(result, "the estimate").limits
+    except AmbidError:  # it remembers no rig: where the rotor stops is not known
+        limits = None
+    source = source_of(result, UNLIMITED if limits is None else limits.position)
+    if path.suffix.lower() == ".fmu":
+        write_fmu(source, path, name, about)
+    else:
+        text = (c_source if path.suffix.lower() == ".c" else declarations)(source, about)
+        path.write_text(prefixed(text, name), encoding="utf-8")
+
+
+def _doubt(result: Any) -> str:
+    """Say why a plant should not be relied on; empty where nothing is against it."""
+    found = []
+    if result.verdict.word == "unusable":
+        found.append(f"the result is unusable ({'; '.join(r.text for r in result.verdict.reasons[:2])})")
+    if not isinstance(result, BlackBoxFit):  # whose coefficients mean nothing one by one
+        unseen = [p.name for p in (*result.parameters, *getattr(result, "mode_parameters", ())) if not p.identifiable]
+        found += [f"its record does not show {', '.join(unseen)}"] if unseen else []
+    return ", and ".join(found)
+
+
+def _about(result: Any) -> list[str]:
+    """Say in a few lines what a plant is and where it comes from, free of what could end a comment or a string."""
+    records = getattr(result, "records", None) or (getattr(result, "record", None) or {},)
+    kind = f"structure {result.structure}" if isinstance(result, BlackBoxFit) else f"model {result.model}"
+    if isinstance(result, NonlinearBearingEstimate):
+        kind = f"{kind}, {result.law}"
+    if isinstance(result, RotorEstimate):
+        kind = f"{kind} at {result.speed:.6g} rad/s, about its mean position"
+    known = [str(getattr(result, "rig", {}).get("name", "")) or "a record", str(records[0].get("file") or "")]
+    lines = [
+        f"The plant of {known[0]}: {kind}.",
+        f"Identified {f'from {known[1]} ' if known[1] else ''}by ambid {version('ambid')};"
+        f" verdict {result.verdict.word}.",
+        f"sha256 of the record: {records[0].get('sha256') or 'none'}",
+    ]
+    return [comment_text(line) for line in lines]
+
+
+def _space(result: Any) -> tuple[Any, Any, Array, float]:
+    """Return states with A, B and C, the model whose signals have names, the delays in samples, the period in s."""
+    bearing = isinstance(result, NonlinearBearingEstimate)
+    at, plant = linearised(result) if bearing else result.continuous, plant_of(result)
+    rate = float(str((result.records[0] if bearing else result.record)["rate_hz"]))
+    late = {"voltage": result.delay_samples(rate) or 0.0} if bearing else {
+        role: x.samples + x.fraction for role, x in result.delay.items()
+    }  # fmt: skip
+    return at, plant, np.array([late.get(role, 0.0) for role in plant.inputs]), 1.0 / rate
+
+
+def _sampled(at: Any, delays: Array, period: float) -> dict[str, Any]:
+    """Return the matrices of the sampled plant, inputs held and late, with states for those on their way."""
+    space = StateSpace(A=at.A, B=at.B, C=at.C, E=np.zeros((at.A.shape[0], 0)))
+    d = delayed(space, period, delays)
+    return {"A": d.A, "B": d.B, "C": d.C, "D": np.zeros((d.C.shape[0], d.B.shape[1])), "sample_time_s": period}
 
 
 def _matrices(result: Any) -> dict[str, Any]:
     """Return what a ``.mat`` file holds: the plant by name, numbers as columns."""
     if isinstance(result, BlackBoxFit):
         form = plant_form(result)
-        names = {"inputs": result.inputs, "outputs": result.outputs}
-        found = {"A": form.A, "B": form.B, "C": form.C, "D": form.D, "sample_time_s": form.dt}
-        return found | {name: _cells(x) for name, x in names.items()}
-    at, plant = (
-        linearised(result) if isinstance(result, NonlinearBearingEstimate) else result.continuous,
-        plant_of(result),
-    )
-    delay = result.delay if isinstance(result.delay, dict) else {}
-    found = {
+        names = {"inputs": _cells(result.inputs), "outputs": _cells(result.outputs)}
+        return {"A": form.A, "B": form.B, "C": form.C, "D": form.D, "sample_time_s": form.dt, **names}
+    at, plant, delays, period = _space(result)
+    found: dict[str, Any] = {
         "A": at.A, "B": at.B, "C": at.C, "D": np.zeros((at.C.shape[0], at.B.shape[1])), "states": _cells(at.states),
-        "inputs": _cells(plant.inputs), "outputs": _cells(plant.outputs),
-        "delay_samples": np.array([_late(delay, role) for role in plant.inputs]),
+        "inputs": _cells(plant.inputs), "outputs": _cells(plant.outputs), "delay_samples": delays,
+        "input_units": _cells(plant.units[x] for x in plant.inputs),
+        "output_units": _cells(plant.units[x] for x in plant.outputs),
         "parameters": _cells(p.name for p in result.parameters), "units": _cells(p.unit for p in result.parameters),
         "value": np.array([p.value for p in result.parameters]), "sd": np.array([p.sd for p in result.parameters]),
+        "covariance": result.covariance, "covariance_names": _cells(result.covariance_names),
+        "sampled": _sampled(at, delays, period),
     }  # fmt: skip
     if isinstance(result, RotorEstimate):
         modes = result.modes
         found |= {
-            "speed_rad_s": result.speed, "rate_hz": float(str(result.record["rate_hz"])),
+            "speed_rad_s": result.speed, "rate_hz": 1.0 / period,
             "mode_hz": np.array([m.frequency_hz.value for m in modes]),
             "mode_damping": np.array([m.damping.value for m in modes]),
             "mode_shape": np.array([[m.shape[p].value for p in result.plant.places] for m in modes]),
             "mode_places": _cells(result.plant.places),
         }  # fmt: skip
+    else:
+        found["operating_point"] = dict(result.operating_point)
     return found
 
 
@@ -86,14 +176,53 @@ def _cells(names: Any) -> Any:
     return np.array(list(names), dtype=object)
 
 
-def _late(delay: Any, role: str) -> float:
-    return float(delay[role].samples + delay[role].fraction) if role in delay else 0.0
+# --- python-control -------------------------------------------------------------------------------------------------
+
+
+def control_script(result: Any, about: list[str]) -> str:
+    """Return a Python script that makes the plant an object of python-control, continuous and sampled."""
+    begin = [*_opened(about), "import control", "import numpy as np", ""]
+    if isinstance(result, BlackBoxFit):
+        form = plant_form(result)
+        names = {"inputs": result.inputs, "outputs": result.outputs}
+        parts = {"plant": ("sampled at DT", {x: getattr(form, x) for x in "ABCD"}, "DT", names)}
+        begin += [f"DT = {form.dt!r}  # s"]
+    else:
+        at, plant, delays, period = _space(result)
+        names = {"inputs": plant.inputs, "outputs": plant.outputs}
+        late = _sampled(at, delays, period)
+        D = np.zeros((at.C.shape[0], at.B.shape[1]))
+        continuous = {"A": at.A, "B": at.B, "C": at.C, "D": D}
+        parts = {
+            "plant": ("continuous, inputs without their delay", continuous, "0", {**names, "states": at.states}),
+            "sampled": ("sampled at DT, inputs held and late by their delay", late, "DT", names),
+        }
+        begin += [
+            f"DT = {period!r}  # s", f"DELAY = {dict(zip(plant.inputs, delays.tolist(), strict=True))}  # samples",
+            f"PARAMETERS = {{  # value, standard deviation, unit{''.join(_entry(p) for p in result.parameters)}\n}}",
+        ]  # fmt: skip
+    for name, (what, matrices, dt, labels) in parts.items():
+        begin += [
+            "", "", f"def {name}():", f'    """Return the plant, {what}."""',
+            *(f"    {x} = np.array({matrices[x].tolist()}).reshape{matrices[x].shape}" for x in "ABCD"),
+            f"    return control.ss(A, B, C, D, {dt}, {', '.join(f'{k}={list(v)}' for k, v in labels.items())})",
+        ]  # fmt: skip
+    return "\n".join([*begin, "", "", 'if __name__ == "__main__":', "    print(plant())", ""])
+
+
+def _entry(p: Any) -> str:
+    return f"\n    {p.name!r}: ({p.value!r}, {p.sd!r}, {p.unit!r}),"
+
+
+def _opened(about: list[str]) -> list[str]:
+    """Return the beginning of a script, its docstring not yet ended by what is to follow."""
+    return [f'"""{about[0]}', "", *about[1:], '"""', ""]
 
 
 # --- ROSS -----------------------------------------------------------------------------------------------------------
 
 
-def ross_script(estimate: RotorEstimate) -> str:
+def ross_script(estimate: RotorEstimate, about: list[str]) -> str:
     """Return a Python script that builds the rotor for ROSS, with its state space."""
     from ambid.rig import rig_from_text
 
@@ -108,7 +237,7 @@ def ross_script(estimate: RotorEstimate) -> str:
     read = "the loop and the magnets" if K is not None else "the magnets alone (no controller is known)"
     of = "the drawing" if rig.shaft else "m, Id and Ip on a shaft that does not bend (no drawing is known)"
     return "\n".join([
-        f'"""{estimate.rig["name"]}: a rotor for ROSS, as identified.', "",
+        f'"""{about[0]}', "", *about[1:], "",
         f"Shaft: {of}. Bearings: synchronous, {read} at {frequency:.6g} Hz; at other frequencies they are wrong.",
         'The identified plant, all frequencies, is state_space(): x\' = A x + B u, y = C x, SI.', '"""', "",
         "import numpy as np", "import ross as rs", "", f"SPEED = {estimate.speed!r}  # rad/s",
@@ -165,7 +294,7 @@ def _bearings(estimate: RotorEstimate, stiffness: list[complex], z: Array) -> li
             k = stiffness[plant.axes.index(axis)]
             words |= {f"k{plane}{plane}": k.real, f"c{plane}{plane}": k.imag / W}
         said = ", ".join(f"{name}={x:.9g}" for name, x in words.items())
-        lines.append(f'        rs.BearingElement(n={node}, {said}, tag="{b.name}"),  # synchronous')
+        lines.append(f"        rs.BearingElement(n={node}, {said}, tag={b.name!r}),  # synchronous")
     return lines
 
 
@@ -201,7 +330,9 @@ def _stiffness(estimate: RotorEstimate, K: Complex | None, frequency_hz: float, 
     if K is None:
         return complex(k_x)
     rate = float(str(estimate.record["rate_hz"]))
-    late = np.exp(-s * (_late(estimate.delay, plant.inputs[j]) + 0.5 * (plant.drive(j) != "current")) / rate)
+    delay = estimate.delay.get(plant.inputs[j])
+    samples = 0.0 if delay is None else delay.samples + delay.fraction
+    late = np.exp(-s * (samples + 0.5 * (plant.drive(j) != "current")) / rate)
     rows = [k for k, (of, _) in enumerate(plant.sensors) if of == j]
     by_position = complex(K[j, rows].sum()) * late
     if plant.drive(j) == "voltage":

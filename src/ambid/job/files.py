@@ -15,11 +15,14 @@ FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm", ".pdf")
 _LOOKED = 64  # bytes of a file that say what it is
 _MADE = (b"# simulated by ambid", b'{"schema": "ambid.', b'{\n "schema": "ambid.')
-EXPORT_ENDINGS = (".mat", ".py")
-LAW_ENDINGS = (*EXPORT_ENDINGS, ".c")
+EXPORT_ENDINGS = (".mat", ".py", ".c", ".h", ".fmu")
+LAW_ENDINGS = (".mat", ".py", ".c")
+_MATRICES = b"MATLAB 5.0 MAT-file, written by ambid"  # as `control.law_files.MAT_HEADER`
+_ARCHIVE = b"documentation/made-by-ambid.txt"  # the first entry of an FMU, as `fmu.MARK`
 _BEGINNINGS = {
-    FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<", b"%PDF"), EXPORT_ENDINGS: (b"MATLAB 5.0", b'"""'),
-    LAW_ENDINGS: (b"MATLAB 5.0", b'"""The law of ', b"/* The law of "),
+    FIGURE_ENDINGS: (b"\x89PNG", b"%PDF", b"<"), PAGE_ENDINGS: (b"<", b"%PDF"),
+    EXPORT_ENDINGS: (_MATRICES, b'"""The plant of ', b"/* The plant of "),
+    LAW_ENDINGS: (_MATRICES, b'"""The law of ', b"/* The law of "),
 }  # fmt: skip
 _STREAMED = ("--json",)  # options that take - for standard output
 
@@ -133,7 +136,7 @@ def _made_here(path: Path, drawn: tuple[bytes, ...]) -> bool:
                 return b"simulat" in found["provenance"][()]
     except (OSError, EOFError, KeyError, TypeError, ValueError, zlib.error):  # damaged: nobody knows what it was
         return False
-    return not begin or begin.startswith((*_MADE, *drawn))
+    return not begin or begin.startswith((*_MADE, *drawn)) or (begin.startswith(b"PK") and _ARCHIVE in begin)
 
 
 def _same(a: Path, b: Path) -> bool:

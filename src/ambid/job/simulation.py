@@ -10,9 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.control.experiment import Experiment
 from ambid.errors import (
     AmbidError,
+    EstimationError,
     check_band,
     check_number,
     check_positive,
@@ -22,19 +24,20 @@ from ambid.errors import (
     refuse_given,
 )
 from ambid.estimation.estimate import Estimate
-from ambid.job.results import experiment_of, read_linear_estimate, rig_of
+from ambid.job.results import experiment_of, load, rig_of
+from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.record import Channel, Record
-from ambid.rig import Rig, load_rig, rig_of_preset
+from ambid.rig import Rig, RigMagnet, load_rig, rig_of_preset
 from ambid.signals import excitation as make_excitation
 from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
-from ambid.simulation.rig_bench import Bench
+from ambid.simulation.rig_bench import Bench, plant_of_law
 from ambid.simulation.rotor_bench import RotorBench
 
-BenchSource = str | Path | Rig | Preset | Estimate
-"""Who has the numbers of a bench: a preset by name, a rig, a linear estimate, or a file of one of these."""
+BenchSource = str | Path | Rig | Preset | Estimate | NonlinearBearingEstimate
+"""Who has the numbers of a bench: a preset by name, a rig, an estimate of one axis, or a file of one of these."""
 
 _LEAST_PERIODS = 4  # of a rotor's record: their scatter is its noise
 _REACH = 10.0  # of the rate over the highest line of a rotor's excitation
@@ -73,8 +76,8 @@ def simulate(
 
     Parameters
     ----------
-    source : str, Path, Rig, Preset or Estimate
-        A preset by its name; a rig or its file; a linear estimate or its file: its rig, with the estimated values.
+    source : str, Path, Rig, Preset, Estimate or NonlinearBearingEstimate
+        A preset by its name; a rig or its file; an estimate of one axis or its file: its rig with the estimated values.
     duration : float, optional
         Length in s; default 1, or the experiment's.
     rate_hz : float, optional
@@ -258,8 +261,10 @@ def bench_of_source(source: BenchSource) -> Rig | Preset:
     if isinstance(source, str) and source in preset_names():
         return preset(source)
     if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
-        source = read_linear_estimate(source, f"{source} is no linear estimate; a simulation needs one. Give a rig")
-    if isinstance(source, Estimate):
+        path, source = source, load(source)
+        if not isinstance(source, Estimate | NonlinearBearingEstimate):
+            raise EstimationError(f"{path} is no estimate of one axis; a simulation needs one. Give a rig")
+    if isinstance(source, Estimate | NonlinearBearingEstimate):
         return _rig_of_estimate(source)
     return source if isinstance(source, (Rig, Preset)) else load_rig(source)
 
@@ -289,16 +294,27 @@ def _bench(
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
 
-def _rig_of_estimate(estimate: Estimate) -> Rig:
+def _rig_of_estimate(estimate: Estimate | NonlinearBearingEstimate) -> Rig:
     """Return the rig that an estimate remembers, with the numbers that it found."""
     rig = rig_of(estimate, "the estimate")
-    known = tuple(replace(p, role="fixed", value=estimate[p.name].value, sd=None) for p in rig.parameters)
-    late = next(iter(estimate.delay.values()))
+    values, point, late = estimate.values, dict(estimate.operating_point), next(iter(estimate.delay.values()))
+    if isinstance(estimate, NonlinearBearingEstimate):
+        law, plant = estimate.law, plant_of_law(estimate.law, values, eddy=estimate.eddy)
+        own = [p for p in estimate.parameters if p.name not in ("m", "R", "c")]
+        magnet = RigMagnet(
+            kind="pair" if law.pair else "single", gap=law.gap, asymmetric=law.asymmetric, saturation=law.saturation,
+            rise=law.rise, eddy=estimate.eddy,
+            parameters=tuple(Parameter(name=p.name, unit=p.unit, role="fixed", value=p.value) for p in own),
+        )  # fmt: skip
+        rig, point = replace(rig, magnet=magnet), plant.equilibrium(point["position"])._asdict()
+        values, record = {**plant.linearise(point["position"]), "R": values["R"]}, estimate.records[0]
+    else:
+        record = estimate.record
+    known = tuple(replace(p, role="fixed", value=values[p.name], sd=None) for p in rig.parameters)
     loop = replace(rig.loop or Loop(), delay=late.samples + late.fraction)
-    rate = rig.record.rate_hz or float(str(estimate.record["rate_hz"]))
+    rate = rig.record.rate_hz or float(str(record["rate_hz"]))
     return replace(
-        rig, parameters=known, loop=loop, operating_point=dict(estimate.operating_point),
-        record=replace(rig.record, rate_hz=rate),
+        rig, parameters=known, loop=loop, operating_point=point, record=replace(rig.record, rate_hz=rate)
     )  # fmt: skip
 
 

@@ -118,6 +118,11 @@ def plant_of_rig(rig: Rig) -> NonlinearPlant:
         If a number cannot be that of a plant.
     """
     law, values = law_of_rig(rig)
+    return plant_of_law(law, values, eddy=rig.magnet is not None and rig.magnet.eddy)
+
+
+def plant_of_law(law: MagnetLaw, values: Mapping[str, float], *, eddy: bool) -> NonlinearPlant:
+    """Return the plant of a law with its numbers, m, R and c by name, as `plant_of_rig`."""
     stage = PowerStage(
         v_drop=values.get("v_drop", 0.0),
         i_drop=values.get("i_drop", IDEAL.i_drop),
@@ -129,7 +134,7 @@ def plant_of_rig(rig: Rig) -> NonlinearPlant:
         R=values["R"],
         c=values["c"],
         gravity=values.get("g", 0.0 if law.pair else 9.81),
-        eddy_pole=values["a"] if rig.magnet is not None and rig.magnet.eddy else math.inf,
+        eddy_pole=values["a"] if eddy else math.inf,
         stage=stage,
     )
 

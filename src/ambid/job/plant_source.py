@@ -1,0 +1,285 @@
+"""An identified plant as C source (C99, math.h alone, no allocation), with the delay of its inputs.
+
+A linear plant is stepped with its exact zero-order-hold matrices, which are computed from the parameters there; a
+nonlinear magnet by the Runge-Kutta steps of the simulator, with its stops. The code stands in ``data/plant_*.c``; an
+estimate adds declarations, numbers and the entries of the matrices.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.bearing.magnet_result import NonlinearBearingEstimate
+from ambid.control.law_files import comment_text
+from ambid.errors import EstimationError
+from ambid.estimation.estimate import Estimate
+from ambid.physics.bearing_numbers import BEARING_NUMBERS
+from ambid.physics.linear_model import MASS, UNITS, C, R, model
+from ambid.physics.loop import UNLIMITED, Interval
+from ambid.physics.power_stage import IDEAL
+from ambid.rotor.estimate import RotorEstimate
+from ambid.simulation.rig_bench import enough_steps, plant_of_law
+
+_FREE = 1e300  # where a stop is that there is none
+_ABSENT = {"L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "sigma": 0.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0,
+           "v_offset": 0.0, "v_drop": 0.0, "i_drop": IDEAL.i_drop, "g": 0.0, "a": 0.0}  # fmt: skip
+_ALWAYS = {"x_offset": 0.0, "i_offset": 0.0}
+_MEANING = {spec.name: spec.meaning for spec in (*BEARING_NUMBERS, MASS, R, C)}
+_MATRICES = {  # of `LinearModel.matrices`: entries of A, then of B with the columns of E behind
+    "one-axis": {
+        "A": {(0, 1): "1.0", (1, 0): "-p->k_x / p->m", (1, 1): "-p->c / p->m", (1, 2): "p->k_i / p->m",
+              (2, 1): "-p->k_i / p->L", (2, 2): "-p->R / p->L"},
+        "B": {(2, 0): "1.0 / p->L", (1, 1): "1.0 / p->m", (2, 2): "1.0 / p->L"},
+    },
+    "coil": {"A": {(0, 0): "-p->R / p->L"}, "B": {(0, 0): "1.0 / p->L", (0, 1): "1.0 / p->L"}},
+    "rotor": {
+        "A": {(0, 1): "1.0", (1, 0): "-p->k_x / p->m", (1, 1): "-p->c / p->m"},
+        "B": {(1, 0): "p->k_i / p->m", (1, 1): "1.0 / p->m"},
+    },
+}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Number:
+    """A parameter of the exported plant, SI: a member of the structure in C, a variable in an FMU."""
+
+    name: str
+    unit: str
+    about: str
+    value: float
+    tunable: bool = True  # while it runs
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PlantSource:
+    """What C source and FMU are made of; signals by name with their SI units."""
+
+    numbers: tuple[Number, ...]  # delays last, one for each input
+    states: Mapping[str, str]
+    inputs: Mapping[str, tuple[str, float]]  # with the value at rest
+    disturbances: Mapping[str, str]
+    outputs: Mapping[str, str]
+    period: float  # of the record, s
+    code: str  # what stands between the declarations and `plant_step`
+    more: str  # further definitions and members
+    members: str = ""
+
+
+def source_of(result: Any, stops: Interval = UNLIMITED) -> PlantSource:
+    """Return the plant of an estimate; `stops`: between which its rotor can move, m."""
+    if isinstance(result, NonlinearBearingEstimate):
+        return _of_magnet(result, stops)
+    if isinstance(result, Estimate):
+        return _of_axis(result, stops)
+    if isinstance(result, RotorEstimate):
+        return _of_rotor(result)
+    raise EstimationError(
+        f"{type(result).__name__} has no physical parameters; C source and FMU hold an estimate of 'ambid identify'. "
+        "Give such an estimate, or a file ending in .mat or .py"
+    )
+
+
+def _of_axis(result: Estimate, stops: Interval) -> PlantSource:
+    of, at = model(result.model), result.operating_point
+    period, units = 1.0 / float(str(result.record["rate_hz"])), of.units
+    numbers = [Number(name=s.name, unit=s.unit, about=s.meaning, value=result[s.name].value) for s in of.parameters]
+    shown = dict.fromkeys([*of.outputs, *(s for s in of.states if s == "velocity")])
+    rows = np.array([[float(s == o) for s in of.states] for o in shown])
+    entries = _MATRICES[of.name]
+    filled = [f"    {name}[{i}][{j}] = {text};" for name in "AB" for (i, j), text in entries[name].items()]
+    late = result.delay[of.inputs[0]]
+    rested = {role: at[role] for role in (*of.outputs, *of.inputs)}
+    return PlantSource(
+        numbers=(*numbers, *_rests(rested), *_stops(stops, "position" in of.states),
+                 _delay("delay", (late.samples + late.fraction) * period)),
+        states={s: units[s] for s in of.states}, inputs={r: (units[r], at[r]) for r in of.inputs},
+        disturbances=_disturbances(of.disturbances), outputs={o: units[o] for o in shown}, period=period,
+        code=_linear(filled, rows, _rest_lines(of.states, of.inputs, rested), stop="position" in of.states),
+        more="", members=_KEPT,
+    )  # fmt: skip
+
+
+def _of_rotor(result: RotorEstimate) -> PlantSource:
+    of, space, units = result.plant, result.plant.matrices(result.numbers), result.plant.units
+    period = 1.0 / float(str(result.record["rate_hz"]))
+    B = np.hstack([result.continuous.B, space.E])
+    tables = [_table(name, x) for name, x in (("a", result.continuous.A), ("b", B))]
+    filled = ["    (void)p;", "    memcpy(A, plant_a, sizeof plant_a);", "    memcpy(B, plant_b, sizeof plant_b);"]
+    late = {r: result.delay[r].samples + result.delay[r].fraction if r in result.delay else 0.0 for r in of.inputs}
+    code = _linear(filled, result.continuous.C, ["    (void)p, (void)x, (void)u;"], stop=False)
+    return PlantSource(
+        numbers=tuple(_delay(f"{r}_delay", x * period) for r, x in late.items()),
+        states={s: units[s] for s in of.states}, inputs={r: (units[r], 0.0) for r in of.inputs},
+        disturbances={f"disturbing_{d}": units[d] for d in of.disturbances},
+        outputs={o: units[o] for o in of.outputs}, period=period, code="\n".join([*tables, code]), more="",
+        members=_KEPT,
+    )  # fmt: skip
+
+
+def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource:
+    plant = plant_of_law(result.law, result.values, eddy=result.eddy)
+    rest, rate = plant.equilibrium(result.operating_point["position"]), float(str(result.records[0]["rate_hz"]))
+    states = {s: UNITS[s] for s in ("position", "velocity", "current")} | ({"pull": "N"} if result.eddy else {})
+    values = {**_ALWAYS, **result.values}
+    numbers = [
+        Number(name=name, unit=unit, about=_MEANING[name], value=values[name])
+        for name, unit in {**{p.name: p.unit for p in result.parameters}, "x_offset": "m", "i_offset": "A"}.items()
+    ]
+    strength, length = result.law.names[:2]
+    named = {name: f"p->{name}" if name in values else repr(x) for name, x in _ABSENT.items()} | {
+        "x_offset": "p->x_offset", "strength": f"p->{strength}", "length": f"p->{length}", "length_name": length,
+    }  # fmt: skip
+    rested = {"position": rest.position, "current": rest.current, "voltage": rest.voltage}
+    return PlantSource(
+        numbers=(*numbers, *_rests(rested), *_stops(stops, True),
+                 _delay("delay", (result.delay_samples(rate) or 0.0) / rate)),
+        states=states, inputs={"voltage": ("V", rest.voltage)}, disturbances=_disturbances(("force", "voltage")),
+        outputs={o: UNITS[o] for o in ("position", "current", "velocity")}, period=1.0 / rate,
+        code="\n".join([*_rest(_rest_lines(tuple(states), ("voltage",), rested)), *_stop(True), "", re.sub(
+            r"@(\w+)@", lambda found: named[found[1]], read_data("plant_magnet.c"))]),
+        more="\n".join([
+            f"#define PLANT_PAIR {int(result.law.pair)}",
+            f"#define PLANT_EXPONENTIAL {int(result.law.gap == 'exponential')}",
+            f"#define PLANT_FOLLOWS {int(result.eddy)} /* whether the force lags behind the current */",
+            f"#define PLANT_SUBSTEPS {enough_steps(plant, rest, rate)} /* Runge-Kutta steps in a sample */",
+        ]),
+    )  # fmt: skip
+
+
+def _rests(values: Mapping[str, float]) -> list[Number]:
+    about = "at the operating point, where the plant starts"
+    return [Number(name=f"{r}_rest", unit=UNITS[r], about=about, value=x, tunable=False) for r, x in values.items()]
+
+
+def _stops(stops: Interval, moves: bool) -> list[Number]:
+    low, high = (math.copysign(_FREE, x) if math.isinf(x) else x for x in stops)
+    ends = {"position_low": ("lower", low), "position_high": ("upper", high)} if moves else {}
+    return [Number(name=n, unit="m", about=f"{which} stop of the rotor", value=x) for n, (which, x) in ends.items()]
+
+
+def _delay(name: str, value: float) -> Number:
+    return Number(name=name, unit="s", about="by which the input acts late", value=value)
+
+
+def _disturbances(names: Sequence[str]) -> dict[str, str]:
+    return {f"disturbing_{name}": UNITS[name] for name in names}
+
+
+def read_data(name: str) -> str:
+    """Return the text of a file of the package."""
+    return (files("ambid") / "data" / name).read_text(encoding="utf-8")
+
+
+# --- text -----------------------------------------------------------------------------------------------------------
+
+_KEPT = """    struct plant_transition {
+        double length;
+        struct plant_parameters p;
+        double P[PLANT_STATES][PLANT_STATES], G[PLANT_STATES][PLANT_INPUTS + PLANT_DISTURBANCES];
+    } kept[PLANT_KEPT];
+    int oldest;
+"""
+
+
+def _rest_lines(states: Sequence[str], inputs: Sequence[str], rested: Mapping[str, float]) -> list[str]:
+    found = [f"    {to}[{k}] = p->{name}_rest;" for to, names in (("x", states), ("u", inputs))
+             for k, name in enumerate(names) if name in rested]  # fmt: skip
+    return found
+
+
+def _rest(lines: Sequence[str]) -> list[str]:
+    """Return the function that writes the states and inputs at rest which are not zero."""
+    return ["static void plant_rest(const struct plant_parameters *p, double *x, double *u)", "{", *lines, "}", ""]
+
+
+def _stop(moves: bool) -> list[str]:
+    """Return the function that ends a movement at a stop."""
+    ends = "(void)s;\n    return 0;" if not moves else (
+        "double *x = s->x;\n\n    if (x[0] > s->p.position_low && x[0] < s->p.position_high)\n        return 0;\n"
+        "    x[1] = x[0] >= s->p.position_high ? fmin(x[1], 0.0) : fmax(x[1], 0.0);\n"
+        "    x[0] = x[0] >= s->p.position_high ? s->p.position_high : s->p.position_low;\n    return 1;"
+    )  # fmt: skip
+    return ["/* Whether the rotor touches a stop, which it does without rebound. */",
+            "static int plant_stop(struct plant *s)", "{", f"    {ends}", "}"]  # fmt: skip
+
+
+def _linear(filled: Sequence[str], rows: Array, rest: Sequence[str], *, stop: bool) -> str:
+    wide = "B[PLANT_STATES][PLANT_INPUTS + PLANT_DISTURBANCES]"
+    return "\n".join([
+        _table("C", rows), "", *_rest(rest),
+        f"static void plant_matrices(const struct plant_parameters *p, double A[PLANT_STATES][PLANT_STATES],\n"
+        f"                           double {wide})", "{", *filled, "}", "", *_stop(stop), "",
+        read_data("plant_linear.c"),
+    ])  # fmt: skip
+
+
+def _table(name: str, matrix: Array) -> str:
+    rows = ",\n".join("    {" + ", ".join(map(repr, row)) + "}" for row in matrix.tolist())
+    return f"static const double plant_{name}[{matrix.shape[0]}][{matrix.shape[1]}] = {{\n{rows},\n}};"
+
+
+def declarations(of: PlantSource, about: Sequence[str]) -> str:
+    """Return what a program that uses the plant has to know; `about`: lines of the comment that begins it."""
+    own = [x for x in of.numbers if x.name.rpartition("_")[2] != "delay"]
+    longest = max((x.value for x in of.numbers[len(own) :]), default=0.0)
+    listed = {
+        "x": of.states,
+        "u": {k: unit for k, (unit, _) in of.inputs.items()},
+        "d": of.disturbances,
+        "y": of.outputs,
+    }
+    words = {key: ", ".join(f"{name} [{unit}]" for name, unit in names.items()) for key, names in listed.items()}
+    sizes = {"STATES": len(of.states), "INPUTS": len(of.inputs), "DISTURBANCES": len(of.disturbances),
+             "OUTPUTS": len(of.outputs), "HISTORY": 8 * math.ceil(longest / of.period) + 64,
+             "KEPT": len(of.inputs) + 2}  # fmt: skip
+    return "\n".join([
+        f"/* {comment_text(about[0])}", *(f" * {comment_text(line)}" for line in about[1:]), " *",
+        *(f" * {key}: {comment_text(text)}" for key, text in words.items()), " *",
+        " * All in SI. plant_reset once; then, each sample, plant_outputs, and plant_step with the inputs that the",
+        " * plant was just given, the disturbances, and how long both are held (such as PLANT_PERIOD).",
+        " * plant_step returns 1 where the rotor touched a stop, else 0, or one of the negative numbers below.", " */",
+        "#ifndef PLANT_DECLARED", "#define PLANT_DECLARED", "", "#include <math.h>", "#include <string.h>", "",
+        *(f"#define PLANT_{name} {n}" for name, n in sizes.items()),
+        f"#define PLANT_PERIOD {of.period!r} /* s, of the record */",
+        "#define PLANT_LOST (-1) /* the rotor left the air gap, or numbers are no longer finite: reset */",
+        "#define PLANT_REFUSED (-2) /* no step, far too long a one, or too many changes within the delay */",
+        *([of.more] if of.more else ["#define PLANT_FOLLOWS 0"]), "", "struct plant_parameters {",
+        *(f"    double {x.name}; /* {x.unit}: {x.about} */" for x in own),
+        "    double delay[PLANT_INPUTS]; /* s: by which each input acts late */", "};", "", "struct plant {",
+        "    struct plant_parameters p; /* may be changed between steps */", "    double x[PLANT_STATES];",
+        "    int known; /* changes of the inputs that still count, and how long ago each was */",
+        "    double age[PLANT_HISTORY], past[PLANT_HISTORY][PLANT_INPUTS];", of.members + "};", "",
+        "extern const struct plant_parameters plant_identified;",
+        "void plant_reset(struct plant *s, const struct plant_parameters *p);",
+        "void plant_outputs(const struct plant *s, double *y);",
+        "int plant_step(struct plant *s, const double *u, const double *d, double length);",
+        "void plant_derivative(const struct plant_parameters *p, const double *x, const double *u, const double *d,",
+        "                      double *dx); /* x' with inputs that act at once */", "", "#endif", "",
+    ])  # fmt: skip
+
+
+def c_source(of: PlantSource, about: Sequence[str]) -> str:
+    """Return the whole source, declarations first."""
+    own = [x for x in of.numbers if x.name.rpartition("_")[2] != "delay"]
+    late = ", ".join(repr(x.value) for x in of.numbers[len(own) :])
+    return "\n".join([
+        declarations(of, about), "const struct plant_parameters plant_identified = {",
+        *(f"    {x.value!r}, /* {x.name} */" for x in own), f"    {{{late}}},", "};", "",
+        of.code + read_data("plant_step.c"),
+    ])  # fmt: skip
+
+
+def prefixed(text: str, stem: str) -> str:
+    """Return C source with a prefix of its own, so that one program may hold several plants; `stem`: of the file."""
+    name = re.sub(r"[^A-Za-z0-9]+", "_", stem).strip("_").lower()[:40]
+    name = name if name[:1].isalpha() and name.isascii() else f"plant_{name}".rstrip("_")
+    found = re.sub(r"\bplant_(?=\w)", f"{name}_", re.sub(r"\bPLANT_(?=\w)", f"{name.upper()}_", text))
+    return re.sub(r"\bstruct plant\b", f"struct {name}", found)
