@@ -80,7 +80,7 @@ def test_the_voltage_is_what_the_pulse_widths_allowed_can_order(duty, volts):
             {"fault": DeviceEvent(kind="fault", sample=7, what="out_of_gap"), "samples": 7},
             "safe state during the trial: out_of_gap, position outside limits at sample 7. Change the gains",
         ),
-        ({"interrupted": True, "samples": 40}, "the trial was interrupted after 40 of 100 samples"),
+        ({"interrupted": True, "samples": 40}, "the trial was interrupted after 40 samples"),
         ({"lost": 3, "samples": 97}, "3 of 100 samples were lost during the trial: check cable"),
         ({"samples": 60}, "the trial ended after 60 of 100 samples"),
     ],

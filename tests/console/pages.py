@@ -80,12 +80,13 @@ def told(frames, kind):
     return [m for m in frames if m["kind"] == kind]
 
 
-def until(run, kind="end", seconds=120.0):
-    """The JSON frames of a run up to one of a kind, from its feed."""
+def until(run, kind="end", seconds=120.0, of=None):
+    """The JSON frames of a run up to one of a kind that says what `of` does, from its feed."""
     from ambid.console.feed import FeedReader, json_frames
 
     reader, found, end = FeedReader(run.place, parts=99), [], time.monotonic() + seconds
-    while time.monotonic() < end and not told(found, kind):
+    wanted = (of or {}).items()
+    while time.monotonic() < end and not any(wanted <= m.items() for m in told(found, kind)):
         found += json_frames(reader.read())
         time.sleep(0.02)
     return found

@@ -1,13 +1,16 @@
 """The whole way in a browser, headless Chromium: a record, its rig, identification; a live bench; commissioning."""
 
+import json
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import time
 
 import pytest
 
+from ambid.console.runs import Runs
 from ambid.job import identify, load
 from ambid.physics.presets import preset
 from ambid.rig import preset_text
@@ -81,6 +84,7 @@ def test_a_live_bench_is_watched_held_frozen_and_stopped(page, folder):
     page.click("#live-form button.go")
     page.wait_for_selector("#parameters .chart:nth-child(5)")
     until(page, "ambidConsole.feed.lines.length > 3")
+    until(page, "!document.querySelector('[data-say=hold]').disabled")
     page.click("[data-say=hold]")
     page.wait_for_selector("#state:text-is('hold')")
     page.click("[data-say=accept]")
@@ -126,6 +130,16 @@ def test_commissioning_asks_and_ends_with_its_report(page, folder):
     page.fill("#commission-form [name=seconds]", "4")
     page.fill("#commission-form [name=out]", "first")
     page.click("#commission-form button.go")
+    page.wait_for_selector("dialog[open]")
+    assert page.locator("[data-say]:disabled").count() == 4
+    (process,) = [r.place / "process.json" for r in Runs(folder).all() if r.alive]
+    number = json.loads(process.read_text(encoding="utf-8"))["pid"]
+    os.kill(number, signal.SIGSTOP)
+    try:
+        page.wait_for_selector("#banner:has-text('OLD: the run has been silent')")
+    finally:
+        os.kill(number, signal.SIGCONT)
+    page.wait_for_selector("#banner", state="hidden")
     page.click("dialog[open] button[value=go]")
     page.wait_for_selector("#steps a:has-text('report.html')")
     assert page.locator("#steps > li .usable").count() >= 7

@@ -14,6 +14,7 @@ pytest.importorskip("starlette", reason="the extra [console] is not installed")
 
 from websockets.exceptions import InvalidStatus, WebSocketException
 
+from ambid.console.feed import json_frames
 from ambid.console.folder import Folder, open_plain
 from ambid.console.runs import Heard, Run, Runs
 from ambid.errors import AmbidError
@@ -26,6 +27,7 @@ def folder(tmp_path_factory):
     (made / "outside").mkdir()
     (made / "shown" / "named.toml").mkdir(parents=True)
     (made / "shown" / "sub").mkdir()
+    (made / "shown" / "sub" / "plain.csv").write_text("time [s],x [V]\n0,1\n0.1,2\n", encoding="utf-8")
     secret = made / "outside" / "secret.toml"
     secret.write_text('schema = "ambid.rig/1"\nname = "secret"\n', encoding="utf-8")
     shown = made / "shown"
@@ -227,10 +229,17 @@ def test_pages_and_reports_cannot_run_what_is_planted(page):
 
 
 def test_read_only_changes_nothing(folder):
+    before = sorted(folder.rglob("*"))
     with console(folder, "--read-only") as started:
         started.open()
         assert started.ask("POST", "/api/drive", {}).status == 403
         assert started.ask("POST", "/api/runs", {"job": "rig", "text": "", "out": "new"}).status == 403
+        assert started.ask("POST", "/api/previews", {"job": "rig", "text": "", "out": "new"}).status == 400
+        begun = started.json("POST", "/api/previews", {"job": "preview", "record": started.number("sub/plain.csv")})
+        with started.feed(begun["id"]) as feed:
+            assert told([m for data in feed for m in json_frames(data)], "end")
+        assert sorted(folder.rglob("*")) == before
+        assert started.ask("POST", "/api/runs/0000000000-000000/say", {"word": "stop"}).status == 403
         assert started.state()["read_only"] is True
 
 

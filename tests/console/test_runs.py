@@ -128,8 +128,9 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
     with console(tmp_path) as page:
         page.open()
         begun = page.json("POST", "/api/runs", {"job": "preview", "record": page.number("rec.csv")})
-        seen = until(Runs(tmp_path).one(begun["id"]))
-        (shown,) = told(seen, "preview")
+        with page.feed(begun["id"]) as feed:
+            (shown,) = told([m for data in feed for m in json_frames(data)], "preview")
+        assert not (tmp_path / ".ambid").exists()  # of a look nothing stays
         assert [c["name"] for c in shown["channels"]] == ["voltage", "current", "position"]
         wish = {"job": "rig", "text": shown["draft"], "out": "drafted"}
         assert told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wish)["id"])), "end")[0]["how"] == "done"
@@ -142,11 +143,14 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
         end = told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wrong)["id"])), "end")[0]
         assert end["how"] == "refused"
         assert "modle" in end["why"]
+        while any(r["alive"] for r in page.state()["runs"]):
+            time.sleep(0.05)
+        assert [r["why"] for r in page.state()["runs"] if r["end"] == "refused"] == [end["why"][:400]]
         assert not (tmp_path / "wrong.toml").exists()
 
 
 def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
-    wish = {"job": "live", "port": "simulated", "seconds": 9.0, "amplitude": 1.4, "excitation": "multisine"}
+    wish = {"job": "live", "port": "simulated", "seconds": 14.0, "amplitude": 1.4, "excitation": "multisine"}
     run = None
     for k in range(5):
         with console(bench) as page:
@@ -154,14 +158,18 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
             if run is None:
                 started = page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "run"})
                 run = Runs(bench).one(started["id"])
+                early = page.json("POST", f"/api/runs/{run.id}/say", {"word": "accept"})
+                assert "tracks nothing now" in early["error"]
+                until(run, "header")
                 second = page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "two"})
                 assert "under way" in second["error"]
             (found,) = [r for r in page.state()["runs"] if r["id"] == run.id]
             assert found["alive"]
             path = f"/api/runs/{run.id}/say"
-            assert page.ask("POST", path, {"word": "hold" if k == 0 else "track"}).status == 200
-            other = page.ask("POST", path, {"word": "accept"}, headers={"X-Ambid": "page-2"})
-            assert b"another page has the machine" in other.body
+            if k == 0:
+                assert page.ask("POST", path, {"word": "hold"}).status == 200
+                other = page.ask("POST", path, {"word": "accept"}, headers={"X-Ambid": "page-2"})
+                assert b"another page has the machine" in other.body
             with page.feed(run.id) as feed:
                 assert json_frames(feed.recv(timeout=5))[0]["kind"] == "begin"
             # the console is killed here
@@ -170,7 +178,7 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
     (kept,) = told(seen, "recorded")
     record = read_record(bench / "run.h5")
     assert kept["lost"] == kept["not_stored"] == 0
-    assert record.n_samples == kept["samples"] == 18_000
+    assert record.n_samples == kept["samples"] == 28_000
     names = told(seen, "signals")[0]["names"]
     assert set(names) == {"voltage", "position", "current"}
     assert told(seen, "line")
@@ -178,6 +186,31 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
     while run.alive and time.monotonic() < end:
         time.sleep(0.05)
     assert not run.alive
+    with console(bench) as page:
+        late = page.open().json("POST", f"/api/runs/{run.id}/say", {"word": "hold"})
+        assert "the run is over" in late["error"]
+
+
+def test_a_stopped_commissioning_tells_what_was_reached_and_takes_no_word_of_tracking(bench):
+    with console(bench) as page:
+        wish = {"job": "commission", "port": "simulated", "seconds": 4.0, "rig": page.open().number("rig.toml")}
+        run = Runs(bench).one(page.json("POST", "/api/runs", {**wish, "out": "halted"})["id"])
+        path = f"/api/runs/{run.id}/say"
+        for word in ("hold", "track", "accept", "revert"):
+            assert "is for a run of live" in page.json("POST", path, {"word": word})["error"]
+        (asked,) = told(until(run, "ask"), "ask")
+        page.ask("POST", path, {"word": "go", "number": asked["number"] - 1})  # an answer to another question is none
+        beats = told(until(run, "beat"), "beat")
+        assert beats, "a run that waits is not silent"
+        page.ask("POST", path, {"word": "go", "number": asked["number"]})
+        until(run, "beginning", of={"name": "levitate"})
+        page.ask("POST", path, {"word": "stop"})
+        seen = until(run)
+        (made,) = told(seen, "commissioned")
+        assert made["reached"] == "3 of 9 steps were good enough: self-test, rest, polarity"
+        assert (bench / made["report"]).stat().st_size > 10_000
+        assert [(m["how"], made["reached"] in m["why"]) for m in told(seen, "end")] == [("cancelled", True)]
+        assert all(p["png"] for m in told(seen, "step") for p in m["pictures"])
 
 
 def test_anybody_may_stop_and_what_came_is_kept(bench):

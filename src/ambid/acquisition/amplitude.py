@@ -123,7 +123,7 @@ def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
     if report.fault is not None:
         return (f"the controller went to its safe state during {what}: {fault_words(report.fault)}",)
     if report.interrupted:
-        return (f"{what} was interrupted after {report.samples} of {report.wanted} samples",)
+        return (f"{what} was interrupted after {report.samples} samples",)
     if report.lost:
         return (f"{report.lost} of {report.wanted} samples were lost during {what}: check cable, baud rate and load",)
     if not report.complete:

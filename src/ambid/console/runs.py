@@ -49,6 +49,16 @@ class Run:
         pid, began = about.get("pid"), about.get("began")
         return isinstance(pid, int) and isinstance(began, float) and 0 < pid < 1 << 31 and process_began(pid) == began
 
+    @property
+    def follows(self) -> bool:
+        """Whether it tracks a live bench now."""
+        return self.alive and (self.place / "follows").exists()
+
+    def follow(self, *, on: bool) -> None:
+        """Note whether it does."""
+        with suppress(OSError):
+            (self.place / "follows").touch() if on else (self.place / "follows").unlink(missing_ok=True)
+
     def say(self, word: str, **more: Any) -> None:
         """Tell the process something; it is appended, and read within 20 ms. A full disk hinders no stop."""
         line = json.dumps({"word": word, **more})
@@ -94,11 +104,14 @@ class Heard:
 
 
 class Runs:
-    """The runs of a folder."""
+    """The runs of a folder.
 
-    def __init__(self, folder: Path) -> None:
+    `place`: where they are kept; None: in the folder itself.
+    """
+
+    def __init__(self, folder: Path, place: Path | None = None) -> None:
         self.folder = folder
-        self._place = folder / ".ambid" / "runs"
+        self._place = folder / ".ambid" / "runs" if place is None else place
 
     def start(self, spec: Mapping[str, Any]) -> Run:
         """Begin a run in a process that outlives this one."""
@@ -129,10 +142,14 @@ class Runs:
         found = self._place.iterdir() if self._own and self._place.is_dir() else ()
         return [Run(p) for p in sorted(found, reverse=True) if _ID.fullmatch(p.name) and not p.is_symlink()]
 
+    def has(self, name: str) -> bool:
+        """Whether there is a run of a name."""
+        return bool(_ID.fullmatch(name)) and self._own and (self._place / name).is_dir()
+
     def one(self, name: str) -> Run:
         """Return the run of a name."""
         place = self._place / name
-        if not _ID.fullmatch(name) or not self._own or place.is_symlink() or not place.is_dir():
+        if not self.has(name) or place.is_symlink():
             raise AmbidError("there is no such run in the folder. Reload the page")
         return Run(place)
 

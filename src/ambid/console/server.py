@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import asdict
 from importlib.resources import files
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import uvicorn
@@ -48,7 +49,7 @@ _STATIC = {
     "console.js": ("console/static", "text/javascript"), "console.css": ("console/static", "text/css"),
     "uPlot.iife.min.js": ("data", "text/javascript"), "uPlot.min.css": ("data", "text/css"),
 }  # fmt: skip
-_WORDS = ("stop", "go", "no", "track", "hold", "accept", "revert")
+_WORDS = {"live": ("track", "hold", "accept", "revert"), "commission": ("go", "no")}  # beside "stop", of any
 # of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
 _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "preview": ({"record": "record"}, {"rate_hz": float}, ""),
@@ -81,10 +82,16 @@ class Console:
 
     def __init__(self, folder: Path, *, read_only: bool = False) -> None:
         self.files, self.runs, self._read_only = Folder(folder), Runs(folder), read_only
+        self._beside = TemporaryDirectory(prefix="ambid-console-", ignore_cleanup_errors=True)
+        self._looks = Runs(folder, Path(self._beside.name))  # previews: nothing of them stays
         self._driver: str | None = None  # the page that orders what moves the machine
         self._viewers = 0
         self._over: dict[str, dict[str, Any]] = {}  # runs that are over, as they are shown
         self.guard: Guard | None = None
+
+    def close(self) -> None:
+        """Remove what is kept beside the folder."""
+        self._beside.cleanup()
 
     def routes(self) -> list[Any]:
         """Return what can be asked for."""
@@ -94,8 +101,8 @@ class Console:
             Route("/static/{name}", self._static),
             Route("/api/state", self._state),
             Route("/api/rigs/{number:int}", self._rig_text),
-            Route("/api/runs", self._start, methods=["POST"]),
-            Route("/api/runs/{name}/say", self._say, methods=["POST"]),
+            *(Route(f"/api/{of}", self._start, methods=["POST"]) for of in ("runs", "previews")),
+            *(Route(f"/api/{of}/{{name}}/say", self._say, methods=["POST"]) for of in ("runs", "previews")),
             Route("/api/drive", self._drive, methods=["POST"]),
             Route("/reports/{number:int}", self._report),
             WebSocketRoute("/api/runs/{name}/feed", self._feed),
@@ -139,7 +146,8 @@ class Console:
         if run.alive:
             return {**_about(run), "alive": True, "end": ""}
         ends = [m for m in json_frames(FeedReader(run.place, parts=1).read(1 << 24)) if m.get("kind") == "end"]
-        found = {**_about(run), "alive": False, "end": str(ends[-1].get("how"))[:20] if ends else "broke off"}
+        how, why = (str(ends[-1].get(k, ""))[:400] for k in ("how", "why")) if ends else ("broke off", "")
+        found = {**_about(run), "alive": False, "end": how[:20], "why": why}
         self._over[run.id] = found
         return found
 
@@ -160,6 +168,10 @@ class Console:
 
         def start() -> Mapping[str, Any]:
             spec = self._spec(asked)
+            if spec["job"] == "preview":
+                return {"id": self._looks.start(spec).id}
+            if request.url.path != "/api/runs":
+                raise AmbidError(f"{spec['job']} is no preview. Reload the page")
             if spec["job"] in MOVING:
                 self._take_wheel(request)
                 if any(r.alive and r.spec.get("job") in MOVING for r in self.runs.all()):
@@ -172,15 +184,27 @@ class Console:
         asked = await _json(request)
 
         def say() -> Mapping[str, Any]:
-            run, word = self.runs.one(request.path_params["name"]), asked.get("word")
-            if word not in _WORDS:
-                raise AmbidError(f"the word {str(word)[:20]!r} is unknown; known: {', '.join(_WORDS)}")
-            if word != "stop" and run.spec.get("job") in MOVING:  # everybody may stop a machine
+            runs = self.runs if request.url.path.startswith("/api/runs/") else self._looks
+            run, word, number = runs.one(request.path_params["name"]), str(asked.get("word"))[:20], asked.get("number")
+            if word != "stop":  # everybody may stop a machine
+                self._check_word(run, word)
                 self._take_wheel(request)
-            run.say(str(word))
+            run.say(word, **({"number": number} if isinstance(number, int) and abs(number) < 1 << 31 else {}))
             return {}
 
         return await _answer(say)
+
+    def _check_word(self, run: Run, word: str) -> None:
+        """Refuse what is said to a run that it does not mean anything to."""
+        job, of = str(run.spec.get("job"))[:20], [job for job, words in _WORDS.items() if word in words]
+        if not of:
+            raise AmbidError(f"the word {word!r} is unknown; known: stop, {', '.join(sum(_WORDS.values(), ()))}")
+        if job not in of:
+            raise AmbidError(f"{word} is for a run of {of[0]}; this one is of {job}. Choose another run")
+        if not run.alive:
+            raise AmbidError(f"{word} does nothing: the run is over")
+        if job == "live" and not run.follows:
+            raise AmbidError(f"{word} does nothing: the run tracks nothing now. Wait until tracking has begun")
 
     async def _drive(self, request: Request) -> Response:
         self._driver = _client(request)
@@ -232,7 +256,8 @@ class Console:
 
     async def _feed(self, socket: WebSocket) -> None:
         try:
-            run = self.runs.one(socket.path_params["name"])
+            name = socket.path_params["name"]
+            run = (self._looks if self._looks.has(name) else self.runs).one(name)
         except AmbidError:
             await socket.close(1008)
             return
@@ -425,3 +450,4 @@ def serve(
         pass
     finally:
         listening.close()
+        console.close()

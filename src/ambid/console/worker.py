@@ -28,6 +28,7 @@ from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
 
 _LISTEN_S = 0.02
+_BEAT_S = 0.5  # between two signs of life
 _LINE_S = 0.1  # between two lines of parameters that are shown
 _FLAGS = ("track", "hold", "accept", "revert")
 _PREVIEW = 800  # envelopes of a channel in a preview
@@ -43,6 +44,8 @@ class Worker:
         self.folder = Path(self.spec["folder"])
         self.wished = threading.Event()  # the operator wants the end
         self.flags: deque[str] = deque()
+        self.cancelled = "cancelled before a result was there"
+        self._asked, self._follows = 0, False
         self._answers: deque[str] = deque()
         self._began = time.perf_counter()
         self._progress = throttled(_LINE_S, self._tell_progress)
@@ -52,15 +55,15 @@ class Worker:
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: self.wished.set())
         self.run.claim()
-        threading.Thread(target=self._listen, name="operator", daemon=True).start()
         self.feed.tell("begin", {"job": self.spec["job"], "wall": time.time()}, sticky="begin")
+        threading.Thread(target=self._listen, name="operator", daemon=True).start()
         try:
             JOBS[self.spec["job"]](self)
             self.end("done", "")
         except AmbidError as refusal:
             self.end("refused", str(refusal))
         except KeyboardInterrupt:
-            self.end("cancelled", "cancelled before a result was there")
+            self.end("cancelled", self.cancelled)
         except BaseException as defect:
             with suppress(OSError):  # of a full disk
                 traceback.print_exc()
@@ -78,6 +81,10 @@ class Worker:
         """Take progress of a job; a job that is to be cancelled is interrupted here, and keeps its best."""
         if self.wished.is_set():
             raise KeyboardInterrupt
+        self.show(stage, done)
+
+    def show(self, stage: str, done: float | None = None, /) -> None:
+        """Take progress of a job that ends itself where it is stopped."""
         self._progress(stage, done)
 
     def note(self, line: str) -> None:
@@ -88,10 +95,17 @@ class Worker:
         """Whether the operator wants the end."""
         return self.wished.is_set()
 
+    def follow(self, *, on: bool) -> None:
+        """Tell whether a live bench is tracked from now on; only then do the words of `_FLAGS` mean something."""
+        self._follows = on
+        self.run.follow(on=on)
+        self.feed.tell("following", {"on": on}, sticky="following")
+
     def agreed(self, what: str) -> bool:
         """Ask the operator, and wait for the answer."""
+        self._asked += 1  # an answer to the question before is none
         self._answers.clear()
-        self.feed.tell("ask", {"what": what}, sticky="ask")
+        self.feed.tell("ask", {"what": what, "number": self._asked}, sticky="ask")
         while not self._answers and not self.wished.is_set():
             time.sleep(_LISTEN_S)
         answer = self._answers.popleft() if self._answers else "no"
@@ -130,15 +144,21 @@ class Worker:
         self.feed.tell("progress", {"stage": stage, "done": done, "seconds": round(taken, 2)}, sticky="progress")
 
     def _listen(self) -> None:
-        heard = Heard(self.run)
+        heard, beat = Heard(self.run), 0.0
         while True:
+            if time.perf_counter() - beat >= _BEAT_S:  # a frozen process falls silent, one that waits does not
+                beat = time.perf_counter()
+                self.feed.tell("beat", {})
             for said in heard:
                 word = said.get("word")
                 if word == "stop":
                     self.wished.set()
-                elif word in _FLAGS:
+                    self.feed.tell("stopping", {}, sticky="stopping")
+                elif word in _FLAGS and self._follows:
                     self.flags.append(word)
-                elif word in ("go", "no"):
+                elif word in _FLAGS:
+                    self.note(f"{word} came while nothing was tracked; it did nothing")
+                elif word in ("go", "no") and said.get("number") == self._asked:
                     self._answers.append(word)
             if not self.run.place.exists():  # nobody can stop it from now on
                 self.wished.set()
@@ -263,10 +283,14 @@ def _live(worker: Worker) -> None:
                 tap.tell(what)
                 worker.feed.tell("device", {"what": what.kind, "text": what.what, "sample": what.sample})
 
+            def trouble(error: AmbidError) -> None:
+                worker.follow(on=False)
+                worker.note(f"tracking ended, recording continues: {error}")
+
             try:
                 made = track_live(
                     device, rig, course, start=known, taps=[tap, picture], on_event=event, on_run=runs.append,
-                    on_trouble=lambda e: worker.note(f"tracking ended, recording continues: {e}"),
+                    on_trouble=trouble,
                     on_header=told.header, on_line=told.line, on_lag=told.lag, keep=False, stopped=worker.stopped,
                     every_s=0.02,
                 )  # fmt: skip
@@ -275,6 +299,8 @@ def _live(worker: Worker) -> None:
                 if not runs:
                     raise
                 worker.note(str(refusal))
+            finally:
+                worker.follow(on=False)
         done = tap.acquired(runs[0])
         fault = done.run.fault
         worker.feed.tell(
@@ -299,6 +325,7 @@ class _Lines:
              "start": start, "warnings": list(header.warnings)},
             sticky="header",
         )  # fmt: skip
+        self._worker.follow(on=True)
 
     def lag(self, lag_s: float) -> None:
         self._lag = max(lag_s, self._lag)
@@ -354,10 +381,10 @@ def _commission(worker: Worker) -> None:
         redesign=bool(spec.get("redesign", False)),
     )  # fmt: skip
     worker.feed.tell("plan", {"steps": list(plan.steps)}, sticky="plan")
-    done = list[str]()
+    good = list[str]()
 
     def step(found: Any) -> None:
-        done.append(found.name)
+        good.extend([found.name] if found.passed else [])
         content = {
             "name": found.name, "passed": found.passed, "findings": list(found.findings),
             "reasons": list(found.reasons), "cautions": list(found.cautions), "text": found.text,
@@ -366,24 +393,31 @@ def _commission(worker: Worker) -> None:
         worker.feed.tell("step", content, sticky=f"step {found.name}")
 
     def progress(now: Progress) -> None:
-        worker.tick("record", now.samples / max(now.wanted, 1))
+        worker.show("record", now.samples / max(now.wanted, 1))
 
     opening = opened(
         str(spec["port"]), rig, bench=None, pace=spec.get("pace", "fastest"), seed=0, closes=True, note=worker.note
     )
     with opening as device:
         folder.mkdir()
-        found = commission(
-            device, rig, folder, plan=plan, confirm=lambda name: worker.agreed(f"{name}"), stopped=worker.stopped,
-            on_begin=lambda name: worker.feed.tell("beginning", {"name": name}, sticky="beginning"),
-            on_step=step, on_progress=progress, tick=worker.tick,
-        )  # fmt: skip
-    worker.feed.tell(
-        "commissioned",
-        {"passed": found.passed, "verdict": found.verdict.word, "reasons": [r.text for r in found.verdict.reasons],
-         "report": f"{folder.name}/report.html"},
-        sticky="commissioned",
-    )  # fmt: skip
+        told: Mapping[str, Any] = {"passed": False, "verdict": "unusable", "reasons": []}
+        try:
+            found = commission(
+                device, rig, folder, plan=plan, confirm=lambda name: worker.agreed(f"{name}"), stopped=worker.stopped,
+                on_begin=lambda name: worker.feed.tell("beginning", {"name": name}, sticky="beginning"),
+                on_step=step, on_progress=progress, tick=worker.show,
+            )  # fmt: skip
+            reasons = [r.text for r in found.verdict.reasons]
+            told = {"passed": found.passed, "verdict": found.verdict.word, "reasons": reasons}
+        finally:
+            reached = ", ".join(good) or "none"
+            told = {**told, "reached": f"{len(good)} of {len(plan.steps)} steps were good enough: {reached}",
+                    "report": f"{folder.name}/report.html"}  # fmt: skip
+            if (folder / "report.html").exists():
+                worker.feed.tell("commissioned", told, sticky="commissioned")
+        if worker.stopped() and not found.passed:
+            worker.cancelled = f"stopped. {told['reached']}. {folder.name} keeps what they found"
+            raise KeyboardInterrupt
 
 
 def _png(block: Any) -> str:

@@ -3,7 +3,7 @@
 
 const $ = (id) => document.getElementById(id);
 const CLIENT = sessionStorage.client ??= Array.from(crypto.getRandomValues(new Uint8Array(9)), (b) => b.toString(16).padStart(2, "0")).join("");
-const MOVING = ["live", "commission"], LATE_S = 0.2, OLD_S = 2.0, SLOTS = 2000;
+const MOVING = ["live", "commission"], LATE_S = 0.2, SILENT_S = 1.5, START_S = 15, OLD_S = 2.0, SLOTS = 2000;
 let state = { files: [], runs: [] };
 
 function el(tag, props = {}, ...children) {
@@ -44,14 +44,29 @@ async function ask(path, body) {
   let answer;
   try {
     answer = await fetch(path, { ...how, headers: { ...how.headers, "x-ambid": CLIENT } });
-  } catch { banner("OLD: the console does not answer. Runs go on; start 'ambid console' again"); throw new Error("no answer"); }
+    gone = false;
+  } catch { gone = true; lookOld(); throw new Error("no answer"); }
   const found = (answer.headers.get("content-type") ?? "").includes("json") ? await answer.json() : { error: (await answer.text()).trim() };
   if (!answer.ok) throw new Error(found.error ?? answer.statusText);
   return found;
 }
+let gone = false;  // whether the console itself is silent
 function banner(text, kind = "") {
-  $("banner").textContent = text; $("banner").className = kind; $("banner").hidden = !text;
+  const host = $("banner");
+  if (host.dataset.text === text) return;
+  host.dataset.text = text; host.className = kind; host.hidden = !text;
+  put(host, text, kind || feed?.over ? el("button", { onclick: () => { if (feed) feed.lost = false; banner(""); } }, "Close") : null);
 }
+// What is shown is not now: the console, the run's process, or the samples are silent. It outdoes every other banner.
+function lookOld() {
+  const why = gone ? "the console does not answer. Runs go on; start 'ambid console' again" : feed?.old() ?? "";
+  if (why) banner(`OLD: ${why}`);
+  else if ($("banner").dataset.text?.startsWith("OLD: ")) banner("");
+  const not = refused(!(feed instanceof Live) ? "no live run is shown" : feed.over ? "the run is over" : !feed.following ? "nothing is tracked now" : why && "the run is silent");
+  for (const button of document.querySelectorAll("[data-say]")) { button.disabled = not !== ""; button.title = not && `Not now: ${not}`; }
+  if (feed?.asked) feed.pose();
+}
+const refused = (why) => state.read_only ? "this console is read only" : state.driver === "another page" ? "another page has the machine" : why || "";
 const trouble = (error) => banner(error.message, "note");
 function confirmed(question, yes = "Yes") {
   const dialog = $("ask");
@@ -94,7 +109,7 @@ async function refresh() {
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
   const moving = state.runs.find((r) => r.alive && MOVING.includes(r.spec.job));
-  if (moving && feed?.id !== moving.id && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
+  if (moving && (feed?.id !== moving.id || feed.lost) && !attached.has(moving.id)) { attached.add(moving.id); watch(moving); }
 }
 const attached = new Set();
 const when = (s) => { const d = new Date(1000 * s); return d.toDateString() === new Date().toDateString() ? d.toTimeString().slice(0, 8) : d.toISOString().slice(0, 10); };
@@ -106,6 +121,7 @@ function fill(body, things, cells, chosen, key) {
     const pick = () => chosen(thing);
     const row = el("tr", { tabIndex: 0, onclick: pick, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
     row.append(...cells(thing).map((c, k) => el("td", { className: k ? (c === thing.verdict ? thing.verdict : "") : "name" }, String(c))));
+    if (thing.why) row.lastChild.append(el("div", { className: "hint why", title: thing.why }, thing.why));
     return row;
   }));
 }
@@ -160,8 +176,8 @@ async function job(spec, host, told) {
   host.append(line);
   bar.removeAttribute("value");
   try {
-    const { id } = await ask("/api/runs", spec);
-    cancel.onclick = () => ask(`/api/runs/${id}/say`, { word: "stop" }).catch(trouble);
+    const place = spec.job === "preview" ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
+    cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
       if (m.kind === "progress") {
         if (m.done === null) bar.removeAttribute("value"); else bar.value = m.done;
@@ -299,11 +315,30 @@ function strip(title, t, low, high, height = 110, unit = title.match(/\[(.*)\]/)
   return made;
 }
 
+// A run that is watched: it is silent where its process is frozen, also while it only waits.
+class Watched {
+  constructor(run) { Object.assign(this, { id: run.id, alive: run.alive, last: performance.now(), began: false, over: false, lost: false, sampled: Infinity }); }
+  listen() {
+    this.socket = listen(this.id, (m) => {
+      this.last = performance.now(); this.began = true;
+      if (m.kind === "end") { this.over = true; this.lost = this.alive && m.how === "lost"; if (this.lost) attached.delete(this.id); }
+      this.tell(m);
+    }, (data, at) => this.envelope?.(data, at));
+  }
+  old() {
+    const now = performance.now(), silent = (now - this.last) / 1000, dry = (now - this.sampled) / 1000;
+    if (this.lost) return "the run broke off. What is shown is not now";
+    if (!this.over && this.alive && silent > (this.began ? SILENT_S : START_S)) return `the run has been silent for ${silent.toFixed(0)} s, as if its process were frozen. What is shown is not now`;
+    return !this.over && this.alive && dry > OLD_S ? `no sample came for ${dry.toFixed(0)} s. What is shown is not now` : "";
+  }
+}
+
 // The live view.
 let feed = null;
-class Live {
-  constructor(id) {
-    Object.assign(this, { id, signals: null, header: null, strips: [], parameters: {}, frozen: false, marked: null, last: performance.now(), over: false, record: null });
+class Live extends Watched {
+  constructor(run) {
+    super(run);
+    Object.assign(this, { signals: null, header: null, strips: [], parameters: {}, frozen: false, following: false, marked: null, record: null, wanted: run.spec.seconds ?? Infinity });
     this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
     $("live-view").hidden = false;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
@@ -311,18 +346,17 @@ class Live {
     for (const host of ["lag", "count", "lost"]) put($(host));  // nothing of the run before stands as this one's
     freeze(this, false);
     this.unmark();
-    this.socket = listen(id, (m) => this.tell(m), (data, at) => this.envelope(data, at));
+    this.listen();
     this.draw = this.draw.bind(this);
     requestAnimationFrame(this.draw);
   }
   tell(m) {
-    this.last = performance.now();
-    const how = { signals: () => this.begin(m), header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
+    const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
       event: () => this.event(m.t, m.what, m.why), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
-      recorded: () => { this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
-      end: () => { this.over = true; $("state").textContent = m.how === "done" ? "over" : m.how; $("state").className = `badge ${m.how}`; if (m.why) this.event(null, m.how, m.why); refresh().catch(() => {}); } }[m.kind];
+      recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
+      end: () => { $("state").textContent = m.how === "done" ? "over" : m.how === "lost" ? "broke off" : m.how; $("state").className = `badge ${m.how}`; if (m.why) this.event(null, m.how, m.why); refresh().catch(() => {}); } }[m.kind];
     how?.();
   }
   begin(m) {
@@ -355,6 +389,7 @@ class Live {
     const most = 130_000;
     if (this.t.length > most) { const cut = this.t.length - 100_000; this.t.splice(0, cut); for (const a of [...this.low, ...this.high]) a.splice(0, cut); }
     this.fresh = wall; this.last = performance.now(); this.dirty = true;
+    this.sampled = end >= this.wanted - 0.1 ? Infinity : this.last;  // after the last sample none is missed
     this.samples = Number(view.getBigUint64(at, true)) + n * group; this.lost = lost;
   }
   start(m) {
@@ -395,9 +430,6 @@ class Live {
   }
   draw() {
     if (feed !== this) return;
-    const age = (performance.now() - this.last) / 1000;
-    if (!this.over && this.signals && age > OLD_S) banner(`OLD: nothing came for ${age.toFixed(0)} s. What is shown is not now`);
-    else if ($("banner").textContent.startsWith("OLD: nothing")) banner("");
     if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
       if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines();
@@ -472,9 +504,10 @@ $("commission-form").elements.out.value = `commission-${stamp()}`;
 
 function watch(run) {
   attached.add(run.id);
-  if (run.spec.job === "live") { feed?.socket?.close(); feed = null; feed = new Live(run.id); open("live"); }
-  else if (run.spec.job === "commission") { feed?.socket?.close(); feed = new Steps(run.id); open("commission"); }
-  else past(run);
+  if (!MOVING.includes(run.spec.job)) return past(run);
+  feed?.socket?.close(); feed = null;
+  feed = run.spec.job === "live" ? new Live(run) : new Steps(run);
+  open(run.spec.job); lookOld();
 }
 function past(run) {
   const detail = $("detail"), host = el("div");
@@ -487,7 +520,7 @@ function past(run) {
     else if (m.kind === "end") { if (!found || m.why) host.append(el("p", { className: m.how }, m.why || m.how)); socket.close(); }
   });
 }
-const word = (w) => feed && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(trouble);
+const word = (w) => feed instanceof Live && ask(`/api/runs/${feed.id}/say`, { word: w }).catch(trouble);
 for (const button of document.querySelectorAll("[data-say]")) {
   button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
 }
@@ -519,11 +552,12 @@ addEventListener("keydown", (e) => {
 });
 
 // Commissioning.
-class Steps {
-  constructor(id) {
-    this.id = id; this.items = {}; this.over = false;
+class Steps extends Watched {
+  constructor(run) {
+    super(run);
+    this.items = {}; this.done = new Set();
     $("steps").replaceChildren();
-    this.socket = listen(id, (m) => this.tell(m));
+    this.listen();
   }
   item(name) {
     return this.items[name] ??= $("steps").appendChild(el("li", {}, el("strong", {}, name), " ", el("span", { className: "hint" }, "waits")));
@@ -532,29 +566,40 @@ class Steps {
   tell(m) {
     const how = {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
-      progress: () => this.at && !this.done?.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
-      step: () => this.step(m), note: () => this.last(el("p", { className: "hint" }, m.text)), ask: () => this.question(m),
-      commissioned: () => { const words = m.passed ? "Commissioned: every step is good enough." : "Ended early."; this.last(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.last(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.last(link(f)); }).catch(() => {}); },
-      end: () => { this.over = true; if (m.why) this.last(el("p", { className: m.how, role: "alert" }, m.why)); refresh().catch(() => {}); },
+      progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
+      step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
+      commissioned: () => { const words = m.passed ? "Commissioned: every step is good enough." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); }).catch(() => {}); },
+      end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); if (m.why) this.append(el("p", { className: m.how, role: "alert" }, m.why)); refresh().catch(() => {}); },
     }[m.kind];
     how?.();
   }
-  last(node) { $("steps").append(el("div", {}, node)); }
+  append(node, once) { if (!once || !$("steps").querySelector(`.${once}`)) $("steps").append(el("div", { className: once ?? "" }, node)); }
   step(m) {
-    (this.done ??= new Set()).add(m.name);
+    this.done.add(m.name);
     const pictures = el("div", { className: "pictures" }, ...m.pictures.map((p) => el("figure", {}, el("img", { src: `data:image/png;base64,${p.png}`, alt: p.title, loading: "lazy" }), el("figcaption", { className: "caption" }, p.caption))));
     put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
       ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
       m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
   }
-  async question(m) {
-    if (!m.what || this.over) { if ($("ask").open) $("ask").close("no"); return; }
+  question(m) {
+    this.asked = m.what && !this.over ? m : null;
+    if (!this.asked && this.posed) { this.posed = null; $("ask").close("no"); }
+    lookOld();
+  }
+  async pose() {  // to whom may answer; what was answered elsewhere meanwhile is not answered again
+    const m = this.asked, not = refused();
+    if (this.posed === m.number) return;
+    if (not) { this.append(el("p", { className: "hint" }, `It asks whether ${m.what} may begin; ${not}.`), "asks"); return; }
+    this.posed = m.number;
     const yes = await confirmed(`Next step: ${m.what}. The controller will switch its output on; the rotor may move. Is the bench clear, and the emergency stop within reach?`, "Go");
-    word(yes ? "go" : "no");
+    if (this.posed !== m.number) return;
+    this.asked = this.posed = null;
+    ask(`/api/runs/${this.id}/say`, { word: yes ? "go" : "no", number: m.number }).catch(trouble);
   }
 }
 
 if (["files", "live", "commission"].includes(location.hash.slice(1))) open(location.hash.slice(1));
 refresh().catch(trouble);
-setInterval(() => { if (!document.hidden) refresh().then(() => $("banner").textContent.startsWith("OLD: the console") && banner("")).catch(() => {}); }, 2000);
+setInterval(() => { if (!document.hidden) refresh().catch(() => {}); }, 2000);
+setInterval(lookOld, 250);
 window.ambidConsole = { get feed() { return feed; } };  // for tests and the curious
