@@ -17,8 +17,10 @@ pytest.importorskip("uvicorn", reason="the extra [console] is not installed")
 from ambid.console.envelope import spectrum
 from ambid.console.feed import FeedReader, FeedWriter, json_frames, whole_frames
 from ambid.console.runs import Runs
+from ambid.errors import AmbidError
 from ambid.job import load
 from ambid.record import read_record
+from ambid.rig import rig_from_text
 from tests.console.pages import console, prototype_rig, told, until
 
 
@@ -139,14 +141,36 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
         assert told(seen, "result")[0]["verdict"] == load(tmp_path / "found.json").verdict.word
         assert {"found.json", "found.html"} <= {f["name"] for f in page.state()["files"]}
         assert page.json("POST", "/api/runs", wish)["error"].startswith("found.json already exists")
-        wrong = {"job": "rig", "text": 'schema = "ambid.rig/1"\nmodle = "x"', "out": "wrong"}
-        end = told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wrong)["id"])), "end")[0]
-        assert end["how"] == "refused"
-        assert "modle" in end["why"]
-        while any(r["alive"] for r in page.state()["runs"]):
-            time.sleep(0.05)
-        assert [r["why"] for r in page.state()["runs"] if r["end"] == "refused"] == [end["why"][:400]]
-        assert not (tmp_path / "wrong.toml").exists()
+        for text, why in (('modle = "x"', "modle"), (ELSEWHERE.format("/etc/passwd"), "is outside of")):
+            wrong = {"job": "rig", "text": f'schema = "ambid.rig/1"\n{text}', "out": "wrong"}
+            end = told(until(Runs(tmp_path).one(page.json("POST", "/api/runs", wrong)["id"])), "end")[0]
+            assert end["how"] == "refused"
+            assert why in end["why"]
+            while any(r["alive"] for r in page.state()["runs"]):
+                time.sleep(0.05)
+            assert end["why"][:400] in [r["why"] for r in page.state()["runs"] if r["end"] == "refused"]
+            assert not (tmp_path / "wrong.toml").exists()
+
+
+ELSEWHERE = 'model = "one-axis"\n[channels.voltage]\ncolumn = "duty"\ntable = "{}"\n'
+
+
+@pytest.mark.parametrize(
+    "name", ["../outside.csv", "{outside}", "linked.csv", "sub/../../outside.csv", "way/outside.csv"]
+)
+def test_tables_of_a_rig_lie_in_the_folder(tmp_path, monkeypatch, name):
+    shown, outside = tmp_path / "shown", tmp_path / "outside.csv"
+    (shown / "sub").mkdir(parents=True)
+    outside.write_text("duty [1],voltage [V]\n0,0\n1,12\n", encoding="utf-8")
+    shutil.copy(outside, shown / "inside.csv")
+    (shown / "linked.csv").symlink_to(outside)
+    (shown / "way").symlink_to(tmp_path)
+    monkeypatch.setattr("ambid.record.calibration.INSIDE", [shown])
+    rig = f'schema = "ambid.rig/1"\n{ELSEWHERE}'
+    with pytest.raises(AmbidError, match="is outside of"):
+        rig_from_text(rig.format(name.format(outside=outside)), shown / "rig.toml")
+    with pytest.raises(AmbidError, match=r"channels\.(current|position)"):  # the table is none of its faults
+        rig_from_text(rig.format("sub/../inside.csv"), shown / "rig.toml")
 
 
 def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):

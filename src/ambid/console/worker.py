@@ -26,6 +26,7 @@ from ambid.console.feed import FeedWriter
 from ambid.console.folder import plain
 from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
+from ambid.record.calibration import INSIDE
 
 _LISTEN_S = 0.02
 _BEAT_S = 0.5  # between two signs of life
@@ -54,6 +55,7 @@ class Worker:
         """Do the job, and tell how it ended; the exit code."""
         for number in (signal.SIGINT, signal.SIGTERM):
             signal.signal(number, lambda *_: self.wished.set())
+        INSIDE.append(self.folder)
         self.run.claim()
         self.feed.tell("begin", {"job": self.spec["job"], "wall": time.time()}, sticky="begin")
         threading.Thread(target=self._listen, name="operator", daemon=True).start()
