@@ -6,10 +6,13 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 
+import ambid
+from ambid.errors import RigError
 from ambid.job.identification import identify_nonlinear
 from ambid.physics.presets import preset
 from ambid.rig import preset_text, rig_from_text
 from ambid.simulation import simulate_rig
+from tests.job.benches import PROTOTYPE_FILE
 
 HEAD = """schema = "ambid.rig/1"
 model = "one-axis"
@@ -117,3 +120,9 @@ def test_what_is_simulated_is_found_again(text, bench, how, names) -> None:
     assert estimate.law.gap == ("exponential" if text is BALL else "hyperbolic")
     found_again(estimate, done[0].truth, names)
     assert all(check.passed for check in estimate.checks.values())
+
+
+def test_a_controllers_rig_is_simulated_at_its_rate_and_names_its_magnet():
+    with pytest.raises(RigError, match=r"no value for k_x, k_i, L; .* Simulate its \[magnet\] \(--nonlinear"):
+        ambid.simulate(PROTOTYPE_FILE, duration=0.1)
+    assert ambid.simulate(PROTOTYPE_FILE, duration=0.1, nonlinear=True).rate_hz == 2000.0

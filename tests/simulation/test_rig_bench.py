@@ -82,7 +82,7 @@ def test_loop_opens_on_request(rig: Rig) -> None:
 def test_what_the_rig_lacks_is_named(rig: Rig) -> None:
     u = np.zeros(5)
     bare = tuple(replace(p, value=None, role="free") if p.name in ("R", "L") else p for p in rig.parameters)
-    with pytest.raises(RigError, match=r"no value for .*R, L; a simulation"):
+    with pytest.raises(RigError, match=r"no value for .*R, L; a linear simulation"):
         simulate_rig(replace(rig, parameters=bare), u, rate_hz=2000.0, seed=1)
     with pytest.raises(RigError, match=r"no \[loop\]"):
         simulate_rig(replace(rig, loop=None), u, rate_hz=2000.0, seed=1, closed=True)

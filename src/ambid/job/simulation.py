@@ -282,11 +282,7 @@ def _bench(
         return Bench.of(source, rate, source.usually_closed if closed is None else closed, nonlinear=nonlinear)
     if position is not None:
         source = replace(source, operating_point={**source.operating_point, "position": position})
-    if rate is None and source.rate_hz is None:
-        raise AmbidError(
-            f"rig {source.source or source.name} gives no rate; a simulation needs one. Give --rate HZ, or "
-            "record.rate_hz"
-        )
+    rate = source.rate_for(rate)
     if source.rotor is not None:
         if position is not None:
             raise AmbidError("--position is for one axis. Omit it")

@@ -282,9 +282,24 @@ class Rig:
 
     @property
     def rate_hz(self) -> float | None:
-        """Sampling rate that the rig gives: of its records, else of the law of its loop."""
+        """Sampling rate that the rig gives: of its records, else of the law of its loop, else of its controller."""
         law = None if self.loop is None else self.loop.law
-        return self.record.rate_hz if self.record.rate_hz is not None or law is None else law.rate_hz
+        return next((x.rate_hz for x in (self.record, law, self.daq) if x is not None and x.rate_hz is not None), None)
+
+    def rate_for(self, rate_hz: float | None) -> float:
+        """Return the rate in Hz of a simulation: `rate_hz` where it is given, else the rig's own.
+
+        Raises
+        ------
+        RigError
+            If neither is given.
+        """
+        if (rate := self.rate_hz if rate_hz is None else rate_hz) is None:
+            raise RigError(
+                f"rig {self.source or self.name} gives no rate; a simulation needs one. Give --rate HZ (rate_hz), or "
+                "record.rate_hz"
+            )
+        return rate
 
     def channel(self, role: str) -> RigChannel:
         """Return the channel of a role.

@@ -319,14 +319,9 @@ class Bench:
                 point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
             )  # fmt: skip
         plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
-        rate = source.rate_hz if rate_hz is None else rate_hz
-        if rate is None:
-            raise RigError(
-                f"rig {source.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz"
-            )
         return cls(
             name=source.name, plant=plant, loop=found or Loop(), limits=source.limits or Limits(),
-            noise=source.noise or Noise(), point=point, rate_hz=rate, rig=source,
+            noise=source.noise or Noise(), point=point, rate_hz=source.rate_for(rate_hz), rig=source,
         )  # fmt: skip
 
     @property
@@ -400,8 +395,12 @@ def parts_of_rig(
     missing = [name for name in values if name not in parameters]
     if missing:
         raise RigError(
-            f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a simulation needs every parameter. Give"
-            " value = ..."
+            f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a linear simulation needs every parameter. "
+            + (
+                "Simulate its [magnet] (--nonlinear, nonlinear=True), or give value = ..."
+                if rig.magnet
+                else "Give value = ..."
+            )
         )
     plant = LinearPlant(model=model(rig.model), parameters=parameters)
     rest = dict(rig.operating_point)

@@ -95,9 +95,7 @@ class RotorBench:
     def of(cls, rig: Rig, rate_hz: float | None, closed: bool | None, *, nonlinear: bool = False) -> RotorBench:
         """Return the bench of a rig with ``[bearings.X]``, as its records are taken unless `closed` says otherwise."""
         assert rig.rotor is not None
-        numbers, rate = rig.modes.numbers, rig.rate_hz if rate_hz is None else rate_hz
-        if rate is None:
-            raise RigError(f"rig {rig.name!r} gives no rate; a simulation needs one. Give the rate, or record.rate_hz")
+        numbers, rate = rig.modes.numbers, rig.rate_for(rate_hz)
         values = {p.name: p.value for p in rig.parameters if p.value is not None}
         n = sum(name.endswith(".omega") for name in numbers)
         if rig.shaft is not None:  # of a rig that gives its modes, the drawing gives the rigid motion alone
