@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from ambid.job import design_experiment as design_experiment
     from ambid.job import fit as fit
     from ambid.job import frf as frf
+    from ambid.job import history as history
     from ambid.job import identify as identify
     from ambid.job import identify_nonlinear as identify_nonlinear
     from ambid.job import info as info
@@ -49,8 +50,8 @@ if TYPE_CHECKING:
     from ambid.simulation import simulate_rig as simulate_rig
 
 _ROOMS = (
-    "bearing", "blackbox", "control", "errors", "estimation", "job", "nonlinear", "physics", "record", "recursive",
-    "report", "rig", "signals", "simulation", "tracking", "units", "validation",
+    "bearing", "blackbox", "control", "errors", "estimation", "job", "ledger", "nonlinear", "physics", "record",
+    "recursive", "report", "rig", "signals", "simulation", "tracking", "units", "validation",
 )  # fmt: skip
 
 _exported, __dir__, __all__ = exports(__name__)

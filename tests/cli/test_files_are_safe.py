@@ -4,7 +4,9 @@ import pytest
 
 from ambid.acquisition.recorder import Recorder
 from ambid.cli import run
+from ambid.ledger import open_ledger
 from tests.acquisition.recorder.signals import block, header
+from tests.ledger.entries import entry
 
 MEASURED = "time [s],voltage [V],current [A],position [m]\n0,1,2,3\n"
 RECORD = ("simulate", "thesis", "--duration", "0.3", "-o")
@@ -20,6 +22,8 @@ def made(tmp_path_factory):
         ("init", "--preset", "prototype", "-o", folder / "rig.toml"),
     ):
         assert run([str(word) for word in words]) == 0
+    with open_ledger(folder / "l.db") as ledger:
+        ledger.add([entry()])
     return folder
 
 
@@ -28,6 +32,7 @@ VERBS = {
     "init": ("init", "r.csv", "-o"),
     "identify": ("identify", "r.csv", "--json"),
     "validate": ("validate", "e.json", "r.csv", "--json"),
+    "history": ("history", "A", "--ledger", "l.db", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),
     "design controller": ("design", "controller", "e.json", "--rig", "rig.toml", "--out"),

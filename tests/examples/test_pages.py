@@ -175,6 +175,18 @@ def test_the_way_to_a_better_loop_can_be_gone(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "better.toml").exists()
 
 
+def test_the_page_on_the_ledger_runs(tmp_path, monkeypatch, capsys):
+    from ambid.cli.app import run_verb
+
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "ledger.md"
+    for line in "".join(blocks(page, "sh")).splitlines():
+        assert run_verb(shlex.split(line)[1:]) == 0, line
+    assert "pump 1: 2 estimates, 2026-03-02 06:00 to 2026-03-03 06:00 UTC" in capsys.readouterr().out
+    exec(compile(blocks(page, "python")[0], "ledger.md", "exec"), {})
+    assert {"history.png", "history.html", "tables"} <= {p.name for p in tmp_path.iterdir()}
+
+
 def test_the_quickstart_has_commands_of_the_readme_and_its_python_runs(tmp_path, monkeypatch, capsys):
     import ambid
 

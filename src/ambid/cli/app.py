@@ -21,6 +21,7 @@ from ambid.cli import (
     export,
     fit,
     frf,
+    history,
     identify,
     info,
     init,
@@ -49,6 +50,7 @@ app.command("commission", short_help="go from a controller to tracked parameters
 app.command("console", short_help="watch, commission and judge a bearing in the browser")(console.command)
 app.command("track", short_help="track parameters through a record, as on-line")(track.command)
 app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
+app.command("history", short_help="show a bearing over time, from a ledger")(history.command)
 app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")
 app.command("export", short_help="write an identified plant for other programs")(export.command)
 app.command("recover", short_help="recover a recording that was cut off")(recover.command)

@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -13,6 +14,7 @@ import typer
 
 from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
+from ambid.cli.keeping import Bearing, LedgerPlace, keeping
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import painter, say_note, watching
@@ -45,6 +47,8 @@ def command(
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
+    ledger: LedgerPlace = None,
+    bearing: Bearing = None,
     redesign: Annotated[
         bool, switch("--redesign", "Design a better loop, load it on trial, and measure again.")
     ] = False,
@@ -56,6 +60,7 @@ def command(
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
     what was found up to there stays in the folder. A real bench is asked for before its output is switched on.
     """
+    from ambid.estimation.estimate import plain_json
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
@@ -86,6 +91,12 @@ def command(
     begun: list[StepName] = []
     behind = None if bench is None else opt.preset_of(bench) or bench
     opening = opened(port, known, bench=behind, pace=pace, seed=seed, closes=not force, note=say_note)
+    shelf = partial(
+        keeping, ledger, [folder / "record.h5"], rig, bearing=bearing, job="commission", taken_now=True,
+        **plain_json(plan),
+    )  # fmt: skip
+    with shelf():  # refused before the rotor moves
+        pass
     with watching() as watch, signals(stop.take), opening as device:
         new = _make(folder)
 
@@ -134,6 +145,9 @@ def command(
         outputs.give(done)
     if json == "-":
         outputs.show(done)
+    if done.estimate is not None:
+        with shelf() as store:
+            store(done.estimate)
     name, command, passed = last[-1].name, "", done.passed
     if passed:
         volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")

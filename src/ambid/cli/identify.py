@@ -12,6 +12,7 @@ import typer
 
 from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, interruptible, signals
+from ambid.cli.keeping import Bearing, LedgerPlace, TakenAt, keeping
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
@@ -96,6 +97,9 @@ def command(
         Path | None,
         option("--export FILE", "Write the plant for other programs, as 'ambid export' does."),
     ] = None,
+    ledger: LedgerPlace = None,
+    bearing: Bearing = None,
+    taken_at: TakenAt = None,
     strict: opt.Strict = False,
 ) -> None:
     """Identify the physical parameters of a bench from a record of voltage, current and position.
@@ -111,37 +115,40 @@ def command(
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
-    with Outputs(*records, *kept, rig, second, experiment, json=json, plot=plot, report=report) as outputs:
-        opt.refuse_twice([*records, *kept])
-        outputs.claim(export, "--export", EXPORT_ENDINGS)
-        if nonlinear:
-            if off_below is not None and not isfinite(off_below):
-                raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
-            refuse_given({"--speed": speed}, "{} is for rotors with a linear model. Omit {}")
-            refuse_given({"--experiment": experiment}, "{} is for the linear model. Omit {}")
-        else:
-            refuse_given(
-                {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
-                "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
-            )
-        with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
-            estimate: Estimate | NonlinearBearingEstimate | RotorEstimate = (
-                job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
-                if nonlinear
-                else job.identify(list(records), rig, speed_rpm=speed, experiment=experiment, tick=show, **how)
-            )
-            stop.torn()
-            outputs.give(estimate, show)
-            refused: AmbidError | None = None
-            if export is not None:
-                try:
-                    outputs.stage(export, partial(write_plant, estimate, name=export.stem))
-                except EstimationError as error:  # the estimate is given all the same
-                    refused = error
-    outputs.show(estimate)
+    asked = {**how, **own, "nonlinear": nonlinear, "held": len(kept), "speed_rpm": speed, "experiment": experiment}
+    with keeping(ledger, [*records, *kept], rig, bearing=bearing, taken_at=taken_at, job="identify", **asked) as store:
+        with Outputs(*records, *kept, rig, second, experiment, json=json, plot=plot, report=report) as outputs:
+            opt.refuse_twice([*records, *kept])
+            outputs.claim(export, "--export", EXPORT_ENDINGS)
+            if nonlinear:
+                if off_below is not None and not isfinite(off_below):
+                    raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
+                refuse_given({"--speed": speed}, "{} is for rotors with a linear model. Omit {}")
+                refuse_given({"--experiment": experiment}, "{} is for the linear model. Omit {}")
+            else:
+                refuse_given(
+                    {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
+                    "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
+                )
+            with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:
+                estimate: Estimate | NonlinearBearingEstimate | RotorEstimate = (
+                    job.identify_nonlinear(records, rig, held=kept, tick=interruptible(show, stop), **own, **how)
+                    if nonlinear
+                    else job.identify(list(records), rig, speed_rpm=speed, experiment=experiment, tick=show, **how)
+                )
+                stop.torn()
+                outputs.give(estimate, show)
+                refused: AmbidError | None = None
+                if export is not None:
+                    try:
+                        outputs.stage(export, partial(write_plant, estimate, name=export.stem))
+                    except EstimationError as error:  # the estimate is given all the same
+                        refused = error
+        outputs.show(estimate)
+        search = getattr(estimate, "global_search", None)
+        if stop.wished() or (search is not None and search["interrupted"]):
+            raise typer.Exit(stop.code or INTERRUPTED)
+        store(estimate)
     if refused is not None:
         raise refused
-    search = getattr(estimate, "global_search", None)
-    if stop.wished() or (search is not None and search["interrupted"]):
-        raise typer.Exit(stop.code or INTERRUPTED)
     end(failed=strict and not estimate.passed)

@@ -132,11 +132,12 @@ class Follower:
         drawn: Path | None = None,
         strict: bool = False,
         flags: Sequence[tuple[float, Flag]] = (),
+        store: Callable[[Track], object] = repr,
     ) -> None:
         """Print the track, say what was interrupted or not reached, and end with the exit code.
 
         `drawn`: the figure of the track; `strict`: whether all but a usable one ends with exit code 3; `flags`: as
-        given.
+        given; `store`: takes a track that was not interrupted.
         """
         if self.track is None:
             if self.code:
@@ -157,6 +158,7 @@ class Follower:
             if t > end_s:
                 said = f"the last line is at {end_s:.6g} s. Give a time in the record"
                 print(f"ambid: --flag {t:g}:{flag} was not reached: {said}", file=sys.stderr)
+        store(self.track)
         end(failed=strict and not self.track.passed)
 
     def _abandon(self) -> None:

@@ -11,6 +11,7 @@ import typer
 
 from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED
+from ambid.cli.keeping import Bearing, LedgerPlace, TakenAt, keeping
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, json_path
 from ambid.errors import AmbidError, nearest
@@ -80,6 +81,9 @@ def command(
         option("--plot FILE.png", "Draw the tracks, with the truth if the record has columns true_NAME."),
     ] = None,
     report: opt.Report = None,
+    ledger: LedgerPlace = None,
+    bearing: Bearing = None,
+    taken_at: TakenAt = None,
     quiet: Annotated[bool, switch("--no-live --quiet", "No live view, even on a terminal.")] = False,
     strict: opt.Strict = False,
 ) -> None:
@@ -105,41 +109,43 @@ def command(
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:
         raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or omit it")
-    with Outputs(record, rig, start, plot=plot, report=report) as outputs:
-        outputs.claim(json_path(json), "--json")
-        bench = None if rig is None else load_rig(rig)
-        follower = Follower(
-            json, keep=plot is not None or report is not None, quiet=quiet, real_time=pace == "real-time"
-        )
-        follower.record, follower.rate_hz = record, rate
-
-        def begin(header: TrackHeader) -> None:
-            _check_interval(every, header.rate_hz)
-            follower.on_header(header)
-
-        follower.run(
-            lambda: track(
-                record,
-                bench,
-                method=method,
-                from_s=from_s,
-                to_s=to_s,
-                on_header=begin,
-                on_line=follower.on_line,
-                keep=False,
-                tick=follower.tick,
-                **how,
-                **given,
+    asked = {**how, **given, "method": method, "from_s": from_s, "to_s": to_s}
+    with keeping(ledger, [record], rig, bearing=bearing, taken_at=taken_at, job="track", **asked) as store:
+        with Outputs(record, rig, start, plot=plot, report=report) as outputs:
+            outputs.claim(json_path(json), "--json")
+            bench = None if rig is None else load_rig(rig)
+            follower = Follower(
+                json, keep=plot is not None or report is not None, quiet=quiet, real_time=pace == "real-time"
             )
-        )
-        if follower.track is not None:
-            try:
-                outputs.give(follower.track)
-            except KeyboardInterrupt:
-                kept = f"; {follower.path} holds the track" if follower.path else ""
-                print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
-                raise typer.Exit(INTERRUPTED) from None
-    follower.finish(outputs, drawn=plot, strict=strict, flags=times)
+            follower.record, follower.rate_hz = record, rate
+
+            def begin(header: TrackHeader) -> None:
+                _check_interval(every, header.rate_hz)
+                follower.on_header(header)
+
+            follower.run(
+                lambda: track(
+                    record,
+                    bench,
+                    method=method,
+                    from_s=from_s,
+                    to_s=to_s,
+                    on_header=begin,
+                    on_line=follower.on_line,
+                    keep=False,
+                    tick=follower.tick,
+                    **how,
+                    **given,
+                )
+            )
+            if follower.track is not None:
+                try:
+                    outputs.give(follower.track)
+                except KeyboardInterrupt:
+                    kept = f"; {follower.path} holds the track" if follower.path else ""
+                    print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
+                    raise typer.Exit(INTERRUPTED) from None
+        follower.finish(outputs, drawn=plot, strict=strict, flags=times, store=store)
 
 
 def _check_interval(every: float, rate_hz: float) -> None:

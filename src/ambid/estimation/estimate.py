@@ -422,15 +422,17 @@ def _array(dtype: Any, value: Any, at: str) -> Any:
     """Read numbers, null as NaN; text and truth values are no numbers. An array is taken as it is."""
     if isinstance(value, np.ndarray):
         return value
-    found = np.array(value)
+    found, kinds = np.array(value), get_args(dtype)
+    if kinds == (np.bool_,) and found.dtype.kind == "b":
+        return found
     if found.size and found.dtype.kind == "O":
         found = np.array(value, dtype=np.float64)  # null becomes NaN; anything else raises
     if found.size and found.dtype.kind not in "iuf":
         _refuse(value, at, "numbers")
-    if get_args(dtype) == (np.complex128,):
+    if kinds == (np.complex128,):
         pairs = found.astype(np.float64).reshape(-1, 2)
         return pairs[:, 0] + 1j * pairs[:, 1]
-    return found.astype(np.float64)
+    return found.astype(np.int64 if kinds == (np.int64,) and found.dtype.kind in "iu" else np.float64)
 
 
 def _number(value: Any, at: str) -> float:

@@ -67,7 +67,13 @@ def origin(record: Record) -> dict[str, object]:
         "sha256": record.provenance.get("sha256"),
         "file": record.provenance.get("file"),
         "history": [str(step) for step in record.history],
+        **began(record),
     }
+
+
+def began(record: Record) -> dict[str, str]:
+    """Return ``started``, when a record was taken, where it says so; else nothing."""
+    return {name: record.provenance[name] for name in ("started",) if name in record.provenance}
 
 
 Stretch = tuple[object, float, int, float]

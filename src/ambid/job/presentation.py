@@ -12,7 +12,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, EstimationError
+from ambid.errors import AmbidError, EstimationError, counted
 from ambid.estimation.estimate import EstimatedParameter, fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
@@ -585,7 +585,34 @@ def _design() -> View:
     )  # fmt: skip
 
 
+def _history() -> View:
+    from ambid.ledger.history import SCHEMA
+    from ambid.report.history_figures import dates, history_figure
+    from ambid.report.history_text import history_text
+
+    def table(h: Any) -> Table:
+        import numpy as np
+
+        n = len(h.estimates)
+        columns: dict[str, Any] = {"taken_at": dates(np.array([e.taken_at for e in h.estimates]))}
+        columns |= {name: [getattr(e, name) for e in h.estimates] for name in ("record", "verdict", "failed")}
+        for name, s in h.measured.items():
+            for what, values in ((name, s.value), (f"{name} sd", s.sd)):
+                columns[what] = np.full(n, np.nan)
+                columns[what][s.estimate] = values
+        return "taken_at", columns
+
+    def title(h: Any) -> str:
+        return f"{h.bearing}, history of {counted(len(h.estimates), 'estimate')}"
+
+    return View(
+        text=history_text, figure=lambda h, _, width: history_figure(h, title(h), width),
+        document=_fields_of(SCHEMA), table=table, title=title,
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
+    "History": _history,
     "RotorEstimate": _rotor,
     "Estimate": _estimate,
     "NonlinearBearingEstimate": _bearing,

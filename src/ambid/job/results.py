@@ -131,6 +131,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.comparison/1": _comparison,
     _EXPERIMENT: _whole("control.experiment", "Experiment", "design experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design controller"),
+    "ambid.history/1": _whole("ledger.history", "History", "history"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),

@@ -13,7 +13,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import EstimationError, RecordError, counted
 from ambid.estimation.estimate import Estimate
-from ambid.job.data import Reading, known_rig, load_bench
+from ambid.job.data import Reading, began, known_rig, load_bench
 from ambid.job.identification import identify_axis
 from ambid.job.results import read_linear_estimate
 from ambid.physics.linear_model import LinearModel, Parameter, model
@@ -53,7 +53,8 @@ class BenchRows:
     @property
     def origin(self) -> dict[str, object]:
         """Where the record came from."""
-        return {"file": self.record.provenance.get("file"), "sha256": self.record.provenance.get("sha256")}
+        said = self.record.provenance
+        return {"file": said.get("file"), "sha256": said.get("sha256"), **began(self.record)}
 
     def clean_part(self, n: int, *, begin_anywhere: bool) -> tuple[Record, int]:
         """Return the first clean stretch, and the number of the sample after it.

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import version as installed
@@ -14,7 +13,8 @@ from typing import Any
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError
-from ambid.estimation.estimate import EstimatedParameter
+from ambid.estimation.estimate import EstimatedParameter, plain_json
+from ambid.recursive.lines import Track, is_vague
 from ambid.rig import Rig, rig_text
 
 
@@ -93,68 +93,95 @@ def entry_of(
     result: Any,
     *,
     bearing: str,
-    taken_at: float,
     sha: str,
     rig: Rig,
     settings: str,
     job: str = "identify",
+    taken_at: float | None = None,
     document: str = "",
-    events: Sequence[Note] = (),
 ) -> Entry:
     """Return what a ledger keeps of a result.
 
     Parameters
     ----------
-    result : Estimate, RotorEstimate, NonlinearBearingEstimate, Margins, BlackBoxFit or NonlinearFit
+    result : Result
+        Estimate, track, margins or fit.
     bearing : str
         Its name; of a rotor the machine's.
-    taken_at : float
-        When the record was taken, s since 1970, UTC.
     sha : str
-        SHA-256 of the record.
+        SHA-256 of the record, `sha_of`.
     rig : Rig
         Through which it was read.
     settings : str
         As `settings_text` writes them.
     job : str, optional
         The verb.
+    taken_at : float, optional
+        When the record was taken, s since 1970, UTC; default: what the record says itself.
     document : str, optional
         The result's JSON.
-    events : sequence of Note, optional
 
     Returns
     -------
     Entry
+        Of a track its last values, and its changes as events.
 
     Raises
     ------
     AmbidError
-        If bearing or time is missing.
+        If the bearing has no name, or nothing says when the record was taken.
     """
-    if not bearing.strip():
+    name = " ".join(bearing.split())
+    if not name:
         raise AmbidError("the bearing has no name. Give --bearing NAME, or a name in the rig")
-    if not math.isfinite(taken_at):
-        raise AmbidError(f"the record's time is {taken_at}; it must be a number of seconds since 1970. Correct it")
-    about: Mapping[str, object] = getattr(result, "record", None) or (getattr(result, "records", None) or ({},))[0]
+    track = isinstance(result, Track)
+    of = result.header if track else result
+    about: Mapping[str, object] = getattr(of, "record", None) or (getattr(of, "records", None) or ({},))[0]
+    began = _time_of(about) if taken_at is None else taken_at
+    changes = result.totals.changes if track else ()
+    model = getattr(of, "model", None)
     return Entry(
-        bearing=" ".join(bearing.split()), taken_at=taken_at, sha=sha, rig_sha=rig_sha_of(rig), settings=settings,
-        version=installed("ambid"), job=job, record=str(about.get("file") or ""),
-        status=getattr(result, "status", "converged"), verdict=result.verdict.word,
-        model=getattr(result, "model", "") if isinstance(getattr(result, "model", ""), str) else result.structure,
-        failed=tuple(dict.fromkeys(r.check for r in result.verdict.reasons)), parameters=_parameters(result),
+        bearing=name, taken_at=began, sha=sha, rig_sha=rig_sha_of(rig), settings=settings, version=installed("ambid"),
+        job=job, record=str(about.get("file") or ""), status=getattr(result, "status", "converged"),
+        verdict=result.verdict.word, model=model if isinstance(model, str) else str(getattr(of, "structure", "")),
+        failed=tuple(dict.fromkeys(r.check for r in result.verdict.reasons)),
+        parameters=_tracked(result) if track else _parameters(result),
         covariance_names=getattr(result, "covariance_names", ()), covariance=getattr(result, "covariance", None),
-        document=document, rig_name=rig.name, rig=_rig_text(rig), events=tuple(events),
+        document=document, rig_name=rig.name, rig=_rig_text(rig),
+        events=tuple(Note(at=began + e.t, kind=e.kind, text=e.why, parameter=e.parameter or "") for e in changes),
     )  # fmt: skip
+
+
+def _time_of(about: Mapping[str, object]) -> float:
+    """Return when a record says that it was taken."""
+    if not about.get("started"):
+        raise AmbidError(
+            f"{about.get('file') or 'the record'} does not say when it was taken, and the ledger has to know. Give "
+            "--taken-at TIME, or --taken-at file for the time of its file"
+        )
+    return moment(str(about["started"]), "the record's time")
 
 
 def _parameters(result: Any) -> tuple[EstimatedParameter, ...]:
     """Return the numbers of a result: its parameters, bending modes, and the peak of the sensitivity by axis."""
     found = [*getattr(result, "parameters", ()), *getattr(result, "mode_parameters", ())]
     for axis, s in (getattr(result, "sensitivity", None) or {}).items():
-        peak = s["peak_db"] if isinstance(s, Mapping) else s.peak_db
-        number = peak if isinstance(peak, Mapping) else {n: getattr(peak, n) for n in peak.__slots__}
-        found.append(EstimatedParameter(name=f"{axis}.sensitivity", unit="dB", role="free", **number))
+        peak = plain_json(s)["peak_db"]
+        ends = dict(peak, ci95=tuple(peak["ci95"]))
+        found.append(EstimatedParameter(name=f"{axis}.sensitivity", unit="dB", role="free", **ends))
     return tuple(found)
+
+
+def _tracked(track: Track) -> tuple[EstimatedParameter, ...]:
+    """Return the last values of a track; one that was frozen for want of information is not identifiable."""
+    last = track.lines[-1].parameters if track.lines else {}
+    return tuple(
+        EstimatedParameter(
+            name=name, unit=x.unit, value=x.value, sd=x.sd, ci95=x.ci95, role="free",
+            identifiable=not v.stale and not is_vague(v),
+        )
+        for name, v in last.items() for x in (track[name],)
+    )  # fmt: skip
 
 
 def key_of(sha: str, rig_sha: str, settings: str, version: str | None = None) -> str:
@@ -186,7 +213,10 @@ def _rig_text(rig: Rig) -> str:
 
 
 def settings_text(job: str, **settings: object) -> str:
-    """Return a job and its options as text; what was not given (None, False, nothing) does not count."""
+    """Return a job and its options, named as the job's function has them; what was not given does not count.
+
+    A file among them stands there as its `sha_of`.
+    """
     given = {name: x for name, x in settings.items() if x is not None and x is not False and x not in ((), [], {})}
     return json.dumps({"job": job, **given}, sort_keys=True, default=str, separators=(",", ":"))
 

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import islice, pairwise, zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.errors import AmbidError, EstimationError, counted, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.ledger import schema
 from ambid.ledger.entry import Note
@@ -20,6 +21,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
 SCHEMA = "ambid.history/1"
+_SHOWN = 3  # lines of a rig that changed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,7 +54,7 @@ class Series:
     role: str
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True)
 class KnownEstimate:
     """One estimate of a history."""
 
@@ -103,6 +105,11 @@ class History(Result):
         never = all(e.verdict == "unusable" for e in self.estimates)
         return (Reason(check="latest", text=f"{text}. Look at it, or take another record", grave=never),)
 
+    @property
+    def measured(self) -> dict[str, Series]:
+        """The series that were estimated: fixed numbers are left out."""
+        return {name: s for name, s in self.series.items() if s.role != "fixed"}
+
     def __getitem__(self, name: str) -> Series:
         if name not in self.series:
             known = list(self.series)
@@ -115,7 +122,7 @@ class History(Result):
 
 def history_of(c: Connection, bearing: str, shown: str) -> History:
     """Read the history of a bearing; `shown`: name of the ledger."""
-    from sqlalchemy import select
+    from sqlalchemy import Integer, func, select, type_coerce
 
     t = schema.tables().tables
     b, e, v, n = (t[name].c for name in ("bearing", "estimate", "value", "event"))
@@ -127,46 +134,82 @@ def history_of(c: Connection, bearing: str, shown: str) -> History:
             "lists them"
         )
     asked = [getattr(e, name) for name in KnownEstimate.__slots__]
-    rows = c.execute(select(e.id, *asked).where(e.bearing == known.id).order_by(e.taken_at, e.id)).all()
-    estimates = tuple(KnownEstimate(**dict(zip(KnownEstimate.__slots__, row[1:], strict=True))) for row in rows)
-    place = {row[0]: k for k, row in enumerate(rows)}
-    lines = c.execute(
-        select(v.name, v.taken_at, v.estimate, v.value, v.sd, v.identifiable, v.unit, v.role)
-        .where(v.bearing == known.id).order_by(v.name, v.taken_at, v.estimate)
-    ).all()  # fmt: skip
-    events = c.execute(select(n.at, n.kind, n.text, n.parameter).where(n.bearing == known.id).order_by(n.at)).all()
-    notes = [Note(at=x.at, kind=x.kind, text=x.text, parameter=x.parameter) for x in events]
-    notes += _rig_changes(estimates)
+    rows = _rows(c, select(*asked, e.id).where(e.bearing == known.id).order_by(e.taken_at, e.id))
+    estimates = tuple(KnownEstimate(*row[:-1]) for row in rows)
+    of = v.bearing == known.id
+    heads = _rows(
+        c, select(v.name, func.count(), func.max(v.unit), func.max(v.role)).where(of).group_by(v.name).order_by(v.name)
+    )
+    seen = type_coerce(v.identifiable, Integer)
+    numbers = _rows(c, select(v.estimate, v.value, v.sd, seen).where(of).order_by(v.name, v.taken_at, v.estimate))
+    events = _rows(c, select(n.at, n.kind, n.text, n.parameter).where(n.bearing == known.id).order_by(n.at))
+    notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
+    notes += _rig_changes(c, estimates)
     return History(
         bearing=known.name, plant=known.plant, ledger=shown, estimates=estimates,
-        series=_series(lines, place, estimates), events=tuple(sorted(notes, key=lambda x: x.at)),
+        series=_series(heads, numbers, [row[-1] for row in rows], estimates),
+        events=tuple(sorted(notes, key=lambda x: x.at)),
     )  # fmt: skip
 
 
-def _series(lines: Any, place: Mapping[int, int], estimates: tuple[KnownEstimate, ...]) -> dict[str, Series]:
-    """Divide rows in order of name and time into series."""
-    if not lines:
-        return {}
-    names, taken_at, number, value, sd, seen, units, roles = zip(*lines, strict=True)
-    ends = [0, *(k for k in range(1, len(names)) if names[k] != names[k - 1]), len(names)]
-    usable = np.array([x.verdict != "unusable" for x in estimates])
-    of = np.array([place[x] for x in number])
-    shown = np.array(seen, dtype=bool)
-    kept = shown & usable[of]
-    at, x, s = (np.array(column, dtype=float) for column in (taken_at, value, sd))
-    found = {}
-    for a, z in pairwise(ends):
-        cut = slice(a, z)
-        found[names[a]] = Series(
-            name=names[a], unit=units[z - 1], role=roles[z - 1], taken_at=at[cut], identifiable=shown[cut],
-            value=np.where(kept[cut], x[cut], np.nan), sd=np.where(kept[cut], s[cut], np.nan), estimate=of[cut],
-        )  # fmt: skip
-    return found
+def _rows(c: Connection, asked: Any) -> list[tuple[Any, ...]]:
+    """Return rows as the driver has them: a history is thousands."""
+    return list(c.execute(asked).cursor.fetchall())
 
 
-def _rig_changes(estimates: tuple[KnownEstimate, ...]) -> list[Note]:
+def _series(
+    heads: list[tuple[Any, ...]], rows: list[tuple[Any, ...]], ids: list[int], estimates: tuple[KnownEstimate, ...]
+) -> dict[str, Series]:
+    """Divide rows in order of name and time into series; `heads`: name, number of rows, unit and role of each."""
+    table = np.array(rows, dtype=float).reshape(-1, 4)
+    usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
+    times = np.array([x.taken_at for x in estimates])
+    order = np.argsort(ids)
+    of = order[np.searchsorted(np.array(ids)[order], table[:, 0])]
+    seen = table[:, 3] == 1.0
+    at = times[of]
+    table[~(seen & usable[of]), 1:3] = np.nan
+    ends = np.cumsum([0, *(head[1] for head in heads)])
+    return {
+        name: Series(
+            name=name, unit=unit, role=role, taken_at=at[a:z], value=table[a:z, 1], sd=table[a:z, 2],
+            identifiable=seen[a:z], estimate=of[a:z],
+        )
+        for (name, _, unit, role), (a, z) in zip(heads, pairwise(ends), strict=True)
+    }  # fmt: skip
+
+
+def _rig_changes(c: Connection, estimates: tuple[KnownEstimate, ...]) -> list[Note]:
+    """Return where the rig is another one than before, and in what."""
+    from sqlalchemy import select
+
+    at = [k for k, (old, new) in enumerate(pairwise(estimates), 1) if old.rig_sha != new.rig_sha]
+    if not at:
+        return []
+    t = schema.tables().tables["rig"].c
+    used = {estimates[k - j].rig_sha for k in at for j in (0, 1)}
+    lines = {
+        row.sha: zlib.decompress(row.text).decode().splitlines()
+        for row in c.execute(select(t.sha, t.text).where(t.sha.in_(used)))
+    }
     return [
-        Note(at=new.taken_at, kind="rig", text=f"the rig changed ({old.rig_sha[:8]} to {new.rig_sha[:8]})")
-        for old, new in pairwise(estimates)
-        if old.rig_sha != new.rig_sha
-    ]
+        Note(
+            at=estimates[k].taken_at, kind="rig",
+            text=_difference(lines[estimates[k - 1].rig_sha], lines[estimates[k].rig_sha]),
+        )
+        for k in at
+    ]  # fmt: skip
+
+
+def _difference(old: list[str], new: list[str]) -> str:
+    """Say in what two rigs differ."""
+    gone = [x for x in old if x and x not in new]
+    come = [x for x in new if x and x not in old]
+    if not gone and not come:
+        return "a calibration table changed"
+    shown = "; ".join(
+        f"{' '.join(a.split()) or 'nothing'} became {' '.join(b.split()) or 'nothing'}"
+        for a, b in islice(zip_longest(gone, come, fillvalue=""), _SHOWN)
+    )
+    rest = max(len(gone), len(come)) - _SHOWN
+    return shown + (f"; and {counted(rest, 'more line')}" if rest > 0 else "")

@@ -230,6 +230,29 @@ class Ledger:
         with self._reading() as c:
             return history_of(c, bearing, self.shown)
 
+    def export(self, folder: str | Path) -> tuple[str, ...]:
+        """Write the tables as Parquet files, for DuckDB or pandas; needs the extra ``ambid[formats]``.
+
+        Parameters
+        ----------
+        folder : str or Path
+            Made where there is none; a table that is there is replaced only where this wrote it.
+
+        Returns
+        -------
+        tuple of str
+            Names of the files.
+
+        Raises
+        ------
+        AmbidError
+            If pyarrow is not installed, or the folder cannot be written.
+        """
+        from ambid.ledger.parquet import export
+
+        with self._reading() as c:
+            return export(c, Path(folder))
+
     # --- inside -----------------------------------------------------------------------------------------------------
 
     @contextmanager

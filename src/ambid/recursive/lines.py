@@ -34,6 +34,11 @@ class TrackedValue:
     stale: bool = False  # whether it is frozen for want of information: the value is the last that data showed
 
 
+def is_vague(v: TrackedValue) -> bool:
+    """Whether data do not show a parameter: its standard deviation is above a quarter of it."""
+    return v.sd > _VAGUE * abs(v.value)
+
+
 _UNKNOWN = TrackedValue(value=math.nan, sd=math.nan)
 
 
@@ -196,9 +201,7 @@ class Track(Result):
         if last.state == "frozen":
             text = "the record ends without excitation: the parameters are frozen at an earlier time. Excite more"
             found.append(Reason(check="frozen", text=text))
-        vague = [
-            n for n, v in last.parameters.items() if self.header.model in model_names() and v.sd > _VAGUE * abs(v.value)
-        ]
+        vague = [n for n, v in last.parameters.items() if self.header.model in model_names() and is_vague(v)]
         if vague:
             text = f"not identifiable: {', '.join(vague)} (sd above {_VAGUE:.0%} of the value). Excite more"
             found.append(Reason(check="identifiable", text=text))

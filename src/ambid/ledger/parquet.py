@@ -1,0 +1,78 @@
+"""A ledger's tables as Parquet files, for DuckDB or pandas."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ambid.errors import AmbidError
+from ambid.ledger import schema
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
+_TABLES = ("bearing", "rig", "estimate", "value", "event", "failure")
+_TIMES = ("taken_at", "added_at", "at", "failed_at")
+_ROWS = 50_000  # at once
+_MADE = b"ambid.ledger"
+
+
+def export(c: Connection, folder: Path) -> tuple[str, ...]:
+    """Write the tables; times as timestamps of UTC, names of bearings beside their numbers; documents are left out."""
+    try:
+        import pyarrow.parquet as parquet
+    except ImportError:
+        raise AmbidError("pyarrow is not installed, and Parquet needs it. Install ambid[formats]") from None
+    try:
+        folder.mkdir(exist_ok=True)
+        files = [folder / f"{name}.parquet" for name in _TABLES]
+        for path in files:
+            if path.exists() and _MADE not in (parquet.read_schema(path).metadata or {}):
+                raise AmbidError(f"--export {path} exists, and is not of a ledger. Choose another folder")
+        for name, path in zip(_TABLES, files, strict=True):
+            _write(c, name, path)
+    except (OSError, ValueError) as failure:
+        words = getattr(failure, "strerror", None) or failure
+        raise AmbidError(f"--export {folder} cannot be written: {words}. Give another folder") from None
+    return tuple(path.name for path in files)
+
+
+def _write(c: Connection, name: str, path: Path) -> None:
+    """Write a table, some rows at a time, under another name until it is whole."""
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+    from sqlalchemy import select
+
+    table = schema.tables().tables[name]
+    kinds = [pa.field(x.name, _kind(pa, name, x)) for x in table.columns]
+    whole = pa.schema(kinds, metadata={_MADE: schema.SCHEMA.encode()})
+    beside = path.with_name(f".{path.name}")
+    try:
+        with parquet.ParquetWriter(beside, whole) as writer:
+            found = c.execute(select(table)).mappings()
+            for rows in found.partitions(_ROWS):
+                writer.write_table(pa.Table.from_pylist([_row(row) for row in rows], schema=whole))
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _kind(pa: Any, table: str, column: Any) -> Any:
+    """Return the type of a column."""
+    if column.name in _TIMES:
+        return pa.timestamp("us", tz="UTC")
+    if (table, column.name) == ("rig", "text"):
+        return pa.string()
+    python = column.type.python_type
+    return {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}[python]
+
+
+def _row(row: Any) -> dict[str, Any]:
+    found = dict(row)
+    for name in _TIMES:
+        if name in found:
+            found[name] = round(1e6 * found[name])
+    if isinstance(found.get("text"), bytes):
+        found["text"] = zlib.decompress(found["text"]).decode()
+    return found

@@ -1,0 +1,106 @@
+"""``--ledger`` of the verbs and ``ambid history``: each result once, told what is missing, nothing half done."""
+
+from importlib.resources import as_file
+
+import pytest
+
+from ambid.cli.demo import demo_file
+from ambid.ledger import open_ledger
+from tests.ledger.entries import entry
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("demo")
+    for name in ("demo.csv.gz", "demo.toml"):
+        with as_file(demo_file(name)) as path:
+            (folder / name).write_bytes(path.read_bytes())
+    return folder
+
+
+WORDS = ("identify", "demo.csv.gz", "--rig", "demo.toml", "--ledger", "l.db", "--bearing", "pump 1")
+
+
+def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monkeypatch):
+    monkeypatch.chdir(demo)
+    first = ambid(*WORDS, "--taken-at", "2026-03-01T14:30")
+    assert (first.code, first.err) == (0, "stored in l.db: pump 1, record of 2026-03-01 14:30 UTC\n")
+    again = ambid(*WORDS, "--taken-at", "2026-03-01T14:30")
+    assert again.out.splitlines()[0] == first.out.splitlines()[0]
+    assert again.err == "l.db has this already (same record, rig, settings and version); nothing was added\n"
+    assert "stored in" in ambid(*WORDS, "--taken-at", "2026-04-01", "--from", "0.05").err  # other settings
+    tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start-seconds", "0.2", "--quiet")
+    assert (tracked.code, "stored in" in tracked.err) == (0, True)
+    with open_ledger("l.db", write=False) as ledger:
+        found = ledger.history("pump 1")
+    assert [e.job for e in found.estimates] == ["identify", "identify", "track"]
+    shown = ambid("history", "pump 1", "--ledger", "l.db", "--plot", "h.png", "--json", "-")
+    assert (shown.code, shown.out.startswith('{\n "schema": "ambid.history/1"')) == (0, True)
+    assert (demo / "h.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (("--ledger", "new.db"), "does not say when it was taken"),
+        (("--ledger", "new.db", "--taken-at", "yesterday"), "must be a date and time such as 2026-03-01T14:30"),
+        (("--bearing", "A"), "--bearing is for --ledger"),
+        (("--taken-at", "file"), "--taken-at is for --ledger"),
+        (("--ledger", "demo.toml", "--taken-at", "file"), "is not a ledger of ambid"),
+        (("--ledger", ".", "--taken-at", "file"), "is no file"),
+        (("--ledger", "none/new.db", "--taken-at", "file"), "there is no folder"),
+        (("--ledger", "mysql://h/d", "--taken-at", "file"), "must be a file of SQLite or a URL postgresql://"),
+        (("--ledger", "new.db", "--taken-at", "file", "--bearing", " "), "has to know which bearing"),
+        (("--ledger", "new.db", "--taken-at", "file", "--from", "3"), "cut from 3 s"),
+        (("--ledger", "new.db", "--json", "new.db", "--taken-at", "file"), "new.db"),
+    ],
+)
+def test_what_is_missing_is_told_and_leaves_no_ledger(demo, ambid, monkeypatch, words, said):
+    monkeypatch.chdir(demo)
+    done = ambid("identify", "demo.csv.gz", "--rig", "demo.toml", *words)
+    assert (done.code, done.out, len(done.err.splitlines())) == (2, "", 1)
+    assert said in done.err
+    assert not list(demo.glob("new.db*"))
+
+
+def test_without_a_bearing_all_are_listed_with_what_failed(demo, ambid, monkeypatch):
+    from ambid.ledger.store import Failure
+
+    monkeypatch.chdir(demo)
+    with open_ledger("list.db") as ledger:
+        ledger.add([entry(k, name) for k in range(3) for name in ("A", "B")])
+        poison = entry(9)
+        ledger.fail(
+            [
+                Failure(
+                    bearing="A", record="day9.h5", sha="A9", rig_sha="one", settings="{}", version="0.1.0", reason="NaN"
+                )
+            ]
+        )
+        assert ledger.failures()[poison.key].reason == "NaN"
+    done = ambid("history", "--ledger", "list.db")
+    assert [line.split()[0] for line in done.out.splitlines() if line] == ["bearing", "A", "B", "1", "day9.h5"]
+    assert "day9.h5 (A): NaN" in done.out
+    refused = ambid("history", "--ledger", "list.db", "--plot", "x.png")
+    assert (refused.code, "--plot is for one bearing" in refused.err) == (2, True)
+    assert ambid("history", "A", "--ledger", "none.db").code == 2
+    assert not (demo / "none.db").exists()
+
+
+def test_tables_are_exported_for_other_programs(demo, ambid, monkeypatch):
+    pandas = pytest.importorskip("pandas")
+    pytest.importorskip("pyarrow")
+    monkeypatch.chdir(demo)
+    with open_ledger("export.db") as ledger:
+        ledger.add([entry(k) for k in range(3)])
+    for _ in range(2):  # what it wrote itself it writes again
+        assert ambid("history", "--ledger", "export.db", "--export", "tables").code == 0
+    values, estimates = (pandas.read_parquet(demo / "tables" / f"{n}.parquet") for n in ("value", "estimate"))
+    joined = values.merge(estimates, left_on="estimate", right_on="id")
+    assert joined[joined.name == "k_i"].value.tolist() == [80.0, 79.9, 79.8]
+    assert str(estimates.taken_at[1]) == "2026-01-02 00:00:00+00:00"
+    assert values.identifiable.dtype == bool
+    (demo / "tables" / "rig.parquet").unlink()
+    pandas.DataFrame({"x": [1]}).to_parquet(demo / "tables" / "rig.parquet")
+    done = ambid("history", "--ledger", "export.db", "--export", "tables")
+    assert (done.code, "rig.parquet exists, and is not of a ledger" in done.err) == (2, True)
