@@ -53,6 +53,16 @@ def page(folder):
         browser.close()
 
 
+# whether the first strip has a colour
+DRAWN = """(colour) => {
+  const canvas = document.querySelector("#strips canvas");
+  const bytes = [1, 3, 5].map((k) => parseInt(colour.slice(k, k + 2), 16));
+  const data = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height).data;
+  for (let k = 0; k < data.length; k += 4) if (bytes.every((b, j) => Math.abs(data[k + j] - b) < 3)) return true;
+  return false;
+}"""
+
+
 def until(page, holds):
     """Wait for something to hold; the page's policy forbids the browser's own way of it."""
     end = time.monotonic() + LONG_MS / 1000
@@ -67,6 +77,10 @@ def wide(page):
 
 
 def test_a_record_becomes_an_estimate(page, folder):
+    page.focus("#list tbody tr[tabindex='0']")
+    page.keyboard.press("End")
+    assert page.locator("#list tbody tr[tabindex='0']").count() == 1  # one stop of Tab, whatever the number of files
+    assert page.evaluate("document.activeElement.rowIndex") == len(page.locator("#list tbody tr").all())
     page.click("#list tr:has-text('rec.csv')")
     page.click("button:text-is('Identify')")
     page.wait_for_selector("#detail h2.usable, #detail h2.caution, #detail h2.unusable")
@@ -92,6 +106,19 @@ def test_a_live_bench_is_watched_held_frozen_and_stopped(page, folder):
     page.click("#freeze")
     page.evaluate("(() => { const back = document.getElementById('back'); back.value = 300; back.oninput(); })()")
     assert page.evaluate("ambidConsole.feed.window()[1] <= ambidConsole.feed.t.at(-1)")
+    strip = page.locator("#strips .u-over").first.bounding_box()
+    page.mouse.move(strip["x"] + 60, strip["y"] + 20)
+    page.mouse.down()
+    page.mouse.move(strip["x"] + 180, strip["y"] + 20, steps=3)
+    page.mouse.up()
+    shown = "(() => { const f = ambidConsole.feed, s = f.error.plot.scales.x; return [s.min, s.max, ...f.zoom]; })()"
+    until(page, f"{shown}[0] === {shown}[2] && {shown}[1] === {shown}[3]")  # parameters over the same stretch
+    page.emulate_media(color_scheme="dark")
+    until(page, f"({DRAWN})('#2b343c') && ({DRAWN})('#6ea8e6') && !({DRAWN})('#e3e7eb')")
+    page.emulate_media(color_scheme="light")
+    until(page, f"({DRAWN})('#e3e7eb') && !({DRAWN})('#2b343c')")
+    page.dblclick("#strips .u-over >> nth=0")
+    assert page.evaluate("ambidConsole.feed.zoom") is None
     page.keyboard.press("Control+.")
     until(page, "ambidConsole.feed.over")
     assert (folder / "watched.h5").exists()

@@ -234,7 +234,7 @@ def test_a_stopped_commissioning_tells_what_was_reached_and_takes_no_word_of_tra
         assert made["reached"] == "3 of 9 steps were good enough: self-test, rest, polarity"
         assert (bench / made["report"]).stat().st_size > 10_000
         assert [(m["how"], made["reached"] in m["why"]) for m in told(seen, "end")] == [("cancelled", True)]
-        assert all(p["png"] for m in told(seen, "step") for p in m["pictures"])
+        assert all(p["image"].startswith("data:image/svg+xml") for m in told(seen, "step") for p in m["pictures"])
 
 
 def test_anybody_may_stop_and_what_came_is_kept(bench):

@@ -6,8 +6,6 @@ acquires writes the journal of every acquisition.
 
 from __future__ import annotations
 
-import base64
-import io
 import signal
 import sys
 import threading
@@ -122,9 +120,9 @@ class Worker:
             raise AmbidError(f"{name} is no plain file of the folder any more. Choose another one")
         return found
 
-    def give(self, result: Any, name: str, record: object = None) -> None:
-        """Write a result and its report beside each other, and tell them."""
-        from ambid.job.presentation import text
+    def give(self, result: Any, name: str, record: object = None, *, drawn: str = "") -> None:
+        """Write a result and its report beside each other, and tell them; `drawn`: what its figure shows."""
+        from ambid.job.presentation import text, view
 
         self._tell_progress("report", None)
         report = self.folder / f"{name}.html"
@@ -133,11 +131,18 @@ class Worker:
                 raise AmbidError(f"{path.name} already exists. Choose another name")
         result.save(self.folder / f"{name}.json")
         result.report(report, record)
-        verdict = result.verdict
+        verdict, pictures = result.verdict, list[Mapping[str, str]]()
+        if drawn:
+            from ambid.report.drawing import WIDE
+            from ambid.report.picture import image
+
+            pictures = [
+                {"title": name, "caption": drawn, "image": image(view(result).figure(result, None, WIDE), name)}
+            ]
         self.feed.tell(
             "result",
             {"name": name, "verdict": verdict.word, "reasons": [r.text for r in verdict.reasons],
-             "text": text(result, width=110), "report": report.name},
+             "text": text(result, width=110), "report": report.name, "pictures": pictures},
             sticky="result",
         )  # fmt: skip
 
@@ -222,7 +227,7 @@ def _margins(worker: Worker) -> None:
     from ambid.job import margins
 
     found = margins(worker.path("record") or worker.path("estimate"), worker.path("rig"))  # type: ignore[arg-type]
-    worker.give(found, str(worker.spec["out"]))
+    worker.give(found, str(worker.spec["out"]), drawn="The loop as it is, with the zones of ISO 14839-3.")
 
 
 def _design(worker: Worker) -> None:
@@ -233,7 +238,7 @@ def _design(worker: Worker) -> None:
     name, estimate = str(worker.spec["out"]), worker.path("estimate")
     assert estimate is not None
     found = design_controller(estimate, worker.path("rig"), method=worker.spec.get("method", "pid"), tick=worker.tick)
-    worker.give(found, name)
+    worker.give(found, name, drawn="The loop before and after, with the zones of ISO 14839-3.")
     with (worker.folder / f"{name}.toml").open("x", encoding="utf-8") as file:
         file.write(rig_text(found.new_rig, worker.folder))
 
@@ -372,6 +377,8 @@ def _commission(worker: Worker) -> None:
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning_steps import Plan
+    from ambid.report.drawing import single
+    from ambid.report.picture import image
     from ambid.rig import load_rig
 
     spec, rig_path = worker.spec, worker.path("rig")
@@ -390,7 +397,10 @@ def _commission(worker: Worker) -> None:
         content = {
             "name": found.name, "passed": found.passed, "findings": list(found.findings),
             "reasons": list(found.reasons), "cautions": list(found.cautions), "text": found.text,
-            "pictures": [{"title": p.title, "caption": p.caption, "png": _png(p.block)} for p in found.pictures],
+            "pictures": [
+                {"title": p.title, "caption": p.caption, "image": image(single(p.block), p.title)}
+                for p in found.pictures
+            ],
         }  # fmt: skip
         worker.feed.tell("step", content, sticky=f"step {found.name}")
 
@@ -420,15 +430,6 @@ def _commission(worker: Worker) -> None:
         if worker.stopped() and not found.passed:
             worker.cancelled = f"stopped. {told['reached']}. {folder.name} keeps what they found"
             raise KeyboardInterrupt
-
-
-def _png(block: Any) -> str:
-    """Return a picture for the page, in base 64."""
-    from ambid.report.drawing import save, single
-
-    buffer = io.BytesIO()
-    save(single(block), buffer, kind="png")
-    return base64.b64encode(buffer.getvalue()).decode()
 
 
 JOBS: Mapping[str, Callable[[Worker], None]] = {

@@ -72,6 +72,21 @@ def picture(figure: Figure, title: str, prefix: str) -> tuple[str, dict[str, Any
     return f'{head} fill="var(--ink)" stroke-linejoin="round">{small}', _read(figure)
 
 
+def image(figure: Figure, title: str) -> str:
+    """Return a figure as the address of an image, whose colours follow light and dark as those of a page do."""
+    from importlib.resources import files
+
+    shown, _ = picture(figure, title, "i")
+    if shown.startswith("<img"):
+        return shown.rpartition('src="')[2].removesuffix('">')
+    sheet = files("ambid").joinpath("data", "report.css").read_text(encoding="utf-8")
+    colours = sheet[: sheet.index("* {")] + "text { font-family: system-ui, sans-serif; }"
+    whole = shown.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).replace(
+        ">", f"><style>{colours}</style>", 1
+    )
+    return "data:image/svg+xml;base64," + base64.b64encode(whole.encode()).decode()
+
+
 def _small(text: str, prefix: str) -> str:
     """Return the body of an SVG in fewer letters: named colours, attributes for styles, rounded paths."""
     used = dict.fromkeys(re.findall(r"(?:url\(|href=\")#([^)\"]+)", text))

@@ -81,7 +81,7 @@ function confirmed(question, yes = "Yes") {
 // Tabs.
 function open(tab) {
   for (const section of document.querySelectorAll(".tab")) section.hidden = section.id !== tab;
-  for (const button of $("tabs").children) button.setAttribute("aria-selected", button.dataset.tab === tab);
+  for (const button of $("tabs").children) { button.ariaSelected = button.dataset.tab === tab; button.tabIndex = button.dataset.tab === tab ? 0 : -1; }
   location.hash = tab;
   dispatchEvent(new Event("resize"));
 }
@@ -105,6 +105,8 @@ async function refresh() {
     choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig"));
     for (const field of $(form).elements) field.disabled = state.read_only;
   }
+  const bare = state.read_only ? "This console is read only: runs that others start are shown here." : state.files.some((f) => f.kind === "rig") ? "" : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
+  for (const [of, next] of [["live", "Choose a rig and a port, then 'Record and track': simulated is a bench of this machine, replay:NAME a record of the folder, anything else the controller's serial port. Signals, parameters and events appear here."], ["commission", "Choose a rig with [loop] and [daq], and a port, then 'Commission': self-test, rest, polarity, levitation, excitation, record, identification, validation and tracking follow one another; the page asks before the output is switched on."]]) $(`${of}-hint`).textContent = state.read_only ? bare : bare + next;
   choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig"), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
@@ -117,14 +119,31 @@ function fill(body, things, cells, chosen, key) {
   const text = JSON.stringify(things.map(key));
   if (body.dataset.key === text) return;
   body.dataset.key = text;
+  const held = body.contains(document.activeElement);
   body.replaceChildren(...things.map((thing) => {
     const pick = () => chosen(thing);
-    const row = el("tr", { tabIndex: 0, onclick: pick, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
+    const row = el("tr", { tabIndex: -1, "data-of": key(thing)[0], onclick: () => { rove(row); pick(); }, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
     row.append(...cells(thing).map((c, k) => el("td", { className: k ? (c === thing.verdict ? thing.verdict : "") : "name" }, String(c))));
     if (thing.why) row.lastChild.append(el("div", { className: "hint why", title: thing.why }, thing.why));
     return row;
   }));
+  const at = [...body.rows].find((r) => r.dataset.of === body.dataset.at) ?? body.rows[0];
+  if (at) { at.tabIndex = 0; if (held) at.focus(); }
 }
+// One row of a list is reached by Tab, the others from it by arrows.
+function rove(row) {
+  const body = row.parentNode;
+  for (const other of body.rows) { other.tabIndex = other === row ? 0 : -1; other.ariaCurrent = other === row ? "true" : null; }
+  body.dataset.at = row.dataset.of;
+}
+for (const body of [$("list").tBodies[0], $("runs").tBodies[0]]) body.addEventListener("keydown", (e) => {
+  const rows = [...body.rows], at = rows.indexOf(document.activeElement);
+  const to = { ArrowDown: at + 1, ArrowUp: at - 1, PageDown: at + 10, PageUp: at - 10, Home: 0, End: rows.length - 1 }[e.key];
+  if (to === undefined || at < 0) return;
+  e.preventDefault();
+  const row = rows[Math.min(Math.max(to, 0), rows.length - 1)];
+  rove(row); row.focus();
+});
 function choices(select, files, none) {
   const text = JSON.stringify(files.map((f) => f.number));
   if (select.dataset.key === text) return;
@@ -166,6 +185,7 @@ function loopForm(file, detail) {
     el("label", {}, "Method ", method), el("button", { className: "go", disabled: state.read_only || !rigs.length, onclick: run("design") }, "Design a better loop")),
     el("p", { className: "hint" }, "A design writes a rig with the new loop. The controller tries it where Live is started with it as 'Loop to try'."), host);
 }
+const drawn = (p) => el("figure", {}, el("img", { src: p.image, className: "drawn", alt: p.title }), el("figcaption", { className: "caption" }, p.caption));
 const link = (report) => el("p", {}, el("a", { href: `/reports/${report.number}`, target: "_blank", rel: "noopener" }, `Open ${report.name}`));
 
 // A job that computes: progress, cancel, and what it found.
@@ -182,7 +202,7 @@ async function job(spec, host, told) {
       if (m.kind === "progress") {
         if (m.done === null) bar.removeAttribute("value"); else bar.value = m.done;
         const left = m.done > 0.05 ? `, about ${seconds(m.seconds * (1 / m.done - 1))} left` : "";
-        words.textContent = `${m.stage}: ${seconds(m.seconds)}${left}`;
+        words.textContent = `${m.stage}: ${seconds(m.seconds)}${m.done === null ? ", of a length that is not known" : left}`;
       } else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why));
       else told(m);
     }));
@@ -229,7 +249,9 @@ async function results(m, host) {
   await refresh();
   const report = state.files.find((f) => f.name === m.report);
   const words = { usable: "Usable", caution: "Usable with caution", unusable: "Do not use" };
-  put(host, el("h2", { className: m.verdict }, words[m.verdict] ?? m.verdict), ...m.reasons.map((r) => el("p", {}, r)), el("pre", {}, m.text), report ? link(report) : null);
+  const head = el("h2", { className: `${m.verdict} result` }, words[m.verdict] ?? m.verdict);
+  put(host, head, report ? link(report) : null, ...m.reasons.map((r) => el("p", {}, r)), ...(m.pictures ?? []).map(drawn), el("pre", {}, m.text));
+  head.scrollIntoView();
 }
 
 // A rig: channels and parameters as a form over the text that is checked and written.
@@ -287,9 +309,17 @@ function listen(id, told, envelope = () => {}, gone = () => {}) {
 }
 
 // Charts.
-const css = (name) => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+let palette = {};  // colours are looked up when they are drawn, as the page may turn dark meanwhile
+const css = (name) => palette[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+const ink = (name, alpha = "") => () => css(name) + alpha;
+const plots = new Set();
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  palette = {};
+  for (const made of plots) made.box.isConnected ? made.plot.redraw() : plots.delete(made);
+  if (feed?.orbitOf) feed.drawOrbit();
+});
 function axes(unit, more = {}) {
-  const ink = css("--dim"), grid = { stroke: css("--grid"), width: 1 };
+  const grid = { stroke: ink("--grid"), width: 1 };
   const label = (u, splits) => {
     const size = Math.max(...splits.map(Math.abs).filter(isFinite), 0), [p, name] = unitOf(unit, size);
     const gap = splits.length > 1 ? Math.abs(splits[1] - splits[0]) : size || 1;
@@ -297,20 +327,23 @@ function axes(unit, more = {}) {
     while (digits < 9 && splits.some((s) => Math.abs(+(s / p).toFixed(digits) * p - s) > 1e-3 * gap)) digits++;
     return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
   };
-  return [{ stroke: ink, grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
-          { stroke: ink, grid, ticks: grid, size: 74, space: 15, values: label, ...(more.yaxis ?? {}) }];
+  return [{ stroke: ink("--dim"), grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
+          { stroke: ink("--dim"), grid, ticks: grid, size: 74, space: 15, values: label, ...(more.yaxis ?? {}) }];
 }
 function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
   const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
   const plot = new uPlot(opts, [[], ...series.map(() => [])], host);
   new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1 && plot.setSize({ width: host.clientWidth, height })).observe(host);
-  return { box, plot, value };
+  const made = { box, plot, value };
+  for (const old of plots) if (!old.box.isConnected) plots.delete(old);
+  setTimeout(() => plots.add(made));
+  return made;
 }
 const line = (color, more = {}) => ({ stroke: color, width: 1.2, points: { show: false }, ...more });
-const BAND = () => [line(css("--accent"), { width: 1 }), line(css("--accent"), { width: 1 })];
+const BAND = () => [line(ink("--accent"), { width: 1 }), line(ink("--accent"), { width: 1 })];
 function strip(title, t, low, high, height = 110, unit = title.match(/\[(.*)\]/)?.[1] ?? "") {
-  const made = chart(title, height, BAND(), unit, { bands: [{ series: [2, 1], fill: css("--accent") + "66" }], zoom: true });
+  const made = chart(title, height, BAND(), unit, { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], zoom: true });
   made.plot.setData([t, low, high]);
   return made;
 }
@@ -339,11 +372,12 @@ class Live extends Watched {
   constructor(run) {
     super(run);
     Object.assign(this, { signals: null, header: null, strips: [], parameters: {}, frozen: false, following: false, marked: null, record: null, wanted: run.spec.seconds ?? Infinity });
+    this.out = new Set(); this.zoom = null;
     this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
-    $("live-view").hidden = false;
+    $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
     $("summary").hidden = true;
-    for (const host of ["lag", "count", "lost"]) put($(host));  // nothing of the run before stands as this one's
+    for (const host of ["lag", "count", "lost", "sensors"]) put($(host));  // nothing of the run before stands as this one's
     freeze(this, false);
     this.unmark();
     this.listen();
@@ -352,7 +386,7 @@ class Live extends Watched {
   }
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
-      event: () => this.event(m.t, m.what, m.why), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
+      event: () => { this.sensors(m); this.event(m.t, m.what, m.why); }, device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
@@ -364,11 +398,12 @@ class Live extends Watched {
     this.signals = m;
     this.low = m.names.map(() => []); this.high = m.names.map(() => []);
     this.strips = m.names.map((name, k) => {
-      const made = chart(name, 118, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: css("--accent") + "66" }], hooks: { setSelect: [(u) => this.mark(u)] } });
+      const made = chart(name, 118, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], hooks: { setSelect: [(u) => this.mark(u)], drawClear: [(u) => this.shade(u)] } });
+      made.plot.over.addEventListener("dblclick", () => { this.zoom = null; this.redraw(); });
       $("strips").append(made.box);
       return made;
     });
-    const made = chart("spectrum", 140, m.names.map((_, k) => line([css("--accent"), css("--doubt"), css("--good"), css("--bad")][k % 4])), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
+    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(["--accent", "--doubt", "--good", "--bad"][k % 4]))), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
     made.box.querySelector("h3").firstChild.textContent = `spectrum, peak: ${m.names.map((n, k) => `${n} ${m.units[k]}`).join(", ")}`;
     $("spectrum").append(made.box);
     this.lines4 = made;
@@ -396,11 +431,11 @@ class Live extends Watched {
     if (this.header) return;
     this.header = m;
     for (const [name, v] of Object.entries(m.start)) {
-      const made = chart(name, 92, [line("transparent"), line("transparent"), line(css("--accent"), { width: 1.6 }), line(css("--dim"), { dash: [4, 4] })], m.units[name], { bands: [{ series: [2, 1], fill: css("--accent") + "33" }] });
+      const made = chart(name, 92, [line("transparent"), line("transparent"), line(ink("--accent"), { width: 1.6 }), line(ink("--dim"), { dash: [4, 4] })], m.units[name], { bands: [{ series: [2, 1], fill: ink("--accent", "33") }] });
       $("parameters").append(made.box);
       this.parameters[name] = { ...made, start: v.value, unit: m.units[name], band: [[], [], []] };
     }
-    const error = chart("model error, limit dashed", 92, [line(css("--accent"), { width: 1.6 }), line(css("--bad"), { dash: [4, 4] })], "");
+    const error = chart("model error, limit dashed", 92, [line(ink("--accent"), { width: 1.6 }), line(ink("--bad"), { dash: [4, 4] })], "");
     $("error").append(error.box);
     this.error = error;
     for (const w of m.warnings) this.event(null, "start", w);
@@ -416,10 +451,19 @@ class Live extends Watched {
     $("events").prepend(el("li", { className: what === "change" || what === "fault" ? "refused" : "" }, `${t === null || t === undefined ? "" : `${t.toFixed(2)} s `}${what}: ${why}`));
     while ($("events").children.length > 200) $("events").lastChild.remove();
   }
-  mark(u) {
+  sensors(m) {  // those that are not used now
+    if (m.what === "excluded") this.out.add(m.parameter);
+    if (m.what === "restored") this.out.delete(m.parameter);
+    $("sensors").textContent = this.out.size ? `not used: ${[...this.out].join(", ")}` : "";
+  }
+  mark(u) {  // what is dragged over; in a picture that stands still it is shown closer too
+    if (!u.select.width) return;
     const a = u.posToVal(u.select.left, "x"), b = u.posToVal(u.select.left + u.select.width, "x");
+    u.setSelect({ left: 0, width: 0, top: 0, height: 0 }, false);
     if (!(b - a > 1e-3)) return this.unmark();
     this.marked = [a, b];
+    if (this.frozen) this.zoom = [a, b];
+    this.redraw();
     $("export").disabled = false;
     $("export").textContent = `Export ${a.toFixed(2)} to ${b.toFixed(2)} s`;
   }
@@ -427,17 +471,25 @@ class Live extends Watched {
     this.marked = null;
     $("export").disabled = true;
     $("export").textContent = "Export marked stretch";
+    this.redraw();
   }
+  shade(u) {  // the stretch that is marked, which moves with its samples
+    if (!this.marked) return;
+    const [a, b] = this.marked.map((x) => Math.min(Math.max(u.valToPos(x, "x", true), u.bbox.left), u.bbox.left + u.bbox.width));
+    u.ctx.fillStyle = css("--doubt") + "44"; u.ctx.fillRect(a, u.bbox.top, b - a, u.bbox.height);
+  }
+  redraw() { if (this.t.length) { this.drawStrips(...this.window()); if (this.lines.length) this.drawLines(...this.window()); } }
   draw() {
     if (feed !== this) return;
     if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
-      if (this.dirty) this.drawStrips(...this.window());
-      if (this.dirtyLines) this.drawLines();
+      if (this.dirty || this.dirtyLines) this.drawStrips(...this.window());
+      if (this.dirtyLines) this.drawLines(...this.window());
       this.dirty = this.dirtyLines = false;
     }
     requestAnimationFrame(this.draw);
   }
   window() {  // the stretch that is shown: the last one, or further back while the picture is frozen
+    if (this.zoom) return this.zoom;
     const span = Number($("span").value), first = this.t[0] ?? 0, last = this.t.at(-1) ?? 0;
     const end = this.frozen ? Math.min(last, first + span + (Number($("back").value) / Number($("back").max)) * Math.max(0, last - first - span)) : last;
     return [Math.max(first, end - span), end];
@@ -461,7 +513,7 @@ class Live extends Watched {
     this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
     this.updates = (this.updates ?? 0) + 1;
   }
-  drawOrbit(a) {
+  drawOrbit(a = this.t.length - 400) {
     const [x, y] = this.orbitOf.map((k) => this.low[k].slice(Math.max(a, this.t.length - 400)).map((v, i) => (v + this.high[k][Math.max(a, this.t.length - 400) + i]) / 2));
     const canvas = $("orbit").firstChild ?? $("orbit").appendChild(el("canvas", { width: 240, height: 240 })), g = canvas.getContext("2d");
     const size = Math.max(...x.map(Math.abs), ...y.map(Math.abs), 1e-12);
@@ -469,15 +521,17 @@ class Live extends Watched {
     x.forEach((v, k) => g.lineTo(120 + 110 * v / size, 120 - 110 * y[k] / size)); g.stroke();
     g.fillStyle = css("--dim"); g.fillText(`orbit, ±${shown(size, "m")}`, 6, 12);
   }
-  drawLines() {
-    const t = this.lines.map((l) => l.t), last = this.lines.at(-1);
+  drawLines(from, end) {  // over the stretch that the strips show
+    const lines = this.lines.filter((l, k) => (this.lines[k + 1] ?? l).t >= from && (this.lines[k - 1] ?? l).t <= end);
+    const t = lines.map((l) => l.t), last = lines.at(-1) ?? this.lines.at(-1);
+    const set = (plot, data) => plot.batch(() => { plot.setData(data, false); plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
     for (const [name, p] of Object.entries(this.parameters)) {
-      const v = this.lines.map((l) => l.values[name]?.[0] ?? null), s = this.lines.map((l) => l.values[name]?.[1] ?? null);
-      p.plot.setData([t, v.map((x, k) => x === null ? null : x - 1.96 * s[k]), v.map((x, k) => x === null ? null : x + 1.96 * s[k]), v, t.map(() => p.start)]);
+      const v = lines.map((l) => l.values[name]?.[0] ?? null), s = lines.map((l) => l.values[name]?.[1] ?? null);
+      set(p.plot, [t, v.map((x, k) => x === null ? null : x - 1.96 * s[k]), v.map((x, k) => x === null ? null : x + 1.96 * s[k]), v, t.map(() => p.start)]);
       const [value, sd, stale] = last.values[name] ?? [];
       p.value.textContent = shown(value, p.unit, sd) + (stale ? " (frozen)" : "");
     }
-    this.error?.plot.setData([t, this.lines.map((l) => l.error), t.map(() => this.header.limit)]);
+    if (this.error) set(this.error.plot, [t, lines.map((l) => l.error), t.map(() => this.header.limit)]);
     if (this.error) this.error.value.textContent = last.error === null ? "unknown" : last.error.toFixed(2);
   }
 }
@@ -525,14 +579,14 @@ for (const button of document.querySelectorAll("[data-say]")) {
   button.onclick = async () => { if (!button.dataset.confirm || await confirmed(button.dataset.confirm)) word(button.dataset.say); };
 }
 function freeze(live, frozen) {
-  live.frozen = frozen;
+  live.frozen = frozen; live.zoom = null;
   $("freeze").setAttribute("aria-pressed", frozen);
   $("freeze").textContent = frozen ? "Go on" : "Freeze";
   $("back").hidden = !frozen;
   $("back").value = $("back").max;
 }
 $("freeze").onclick = () => freeze(feed, !feed.frozen);
-$("back").oninput = $("span").onchange = () => { if (feed?.t?.length) feed.drawStrips(...feed.window()); };
+$("back").oninput = $("span").onchange = () => { if (feed?.t) { feed.zoom = null; feed.redraw(); } };
 $("export").onclick = async () => {
   const file = state.files.find((f) => f.name === feed.record);
   if (!file) { banner("The record can be cut when the run is over", "note"); return; }
@@ -555,7 +609,7 @@ addEventListener("keydown", (e) => {
 class Steps extends Watched {
   constructor(run) {
     super(run);
-    this.items = {}; this.done = new Set();
+    this.items = {}; this.done = new Set(); $("commission-hint").hidden = true;
     $("steps").replaceChildren();
     this.listen();
   }
@@ -576,7 +630,7 @@ class Steps extends Watched {
   append(node, once) { if (!once || !$("steps").querySelector(`.${once}`)) $("steps").append(el("div", { className: once ?? "" }, node)); }
   step(m) {
     this.done.add(m.name);
-    const pictures = el("div", { className: "pictures" }, ...m.pictures.map((p) => el("figure", {}, el("img", { src: `data:image/png;base64,${p.png}`, alt: p.title, loading: "lazy" }), el("figcaption", { className: "caption" }, p.caption))));
+    const pictures = el("div", { className: "pictures" }, ...m.pictures.map(drawn));
     put(this.item(m.name), el("strong", {}, m.name), " ", el("span", { className: m.passed ? "usable" : "refused" }, m.passed ? "good enough" : "not good enough"),
       ...m.findings.map((f) => el("div", {}, f)), ...m.cautions.map((f) => el("div", { className: "caution" }, f)), ...m.reasons.map((f) => el("div", { className: "refused" }, f)),
       m.text ? el("details", {}, el("summary", {}, "table"), el("pre", {}, m.text)) : null, m.pictures.length ? el("details", { open: !m.passed }, el("summary", {}, `pictures (${m.pictures.length})`), pictures) : null);
