@@ -148,7 +148,7 @@ FILES = {
     "gzip without its name": ("record.csv", lambda t: gzip.compress(t.encode()), r"gzipped although"),
     "empty gzip": ("record.csv.gz", lambda t: gzip.compress(b""), r"empty inside"),
     "Latin-1": ("record.csv", lambda t: t.replace("um", "µm").encode("latin-1"), r"row 2: byte 0xb5 is not UTF-8"),
-    "UTF-16": ("record.csv", lambda t: t.encode("utf-16"), r"UTF-16"),
+    "UTF-16": ("record.csv", lambda t: t.encode("utf-16")[:-1], r"utf-16"),
     "binary": ("record.csv", lambda t: bytes(range(256)) * 10, r"record\.csv"),
     "empty MATLAB file": ("record.mat", lambda t: b"", r"empty \(0 bytes\)"),
     "no MATLAB file": ("record.mat", str.encode, r"record\.mat"),

@@ -49,10 +49,6 @@ CASES = {
     "empty line inside": (text(changed(9, "")), ["row 9", "empty"]),
     "comment among data": (text(changed(9, "# pause")), ["row 9", "comment"]),
     "decimal commas, comma separated": (text([r.replace(".", ",") for r in rows()]), ["row 3", "decimal comma"]),
-    "decimal commas, semicolon separated": (
-        text([r.replace(",", ";").replace(".", ",") for r in rows()], HEADER.replace(",", ";")),
-        ["row 3", "'time'", "'0,001'", "decimal comma", "point"],
-    ),
     "semicolons under a comma header": (text([r.replace(",", ";") for r in rows()]), ["row 2", "';'", "commas"]),
     "two delimiters in the header": (text(rows(), "time [s],voltage [V];position [mm]"), ["row 1", "';'", "commas"]),
     "header separated by blanks": (text(rows(), "time [s] voltage [V] position [mm]"), ["row 1", "commas"]),
@@ -70,7 +66,7 @@ CASES = {
     "skipped sample": (text(rows()[:7] + rows()[8:]), ["row 9", "2 samples", "--gaps"]),
     "skipped last sample": (text([*rows()[:19], "0.020,2,20"]), ["row 21", "2 samples"]),
     "not UTF-8": (text(rows()).replace(b"[mm]", b"[\xb5m]"), ["row 1", "0xb5", "UTF-8"]),
-    "UTF-16": (text(rows()).decode().encode("utf-16"), ["UTF-16", "UTF-8"]),
+    "UTF-16": (text(rows()).decode().encode("utf-16")[:-1], ["utf-16", "encoding"]),
     "binary": (text(changed(9, "0.007,\0,7")), ["binary"]),
     "gzip without saying so": (gzip.compress(text(rows())), ["gzipped", ".gz"]),
 }  # fmt: skip
@@ -124,10 +120,10 @@ def test_folder_instead_of_a_file(tmp_path):
 
 
 def test_permission_denied(tmp_path, monkeypatch):
-    def denied(path):
+    def denied(path, *_):
         raise PermissionError(13, "Permission denied", str(path))
 
-    monkeypatch.setattr(Path, "read_bytes", denied)  # file modes do not stop a superuser
+    monkeypatch.setattr(Path, "open", denied)  # file modes do not stop a superuser
     with pytest.raises(RecordError, match=r"r\.csv may not be read \(permission denied\)"):
         read_record(tmp_path / "r.csv")
 

@@ -25,9 +25,7 @@ Part = tuple[float | None, float | None]
 def command(
     records: Annotated[
         list[Path],
-        opt.argument(
-            "RECORD...", "Record: .csv, .csv.gz, .h5 or .mat; nonlinear structures take several of one bench."
-        ),
+        opt.argument("RECORD...", f"{opt.RECORD}; nonlinear structures take several of one bench."),
     ],
     structure: Annotated[str, option("--structure NAME", "Structure; 'ambid models' lists them.")],
     inputs: opt.Inputs = None,
@@ -67,6 +65,7 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     second: opt.SecondRecord = None,
     validate_from: Annotated[
         float | None, option("--validate-from S", "Use the second record from here on, in s.")
@@ -118,7 +117,7 @@ def command(
             _check_second(records, part, second, second_part)
         bench = None if rig is None else load_rig(rig)
         columns: dict[str, Any] = {"input": inputs, "output": output, "rig": bench}
-        columns |= {"rate_hz": rate, "gaps": gaps}
+        columns |= {"rate_hz": rate, "gaps": gaps, "layout": opt.layout_of(layout)}
         with signals(stop.take) if nonlinear else nullcontext(), progress("fit") as show:
             found: Any = fit(
                 records, structure=structure, orders=orders, settings=settings, criterion=criterion, fix=fix,

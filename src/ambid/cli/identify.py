@@ -29,7 +29,7 @@ def command(
         list[Path],
         opt.argument(
             "RECORD...",
-            "Record: .csv, .csv.gz, .h5 or .mat; with --nonlinear several, best at several positions; of a rotor "
+            f"{opt.RECORD}; with --nonlinear several, best at several positions; of a rotor "
             "several, best at rest and at speed.",
         ),
     ],

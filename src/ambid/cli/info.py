@@ -17,6 +17,7 @@ def info(
     rig: opt.RigFile = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
@@ -29,7 +30,7 @@ def info(
     from ambid.job import info
 
     with Outputs(record, rig, json=json, plot=plot, report=report) as outputs, progress("look") as show:
-        found = info(record, rig, rate_hz=rate, gaps=gaps)
+        found = info(record, rig, rate_hz=rate, gaps=gaps, layout=opt.layout_of(layout))
         outputs.give(found, show)
     outputs.show(found, strict=strict)
 

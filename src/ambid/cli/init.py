@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from ambid.cli.options import Gaps, Rate, argument, option, switch
+from ambid.cli.options import RECORD, Gaps, Layout, Rate, argument, layout_of, option, switch
 from ambid.cli.output import Outputs
 from ambid.errors import AmbidError, counted, nearest
 
@@ -20,7 +20,7 @@ _WIRED = ("prototype",)  # presets with a controller, whose rig is among the pac
 
 
 def command(
-    record: Annotated[Path | None, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")] = None,
+    record: Annotated[Path | None, argument("RECORD", f"{RECORD}.")] = None,
     rig: Annotated[Path | None, option("--out -o RIG", "Rig file to write.", "standard output")] = None,
     preset: Annotated[
         str | None,
@@ -35,6 +35,7 @@ def command(
     yes: Annotated[bool, switch("--yes", "Choose the most likely columns without asking.")] = False,
     rate: Rate = None,
     gaps: Gaps = None,
+    layout: Layout = None,
     force: Annotated[bool, switch("--force", "Overwrite an existing rig file.")] = False,
 ) -> None:
     """Write a commented rig file, guessed from a record's columns or of a preset bench, to be checked and edited."""
@@ -43,13 +44,17 @@ def command(
             "both a record and --preset were given" if record is not None else "neither a record nor --preset was given"
         )
         raise AmbidError(f"{given}; a rig file comes from exactly one. Give RECORD, or --preset {_WIRED[0]}")
-    if preset is not None and (rate is not None or gaps is not None):
-        raise AmbidError("--rate and --gaps are for reading a record; --preset reads none. Omit them")
+    if preset is not None and (rate is not None or gaps is not None or layout):
+        raise AmbidError("--rate, --gaps and --layout are for reading a record; --preset reads none. Omit them")
     if preset is not None and plot is not None:
         raise AmbidError("--plot draws the columns of a record; --preset reads none. Omit it")
     with Outputs(record, plot=plot) as outputs:
         outputs.claim(rig, "-o", force=force)
-        text = _of_preset(preset) if preset is not None else _of_record(record, rate, gaps, outputs, plot, ask=not yes)
+        text = (
+            _of_preset(preset)
+            if preset is not None
+            else _of_record(record, rate, gaps, layout, outputs, plot, ask=not yes)
+        )
         if rig is not None:
             outputs.stage_text(rig, text)
     if rig is None:
@@ -69,14 +74,16 @@ def command(
         )
 
 
-def _of_record(record: Path | None, rate: Rate, gaps: Gaps, outputs: Outputs, plot: Path | None, *, ask: bool) -> str:
+def _of_record(
+    record: Path | None, rate: Rate, gaps: Gaps, layout: Layout, outputs: Outputs, plot: Path | None, *, ask: bool
+) -> str:
     from ambid.record import read_record
     from ambid.rig import draft_rig
     from ambid.rig.draft import axes_of
     from ambid.rig.roles import rank_roles
 
     assert record is not None
-    read = read_record(record, rate_hz=rate, gaps=gaps or "error")
+    read = read_record(record, rate_hz=rate, gaps=gaps or "error", layout=layout_of(layout))
     if plot is None and len(axes_of(read)) > 1:
         return draft_rig(read)
     ranked = rank_roles(read)

@@ -35,7 +35,8 @@ def argument(metavar: str, about: str) -> Any:
     return typer.Argument(metavar=metavar, help=about, show_default=False, autocompletion=values_of(metavar))
 
 
-RecordFile = Annotated[Path, argument("RECORD", "Record: .csv, .csv.gz, .h5 or .mat.")]
+RECORD = "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or .arrow"
+RecordFile = Annotated[Path, argument("RECORD", f"{RECORD}.")]
 RigFile = Annotated[Path | None, option("--rig RIG", "Rig file (TOML): what is known about the bench.")]
 From = Annotated[float | None, option("--from S", "Start time in the record, in s.")]
 To = Annotated[float | None, option("--to S", "End time in the record, in s.")]
@@ -47,6 +48,10 @@ Gaps = Annotated[
         "Missing values: refuse them, interpolate, or use the longest part without any.",
         "error, or as the rig says",
     ),
+]
+Layout = Annotated[
+    list[str] | None,
+    option("--layout WORD=VALUE", "What the file leaves open, such as group=NAME or decimal=comma; repeatable."),
 ]
 JsonFile = Annotated[str | None, option("--json FILE", "Write the result as JSON; - for standard output.")]
 TrackFile = Annotated[
@@ -106,6 +111,17 @@ def band_of(text: str | None) -> tuple[float, float] | None:
     except ValueError:
         found = (0.0, 0.0)
     check_band(found, text)
+    return found
+
+
+def layout_of(words: Sequence[str] | None) -> dict[str, str]:
+    """Read ``--layout``: words of a file's layout."""
+    found = dict[str, str]()
+    for text in words or ():
+        word, sign, value = text.partition("=")
+        if not (sign and value) or word in found:
+            raise AmbidError(f"--layout {text!r}: it must be a word and its value, once. Give --layout decimal=comma")
+        found[word] = value
     return found
 
 

@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from ambid.errors import AmbidError
+from ambid.record import ENDINGS
 
-_RECORDS = (".csv", ".csv.gz", ".h5", ".hdf5", ".mat")
 _MOST = 2000  # files that are listed, the newest
 _WALKED = 50_000  # files that are looked at
 _DEPTH = 2
@@ -122,7 +122,7 @@ _KINDS = {".toml": "rig", ".json": "result", ".html": "report"}
 
 def _kind(name: str) -> str:
     lower = name.lower()
-    return "record" if lower.endswith(_RECORDS) else _KINDS.get(Path(lower).suffix, "")
+    return "record" if lower.endswith(ENDINGS) else _KINDS.get(Path(lower).suffix, "")
 
 
 def plain(path: Path, folder: Path) -> os.stat_result | None:

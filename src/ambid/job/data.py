@@ -178,6 +178,7 @@ class Columns(TypedDict, total=False):
     gaps: GapPolicy | None
     units: Mapping[str, str] | None  # of the columns of a table in memory
     rig: Rig | str | Path | None  # names and calibrates the channels
+    layout: Mapping[str, str] | None  # of a file, as `read_record` takes it
 
 
 def names_of(said: Names | None) -> tuple[str, ...]:
@@ -200,6 +201,7 @@ class Channels:
     gaps: GapPolicy | None = None
     units: Mapping[str, str] | None = None
     rig: Rig | None = None
+    layout: Mapping[str, str] | None = None
 
     @classmethod
     def of(cls, **columns: Unpack[Columns]) -> Channels:
@@ -219,7 +221,9 @@ class Channels:
 
         if self.rig is not None:
             return self._through(self.rig, record, part)
-        found = read_record(record, rate_hz=self.rate_hz, gaps=self.gaps or "error", units=self.units)
+        found = read_record(
+            record, rate_hz=self.rate_hz, gaps=self.gaps or "error", units=self.units, layout=self.layout
+        )
         if part != WHOLE:
             found = cut(found, *part)
         return io_data(found, self.inputs, self.outputs, references=self.references, open_loop=self.open_loop)
@@ -228,7 +232,10 @@ class Channels:
         from ambid.blackbox.data import io_data
 
         plant = rig.plant
-        bench = read_bench(record, rig, rate_hz=self.rate_hz, gaps=self.gaps, units=self.units, beside=self.references)
+        bench = read_bench(
+            record, rig, rate_hz=self.rate_hz, gaps=self.gaps, units=self.units, beside=self.references,
+            layout=self.layout,
+        )  # fmt: skip
         bench = _cut_by(rig, bench, part)
         inputs = [_role(x, rig, plant.inputs, "input") for x in self.inputs] or list(plant.inputs)
         outputs = [_role(x, rig, plant.outputs, "output") for x in self.outputs] or list(plant.outputs)

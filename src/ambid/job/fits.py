@@ -55,6 +55,7 @@ def fit(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     validate: Source | None = None,
     validate_from_s: float | None = None,
     validate_to_s: float | None = None,
@@ -97,6 +98,8 @@ def fit(
         What to do about missing values.
     units : Mapping of str to str, optional
         Unit by column, for tables in memory.
+    layout : Mapping of str to str, optional
+        What files leave open, as `ambid.record.read_record` takes it.
     validate : as `records`, optional
         A further record to validate on; may be one of the first, with another part.
     validate_from_s, validate_to_s : float, optional
@@ -119,7 +122,7 @@ def fit(
     """
     say, channels = tick or silent, Channels.of(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
-        rig=rig,
+        rig=rig, layout=layout,
     )  # fmt: skip
     sources = sources_of(records)
     nonlinear, wanted, fixed = structure in NONLINEAR_STRUCTURES, orders_of(orders), fixed_of(fix)

@@ -270,6 +270,7 @@ def info(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
 ) -> Inspection:
     """Look through a record: levels, resolution, noise, saturation, drop-outs, outliers, excitation, likely roles.
 
@@ -280,6 +281,8 @@ def info(
         Names and calibrates the channels; what the inputs explain then does not count as noise.
     rate_hz, gaps, units : optional
         As `ambid.identify`.
+    layout : Mapping of str to str, optional
+        What a file leaves open, as `ambid.record.read_record` takes it.
 
     Returns
     -------
@@ -298,9 +301,9 @@ def info(
     ['voltage', 'current', 'position']
     """
     if rig is None:
-        return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units))
+        return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units, layout=layout))
     bench = known_rig(rig)
-    found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units)
+    found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
     return inspect(found, inputs=bench.plant.inputs)
 
 

@@ -1,18 +1,20 @@
-"""The record and its files: CSV, HDF5 and MATLAB, one module per format."""
+"""The record and its files: one module per format."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Protocol
 
-from ambid.errors import RecordError
+from ambid.errors import RecordError, nearest
 from ambid.record.csv_format import read_csv, read_csv_rows, write_csv
 from ambid.record.record import Channel, Record, Step, cut
 from ambid.record.rows import Rows
-from ambid.record.sampling import GapPolicy, checked
+from ambid.record.sampling import GapPolicy, check_gap_policy, checked
 
 __all__ = [
+    "ENDINGS",
     "Channel",
     "Frame",
     "GapPolicy",
@@ -46,14 +48,15 @@ def read_record(
     gaps: GapPolicy = "error",
     units: Mapping[str, str] | None = None,
     variables: Mapping[str, tuple[str, str]] | None = None,
+    layout: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record from a file, whose name tells its format, or take it from a table in memory.
 
     Parameters
     ----------
     source : str, Path, Record, DataFrame, Dataset or Mapping of str to array
-        ``.csv``, ``.csv.gz``, ``.h5``, ``.hdf5`` or ``.mat``; a table as `Record.from_dataframe` takes it; or a record,
-        which stays as it is unless gaps are to be treated.
+        A file that ends in one of `ENDINGS`; a table as `Record.from_dataframe` takes it; or a record, which stays as
+        it is unless gaps are to be treated. TDMS, MDF, Parquet and Arrow need the extra ``ambid[formats]``.
     rate_hz : float, optional
         Sampling rate in Hz, for a source that does not hold it.
     gaps : {"error", "interpolate", "cut"}
@@ -62,6 +65,9 @@ def read_record(
         For tables only: unit by column.
     variables : Mapping of channel name to (variable, unit), optional
         For ``.mat`` only: which variable is which channel, e.g. ``{"current": ("data.i", "mA")}``.
+    layout : Mapping of str to str, optional
+        What a file leaves open, e.g. ``{"group": "Log"}`` or ``{"decimal": ","}``: `LAYOUTS` lists the words of each
+        format. A reader that is not sure asks for one of them.
 
     Returns
     -------
@@ -74,7 +80,7 @@ def read_record(
         If the format is not known or the source breaks one of its rules.
     """
     if units and isinstance(source, (str, Path, Record)):
-        raise RecordError("units= is for tables in memory; a file says its units in the header row. Omit it")
+        raise RecordError("units= is for tables in memory; a file says its units itself. Omit it")
     if isinstance(source, Record):
         return source if rate_hz is None and gaps == "error" else checked(source, "the record", rate_hz, gaps)
     if not isinstance(source, (str, Path)):
@@ -82,21 +88,40 @@ def read_record(
 
         return read_table(source, rate_hz=rate_hz, units=units, gaps=gaps)
     path = Path(source)
-    kind = _format_of(path)
+    kind, layout = _format_of(path), dict(layout or {})
     if variables is not None and kind != "mat":
         raise RecordError(f"{path}: a mapping of variables is for .mat files. Omit it")
+    _check_layout(kind, layout, path)
     if kind == "csv":
-        return read_csv(path, rate_hz=rate_hz, gaps=gaps)
+        return read_csv(path, rate_hz=rate_hz, gaps=gaps, layout=layout)
     if kind == "mat":
         from ambid.record.mat_format import read_mat
 
         return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps)
-    from ambid.record.hdf5_format import read_hdf5
+    if kind == "hdf5":
+        from ambid.record.hdf5_format import read_hdf5
 
-    return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
+        return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
+    check_gap_policy(gaps)
+    reader: Any = getattr(import_module(f"ambid.record.{kind}_format"), f"read_{kind}")
+    return reader(path, layout=layout, rate_hz=rate_hz, gaps=gaps)  # type: ignore[no-any-return]
 
 
-def read_rows(source: Source, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
+def _check_layout(kind: str, layout: Mapping[str, str], path: Path) -> None:
+    known = LAYOUTS.get(kind, ())
+    for word, value in layout.items():
+        if word not in known or not isinstance(value, str) or not value:
+            has = f"the layout of .{kind} files has {', '.join(known)}" if known else f".{kind} files have no layout"
+            raise RecordError(f"{path}: layout {word}={value!r}; {has}.{nearest(word, known)} Correct or omit it")
+
+
+def read_rows(
+    source: Source,
+    *,
+    rate_hz: float | None = None,
+    units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
+) -> Rows:
     """Read the rows of a record that may be damaged.
 
     Parameters
@@ -107,6 +132,8 @@ def read_rows(source: Source, *, rate_hz: float | None = None, units: Mapping[st
         Sampling rate in Hz, for a source that does not hold it.
     units : Mapping of str to str, optional
         For tables only: unit by column.
+    layout : Mapping of str to str, optional
+        As `read_record`.
 
     Returns
     -------
@@ -126,8 +153,9 @@ def read_rows(source: Source, *, rate_hz: float | None = None, units: Mapping[st
         return read_table_rows(source, rate_hz=rate_hz, units=units)
     path = Path(source)
     kind = _format_of(path)
+    _check_layout(kind, layout or {}, path)
     if kind == "csv":
-        return read_csv_rows(path, rate_hz=rate_hz)
+        return read_csv_rows(path, rate_hz=rate_hz, layout=layout or {})
     if kind == "hdf5":
         from ambid.record.hdf5_format import read_hdf5
 
@@ -157,8 +185,8 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
     if kind == "csv":
         write_csv(record, path, comments=comments)
         return
-    if kind == "mat":
-        raise RecordError(f"{path}: .mat files are read, not written. Write .csv, .csv.gz or .h5")
+    if kind != "hdf5":
+        raise RecordError(f"{path}: {path.suffix} files are read, not written. Write .csv, .csv.gz or .h5")
     if comments:
         raise RecordError(f"{path}: comment lines go into CSV only. Omit them, or write .csv")
     from ambid.record.hdf5_format import write_hdf5
@@ -166,7 +194,21 @@ def write_record(record: Record, path: str | Path, *, comments: Sequence[str] = 
     write_hdf5(record, path)
 
 
-_SUFFIXES = {".csv": "csv", ".csv.gz": "csv", ".h5": "hdf5", ".hdf5": "hdf5", ".mat": "mat"}
+_SUFFIXES = {
+    ".csv": "csv", ".csv.gz": "csv", ".h5": "hdf5", ".hdf5": "hdf5", ".mat": "mat", ".tdms": "tdms", ".mf4": "mdf",
+    ".mdf": "mdf", ".parquet": "parquet", ".feather": "parquet", ".arrow": "parquet",
+}  # fmt: skip
+
+ENDINGS = tuple(_SUFFIXES)
+"""How names of records end that can be read."""
+
+LAYOUTS = {
+    "csv": ("decimal", "separator", "thousands", "units", "encoding"),
+    "tdms": ("group", "channels"),
+    "mdf": ("group", "channels"),
+    "parquet": ("channels",),
+}
+"""Words by which the layout of a file is told, by format."""
 
 
 def _format_of(path: Path) -> str:

@@ -1,22 +1,24 @@
 """Records as CSV (contracts.md): ``#`` comments, one header row of ``name [unit]``, then numbers.
 
 The columns are separated by commas; semicolons or tabs are read too where the header row holds no comma, and the
-history then says so. Numbers have a decimal point. Rows in messages are lines of the file, counted from 1.
+history then says so. `csv_dialect` reads other forms. Rows in messages are lines of the file, counted from 1.
 """
 
 from __future__ import annotations
 
 import gzip
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.record import Record, file_bytes, gunzipped, sha256_of, utf8_text
+from ambid.record.csv_dialect import Dialect, decoded, recognised
+from ambid.record.record import Record, file_bytes, gunzipped, sha256_of
 from ambid.record.rows import Rows
 from ambid.record.sampling import (
     MIN_SAMPLES,
@@ -33,25 +35,33 @@ from ambid.units import UNKNOWN
 _REFUSED_IN_NAMES = set(',;\t\n[]"#')
 
 
-def read_csv(path: str | Path, *, rate_hz: float | None = None, gaps: GapPolicy = "error") -> Record:
+def read_csv(
+    path: str | Path,
+    *,
+    rate_hz: float | None = None,
+    gaps: GapPolicy = "error",
+    layout: Mapping[str, str] = MappingProxyType({}),
+) -> Record:
     """Read a record from a CSV file, gzipped or not.
 
     `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
     Returns all columns but time, in SI units. A column whose unit is missing or unknown has the unit ``"?"``.
     """
     check_gap_policy(gaps)
-    return uniform_record(_table(Path(path), gaps), rate_hz, gaps)
+    return uniform_record(_table(Path(path), gaps, layout), rate_hz, gaps)
 
 
-def read_csv_rows(path: str | Path, *, rate_hz: float | None = None) -> Rows:
+def read_csv_rows(
+    path: str | Path, *, rate_hz: float | None = None, layout: Mapping[str, str] = MappingProxyType({})
+) -> Rows:
     """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.rows`).
 
     `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
     """
-    return record_of_rows(_table(Path(path), "cut"), rate_hz)
+    return record_of_rows(_table(Path(path), "cut", layout), rate_hz)
 
 
-def _table(path: Path, gaps: GapPolicy) -> Table:
+def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
     """Read the header and the numbers, time in s."""
     data = file_bytes(path)
     provenance = {"file": path.name, "sha256": sha256_of(data)}
@@ -61,11 +71,17 @@ def _table(path: Path, gaps: GapPolicy) -> Table:
             raise RecordError(f"record {path} is empty inside its gzip wrapping. Export or copy it again")
     elif data[:2] == b"\x1f\x8b":
         raise RecordError(f"record {path} is gzipped although its name does not say so. Rename it to {path.name}.gz")
-    plain = read_plain(data, path)
+    plain, encoding = None if layout else read_plain(data, path), "utf-8"
+    found: Mapping[str, object] = {}
     if plain is None:
-        lines = utf8_text(data, path).split("\n")
-        del data
-        header = find_header(lines, path)
+        text, encoding = decoded(data, path, layout)
+        lines = text.split("\n")
+        del data, text
+        dialect = recognised(lines, path, layout)
+        if dialect is None:
+            header = find_header(lines, path)
+        else:
+            header, lines, found = _header_of(dialect, path), dialect.lines, dialect.settings
         values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     else:
         header, values = plain
@@ -76,8 +92,9 @@ def _table(path: Path, gaps: GapPolicy) -> Table:
         place = f"{path}, row {header.row}"
         values[:, time] = seconds(values[:, time], header.names[time], header.unit_texts[time], place)
     settings: dict[str, object] = {"format": "csv", "rows": values.shape[0]}
-    if header.delimiter != ",":
-        settings["delimiter"] = header.delimiter
+    settings |= {"delimiter": header.delimiter} if header.delimiter != "," else {}
+    settings |= {**found, **({"encoding": encoding} if encoding != "utf-8" else {})}
+    settings |= {"layout": dict(layout)} if layout else {}
     return Table(
         where=str(path), names=header.names, unit_texts=header.unit_texts, values=values, first_row=header.row + 1,
         time=time, provenance=provenance, settings=settings,
@@ -152,7 +169,21 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
             f"{path}, row {row}: numbers instead of the header row. Write one row of 'name [unit]' before them, "
             "without '#'"
         )
-    names, units = [], []
+    names, units = _names_and_units(cells, row, path)
+    return Header(row=row, delimiter=delimiter, names=names, unit_texts=units, comments=tuple(comments))
+
+
+def _header_of(found: Dialect, path: Path) -> Header:
+    names, units = _names_and_units(found.cells, found.row, path)
+    return Header(
+        row=found.row, delimiter=found.delimiter, names=names, comments=found.comments,
+        unit_texts=units if found.units is None else found.units,
+    )  # fmt: skip
+
+
+def _names_and_units(cells: Sequence[str], row: int, path: Path) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
+    """Take the cells of a header row apart."""
+    names, units = list[str](), list[str | None]()
     for j, cell in enumerate(cells, start=1):
         match = _HEADER_CELL.fullmatch(cell)
         name = match["name"].strip() if match else cell
@@ -164,7 +195,7 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
             raise RecordError(f"{path}, row {row}: column {name!r} occurs twice; names must differ. Rename one")
         names.append(name)
         units.append(match["unit"].strip() if match else None)
-    return Header(row=row, delimiter=delimiter, names=tuple(names), unit_texts=tuple(units), comments=tuple(comments))
+    return tuple(names), tuple(units)
 
 
 def _delimiter(line: str, row: int, path: Path) -> str:
@@ -187,6 +218,8 @@ def read_plain(data: bytes, path: Path) -> tuple[Header, Array] | None:
         return None
     lines = head.decode().split("\n")[:-1]
     try:
+        if recognised(lines, path, {}) is not None:
+            return None
         header = find_header(lines, path)
     except RecordError:
         return None

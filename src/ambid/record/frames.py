@@ -76,14 +76,14 @@ def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mappi
 
 def to_dataframe(record: Record) -> Any:
     """Return a record as a pandas DataFrame."""
-    pandas = _imported("pandas", "a DataFrame")
+    pandas = imported("pandas", "a DataFrame")
     columns = {_label(c): c.values for c in record.channels}
     return pandas.DataFrame(columns, index=pandas.Index(record.time_s, name="time [s]"))
 
 
 def to_xarray(record: Record) -> Any:
     """Return a record as an xarray Dataset."""
-    xarray = _imported("xarray", "a Dataset")
+    xarray = imported("xarray", "a Dataset")
     return xarray.Dataset(
         {c.name: ("time", c.values, {} if c.unit == UNKNOWN else {"units": c.unit}) for c in record.channels},
         coords={"time": ("time", record.time_s, {"units": "s"})},
@@ -95,12 +95,18 @@ def to_xarray(record: Record) -> Any:
     )
 
 
-def _imported(name: str, what: str) -> Any:
-    """Import a package that is asked for."""
+def imported(name: str, what: str, extra: str = "frames") -> Any:
+    """Import a package that is asked for, one of an extra."""
     try:
         return import_module(name)
     except ImportError:
-        raise RecordError(f"{name} is not installed, and {what} needs it. Install {name}, or ambid[frames]") from None
+        raise RecordError(f"{name} is not installed, and {what} needs it. Install {name}, or ambid[{extra}]") from None
+
+
+def label_of(label: str) -> tuple[str, str | None]:
+    """Return name and unit of a column that is called ``name [unit]``."""
+    match = _LABEL.fullmatch(label.strip())
+    return (match["name"].strip(), match["unit"].strip()) if match else (label.strip(), None)
 
 
 def _label(channel: Channel) -> str:
@@ -204,7 +210,7 @@ def _table(parts: _Parts, units: Mapping[str, str] | None) -> Table:
             time, text = len(names), _time_text(values, text)
         names.append(name)
         texts.append(text)
-        arrays.append(_numbers(parts.what, name, values, time=time == len(names) - 1))
+        arrays.append(numbers(parts.what, name, values, time=time == len(names) - 1))
     index = None if parts.index is None else _index(parts, parts.index, left)
     if index is not None and time is not None:
         raise RecordError(
@@ -240,8 +246,7 @@ def _named(what: str, column: _Column, units: dict[str, str]) -> tuple[str, str 
         raise RecordError(
             f"{what} has a column called {column.label!r}; a name is a text. Rename it, as 'voltage [V]' and so on"
         )
-    match = _LABEL.fullmatch(column.label.strip())
-    name, inside = (match["name"].strip(), match["unit"].strip()) if match else (column.label.strip(), None)
+    name, inside = label_of(column.label)
     said = {text for text in (inside, column.unit) if text is not None}
     said |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
     if len(said) > 1:
@@ -261,8 +266,8 @@ def _time_text(values: np.ndarray, text: str | None) -> str | None:
     return "s" if values.dtype.kind in "mM" else text
 
 
-def _numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
-    """Return a column as real numbers, dates and time differences in s."""
+def numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
+    """Return a column as real numbers, dates and time differences in s; `what`: the table, for messages."""
     place, kind = f"column {name!r} of {what}", values.dtype.kind
     if values.ndim != 1:
         raise RecordError(f"{place} has shape {values.shape}; a channel is one column (n_samples,). Pass one column")
@@ -306,4 +311,4 @@ def _index(parts: _Parts, index: _Column, units: dict[str, str]) -> tuple[str | 
             f"the index{called} of {parts.what} is no time: it has to hold seconds, time differences or dates, and be"
             " called 'time'. Convert or rename it, or reset_index"
         )
-    return _time_text(values, text) or "s", _numbers(parts.what, "time", values, time=True)
+    return _time_text(values, text) or "s", numbers(parts.what, "time", values, time=True)

@@ -8,16 +8,18 @@ from __future__ import annotations
 import difflib
 import gzip
 import hashlib
+import io
 import math
 import zlib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from html import escape
 from importlib import import_module
 from numbers import Real
 from pathlib import Path
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, Any, BinaryIO, overload
 
 import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
@@ -318,6 +320,8 @@ def _shown(key: object) -> str:
     return f"[{':'.join([*ends, repr(key.step)] if key.step is not None else ends)}]"
 
 
+_MOST_UNPACKED = 1 << 28  # bytes, unless the packed ones are many: what packs better than any numbers is no record
+
 # Sampling instants that are given as decimals (2.0 s at 1 kHz) miss the grid by round-off; a thousandth of a sample is
 # none.
 _GRID_TOLERANCE = 1e-3
@@ -380,8 +384,19 @@ def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "r
 
     `path`: the file; `error`: what to raise; `what`: what the file is, for messages. Returns at least one.
     """
+    with readable(path, error, what) as file:
+        data = file.read()
+    if not data:
+        raise error(f"{what} {path} is empty (0 bytes). Export or copy it again")
+    return data
+
+
+@contextmanager
+def readable(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> Iterator[BinaryIO]:
+    """Open a file that exists, is a file and can be read; arguments as `file_bytes`."""
     try:
-        data = path.read_bytes()
+        with path.open("rb") as file:
+            yield file
     except FileNotFoundError:
         raise error(f"{what} {path} does not exist{_similar(path)}. Check the path") from None
     except IsADirectoryError:
@@ -392,9 +407,6 @@ def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "r
         raise error(
             f"{what} {path} cannot be read: {failure.strerror or failure}. Check the path and the disk"
         ) from None
-    if not data:
-        raise error(f"{what} {path} is empty (0 bytes). Export or copy it again")
-    return data
 
 
 def _similar(path: Path) -> str:
@@ -420,12 +432,20 @@ def gunzipped(data: bytes, path: Path) -> bytes:
 
     `data`: of the gzip file; `path`: its name, for messages. Returns unpacked.
     """
+    most = max(_MOST_UNPACKED, 200 * len(data))
     try:
-        return gzip.decompress(data)
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
+            text = file.read(most + 1)
     except EOFError:
         raise RecordError(f"record {path} is a truncated gzip file: its end is missing. Copy it again") from None
     except (gzip.BadGzipFile, zlib.error) as failure:
         raise RecordError(f"record {path} is not a valid gzip file ({failure}). Copy it again, or rename it") from None
+    if len(text) > most:
+        raise RecordError(
+            f"record {path} unpacks to more than {most >> 20} MiB, over 200 times its size: that is no record. Check "
+            "where it comes from"
+        )
+    return text
 
 
 def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> str:
@@ -441,7 +461,10 @@ def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, wh
     except UnicodeDecodeError as failure:
         row = data.count(b"\n", 0, failure.start) + 1
         byte = data[failure.start]
-        raise error(f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8") from None
+        told = ", or give --layout encoding=latin-1" if what == "record" else ""
+        raise error(
+            f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8{told}"
+        ) from None
     if "\0" in text:
         raise error(f"{what} {path} holds binary data (a zero byte); it must be text. Check that it is the right file")
     return text.replace("\r\n", "\n").replace("\r", "\n") if "\r" in text else text

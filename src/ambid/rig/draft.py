@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 
 from ambid.physics.linear_model import LinearModel, model
 from ambid.record.record import Channel, Record
-from ambid.rig.rig import OPTIONAL_ROLES, role_units, toml_text
+from ambid.rig.rig import OPTIONAL_ROLES, layout_line, role_units, toml_text
 from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
 from ambid.units import UNKNOWN, parse_unit
 
@@ -59,11 +59,17 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         "# [operating_point]   # default: the means of the record",
         '# position = { value = 10.0, unit = "mm" }',
         "",
-        "# [record]",
+        *_record_lines(record),
         "# from = 2.0          # s: leave out what comes before, such as the pick-up from rest",
         '# gaps = "error"      # or "interpolate", "cut"',
     ]
     return "\n".join(lines) + "\n"
+
+
+def _record_lines(record: Record) -> list[str]:
+    """Begin the section of records with the layout that the file was read in."""
+    layout = record.history[0].settings.get("layout") if record.history else None
+    return ["[record]", layout_line(layout)] if isinstance(layout, Mapping) else ["# [record]"]
 
 
 def axes_of(record: Record) -> list[str]:

@@ -160,6 +160,7 @@ def _build(file: RigFile, path: Path) -> Rig:
             from_s=record.from_,
             to_s=record.to,
             time=(record.time.variable, record.time.unit) if record.time else None,
+            layout=MappingProxyType(record.layout),
         ),
         daq=daq_of(file.daq, channels=channels, plant=plant, limits=limits, record_rate_hz=record.rate_hz, where=where)
         if file.daq
@@ -510,6 +511,7 @@ def read_bench(
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
     beside: Sequence[str] = (),
+    layout: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record as the rig says, and name its columns by their roles.
 
@@ -528,6 +530,8 @@ def read_bench(
         Unit by column, for a table in memory.
     beside : sequence of str, optional
         As :func:`bench_record`.
+    layout : Mapping of str to str, optional
+        Overrides words of the rig's ``record.layout``.
 
     Returns
     -------
@@ -545,6 +549,7 @@ def read_bench(
         rate_hz = rig.record.rate_hz
     record = read_record(
         source, rate_hz=rate_hz, gaps=gaps or rig.record.gaps or "error", units=units,
+        layout=None if isinstance(source, Record) else {**rig.record.layout, **(layout or {})},
         variables={**{x: (x, UNKNOWN) for x in beside}, **mat_variables(rig)} if mat else None,
     )  # fmt: skip
     return bench_record(record, rig, beside=beside)

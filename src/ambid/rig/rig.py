@@ -79,6 +79,8 @@ class RecordSettings:
         Which part of a record is used, s.
     time : (variable, unit) or None
         Time variable of a ``.mat`` file.
+    layout : Mapping of str to str
+        What files leave open, as `ambid.record.read_record` takes it.
     """
 
     rate_hz: float | None = None
@@ -86,6 +88,7 @@ class RecordSettings:
     from_s: float | None = None
     to_s: float | None = None
     time: tuple[str, str] | None = None
+    layout: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -586,6 +589,11 @@ def _noise_lines(noise: Noise) -> list[str]:
     return [*lines, f"resolutions = {{ {inside} }}"] if inside else lines
 
 
+def layout_line(layout: Mapping[str, str]) -> str:
+    """Return the line of ``[record]`` that tells the layout of files."""
+    return f"layout = {{ {', '.join(f'{key} = {toml_text(value)}' for key, value in layout.items())} }}"
+
+
 def _record_lines(record: RecordSettings) -> list[str]:
     lines = ["[record]"]
     numbers = {"rate_hz": record.rate_hz, "from": record.from_s, "to": record.to_s}
@@ -593,6 +601,7 @@ def _record_lines(record: RecordSettings) -> list[str]:
     lines += [f'gaps = "{record.gaps}"'] if record.gaps else []
     if record.time is not None:
         lines.append(f"time = {{ variable = {toml_text(record.time[0])}, unit = {toml_text(record.time[1])} }}")
+    lines += [layout_line(record.layout)] if record.layout else []
     return lines
 
 

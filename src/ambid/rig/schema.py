@@ -144,6 +144,7 @@ class RecordEntry(_Entry):
     from_: NotNegative | None = Field(default=None, alias="from")
     to: Positive | None = None
     time: TimeEntry | None = None
+    layout: dict[str, str] = Field(default_factory=dict)
 
 
 class TripEntry(_Entry):

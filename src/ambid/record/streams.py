@@ -1,0 +1,226 @@
+"""Columns of long files, read piece by piece into a record, so that memory holds their values once.
+
+What the readers of TDMS, MDF and Arrow share: the choice of a group and of channels, one length and one rate for all,
+and one line for whatever a library raises about a damaged file.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import RecordError, UnitError, nearest
+from ambid.record.frames import numbers
+from ambid.record.record import Channel, Record, Step, readable
+from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, agreed_rate, refuse_gaps, sample_uniformly, seconds
+from ambid.units import UNKNOWN, Unit, parse_unit
+
+PIECE = 1 << 18  # samples that are read at once
+_MOST_PACKED = 1032  # values a byte of a file can stand for: the most that deflate packs
+
+_WORDS = {"Volts": "V", "Volt": "V", "Amps": "A", "Amperes": "A", "Ampere": "A", "Meters": "m", "Seconds": "s",
+          "Newtons": "N", "Hertz": "Hz", "Ohms": "ohm", "Degrees": "deg", "Radians": "rad"}  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Stream:
+    """A column of a file, still to be read."""
+
+    name: str
+    units: frozenset[str] = frozenset()  # all that the file says, as it says it
+    size: int
+    pieces: Callable[[], Iterable[np.ndarray]]  # together `size` values
+    time: bool = False
+    rate_hz: float | None = None
+    start: tuple[float, str] = (0.0, "")  # time of the first sample in s, and its date
+
+
+@contextmanager
+def library(path: Path, what: str, magic: Sequence[bytes]) -> Iterator[str]:
+    """Open a file that begins with one of `magic`; what a library raises about its content becomes one line.
+
+    Yields the SHA-256 of the file.
+    """
+    with readable(path) as file:
+        head = file.read(max(map(len, magic)))
+        if not head:
+            raise RecordError(f"record {path} is empty (0 bytes). Export or copy it again")
+        if not head.startswith(tuple(magic)):
+            raise RecordError(
+                f"record {path} is no {what} file: it begins with {head!r}. Copy it again, or name its real format"
+            )
+        file.seek(0)
+        digest = hashlib.file_digest(file, "sha256").hexdigest()  # type: ignore[arg-type]
+    try:
+        yield digest
+    except RecordError:
+        raise
+    except Exception as failure:  # the parsers raise whatever they meet in a damaged file
+        said = " ".join(str(failure).split())[:120]
+        raise RecordError(
+            f"record {path} is damaged, or no {what} file ({type(failure).__name__}: {said}). Copy or export it again"
+        ) from None
+
+
+def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | None) -> str:
+    """Return the group that is wanted, or the only one; several are asked back by the names of their channels.
+
+    `groups`: names of the channels by group, of those that hold any.
+    """
+    if not groups:
+        raise RecordError(f"record {path} holds no samples. Record again")
+    if wanted is None and len(groups) > 1:
+        listed = "; ".join(
+            ", ".join(f"{group}/{name}" for name in names[:6]) + (", …" if len(names) > 6 else "")
+            for group, names in list(groups.items())[:8]
+        )
+        raise RecordError(
+            f"record {path} has {len(groups)} groups ({listed}). Say which: --layout group={next(iter(groups))!r}, or "
+            "record.layout in the rig"
+        )
+    if wanted is not None and wanted not in groups:
+        raise RecordError(
+            f"record {path} has no group {wanted!r}; it has {', '.join(groups)}.{nearest(wanted, list(groups))} "
+            "Correct layout group"
+        )
+    return next(iter(groups)) if wanted is None else wanted
+
+
+def record_of(
+    path: Path, digest: str, streams: Sequence[Stream], settings: Mapping[str, object], layout: Mapping[str, str],
+    rate_hz: float | None, gaps: GapPolicy,
+) -> Record:  # fmt: skip
+    """Read the columns of a file that are wanted, by default all, into a record."""
+    streams = _wanted(path, streams, layout)
+    for what, of in (
+        ("length", {s.name: f"{s.size}" for s in streams}),
+        ("rate", {s.name: f"{s.rate_hz:.10g} Hz" if s.rate_hz else "none" for s in streams if not s.time}),
+        ("start", {s.name: " ".join(map(str, s.start)) for s in streams if not s.time}),
+    ):
+        if len(set(of.values())) > 1:
+            listed = ", ".join(f"{name} {text}" for name, text in list(of.items())[:8])
+            raise RecordError(
+                f"record {path}: channels differ in {what} ({listed}); all must have the same. Choose some: --layout "
+                f"channels={streams[0].name},…"
+            )
+    n, size = streams[0].size, path.stat().st_size
+    if n * len(streams) > _MOST_PACKED * size:
+        raise RecordError(f"record {path} claims {n} samples in {size} bytes: it is damaged. Copy or export it again")
+    provenance = {"file": path.name, "sha256": digest}
+    data = [s for s in streams if not s.time]
+    if not data:
+        raise RecordError(f"record {path} has a time column and nothing else; a record needs a channel. Add a column")
+    start_s, date = data[0].start
+    found = data[0].rate_hz and agreed_rate(f"record {path}", data[0].rate_hz, rate_hz)
+    for clock in (s for s in streams if s.time):
+        stamps, date = _stamps(clock, path)
+        table = Table(where=str(path), names=(clock.name,), values=stamps[:, None], first_row=1, time=0)
+        if gaps == "error":
+            refuse_gaps(table)
+            sampled = sample_uniformly(table, found or rate_hz, gaps)
+            found, start_s = sampled.rate_hz, sampled.start_s
+            del stamps, table, sampled  # before the channels take their room
+        else:
+            data.append(Stream(name=clock.name, units=frozenset("s"), size=n, pieces=lambda x=stamps: (x,), time=True))  # type: ignore[misc]
+    units = [_unit_of(s, path) for s in data]
+    values = np.empty((len(data), n)).T  # each column in one piece
+    for j, (stream, (unit, _)) in enumerate(zip(data, units, strict=True)):
+        _fill(values[:, j], stream, unit, path)
+    values.flags.writeable = False  # so that the channels are views of it
+    table = Table(
+        where=str(path), names=tuple(s.name for s in data), values=values, first_row=1,
+        time=next((j for j, s in enumerate(data) if s.time), None),
+    )  # fmt: skip
+    if gaps == "error":
+        refuse_gaps(table)
+    end = sample_uniformly(table, rate_hz if found is None else found, gaps)
+    channels = tuple(
+        Channel(name=s.name, unit=unit.si if unit else UNKNOWN, values=end.values[:, j], source_unit=text)
+        for j, (s, (unit, text)) in enumerate(zip(data, units, strict=True))
+        if not s.time
+    )
+    read = Step(
+        name="read", settings=MappingProxyType({**settings, "rows": n} | ({"layout": dict(layout)} if layout else {}))
+    )
+    return Record(
+        rate_hz=end.rate_hz, start_s=start_s + end.start_s, channels=channels, history=(read, *end.steps),
+        provenance=MappingProxyType(provenance | ({"taken_at": date} if date else {})),
+    )  # fmt: skip
+
+
+def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) -> list[Stream]:
+    """Keep the channels that the layout names, and time."""
+    if "channels" not in layout:
+        found = list(streams)
+    else:
+        names, known = [x.strip() for x in layout["channels"].split(",")], [s.name for s in streams]
+        for name in names:
+            if name not in known:
+                raise RecordError(
+                    f"record {path} has no channel {name!r}; it has {', '.join(known)}.{nearest(name, known)} Correct "
+                    "layout channels"
+                )
+        found = [s for s in streams if s.name in names or s.time]
+    clocks = [s.name for s in found if s.time]
+    if not found or len(clocks) > 1:
+        what = f"two time columns ({', '.join(clocks)})" if clocks else "no channel of numbers"
+        raise RecordError(f"record {path} has {what}; it needs one time, and a channel. Choose: --layout channels=…")
+    return found
+
+
+def is_time(name: str) -> bool:
+    """Whether a column called so is time."""
+    return name.lower() in TIME_NAMES
+
+
+def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
+    """Return the unit, None where it is missing or not known, and how the file writes it."""
+    said = {_WORDS.get(text, text) for text in stream.units}
+    if len(said) > 1:
+        raise RecordError(
+            f"record {path}: channel {stream.name!r} is in {' and in '.join(f'[{x}]' for x in sorted(said))}; it has "
+            "one unit. Correct its properties, or export it again"
+        )
+    text = next(iter(said), UNKNOWN)
+    try:
+        unit = parse_unit(text)
+    except UnitError:
+        return None, text
+    return unit, unit.symbol
+
+
+def _fill(out: Array, stream: Stream, unit: Unit | None, path: Path) -> None:
+    """Read a column, in SI where the unit is known."""
+    at = 0
+    for piece in stream.pieces():
+        values = numbers(f"record {path}", stream.name, piece, time=False)
+        part = out[at : at + values.size]
+        part[:] = (values if unit is None else unit.to_si(values))[: part.size]
+        at += values.size
+    if at != out.size:
+        raise RecordError(
+            f"record {path}: channel {stream.name!r} has {at} of the {out.size} samples that the file announces: it is "
+            "cut off or damaged. Copy it again"
+        )
+
+
+def _stamps(clock: Stream, path: Path) -> tuple[Array, str]:
+    """Return time in s, and the date of the first stamp where they are dates."""
+    raw = np.concatenate([np.asarray(x) for x in clock.pieces()])
+    if raw.size != clock.size:
+        raise RecordError(
+            f"record {path}: {clock.name!r} has {raw.size} of the {clock.size} samples that the file announces: it is "
+            "cut off or damaged. Copy it again"
+        )
+    stamps = numbers(f"record {path}", clock.name, raw, time=True)
+    if raw.dtype.kind in "mM":
+        return stamps, str(raw[0]) if raw.dtype.kind == "M" else ""
+    _, text = _unit_of(clock, path)
+    return seconds(stamps, clock.name, None if text == UNKNOWN else text, f"record {path}"), clock.start[1]

@@ -1,0 +1,136 @@
+"""Dialects of CSV: what is certain is read and told, what is not is asked back in one line."""
+
+import numpy as np
+import pytest
+
+from ambid.errors import RecordError
+from ambid.record import read_record
+
+TIME, VOLTAGE, POSITION = np.arange(20) * 1e-3, 0.5 * np.arange(20), 1234.5 * np.arange(20)
+HEAD = ["time [s]", "voltage [V]", "position [mm]"]
+
+
+def point(x):
+    return f"{x:.3f}"
+
+
+def comma(x):
+    return f"{x:.3f}".replace(".", ",")
+
+
+def german(x):
+    return f"{x:,.3f}".translate(str.maketrans(",.", ".,"))
+
+
+def text(heads=(HEAD,), form=point, mark=",", columns=(TIME, VOLTAGE, POSITION), tail=""):
+    rows = [mark.join(map(form, row)) for row in zip(*columns, strict=True)]
+    return "\n".join([*(x if isinstance(x, str) else mark.join(x) for x in heads), *rows]) + "\n" + tail
+
+
+NAMES, UNITS = ["time", "voltage", "position"], ["s", "V", "mm"]
+BEHIND = ["time (s)", "voltage (V)", "position (mm)"]
+TEXTS = ["time", "voltage (V)", "position (left)"]
+CERTAIN = {
+    "decimal comma": (text(form=comma, mark=";"), {"delimiter": ";", "decimal": ","}),
+    "decimal comma, tabs": (text(form=comma, mark="\t"), {"delimiter": "\t", "decimal": ","}),
+    "decimal comma, quoted": (text(form=lambda x: f'"{comma(x)}"'), {"decimal": ","}),
+    "thousands": (text(form="{:,.3f}".format, mark=";"), {"delimiter": ";", "thousands": ","}),
+    "thousands points": (text(form=german, mark=";"), {"delimiter": ";", "decimal": ",", "thousands": "."}),
+    "apostrophes": (text(form=lambda x: f"{x:,.3f}".replace(",", "'")), {"thousands": "'"}),
+    "narrow spaces": (text(form=lambda x: f"{x:,.3f}".replace(",", "\u202f")), {"thousands": "\u202f"}),
+    "row of units": (text([NAMES, UNITS]), {"units": "row"}),
+    "units in brackets below": (text([NAMES, [f"[{x}]" for x in UNITS]], comma, ";"),
+                                {"units": "row", "delimiter": ";", "decimal": ","}),
+    "parentheses": (text([BEHIND]), {"units": "parentheses"}),
+    "preamble": (text(["Model,X7,3", "Interval,1e-3", "", "# now", HEAD]), {"preamble": 2}),
+    "preamble, units below": (text(["Model X7", NAMES, UNITS]), {"preamble": 1, "units": "row"}),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", CERTAIN)
+def test_what_is_certain_is_read_and_told(tmp_path, case):
+    data, understood = CERTAIN[case]
+    (tmp_path / "a.csv").write_text(data, encoding="utf-8")
+    record = read_record(tmp_path / "a.csv")
+    assert [(c.name, c.unit) for c in record.channels] == [("voltage", "V"), ("position", "m")]
+    assert record.rate_hz == pytest.approx(1000.0)
+    np.testing.assert_array_equal(record["voltage"].values, VOLTAGE)
+    np.testing.assert_array_equal(record["position"].values, POSITION / 1000)
+    assert dict(record.history[0].settings) == {"format": "csv", "rows": 20, **understood}
+    if "preamble" in understood:
+        assert "Model" in record.provenance["comment"]
+
+
+LARGE = (np.arange(20.0) + 1, np.arange(20.0) + 1)
+BOTH = text(["time [s];voltage [V]"], lambda x: f"{x:.0f},234", ";", LARGE)
+ASKED = {
+    "1,234": (BOTH, r"row 2: '1,234' may be 1.234 or 1234; .*--layout decimal=comma, or thousands=comma$"),
+    "two rows of text": (text([NAMES, ["seconds", "volts", "mm"]]), r"rows 1 and 2 .*units=row, or units=none"),
+    "a place in parentheses": (text([TEXTS]), r"row 1: \(left\) is no known unit.*--layout units=parentheses"),
+    "point among commas": (text(form=comma, mark=";", tail="0,020;1.5;3\n"), r"row 22: '1.5' is not a number"),
+    "comma among points": (text(form="{:,.3f}".format, mark=";", tail="0,020;1;3\n"), r"row 22: '0,020' is not"),
+    "decimal and separating commas": (text(form=comma), r"row 2: 6 cells where the header names 3"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", ASKED)
+def test_what_is_not_certain_is_asked_back(tmp_path, case):
+    data, words = ASKED[case]
+    (tmp_path / "a.csv").write_text(data, encoding="utf-8")
+    with pytest.raises(RecordError, match=words) as refused:
+        read_record(tmp_path / "a.csv")
+    assert "\n" not in str(refused.value)
+
+
+def test_the_layout_decides(tmp_path):
+    path = tmp_path / "a.csv"
+
+    def read(data, stored="utf-8", **layout):
+        path.write_bytes(data.encode(stored))
+        record = read_record(path, layout=layout, rate_hz=None if "time [s]" in data else 1000.0)
+        assert record.history[0].settings["layout"] == layout
+        return record
+
+    assert read(BOTH, decimal="comma")["voltage"].values[0] == 1.234
+    assert read(BOTH, thousands=",")["voltage"].values[0] == 1234.0
+    named = text([["voltage", "position"], ["volts", "mm"]], columns=(VOLTAGE, POSITION))
+    assert [c.source_unit for c in read(named, units="row").channels] == ["volts", "mm"]
+    plain = text([["u (V)", "x (left)"]], columns=(VOLTAGE, POSITION))
+    assert read(plain, units="none").names == ("u (V)", "x (left)")
+    assert [c.source_unit for c in read(plain, units="parentheses").channels] == ["V", "left"]
+    micro = text([["time [s]", "voltage [µV]", "position [mm]"]])
+    assert read(micro, "latin-1", encoding="latin-1")["voltage"].source_unit == "uV"
+    assert read(text(form=comma, mark=";"), decimal=",", separator=";")["voltage"].values[3] == 1.5
+    with pytest.raises(RecordError, match=r"byte 0xb5 is not UTF-8 text.*--layout encoding=latin-1"):
+        path.write_bytes(micro.encode("latin-1")), read_record(path)
+    for layout, words in (
+        ({"decimal": "x"}, "one of ,, comma"),
+        ({"decimal": ",", "separator": ","}, "both decimal and separator"),
+        ({"decimal": ",", "thousands": ","}, "both decimal and thousands"),
+        ({"units": "row"}, "no names stand above"),
+    ):
+        with pytest.raises(RecordError, match=words):
+            read(text(form=comma, mark=";"), **layout)
+
+
+def test_utf_16_is_known_by_its_mark(tmp_path):
+    (tmp_path / "a.csv").write_bytes(text().encode("utf-16"))
+    record = read_record(tmp_path / "a.csv")
+    assert record.history[0].settings["encoding"] == "utf-16"
+    np.testing.assert_array_equal(record["voltage"].values, VOLTAGE)
+
+
+def test_long_files_are_read_in_the_same_dialect(tmp_path, monkeypatch):
+    monkeypatch.setattr("ambid.record.csv_format._LONG", 1)
+    for heads in ([BEHIND], [NAMES, UNITS], ["Model,X7,3", HEAD]):
+        (tmp_path / "a.csv").write_text(text(heads))
+        np.testing.assert_array_equal(read_record(tmp_path / "a.csv")["position"].values, POSITION / 1000)
+
+
+def test_a_bomb_is_refused(tmp_path, monkeypatch):
+    import gzip
+
+    monkeypatch.setattr("ambid.record.record._MOST_UNPACKED", 1 << 16)
+    (tmp_path / "a.csv.gz").write_bytes(gzip.compress(b"0,0\n" * (1 << 18)))
+    with pytest.raises(RecordError, match="over 200 times its size"):
+        read_record(tmp_path / "a.csv.gz")
