@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from ambid.errors import AmbidError as AmbidError
     from ambid.estimation.estimate import Estimate as Estimate
     from ambid.estimation.estimate import estimate_from_json as estimate_from_json
+    from ambid.fleet.run import fleet as fleet
     from ambid.job import acquire as acquire
     from ambid.job import compare as compare
     from ambid.job import design_controller as design_controller

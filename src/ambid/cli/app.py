@@ -20,6 +20,7 @@ from ambid.cli import (
     design,
     export,
     fit,
+    fleet,
     frf,
     history,
     identify,
@@ -53,6 +54,7 @@ app.command("margins", short_help="show the margins of the loop of a record")(ma
 app.command("history", short_help="show a bearing over time, from a ledger")(history.command)
 app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")
 app.command("export", short_help="write an identified plant for other programs")(export.command)
+app.add_typer(fleet.group, name="fleet", short_help="do a job on many records, real or simulated")
 app.command("recover", short_help="recover a recording that was cut off")(recover.command)
 app.command("init", short_help="draft a rig file from a record")(init.command)
 app.command("simulate", short_help="simulate a record from the physics")(simulate.command)

@@ -7,6 +7,7 @@ is left, and is run again alone.
 
 from __future__ import annotations
 
+import copyreg
 import os
 import pickle
 import signal
@@ -15,13 +16,14 @@ import threading
 import time
 import warnings
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from itertools import count, islice
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
+from types import MappingProxyType
 from typing import Any
 
 from ambid.compiled import THREADS
@@ -34,6 +36,13 @@ _CHUNK_S, _CHUNK = 0.02, 64  # a chunk takes about so long, and has at most so m
 _LOOK_S = 0.2  # how often a wait looks whether it should end
 _PATIENCE_S = 2.0  # for a worker that was told to end
 _STILLBORN = 3  # workers in a row that died before they began
+
+
+def _read_only(mapping: dict[Any, Any]) -> MappingProxyType[Any, Any]:
+    return MappingProxyType(mapping)
+
+
+copyreg.pickle(MappingProxyType, lambda x: (_read_only, (dict(x),)))  # so that records, rigs and results can be sent
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +81,7 @@ def work(
     workers: int | None = None,
     limit_s: float = LIMIT_S,
     stopped: Callable[[], bool] = lambda: False,
-) -> Iterator[Done]:
+) -> Generator[Done, None, None]:
     """Do each task in one of several processes, and yield it as soon as it is done, in no certain order.
 
     `job`: can be pickled, as must be tasks and values; `workers`: processes, by default as many as there are
@@ -178,7 +187,7 @@ class _Pool:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
         process = context.Process(target=_serve, args=(theirs, self._job), daemon=True)
-        with ignoring_interrupts(), _one_thread_each():
+        with ignoring_interrupts(), one_thread_each():
             process.start()
         theirs.close()
         self._workers.append(_Worker(process=process, line=ours))
@@ -257,7 +266,7 @@ def _cause(code: int) -> str:
 
 
 @contextmanager
-def _one_thread_each() -> Iterator[None]:
+def one_thread_each() -> Iterator[None]:
     """Let processes that are started meanwhile keep linear algebra to one thread: there are as many as processors."""
     before = {name: os.environ.get(name) for name in THREADS}
     os.environ.update(dict.fromkeys(THREADS, "1"))

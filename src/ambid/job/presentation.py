@@ -611,6 +611,25 @@ def _history() -> View:
     )  # fmt: skip
 
 
+def _fleet_run() -> View:
+    from ambid.ledger.fleet_run import SCHEMA
+    from ambid.report.fleet_text import fleet_figure, fleet_text, fleet_title
+
+    def table(f: Any) -> Table:
+        names = ("record", "bearing", "rig", "taken_at", "state", "status", "verdict", "checks", "reason", "seconds")
+        columns: dict[str, list[object]] = {name: [getattr(row, name) for row in f.rows] for name in names}
+        columns["checks"] = [", ".join(row.checks) for row in f.rows]
+        for name in dict.fromkeys(name for row in f.rows for name in row.values):
+            for k, what in enumerate((name, f"{name} sd")):
+                columns[what] = [row.values.get(name, (None, None))[k] for row in f.rows]
+        return "record", columns
+
+    return View(
+        text=fleet_text, figure=lambda f, _, width: fleet_figure(f, fleet_title(f), width),
+        document=_fields_of(SCHEMA), table=table, title=fleet_title,
+    )  # fmt: skip
+
+
 _VIEWS: Mapping[str, Callable[[], View]] = {
     "History": _history,
     "RotorEstimate": _rotor,
@@ -630,5 +649,6 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Recorded": _recorded,
     "Comparison": _comparison,
     "Commissioned": _commissioned,
+    "FleetRun": _fleet_run,
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

@@ -137,6 +137,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
     "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),
+    "ambid.fleet/1": _whole("ledger.fleet_run", "FleetRun", "fleet run"),
     "ambid.recovery/1": _whole("acquisition.recorder", "Recorded", "recover"),
 }
 

@@ -1,0 +1,131 @@
+"""The same on a cluster: tasks go to workers of Dask distributed, which somebody else may have started anywhere."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Iterator
+from contextlib import contextmanager
+from importlib import import_module
+from threading import Timer
+from typing import Any
+
+from ambid.errors import AmbidError
+from ambid.fleet.pool import Done, attempt, one_thread_each
+
+ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
+_AHEAD = 3  # tasks on their way for each worker
+_LOOK_S = 0.2  # how often a wait looks whether it should end
+
+
+def work_on_cluster(
+    job: Callable[[Any], Any],
+    tasks: Iterable[Any],
+    *,
+    scheduler: str | None,
+    local: int | None,
+    limit_s: float,
+    stopped: Callable[[], bool] = lambda: False,
+) -> Generator[Done, None, None]:
+    """Do each task on a cluster, and yield it as soon as it is done, as `ambid.fleet.pool.work` does.
+
+    A task that is held to have killed its workers is run again alone, when all others are done: it may only have waited
+    on them beside the one that did.
+
+    `scheduler`: its address; `local`: instead, number of workers of a cluster on this machine.
+    """
+    try:
+        distributed: Any = import_module("distributed")
+    except ImportError:
+        raise AmbidError("Dask distributed is not installed, and a cluster needs it. Install ambid[fleet]") from None
+    with _client(distributed, scheduler, local) as client:
+        try:
+            yield from _answers(distributed, client, job, iter(tasks), limit_s, stopped)
+        except (asyncio.CancelledError, distributed.client.FutureCancelledError, OSError) as failure:
+            if client.status == "running":
+                raise
+            raise AmbidError(f"the scheduler has gone ({failure}). Run again: what is done is not repeated") from None
+
+
+def _answers(
+    distributed: Any, client: Any, job: Any, tasks: Iterator[Any], limit_s: float, stopped: Callable[[], bool]
+) -> Iterator[Done]:
+    suspects: deque[Any] = deque()
+    on_their_way: dict[Any, tuple[Any, bool]] = {}  # with whether they are run alone
+    while True:
+        room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
+        while room > 0 and (task := next(tasks, None)) is not None:
+            future = client.submit(timed, job, task, limit_s, pure=False, retries=0)
+            on_their_way[future], room = (task, False), room - 1
+        if not on_their_way and suspects:
+            task = suspects.popleft()
+            on_their_way[client.submit(timed, job, task, limit_s, pure=False, retries=0)] = (task, True)
+        if not on_their_way or stopped():
+            return
+        try:
+            ready = distributed.wait(list(on_their_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
+        except TimeoutError:
+            continue
+        for future in ready:
+            task, alone = on_their_way.pop(future)
+            if future.status == "finished":
+                done = future.result()
+                yield Done(task=task, value=done.value, failure=done.failure, seconds=done.seconds)
+                continue
+            failure = future.exception()
+            if not isinstance(failure, distributed.scheduler.KilledWorker):
+                yield Done(task=task, failure=f"a defect: {type(failure).__name__}: {' '.join(str(failure).split())}")
+            elif alone:
+                text = f"killed {ALLOWED_FAILURES + 1} workers when run alone, or took longer than {limit_s:g} s"
+                yield Done(task=task, failure=text)
+            else:
+                suspects.append(task)
+
+
+def timed(job: Callable[[Any], Any], task: Any, limit_s: float) -> Done:
+    """Do a task in a worker of the cluster; one that takes too long ends the worker."""
+    from os import _exit
+
+    watch = Timer(limit_s, _exit, (1,))
+    watch.daemon = True
+    watch.start()
+    try:
+        return attempt(job, task)
+    finally:
+        watch.cancel()
+
+
+@contextmanager
+def _client(distributed: Any, scheduler: str | None, local: int | None) -> Iterator[Any]:
+    """Yield a client of a cluster; one on this machine lives as long as the context, without a dashboard."""
+    import dask
+
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what concerns the user is told in results
+    quiet = {
+        "distributed.scheduler.allowed-failures": ALLOWED_FAILURES,
+        "distributed.scheduler.worker-saturation": 1.0,  # what waits on the scheduler is not blamed for a death
+        "distributed.logging.distributed": "critical",
+        "distributed.diagnostics.nvml": False,
+    }
+    with dask.config.set(quiet):
+        if scheduler is not None:
+            try:
+                client = distributed.Client(scheduler, timeout=10)
+            except (OSError, ValueError) as failure:
+                said = str(failure).splitlines()[0]
+                raise AmbidError(
+                    f"--scheduler {scheduler} cannot be reached: {said}. Start it, or correct it"
+                ) from None
+            with client:
+                yield client
+            return
+        with (
+            one_thread_each(),
+            distributed.LocalCluster(
+                n_workers=local, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+                worker_dashboard_address=None, silence_logs=logging.CRITICAL,
+            ) as cluster,
+            distributed.Client(cluster) as client,
+        ):  # fmt: skip
+            yield client
