@@ -47,7 +47,7 @@ copyreg.pickle(MappingProxyType, lambda x: (_read_only, (dict(x),)))  # so that 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Done:
-    """A task with what became of it: a value, or why there is none."""
+    """A task with its value, or with why there is none."""
 
     task: Any
     value: Any = None

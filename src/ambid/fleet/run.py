@@ -8,6 +8,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from importlib.metadata import version
 from itertools import islice
 from pathlib import Path
@@ -102,9 +103,7 @@ def function_of(job: Job) -> Callable[..., Any]:
         return job
     if job not in JOBS:
         raise AmbidError(f"--job {job} is unknown; jobs are {', '.join(JOBS)}.{nearest(job, JOBS)} Correct it")
-    import ambid
-
-    found: Callable[..., Any] = getattr(ambid, job)
+    found: Callable[..., Any] = getattr(import_module("ambid.job"), job)
     return found
 
 
@@ -209,7 +208,7 @@ class _Run:
         return f"{rate:.3g} records/s" + (f", {failed} failed" if failed else "")
 
     def take(self, done: Done) -> None:
-        """Take what became of a record."""
+        """Take the answer to a record."""
         task: _Task = done.task
         if done.failure is None:
             found: _Found = done.value

@@ -9,6 +9,7 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.ledger.entry import Entry as Entry
     from ambid.ledger.entry import entry_of as entry_of
+    from ambid.ledger.fleet_run import FleetRun as FleetRun
     from ambid.ledger.history import History as History
     from ambid.ledger.history import Series as Series
     from ambid.ledger.store import Ledger as Ledger

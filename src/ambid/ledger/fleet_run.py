@@ -1,4 +1,4 @@
-"""What came of a job on many records."""
+"""The results of a job on many records."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ class FleetRun(Result):
 
     @property
     def counts(self) -> Mapping[str, int]:
-        """Number of records by what became of them: done, failed, known, left."""
+        """Number of records by state: done, failed, known, left."""
         of = Counter(row.state for row in self.rows)
         return {s: of[s] for s in ("done", "failed", "known")} | {"left": self.records - len(self.rows)}
 

@@ -1,4 +1,4 @@
-"""What came of a fleet, as tables for the terminal, and as panels."""
+"""Results of a fleet, as tables for the terminal, and as panels."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def fleet_title(found: FleetRun) -> str:
 
 
 def fleet_text(found: FleetRun, *, width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write what came of a fleet, below its verdict."""
+    """Write the results of a fleet, below their verdict."""
     n = found.counts
     parts = [f"{n['done']} done", *(f"{n[k]} {what}" for k, what in _COUNTED.items() if n[k])]
     rate = (n["done"] + n["failed"]) / max(found.seconds, 1e-9)
