@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shlex
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -267,6 +269,30 @@ def test_the_page_on_the_nonlinear_magnet_runs_and_shows_what_comes_out(tmp_path
     for (_, value, sd), (_, now, sd_now) in zip(shown, found, strict=True):
         assert abs(float(value) - float(now)) < 0.2 * float(sd)
         assert float(sd) == pytest.approx(float(sd_now), rel=0.2)
+
+
+def test_the_page_on_exports_runs_and_its_c_and_its_fmu_agree(tmp_path, monkeypatch, capsys):
+    """The FMU with its mass first changed, then as identified: what the C program prints."""
+    from ambid.cli.app import run_verb
+
+    compiler = shutil.which("cc")
+    pytest.importorskip("fmpy")
+    if compiler is None:
+        pytest.skip("no C compiler")
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "export.md"
+    for line in blocks(page, "sh")[0].splitlines():
+        assert run_verb(shlex.split(line)[1:]) == 0, line
+    assert "binary for" in capsys.readouterr().out
+    Path("main.c").write_text(blocks(page, "c")[0], encoding="utf-8")
+    flags = ("-std=c99", "-Wall", "-Wextra", "-Werror", "-o", "main")
+    subprocess.run([compiler, *flags, "main.c", "bearing.c", "-lm"], check=True)
+    in_c = subprocess.run(["./main"], capture_output=True, text=True, check=True).stdout
+    piece = blocks(page, "python")[0]
+    for code in (piece, piece.replace(', "m": 2.0', "")):
+        exec(compile(code, "export.md", "exec"), {})
+    changed, as_identified = re.findall(r"[\d.e-]+ m after 2 ms", capsys.readouterr().out)
+    assert as_identified == in_c.strip() != changed
 
 
 COMMISSIONED = re.compile(r"^  (m|k_x|k_i|R|L) = (-?[\d.]+) ± ([\d.]+) (\S+) \(95 %", re.MULTILINE)

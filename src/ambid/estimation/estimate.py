@@ -663,6 +663,11 @@ def _check_consistent(estimate: Estimate) -> None:
             raise ValueError(f"{p.name} is in {p.unit!r} instead of {specs[p.name].unit!r}")
         if not 1e-15 < abs(p.value) < 1e15 and (p.name in ("m", "L") or p.value != 0):
             raise ValueError(f"{p.name} = {p.value:g} is not a number that a plant can have")
+    at, rest = estimate.continuous, estimate.operating_point
+    if not all(math.isfinite(rest.get(role, math.nan)) for role in (*plant.inputs, *plant.outputs)):
+        raise ValueError("the operating point is not that of the inputs and outputs")
+    if at.A.shape != (n, n) or at.B.shape != (n, len(plant.inputs)) or at.C.shape != (n_y, n):
+        raise ValueError("the continuous plant is not of the model's size")
     if estimate.noise.gain.shape != (n, n_y) or estimate.noise.innovation_covariance.shape != (n_y, n_y):
         raise ValueError("the noise model is not of the model's size")
     size = len(estimate.covariance_names)

@@ -30,6 +30,7 @@ from ambid.rotor.estimate import RotorEstimate
 SCRIPTS = ("control", "ross")
 """For which library a script can be."""
 
+_LATEST = 1000  # samples by which an input may act late
 _STILL = 1.0  # Hz at which the bearings of a rotor at rest are read
 _STIFF, _LIGHT, _THICK = 1e14, 1e-3, 0.05  # E, rho and diameter of the shaft of a rotor without drawing
 
@@ -86,6 +87,8 @@ def _write_source(result: Any, path: Path, name: str, about: list[str]) -> None:
         limits = None if isinstance(result, BlackBoxFit) else rig_of(result, "the estimate").limits
     except AmbidError:  # it remembers no rig: where the rotor stops is not known
         limits = None
+    if not isinstance(result, BlackBoxFit):
+        _space(result)  # which refuses what nothing can hold
     source = source_of(result, UNLIMITED if limits is None else limits.position)
     if path.suffix.lower() == ".fmu":
         write_fmu(source, path, name, about)
@@ -131,6 +134,10 @@ def _space(result: Any) -> tuple[Any, Any, Array, float]:
     late = {"voltage": result.delay_samples(rate) or 0.0} if bearing else {
         role: x.samples + x.fraction for role, x in result.delay.items()
     }  # fmt: skip
+    if not all(np.isfinite(x).all() for x in (at.A, at.B, at.C)):
+        raise EstimationError("the plant has numbers that are not finite; it cannot be exported. Identify it again")
+    if max(late.values(), default=0.0) > _LATEST:
+        raise EstimationError(f"an input acts more than {_LATEST} samples late, too many to export. Identify it again")
     return at, plant, np.array([late.get(role, 0.0) for role in plant.inputs]), 1.0 / rate
 
 

@@ -56,13 +56,14 @@ class Files:
             if path.is_file() and not force and not _made_here(path, _BEGINNINGS.get(tuple(suffixes), ())):
                 remedy = "Choose another name" + ("" if force is None else ", or give --force")
                 raise AmbidError(f"{option} {path} exists, and is not a result of ambid. {remedy}")
-        except (OSError, RuntimeError) as failure:  # a name that no file can have, a link to itself
+        except (OSError, RuntimeError, ValueError) as failure:  # a name that no file can have, a link to itself
             words = getattr(failure, "strerror", None) or failure
             raise AmbidError(f"{option} {path} cannot be used: {words}. Give another name") from None
         self._claimed.append(path)
 
     def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
-        folder = (path.resolve() if path.is_symlink() else path).parent
+        whole = path.resolve()
+        folder = (whole if path.is_symlink() else path).parent
         if path.exists() and not path.is_file() and not path.is_dir():
             remedy = "Use - for standard output" if option in _STREAMED else "Name one"
             raise AmbidError(f"{option} {path} is a device or a pipe; it must be a file. {remedy}")

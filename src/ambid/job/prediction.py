@@ -19,7 +19,7 @@ from ambid.job.data import Reading, signals_of
 from ambid.job.exchange import export, plant_of
 from ambid.job.results import AnyEstimate, AnyFit, data_of, validate
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.physics.linear_model import StateSpace, delayed, model
+from ambid.physics.linear_model import StateSpace, discretise, model
 from ambid.rotor.estimate import RotorEstimate
 
 validated, exported = validate, export
@@ -108,8 +108,10 @@ def _delayed(estimate: Estimate, u: Array) -> Array:
     """Outputs (n, n_y) of a plant whose held input comes whole samples and a part of one late."""
     c, late = estimate.continuous, estimate.delay[model(estimate.model).inputs[0]]
     space = StateSpace(A=c.A, B=c.B, C=c.C, E=np.zeros((c.A.shape[0], 0)))
-    d = delayed(space, 1.0 / float(str(estimate.record["rate_hz"])), [late.samples + late.fraction])
-    return run_states(d.A, d.B, u) @ d.C.T
+    d, _ = discretise(space, 1.0 / float(str(estimate.record["rate_hz"])), fraction=late.fraction)
+    shifted = np.vstack([np.zeros((late.samples + 1, u.shape[1])), u])
+    now, last = shifted[1 : 1 + u.shape[0]], shifted[: u.shape[0]]
+    return run_states(d.A, np.hstack([d.B, d.B_late]), np.hstack([now, last])) @ d.C.T
 
 
 def to_control(result: Any) -> Any:
