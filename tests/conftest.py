@@ -49,6 +49,7 @@ LONGEST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    gc.set_threshold(100_000, 50, 100)  # as the command does: what is imported stays to the end
     if hasattr(config.option, "loadscopereorder"):  # else the files with most tests would begin first
         config.option.loadscopereorder = False
 

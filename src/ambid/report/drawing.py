@@ -9,6 +9,7 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
@@ -27,7 +28,6 @@ MEASURED, PREDICTED, BAND, BOUND = "#4d4d4d", "#0072b2", "#a9d1ec", "#d55e00"
 GREEN, ORANGE, PURPLE, SKY = "#009e73", "#e69f00", "#cc79a7", "#56b4e9"
 CYCLE = (PREDICTED, ORANGE, GREEN, PURPLE, SKY, BOUND, MEASURED)
 NORMAL_95 = 1.959963984540054
-FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE = 11.0  # inches of a page
 _DPI = 130  # of a PNG
@@ -172,16 +172,13 @@ def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = No
     kind : str, optional
         Format, where the name does not tell it.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-
     # no date inside: equal estimates give equal files
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     ending = kind or Path(str(target)).suffix.lower().removeprefix(".")
-    if ending == "png":  # `savefig` would draw everything twice
-        figure.set_dpi(_DPI)
-        FigureCanvasAgg(figure).print_png(target)  # type: ignore[no-untyped-call]
-    else:
-        figure.savefig(target, dpi=_DPI, format=ending, metadata=dates.get(ending))
+    backend = import_module(f"matplotlib.backends.backend_{'agg' if ending == 'png' else ending}")
+    figure.set_dpi(_DPI)
+    # `savefig` would draw everything twice
+    getattr(backend.FigureCanvas(figure), f"print_{ending}")(target, metadata=dates.get(ending))
 
 
 def curve(

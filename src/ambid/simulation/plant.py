@@ -114,7 +114,7 @@ class Standing:
             raise ModelError(f"a {type(w).__name__} cannot be simulated. Give a CoEnergy or a LawMagnet")
         stage = p.stage
         body = [p.m, p.c, p.R, p.gravity, p.eddy_pole, stage.v_drop, stage.i_drop, *stage.limits, stage.offset]
-        return magnet, np.array(body), (fraction, period, substeps)
+        return magnet, np.array(body), (float(fraction), period, substeps)  # one type: one kernel
 
 
 def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
