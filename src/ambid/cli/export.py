@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 
 import typer
 
-from ambid.cli.options import Force, argument, option, switch
+from ambid.cli.options import argument, option, switch
 from ambid.cli.output import Outputs
 
 
@@ -22,7 +22,7 @@ def command(
         bool,
         switch("--anyway", "Export an unusable estimate too, or one whose record does not show all; the file says so."),
     ] = False,
-    force: Force = False,
+    force: Annotated[bool, switch("--force", "Overwrite a file that is no export.")] = False,
 ) -> None:
     """Write an identified plant for other programs, by the ending of the file.
 

@@ -92,7 +92,10 @@ class Files:
         self._staged[path] = beside
         try:
             write(beside)
-        except OSError as failure:
+        except (OSError, AmbidError) as failure:  # the other files are still put in place where the caller goes on
+            self._staged.pop(path).unlink(missing_ok=True)
+            if isinstance(failure, AmbidError):
+                raise
             raise AmbidError(
                 f"{path} cannot be written: {failure.strerror or failure}. Check folder and disk"
             ) from None
