@@ -31,8 +31,8 @@ int steps(const double *u, double force, double length)
 class InC:
     """The C source of a plant, compiled."""
 
-    def __init__(self, estimate, folder):
-        write_plant(estimate, folder / "plant.c", "plant")
+    def __init__(self, estimate, folder, *, anyway=False):
+        write_plant(estimate, folder / "plant.c", "plant", anyway=anyway)
         (folder / "driver.c").write_text('#include "plant.c"\n' + DRIVER)
         subprocess.run([CC, *FLAGS, "-o", "plant.so", "driver.c", "-lm"], cwd=folder, check=True)
         self.made, self.y = ctypes.CDLL(str(folder / "plant.so")), (ctypes.c_double * 32)()

@@ -326,3 +326,27 @@ def test_without_a_compiler_an_fmu_holds_its_source(axis, tmp_path, monkeypatch)
     monkeypatch.setattr("shutil.which", lambda name: None)
     axis.export(tmp_path / "a.fmu")
     assert binaries(tmp_path / "a.fmu") == ()
+
+
+@needs_compiler
+@pytest.mark.parametrize(("model", "roles"), [("coil", ("voltage", "current")), ("rotor", ("current", "position"))])
+def test_the_other_linear_models_are_stepped_by_their_matrices(tmp_path, model, roles):
+    fixed = 'm = { value = 4.0, unit = "kg", role = "fixed" }' if model == "rotor" else ""
+    channels = "\n".join(f'[channels.{role}]\ncolumn = "{role}"' for role in roles)
+    rig = rig_from_text(
+        f'schema = "ambid.rig/1"\nname = "{model}"\nmodel = "{model}"\n{channels}\n[parameters]\n{fixed}\n', "rig.toml"
+    )
+    bench = "unstable-bearing" if model == "rotor" else "thesis"
+    estimate = ambid.identify(ambid.simulate(bench, duration=0.1, seed=1), rig)
+    plant, period = InC(estimate, tmp_path, anyway=True), 1.0 / float(estimate.record["rate_hz"])
+    estimate.export(tmp_path / "a.mat", anyway=True)
+    read = loadmat(tmp_path / "a.mat", simplify_cells=True)["sampled"]
+    A, B, C = (np.asarray(read[x]) for x in "ABC")
+    A, x = np.atleast_2d(A), np.zeros(np.atleast_2d(A).shape[0])
+    rest = [estimate.operating_point[role] for role in roles]
+    for u in np.random.default_rng(1).standard_normal(20):
+        found = plant.outputs()[0]
+        wanted = (np.atleast_2d(C.reshape(1, -1)) @ x)[0]
+        assert found - rest[1] == pytest.approx(wanted, rel=1e-9, abs=1e-12 * (abs(rest[1]) + abs(wanted)))
+        assert plant.step(u + rest[0], period) == 0
+        x = A @ x + B.reshape(x.size) * u
