@@ -1,54 +1,245 @@
-"""The ledger: stored once, all or nothing, and only what it is."""
+"""The ledger on both engines: stored once, all or nothing, by several writers at once, and only what it is."""
+
+import json
+import signal
+import sqlite3
+import subprocess
+import sys
+import zlib
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.ledger import open_ledger
+from ambid.ledger import open_ledger, schema, store
+from ambid.ledger.entry import Note, key_of, moment, settings_text
+from ambid.ledger.store import Failure
 from tests.ledger.entries import entry, parameter
 
 
-def test_what_is_stored_comes_back(tmp_path):
-    with open_ledger(tmp_path / "l.db") as ledger:
-        assert len(ledger.add([entry(k) for k in range(3)])) == 3
-    with open_ledger(tmp_path / "l.db", write=False) as ledger:
+def test_what_is_stored_comes_back(place):
+    note = Note(at=5.0, kind="change", text="it fell", parameter="k_i")
+    made = [entry(k, events=(note,) if k == 1 else (), document='{"a": 1}' if k == 2 else "") for k in range(3)]
+    with open_ledger(place) as ledger:
+        assert len(ledger.add(made)) == 3
+    with open_ledger(place, write=False) as ledger:
         found = ledger.history("A")
         (known,) = ledger.bearings()
+        assert "secret" not in ledger.shown
     assert found["k_i"].value == pytest.approx([80.0, 79.9, 79.8])
-    assert (found["R"].unit, found["R"].sd[0]) == ("ohm", 0.02)
+    assert (found["R"].unit, found["R"].sd[0], found["R"].identifiable.all()) == ("ohm", 0.02, True)
     assert (known.name, known.plant, known.estimates) == ("A", "bench A", 3)
+    assert found.events == (note,)
 
 
-def test_the_same_estimate_counts_once(tmp_path):
-    with open_ledger(tmp_path / "l.db") as ledger:
+def test_the_same_estimate_counts_once(place):
+    with open_ledger(place) as ledger:
         first = ledger.add([entry(0), entry(1), entry(1)])
         again = ledger.add([entry(1), entry(2)])
         assert first == ledger.done([entry(0).key, entry(1).key, "none"])
         assert again == {entry(2).key}
         assert ledger.history("A")["k_i"].value.size == 3
+        assert ledger.add([]) == frozenset()
 
 
-def test_what_is_not_identifiable_is_no_number(tmp_path):
-    seen = [(parameter("k_i", 80.0, 0.5),), (parameter("k_i", 5.0, 90.0, seen=False),), (parameter("k_i", 3.0, 0.1),)]
-    verdicts = ["usable", "caution", "unusable"]
-    with open_ledger(tmp_path / "l.db") as ledger:
-        ledger.add([entry(k, parameters=p, verdict=v) for k, (p, v) in enumerate(zip(seen, verdicts, strict=True))])
+def test_what_failed_is_named_until_it_is_estimated(place):
+    failed = {"bearing": "A", "record": "day0.h5", "rig_sha": "one", "settings": "{}", "version": "0.1.0"}
+    with open_ledger(place) as ledger:
+        for reason in ("killed", "out of memory"):
+            ledger.fail([Failure(**failed, sha="A0", reason=reason), Failure(**failed, sha="A9", reason=reason)])
+        assert {f.reason for f in ledger.failures().values()} == {"out of memory"}
+        ledger.add([entry(0)])
+        assert [f.sha for f in ledger.failures().values()] == ["A9"]
+
+
+def test_what_is_not_identifiable_is_no_value(place):
+    seen = [parameter("k_i", 80.0, 0.5), parameter("k_i", 5.0, 90.0, seen=False), parameter("k_i", 3.0, 0.1)]
+    seen += [parameter("k_i", 7.0, np.inf), parameter("k_i", np.nan, 1.0)]
+    verdicts = ["usable", "caution", "unusable", "usable", "usable"]
+    with open_ledger(place) as ledger:
+        ledger.add([entry(k, parameters=(p,), verdict=v) for k, (p, v) in enumerate(zip(seen, verdicts, strict=True))])
         found = ledger.history("A")
-    assert found["k_i"].identifiable.tolist() == [True, False, True]
-    assert np.isnan(found["k_i"].value).tolist() == [False, True, True]
+    assert found["k_i"].identifiable.tolist() == [True, False, True, False, False]
+    assert np.isnan(found["k_i"].value).tolist() == [False, True, True, True, True]
+
+
+WRITER = """
+import sys
+from ambid.ledger import open_ledger
+from tests.ledger.entries import entry
+place, first = sys.argv[1], int(sys.argv[2])
+with open_ledger(place) as ledger:
+    new = sum(len(ledger.add([entry(k, f"B{k % 7}") for k in range(a, a + 25)])) for a in range(first, first + 500, 25))
+print(new)
+"""
+
+
+def writer(*words):
+    return subprocess.Popen([sys.executable, "-c", WRITER, *map(str, words)], stdout=subprocess.PIPE, text=True)
+
+
+def test_two_writers_at_once_lose_nothing_and_repeat_nothing(place):
+    """Both begin where there is no ledger yet."""
+    runs = [writer(place, first) for first in (0, 250)]
+    new = [int(run.communicate(timeout=300)[0]) for run in runs]
+    assert sum(new) == 750
+    with open_ledger(place, write=False) as ledger:
+        assert sum(b.estimates for b in ledger.bearings()) == 750
+        found = [ledger.history(f"B{k}") for k in range(7)]
+    assert sorted(e.record for h in found for e in h.estimates) == sorted(f"day{k}.h5" for k in range(750))
+    assert sum(h["k_i"].value.size for h in found) == 750
+
+
+def test_a_batch_that_fails_in_the_middle_leaves_nothing(place, monkeypatch):
+    with open_ledger(place) as ledger:
+        ledger.add([entry(0)])
+        monkeypatch.setattr(
+            store, "_document", lambda *_: {"estimate": -1, "json": b"", "covariance": b""}
+        )  # no such one
+        with pytest.raises(AmbidError, match="Nothing of this was stored"):
+            ledger.add([entry(k, "new", document="{}") for k in range(1, 5)])
+        assert [b.name for b in ledger.bearings()] == ["A"]
+        assert ledger.done([entry(k, "new").key for k in range(5)]) == frozenset()
+
+
+def test_a_newer_ledger_is_refused_and_an_older_one_brought_up(place, monkeypatch):
+    with open_ledger(place) as ledger:
+        ledger.add([entry(0)])
+    monkeypatch.setattr(schema, "VERSION", 2)
+    monkeypatch.setattr(schema, "STEPS", {1: ("ALTER TABLE event ADD COLUMN more TEXT",)})
+    with pytest.raises(AmbidError, match="is of version 1, and is read as 2"):
+        open_ledger(place, write=False)
+    open_ledger(place).close()
+    with open_ledger(place, write=False) as ledger:
+        assert len(ledger.history("A").estimates) == 1
+    monkeypatch.undo()
+    for write in (True, False):
+        with pytest.raises(AmbidError, match="is of version 2; this ambid reads 1"):
+            open_ledger(place, write=write)
+
+
+def test_covariance_and_document_stand_beside(tmp_path):
+    covariance = np.array([[1.0, 0.5], [0.5, 2.0]])
+    with open_ledger(tmp_path / "l.db") as ledger:
+        ledger.add([entry(0, covariance=covariance, covariance_names=("k_i", "R"), document='{"schema": "x"}')])
+    c = sqlite3.connect(tmp_path / "l.db")
+    text, matrix = (zlib.decompress(x) for x in c.execute("SELECT json, covariance FROM document").fetchone())
+    c.close()
+    assert (json.loads(text), json.loads(matrix)["matrix"]) == ({"schema": "x"}, covariance.tolist())
 
 
 def test_a_foreign_file_is_refused_and_left_as_it_was(tmp_path):
-    import sqlite3
-
     other = tmp_path / "other.db"
-    with sqlite3.connect(other) as c:
-        c.execute("CREATE TABLE estimate (x)")
+    c = sqlite3.connect(other)
+    c.execute("CREATE TABLE estimate (x)")
+    c.commit()
     c.close()
     (tmp_path / "text.db").write_text("no database")
-    for path in (other, tmp_path / "text.db"):
+    (tmp_path / "cut.db").write_bytes(other.read_bytes()[:600])
+    for path in (other, tmp_path / "text.db", tmp_path / "cut.db"):
         before = path.read_bytes()
         with pytest.raises(AmbidError, match="is not a ledger of ambid"):
             open_ledger(path)
         assert path.read_bytes() == before
-    assert len(list(tmp_path.iterdir())) == 2
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_a_foreign_database_on_a_server_is_refused(postgres):
+    import psycopg
+
+    from tests.ledger.server import new_database
+
+    url = new_database(postgres, "foreign")
+    with psycopg.connect(url, autocommit=True) as c:
+        c.execute("CREATE TABLE value (x integer)")
+    with pytest.raises(AmbidError, match="is not a ledger of ambid"):
+        open_ledger(url)
+    with pytest.raises(AmbidError, match="holds no ledger yet"):
+        open_ledger(new_database(postgres, "empty"), write=False)
+    with pytest.raises(AmbidError, match='database "none" does not exist') as refused:
+        open_ledger(postgres.format("none").replace("ambid@", "ambid:secret@"))
+    assert "secret" not in str(refused.value)
+
+
+def test_a_full_disk_leaves_what_was_there(tmp_path):
+    with open_ledger(tmp_path / "l.db") as ledger:
+        ledger.add([entry(0)])
+        with ledger._engine.connect() as c:
+            c.exec_driver_sql(f"PRAGMA max_page_count = {c.exec_driver_sql('PRAGMA page_count').scalar_one() + 2}")
+        with pytest.raises(AmbidError, match="disk is full"):
+            ledger.add([entry(k, document="x") for k in range(1, 2000)])
+        assert len(ledger.history("A").estimates) == 1
+
+
+def test_a_writer_waits_for_another(tmp_path, monkeypatch):
+    path = tmp_path / "l.db"
+    open_ledger(path).close()
+    other = sqlite3.connect(path, isolation_level=None, check_same_thread=False)
+    other.execute("BEGIN IMMEDIATE")
+    with open_ledger(path, write=False) as ledger:  # readers do not wait
+        assert ledger.bearings() == ()
+    with ThreadPoolExecutor(1) as pool:
+        writing = pool.submit(lambda: open_ledger(path).add([entry(0)]))
+        with pytest.raises(TimeoutError):
+            writing.result(timeout=0.8)  # longer than one try
+        other.execute("ROLLBACK")
+        assert len(writing.result(timeout=60)) == 1
+    monkeypatch.setattr(store, "PATIENCE_S", 0.1)
+    other.execute("BEGIN IMMEDIATE")
+    with pytest.raises(AmbidError, match="another program has been writing"):
+        open_ledger(path)
+    other.close()
+
+
+KILLED = """
+import os, sys
+from ambid.ledger import open_ledger, store
+from tests.ledger.entries import entry
+store._document = lambda *_: print("half", flush=True) or sys.stdin.read()
+with open_ledger(sys.argv[1]) as ledger:
+    ledger.add([entry(k, document="{}") for k in range(1, 200)])
+"""
+
+
+def test_a_writer_killed_in_the_middle_leaves_nothing_of_its_batch(place):
+    with open_ledger(place) as ledger:
+        ledger.add([entry(0)])
+    run = subprocess.Popen(
+        [sys.executable, "-c", KILLED, place], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    )
+    assert run.stdout.readline() == "half\n"
+    run.send_signal(signal.SIGKILL)
+    run.communicate()
+    with open_ledger(place) as ledger:
+        assert len(ledger.history("A").estimates) == 1
+        assert len(ledger.add([entry(k) for k in range(200)])) == 199
+
+
+def test_a_ledger_in_a_folder_that_may_not_be_written_can_be_read(tmp_path):
+    folder = tmp_path / "archive"
+    folder.mkdir()
+    with open_ledger(folder / "l.db") as ledger:
+        ledger.add([entry(0)])
+    (folder / "l.db").chmod(0o444)
+    folder.chmod(0o555)
+    try:
+        with open_ledger(folder / "l.db", write=False) as ledger:
+            assert len(ledger.history("A").estimates) == 1
+    finally:
+        folder.chmod(0o755)
+
+
+def test_the_key_counts_what_was_asked_for_and_nothing_else():
+    assert settings_text("identify", from_s=None, nonlinear=False, held=()) == settings_text("identify")
+    assert (
+        settings_text("identify", a=1, b=2) == settings_text("identify", b=2, a=1) != settings_text("track", a=1, b=2)
+    )
+    keys = {key_of(*parts, "1") for parts in (("a", "b", "c"), ("ab", "", "c"), ("a", "bc", ""))}
+    assert len(keys) == 3
+
+
+def test_times_are_read_as_utc_unless_they_say_otherwise():
+    assert moment("2026-03-01T14:30") == moment("2026-03-01T15:30+01:00") == moment("2026-03-01 14:30:00Z")
+    with pytest.raises(AmbidError, match="must be a date and time"):
+        moment("01.03.2026")
