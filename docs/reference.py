@@ -35,6 +35,8 @@ GROUPS: dict[str, dict[str, str]] = {
         "ambid.job": "whole jobs and their parts",
         "ambid.report": "figures",
         "ambid.acquisition": "records from a controller",
+        "ambid.ledger": "estimates of many records, kept once each",
+        "ambid.fleet": "a job on many records",
     },
 }
 

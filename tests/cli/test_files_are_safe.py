@@ -32,6 +32,7 @@ VERBS = {
     "init": ("init", "r.csv", "-o"),
     "identify": ("identify", "r.csv", "--json"),
     "validate": ("validate", "e.json", "r.csv", "--json"),
+    "fleet run": ("fleet", "run", "r.csv", "--ledger", "fleet.db", "--workers", "1", "--job", "info", "--json"),
     "history": ("history", "A", "--ledger", "l.db", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),

@@ -27,7 +27,7 @@ def test_the_prototypes_rig_is_written_and_its_controller_takes_it(bench, ambid)
             "--preset 'prototyp' is unknown; known: thesis, unstable-bearing,",
         ),
         (("--preset", "prototyp"), "Did you mean 'prototype'?"),
-        (("--preset", "prototype", "--rate", "100"), "--rate and --gaps are for reading a record"),
+        (("--preset", "prototype", "--rate", "100"), "--rate, --gaps and --layout are for reading a record"),
     ],
 )
 def test_what_makes_no_rig_is_refused_in_one_line(bench, ambid, words, said):

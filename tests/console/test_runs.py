@@ -241,9 +241,9 @@ def test_anybody_may_stop_and_what_came_is_kept(bench):
     with console(bench) as page:
         page.open()
         wish = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine"}
-        run = Runs(bench).one(
-            page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "long"})["id"]
-        )
+        answer = page.json("POST", "/api/runs", {**wish, "rig": page.number("rig.toml"), "out": "long"})
+        assert "id" in answer, answer
+        run = Runs(bench).one(answer["id"])
         assert told(until(run, "spectrum"), "spectrum")  # a second was recorded
         stop = page.ask("POST", f"/api/runs/{run.id}/say", {"word": "stop"}, headers={"X-Ambid": "page-2"})
         assert stop.status == 200

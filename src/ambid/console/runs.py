@@ -78,6 +78,11 @@ class Run:
         """Note that this process does it."""
         _write(self.place / "process.json", {"pid": os.getpid(), "began": process_began(os.getpid())})
 
+    def release(self) -> None:
+        """Note that it is over: the process, which takes a while to end, holds no machine any more."""
+        with suppress(OSError):
+            (self.place / "process.json").unlink()
+
 
 class Heard:
     """Reads what the operator says to a run, as it comes."""

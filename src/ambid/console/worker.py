@@ -71,6 +71,7 @@ class Worker:
             return 1
         finally:
             self.feed.close()
+            self.run.release()
         return 0
 
     def end(self, how: str, why: str) -> None:
