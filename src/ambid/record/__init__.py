@@ -97,7 +97,7 @@ def read_record(
     if kind == "mat":
         from ambid.record.mat_format import read_mat
 
-        return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps)
+        return read_mat(path, variables=variables, rate_hz=rate_hz, gaps=gaps, layout=layout)
     if kind == "hdf5":
         from ambid.record.hdf5_format import read_hdf5
 
@@ -207,6 +207,7 @@ LAYOUTS = {
     "tdms": ("group", "channels"),
     "mdf": ("group", "channels"),
     "parquet": ("channels",),
+    "mat": ("group", "channels", "units", "values"),
 }
 """Words by which the layout of a file is told, by format."""
 

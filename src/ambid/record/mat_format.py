@@ -1,12 +1,14 @@
 """Records from MATLAB: ``.mat`` of version 5 (SciPy) and 7.3 (which is HDF5).
 
 A mapping says which variable is which channel, and in what unit: ``{"current": ("data.i", "mA")}``. A variable is named
-as in MATLAB: ``i``, ``data.i`` for a field of a struct, ``y(:,2)`` for a column of a matrix.
+as in MATLAB: ``i``, ``data.i`` for a field of a struct, ``y(:,2)`` for a column of a matrix. Structures that hold
+signals with names and units (`mat_structures`) need none.
 """
 
 from __future__ import annotations
 
 import re
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,10 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
+from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, structures
 from ambid.record.record import Record, file_bytes, sha256_of
 from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, check_gap_policy, refuse_gaps, seconds, uniform_record
+from ambid.record.streams import refuse_claim
 from ambid.units import UNKNOWN
 
 _EXPRESSION = re.compile(r"(?P<path>[A-Za-z]\w*(?:\.[A-Za-z]\w*)*)\s*(?:\(\s*:\s*,\s*(?P<column>\d+)\s*\))?")
@@ -28,6 +32,7 @@ def read_mat(
     variables: Mapping[str, tuple[str, str]] | None = None,
     rate_hz: float | None = None,
     gaps: GapPolicy = "error",
+    layout: Mapping[str, str] | None = None,
 ) -> Record:
     """Read a record from a MATLAB file.
 
@@ -38,6 +43,17 @@ def read_mat(
     check_gap_policy(gaps)
     data = file_bytes(path)
     content = _content(path, data)
+    named = [
+        x for name, (x, _) in (variables or {}).items() if name != "time" and (x != name or _is_vector(content.get(x)))
+    ]
+    if not named:
+        refuse_foreign(content, path)
+        groups = structures(content, path)
+        if groups:
+            return read_structures(path, sha256_of(data), groups, layout or {}, rate_hz, gaps)
+    if layout:
+        why = f"the rig names the variable {named[0]}" if named else "it has no structure with signals"
+        raise RecordError(f"record {path}: a layout is for structures; {why}. Omit the layout")
     mapping = dict(variables) if variables is not None else _every_vector(content, path)
     if "time" not in mapping:
         found = next((name for name in TIME_NAMES if name in content), None)
@@ -62,43 +78,79 @@ def read_mat(
 
 def _content(path: Path, data: bytes) -> dict[str, Any]:
     """Return the variables of the file, structs as nested dicts."""
-    if data[:10] == b"MATLAB 7.3" or data[:8] == b"\x89HDF\r\n\x1a\n":
+    if b"\x89HDF\r\n\x1a\n" in (data[:8], data[512:520]):
         return _content_v73(path)
     from scipy.io import loadmat
 
     try:
-        content = loadmat(path, struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True)
+        with warnings.catch_warnings():  # objects are all called None; any other name that occurs twice is a failure
+            warnings.filterwarnings("error", message="Duplicate variable")
+            warnings.filterwarnings("ignore", message='Duplicate variable name "None"')
+            content = loadmat(path, struct_as_record=False, squeeze_me=False, verify_compressed_data_integrity=True)
     except Exception as failure:  # loadmat raises whatever its parser meets in a damaged file
         raise RecordError(
             f"record {path} is not a valid MATLAB file ({type(failure).__name__}: {failure}). Save it again from MATLAB"
         ) from None
-    return {name: _fields(value) for name, value in content.items() if not name.startswith("__")}
+    return {
+        bytes(value["s0"].flat[0]).decode("latin-1") if name == "None" else name: _fields(value)
+        for name, value in content.items()
+        if not name.startswith("__")
+    }
 
 
 def _fields(value: Any) -> Any:
-    """Turn a 1 x 1 MATLAB struct into a dict."""
-    if isinstance(value, np.ndarray) and value.dtype == object and value.size == 1:
-        value = value.item()
+    """Turn structs into dicts, arrays of them and cells into lists, text into str."""
     if hasattr(value, "_fieldnames"):
         return {name: _fields(getattr(value, name)) for name in value._fieldnames}
+    if not isinstance(value, np.ndarray):
+        return value
+    if value.dtype.names and "s2" in value.dtype.names:
+        return Foreign(bytes(value["s2"].flat[0] or b"").decode("latin-1"))
+    if value.dtype == object:
+        return _fields(value.flat[0]) if value.size == 1 else [_fields(x) for x in value.ravel(order="F")]
+    if value.dtype.kind == "U":
+        return value.flat[0] if value.size == 1 else value.tolist()
     return value
 
 
 def _content_v73(path: Path) -> dict[str, Any]:
     import h5py
 
+    size = path.stat().st_size
+
+    def text_of(node: Any, name: str) -> str:
+        said = node.attrs.get(name, b"")
+        return said.decode("latin-1") if isinstance(said, bytes) else str(said)
+
     def taken(node: Any) -> Any:
+        kind = text_of(node, "MATLAB_class")
+        if "MATLAB_object_decode" in node.attrs and kind not in ("function_handle", "string"):
+            return Foreign(kind)
         if isinstance(node, h5py.Group):
-            return {name: taken(node[name]) for name in node if not name.startswith("#")}
+            found = {name: taken(node[name]) for name in node if not name.startswith("#")}
+            arrays = [
+                isinstance(x, list) and "MATLAB_class" not in node[k].attrs and not isinstance(node[k], h5py.Group)
+                for k, x in found.items()
+            ]
+            if arrays and all(arrays) and len({len(x) for x in found.values()}) == 1:  # an array of structs
+                return [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
+            return found
+        refuse_claim(path, node.size, node.dtype.itemsize, size)
+        if "MATLAB_empty" in node.attrs:
+            return "" if kind == "char" else [] if kind == "cell" else np.empty((0, 0))
         values = np.asarray(node[()])
+        if h5py.check_ref_dtype(node.dtype) is not None:
+            return [taken(file[reference]) for reference in values.ravel()]
+        if kind == "char":
+            return values.astype("<u2").tobytes().decode("utf-16-le", "replace") if min(values.shape) < 2 else ""
         # MATLAB stores column-major: what HDF5 shows is the transpose of the variable.
-        return values.T if values.ndim == 2 else values
+        return values.T if values.ndim >= 2 else values
 
     try:
         with h5py.File(path, "r") as file:
             content: dict[str, Any] = taken(file)
             return content
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError) as failure:
+    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as failure:
         raise RecordError(
             f"record {path} is not a valid MATLAB 7.3 file ({failure}). Save it again from MATLAB"
         ) from None
@@ -155,8 +207,10 @@ def _vector(content: Mapping[str, Any], expression: str, path: Path) -> Array:
 
 
 def _shape(value: Any) -> str:
-    if isinstance(value, Mapping):
-        return "a struct"
+    if isinstance(value, Mapping | list):
+        return "a struct" if isinstance(value, Mapping) else "an array of structs, or a cell array"
+    if isinstance(value, Foreign):
+        return f"an object of class {value.kind}"
     if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
         return "a " + " x ".join(map(str, value.shape)) + " matrix"
     if isinstance(value, np.ndarray) and value.dtype.kind == "c":

@@ -25,8 +25,9 @@ from ambid.units import UNKNOWN, Unit, parse_unit
 PIECE = 1 << 18  # samples that are read at once
 _MOST_PACKED = 1032  # values a byte of a file can stand for: the most that deflate packs
 
-_WORDS = {"Volts": "V", "Volt": "V", "Amps": "A", "Amperes": "A", "Ampere": "A", "Meters": "m", "Seconds": "s",
-          "Newtons": "N", "Hertz": "Hz", "Ohms": "ohm", "Degrees": "deg", "Radians": "rad"}  # fmt: skip
+_WORDS = {"volts": "V", "volt": "V", "amps": "A", "amperes": "A", "ampere": "A", "meters": "m", "seconds": "s",
+          "milliseconds": "ms", "microseconds": "us", "newtons": "N", "hertz": "Hz", "ohms": "ohm", "degrees": "deg",
+          "radians": "rad"}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -110,9 +111,8 @@ def record_of(
                 f"record {path}: channels differ in {what} ({listed}); all must have the same. Choose some: --layout "
                 f"channels={streams[0].name},…"
             )
-    n, size = streams[0].size, path.stat().st_size
-    if n * len(streams) > _MOST_PACKED * size:
-        raise RecordError(f"record {path} claims {n} samples in {size} bytes: it is damaged. Copy or export it again")
+    n = streams[0].size
+    refuse_claim(path, n, len(streams), path.stat().st_size)
     provenance = {"file": path.name, "sha256": digest}
     data = [s for s in streams if not s.time]
     if not data:
@@ -155,6 +155,12 @@ def record_of(
     )  # fmt: skip
 
 
+def refuse_claim(path: Path, n: int, width: int, size: int) -> None:
+    """Refuse `n` rows of `width` values or bytes that no file of `size` bytes can hold, before room is made."""
+    if n * width > _MOST_PACKED * size:
+        raise RecordError(f"record {path} claims {n} samples in {size} bytes: it is damaged. Copy or export it again")
+
+
 def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) -> list[Stream]:
     """Keep the channels that the layout names, and time."""
     if "channels" not in layout:
@@ -182,7 +188,7 @@ def is_time(name: str) -> bool:
 
 def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
     """Return the unit, None where it is missing or not known, and how the file writes it."""
-    said = {_WORDS.get(text, text) for text in stream.units}
+    said = {_WORDS.get(text.lower(), text) for text in stream.units}
     if len(said) > 1:
         raise RecordError(
             f"record {path}: channel {stream.name!r} is in {' and in '.join(f'[{x}]' for x in sorted(said))}; it has "
@@ -193,7 +199,7 @@ def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
         unit = parse_unit(text)
     except UnitError:
         return None, text
-    return unit, unit.symbol
+    return (None, text) if text == "g" else (unit, unit.symbol)  # of instruments: gravity rather than gram
 
 
 def _fill(out: Array, stream: Stream, unit: Unit | None, path: Path) -> None:

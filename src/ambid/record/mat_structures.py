@@ -1,0 +1,287 @@
+"""Signals in MATLAB's structures, with their names and units: Simulink, timeseries, Simcenter Testlab, plain structs.
+
+time, signals(k).values, .label          Simulink, "Structure with time"
+Time, Data, Name, units                  a timeseries as struct, alone, in an array, in fields, in Elements{k}.Values
+x_values, y_values, function_record      Simcenter (LMS) Testlab
+time, u, i, …, units.u                   a struct of columns
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.errors import RecordError, UnitError
+from ambid.record.frames import label_of
+from ambid.record.record import Record
+from ambid.record.sampling import TIME_NAMES, GapPolicy
+from ambid.record.streams import Stream, chosen_group, record_of
+from ambid.units import parse_unit
+
+_LONE = "signals"  # group of the structures that hold one signal each
+_VECTORS = "vectors"
+_CLOCKS = ("tout", *TIME_NAMES)
+_UNITS = ("units", "Units", "unit", "Unit")
+_REMEDIES = {
+    "timeseries": "S = struct('Time', {0}.Time, 'Data', {0}.Data, 'Name', {0}.Name, 'units', {0}.DataInfo.Units)",
+    "timetable": "S = struct('time', seconds({0}.Time), 'u', {0}.u, 'units', struct('u', 'V'))",
+    "table": "S = struct('time', {0}.t, 'u', {0}.u, 'units', struct('u', 'V'))",
+    "Simulink.SimulationData": "x = {0}{{1}}.Values; "
+    "S(1) = struct('Time', x.Time, 'Data', x.Data, 'Name', x.Name, 'units', 'V') and so on",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Foreign:
+    """An object of a MATLAB class, whose content no library reads."""
+
+    kind: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Signal:
+    name: str
+    values: np.ndarray
+    units: Mapping[str, str]  # by the field that says them
+    time: Array | None = None
+    time_unit: str = "s"
+    step: tuple[float, float] | None = None  # start and interval, where there is no time
+    factor: tuple[float, float] = (1.0, 0.0)  # of a unit transformation, and its offset
+
+
+def refuse_foreign(content: Mapping[str, Any], path: Path) -> None:
+    """Refuse a file whose data are in objects, and say how they become structs."""
+    for name, kind in _foreign(content):
+        remedy = next((text.format(name) for known, text in _REMEDIES.items() if kind.startswith(known)), None)
+        if remedy is not None:
+            raise RecordError(
+                f"record {path}: {name} is a MATLAB object of class {kind}, which can be read by MATLAB only. There: "
+                f"{remedy}; save('{path.name}', 'S')"
+            )
+
+
+def _foreign(node: Any, name: str = "") -> Iterator[tuple[str, str]]:
+    if isinstance(node, Foreign):
+        yield name, node.kind
+    elif isinstance(node, Mapping):
+        for key, x in node.items():
+            yield from _foreign(x, f"{name}.{key}" if name else key)
+    elif isinstance(node, list):
+        for k, x in enumerate(node, 1):
+            yield from _foreign(x, f"{name}{{{k}}}")
+
+
+def structures(content: Mapping[str, Any], path: Path) -> dict[str, list[_Signal]]:
+    """Return the signals of the file by group: by variable, those of variables with one signal each together."""
+    groups: dict[str, list[_Signal]] = {}
+    for name, node in content.items():
+        found = list(_signals(node, name, path))
+        if found:
+            groups.setdefault(_LONE if len(found) == 1 else name, []).extend(found)
+    loose = {k: v for k, v in content.items() if _vector(v) is not None and k not in _CLOCKS} if groups else {}
+    if loose:
+        time = next((_vector(content[k]) for k in _CLOCKS if k in content), None)
+        groups[_VECTORS] = [_Signal(name=k, values=v, units={}, time=time) for k, v in loose.items()]
+    return groups
+
+
+def read_structures(
+    path: Path, digest: str, groups: Mapping[str, list[_Signal]], layout: Mapping[str, str], rate_hz: float | None,
+    gaps: GapPolicy,
+) -> Record:  # fmt: skip
+    """Make a record of the signals of one group."""
+    group = chosen_group(path, {k: [s.name for s in v] for k, v in groups.items()}, layout.get("group"))
+    every = groups[group]
+    twice = next((s.name for k, s in enumerate(every) if s.name in [x.name for x in every[:k]]), None)
+    if twice is not None:
+        raise RecordError(f"record {path}: {group} has two signals {twice!r}; names must differ. Rename one")
+    names = [x.strip() for x in layout["channels"].split(",")] if "channels" in layout else [s.name for s in every]
+    wanted = [s for s in every if s.name in names] or every
+    streams = [_stream(s, path, layout) for s in wanted]
+    clocks = [s for s in wanted if s.time is not None]
+    for other in clocks[1:]:
+        if not np.array_equal(clocks[0].time, other.time) or clocks[0].time_unit != other.time_unit:  # type: ignore[arg-type]
+            raise RecordError(
+                f"record {path}: {clocks[0].name!r} and {other.name!r} have different times ({_span(clocks[0])}, "
+                f"{_span(other)}); all must have the same. Choose some: --layout channels={clocks[0].name},…"
+            )
+    if clocks:
+        time = np.asarray(clocks[0].time, dtype=np.float64)
+        unit = frozenset({clocks[0].time_unit})
+        streams.append(Stream(name="time", size=time.size, pieces=lambda: (time,), time=True, units=unit))
+    return record_of(path, digest, streams, {"format": "mat", "group": group}, layout, rate_hz, gaps)
+
+
+def _span(signal: _Signal) -> str:
+    time = np.asarray(signal.time)
+    return f"{time.size} samples, {time[0]:.6g} to {time[-1]:.6g} {signal.time_unit}"
+
+
+def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
+    """Return a signal with its one unit; several that differ are asked back, and so is a transformation of it."""
+    said = {field: text for field, text in signal.units.items() if text}
+    if "units" in layout:
+        said = {field: text for field, text in said.items() if field == layout["units"]}
+    if len(set(said.values())) > 1:
+        listed = ", ".join(f"{field} says [{text}]" for field, text in said.items())
+        raise RecordError(
+            f"record {path}: signal {signal.name!r} has several units ({listed}). Say which field to believe: --layout "
+            f"units={next(iter(said))}, or units=none"
+        )
+    values, unit = signal.values, next(iter(said.values()), "")
+    if signal.factor != (1.0, 0.0):
+        if layout.get("values") not in ("si", "label"):
+            raise RecordError(
+                f"record {path}: signal {signal.name!r} is in [{unit}] with a unit transformation (factor "
+                f"{signal.factor[0]:g}, offset {signal.factor[1]:g}). Say what values are in: --layout values=si, or"
+                f" values=label for [{unit}]"
+            )
+        if layout["values"] == "si":
+            unit = _si(unit)
+    step, start = (signal.step[1], signal.step[0]) if signal.step else (0.0, 0.0)
+    return Stream(
+        name=signal.name, size=values.size, pieces=lambda: (values,), units=frozenset({unit} - {""}),
+        rate_hz=float(f"{1 / step:.10g}") if 0 < step < np.inf else None, start=(start, ""),
+    )  # fmt: skip
+
+
+def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
+    """Yield all signals of a variable."""
+    if isinstance(node, list):
+        for k, x in enumerate(node, 1):
+            yield from _signals(x, f"{name}({k})", path)
+    if not isinstance(node, Mapping):
+        return
+    known = {key.lower(): x for key, x in node.items()}
+    time = next((v for key in TIME_NAMES if (v := _vector(known.get(key))) is not None), None)
+    if "signals" in known and "time" in known:
+        parts = known["signals"] if isinstance(known["signals"], list) else [known["signals"]]
+        for k, part in enumerate(parts, 1):
+            if isinstance(part, Mapping) and "values" in part:
+                label, inside = label_of(_text(part.get("label")))
+                units = {"label": inside or "", **_units(part)}
+                yield from _columns(part["values"], label or f"signals({k})", path, units, time=time)
+    elif "data" in known and time is not None:
+        unit = _text(_at(known, "timeinfo", "Units")) or _text(known.get("timeunits")) or "s"
+        called = _text(known.get("name")) or name
+        yield from _columns(known["data"], called, path, _units(node), time=time, time_unit=unit)
+    elif "x_values" in known and "y_values" in known:
+        yield from _testlab(known, name, path)
+    elif time is not None:
+        told = known.get("units")
+        for key, x in node.items():
+            vector = None if key.lower() in TIME_NAMES else _vector(x)
+            if vector is not None and vector.size == time.size:
+                by_name = {"units": _text(told.get(key)) if isinstance(told, Mapping) else ""}
+                yield _Signal(name=key, values=vector, units=by_name, time=time)
+    else:
+        for key, x in node.items():
+            called = _text(known.get("name")) if key.lower() == "values" else ""
+            yield from _signals(x, called or (name if key.lower() in ("values", "elements") else key), path)
+
+
+def _testlab(known: Mapping[str, Any], name: str, path: Path) -> Iterator[_Signal]:
+    x, y = known["x_values"], known["y_values"]
+    if not (isinstance(x, Mapping) and isinstance(y, Mapping) and "values" in y):
+        return
+    over = _text(_at(x, "quantity", "label")) or "s"
+    if over not in ("s", "ms", "us"):
+        raise RecordError(f"record {path}: {name} is over [{over}], not over time. Export the time signals")
+    called = _at(known, "function_record", "name")
+    names = [_text(n) for n in called] if isinstance(called, list) else [_text(called) or name]
+    try:
+        start, step, count = (float(np.ravel(x[k])[0]) for k in ("start_value", "increment", "number_of_values"))
+    except (KeyError, IndexError, TypeError, ValueError):
+        raise RecordError(
+            f"record {path}: {name}.x_values has no start_value, increment and number_of_values. Export it again"
+        ) from None
+    scale = {"s": 1.0, "ms": 1e-3, "us": 1e-6}[over]
+    change = _at(y, "quantity", "unit_transformation")
+    factor = tuple(float(np.ravel(_at(change, k))[0]) if _vector(_at(change, k), 1) is not None else usual
+                   for k, usual in (("factor", 1.0), ("offset", 0.0)))  # fmt: skip
+    unit = {"quantity.label": _text(_at(y, "quantity", "label"))}
+    for signal in _columns(y["values"], names if len(names) > 1 else names[0], path, unit, length=int(count)):
+        if signal.values.size != count:
+            raise RecordError(
+                f"record {path}: {signal.name!r} has {signal.values.size} values; number_of_values is {count:g}. It is "
+                "cut off: export it again"
+            )
+        yield _Signal(
+            name=signal.name, values=signal.values, units=unit, step=(start * scale, step * scale),
+            factor=(factor[0], factor[1]),
+        )  # fmt: skip
+
+
+def _columns(
+    values: Any, name: str | Sequence[str], path: Path, units: Mapping[str, str], *, time: Array | None = None,
+    time_unit: str = "s", length: int | None = None,
+) -> Iterator[_Signal]:  # fmt: skip
+    """Yield the columns of a signal of one or more dimensions, named name(1), name(2), …"""
+    called = name if isinstance(name, str) else ", ".join(name)
+    if isinstance(values, Foreign) or not isinstance(values, np.ndarray) or values.dtype.kind not in "fiub":
+        kind = "complex" if isinstance(values, np.ndarray) and values.dtype.kind == "c" else "not numeric"
+        raise RecordError(
+            f"record {path}: the values of {called!r} are {kind}; they must be real numbers. Save them so"
+        )
+    n = length if time is None else time.size
+    array = values
+    if array.ndim == 3:  # one matrix a sample
+        array = array.reshape(-1, array.shape[2]).T if 1 in array.shape[:2] else array
+    elif array.ndim == 2 and array.shape[0] == 1 and array.shape[1] == (n or array.shape[1]):
+        array = array.T
+    if array.ndim == 1:
+        array = array[:, None]
+    if array.ndim != 2:
+        raise RecordError(
+            f"record {path}: {called!r} is a {' x '.join(map(str, values.shape))} array. Save its columns"
+        )
+    if n is not None and time is not None and array.shape[0] != n:
+        raise RecordError(
+            f"record {path}: {called!r} is {' x '.join(map(str, values.shape))}, its time has {n} samples. Save again"
+        )
+    many = array.shape[1]
+    if not isinstance(name, str) and len(name) != many:
+        raise RecordError(f"record {path}: {len(name)} names ({called}) for {many} columns. Export it again")
+    for j in range(many):
+        own = name[j] if not isinstance(name, str) else name if many == 1 else f"{name}({j + 1})"
+        yield _Signal(name=own, values=array[:, j], units=units, time=time, time_unit=time_unit)
+
+
+def _units(node: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a struct says of its unit, by field."""
+    found = {key: _text(node.get(key)) for key in _UNITS}
+    info = _at(node, "DataInfo", "Units")
+    found["DataInfo.Units"] = _text(info) or _text(_at(info, "Name"))
+    return {key: text for key, text in found.items() if text}
+
+
+def _at(node: Any, *keys: str) -> Any:
+    for key in keys:
+        node = node.get(key) if isinstance(node, Mapping) else None
+    return node
+
+
+def _si(text: str) -> str:
+    try:
+        return parse_unit(text).si
+    except UnitError:
+        return text
+
+
+def _text(value: Any) -> str:
+    """Return a text, or nothing."""
+    while isinstance(value, list) and len(value) == 1:
+        value = value[0]
+    return value.strip() if isinstance(value, str) else ""
+
+
+def _vector(value: Any, least: int = 2) -> Array | None:
+    """Return a numeric vector, shape (n,)."""
+    if isinstance(value, np.ndarray) and value.dtype.kind in "fiu" and value.size >= least:
+        return value.reshape(-1) if value.size == max(value.shape) else None
+    return None
