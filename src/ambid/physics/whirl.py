@@ -22,6 +22,7 @@ from ambid.physics.shaft import FreeRotor, Shaft
 
 SPEEDS = 61  # of the grid on which critical speeds are sought
 _SURE = 0.95  # likeness of two shapes, from which they are one mode
+_EQUAL = 1e-9  # relative distance below which poles are one
 _GONE = 0.2  # likeness below which a mode no longer oscillates
 _STEPS = (1e-4, 1 / 60)  # of the highest speed: at the least step modes that repel each other count as crossing
 _BESIDE = 4  # modes followed beyond the lines shown, so that none is taken for one of them
@@ -275,10 +276,24 @@ class _Whirl:
         up = np.flatnonzero(values.imag > np.maximum(floor, 1e-3 * np.abs(values)))
         up = up[np.argsort(values[up].imag, kind="stable")]
         shapes = vectors[k:, up]
-        shapes = shapes / np.linalg.norm(shapes, axis=0)
+        shapes = _circular(values[up], shapes / np.linalg.norm(shapes, axis=0))
         x, y = shapes[: n // 2], shapes[n // 2 :]
         direction = np.clip(-2.0 * np.sum((x.conj() * y).imag, axis=0), -1.0, 1.0)
         return _At(speed=speed, poles=values[up], shapes=shapes, direction=direction)
+
+
+def _circular(poles: Complex, shapes: Complex) -> Complex:
+    """Return the shapes of equal poles, which may be any mixture, as forward and backward whirl."""
+    n = shapes.shape[0] // 2
+    turn = np.kron(np.array([[0.0, 1j], [-1j, 0.0]]), np.eye(n))  # v^H turn v is the direction of v
+    found = shapes.copy()
+    for pole in poles:
+        alike = np.abs(poles - pole) < _EQUAL * np.abs(pole)
+        if alike.sum() > 1:
+            basis, spread, _ = np.linalg.svd(shapes[:, alike], full_matrices=False)
+            if spread[-1] > _EQUAL:  # else they are one shape
+                found[:, alike] = basis @ np.linalg.eigh(basis.conj().T @ turn @ basis)[1]
+    return found
 
 
 def _followed(whirl: _Whirl, before: _At, speed: float, top: float) -> _At:

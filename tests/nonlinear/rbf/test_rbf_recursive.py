@@ -71,26 +71,28 @@ def test_descent_comes_near_whatever_its_rate() -> None:
 
 
 def test_the_triangle_stands_where_a_covariance_matrix_breaks_down() -> None:
+    """Rounding, and with it the machine, decides in which of the cases the printed recursion is far off."""
     rng = np.random.default_rng(6)
     u = rng.standard_normal((400, 2))
     y = np.sin(2 * u[:, :1]) + 0.1 * rng.standard_normal((400, 1))
     u[:, 1] = u[:, 0] + 1e-8 * u[:, 1]  # condition of the normal matrix: 1e16
     y = y + 0.5 * u[:, :1] + 3e7 * (u[:, 1:] - u[:, :1])
     u, y = (np.concatenate([x[:1], x]) for x in (u, y))  # the first sample is past
-    rng = np.random.default_rng(4)
-    s = network(1, 2, ny=0, nu=1, nk=0, neurons=5)
-    theta = np.concatenate([np.zeros(s.n_weights), rng.standard_normal(10), np.zeros(5)])
-    rows = s.rows(y, u)
-    found, _ = train_by_sample(s, theta, rows.x, rows.y, np.full((1, s.n_weights), 1e-10), None, None)
-    A, target = s.features(theta, rows.x), rows.y[:, 0]
-    batch = np.linalg.lstsq(A, target, rcond=1e-15)[0]
-    off = [np.std(target - A @ w) for w in (s.matrix(found)[0], batch)]
-    assert off[0] < 1.001 * off[1]
-    w, P = np.zeros(s.n_weights), 1e20 * np.eye(s.n_weights)  # recursive least squares as it is usually printed
-    for a, b in zip(A, target, strict=True):
-        k = P @ a / (1 + a @ P @ a)
-        w, P = w + k * (b - a @ w), P - np.outer(k, a @ P)
-    assert not np.std(target - A @ w) < 1.1 * off[1]
+    s, printed = network(1, 2, ny=0, nu=1, nk=0, neurons=5), []
+    for seed in range(4, 10):
+        theta = np.concatenate([np.zeros(s.n_weights), np.random.default_rng(seed).standard_normal(10), np.zeros(5)])
+        rows = s.rows(y, u)
+        found, _ = train_by_sample(s, theta, rows.x, rows.y, np.full((1, s.n_weights), 1e-10), None, None)
+        A, target = s.features(theta, rows.x), rows.y[:, 0]
+        batch = np.linalg.lstsq(A, target, rcond=1e-15)[0]
+        off = [np.std(target - A @ w) for w in (s.matrix(found)[0], batch)]
+        assert off[0] < 1.001 * off[1]
+        w, P = np.zeros(s.n_weights), 1e20 * np.eye(s.n_weights)  # recursive least squares as it is usually printed
+        for a, b in zip(A, target, strict=True):
+            k = P @ a / (1 + a @ P @ a)
+            w, P = w + k * (b - a @ w), P - np.outer(k, a @ P)
+        printed.append(np.std(target - A @ w) / off[1])
+    assert not max(printed) < 1.2
 
 
 def test_curves_stand_beside_each_other_and_an_interruption_keeps_the_weights() -> None:
