@@ -337,9 +337,9 @@ def test_intervals_from_identified_black_boxes_hold():
 
 @pytest.mark.parametrize(
     ("name", "n", "fixed", "structure", "orders", "seeds"),
-    [("falling rotor", 5000, ("m", "c"), "sspem", {"n": 3}, 16),
-     ("falling rotor", 5000, ("m", "c"), "pbsid", {"n": 3}, 16),
-     ("bearing", 8000, ("c",), "sspem", {"n": 4}, 8)],
+    [("falling rotor", 5000, ("m", "c"), "sspem", {"n": 3}, 10),
+     ("falling rotor", 5000, ("m", "c"), "pbsid", {"n": 3}, 10),
+     ("bearing", 8000, ("c",), "sspem", {"n": 4}, 6)],
 )  # fmt: skip
 def test_errors_are_of_the_size_that_is_said(name, n, fixed, structure, orders, seeds):
     # no record is picked: each counts, passed or not. A delay's pole lies where the record hardly sees it, anywhere
