@@ -94,6 +94,8 @@ class Measured(Result):
                 "without a reference, feedback biases the response. Give --reference, or --open-loop if there is none"
             )
             found.append(Reason(check="feedback", text=text))
+        if "assumed" in frf.details:
+            found.append(Reason(check="noise", text=str(frf.details["assumed"])))
         for name, model in (("fit", self.fit), ("physical", self.estimate), ("modes", self.modal)):
             found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
         return tuple(found)

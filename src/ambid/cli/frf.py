@@ -26,9 +26,13 @@ def command(
     ] = "auto",
     band: Annotated[str | None, option("--band LO:HI", "Frequency band to use, in Hz.", "all")] = None,
     hold: Annotated[
-        Literal["zoh", "band-limited"],
-        switch("--hold", "Input between samples: held constant, or band-limited to half the rate."),
-    ] = "zoh",
+        Literal["zoh", "band-limited"] | None,
+        option(
+            "--hold",
+            "Input between samples: held constant, or band-limited to half the rate.",
+            "zoh; band-limited for a file of responses",
+        ),
+    ] = None,
     orders: Annotated[
         str | None,
         option(
@@ -71,12 +75,13 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     json: opt.JsonFile = None,
     plot: Annotated[Path | None, option("--plot FILE.png", "Draw response, levels and models.")] = None,
     report: opt.Report = None,
     strict: opt.Strict = False,
 ) -> None:
-    """Measure a frequency response with its noise and distortion, and fit models to it.
+    """Measure a frequency response with its noise and distortion, or take one from a file, and fit models to it.
 
     With --reference (the loop's outer excitation) feedback does not bias it. With --rig, physical parameters come out,
     and inputs and outputs are the rig's.
@@ -90,7 +95,8 @@ def command(
                 record, input=inputs, output=output, reference=reference, open_loop=open_loop,
                 method=method, hold=hold, band=between, orders=orders, state_space=n, feedthrough=feedthrough,
                 modes=count, estimate=estimate, domain=domain, delay=late, rig=rig, from_s=from_s,
-                to_s=to_s, rate_hz=rate, gaps=gaps, tick=tick,
+                to_s=to_s, rate_hz=rate, gaps=gaps,
+                layout=opt.layout_of(layout), tick=tick,
             )  # fmt: skip
             outputs.give(found, tick)
     outputs.show(found, strict=strict)

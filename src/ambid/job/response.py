@@ -5,13 +5,14 @@ Read -> cut -> measure -> fit -> Measured. With a rig, columns are its roles and
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.bearing.frequency import FrequencyEstimate
 from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders
@@ -28,10 +29,12 @@ from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Channels, Clock, Names, Source
 from ambid.job.results import load, rig_of
 from ambid.physics.linear_model import model
-from ambid.record import GapPolicy
-from ambid.rig import Rig
+from ambid.record import Channel, GapPolicy, Record
+from ambid.rig import Rig, bench_record
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
+from ambid.signals.response_files import is_response_file, read_response
+from ambid.units import UNKNOWN, parse_unit
 
 Delay = float | Literal["auto"]
 
@@ -45,7 +48,7 @@ def frf(
     rig: Rig | str | Path | None = None,
     open_loop: bool = False,
     method: Method = "auto",
-    hold: Hold = "zoh",
+    hold: Hold | None = None,
     band: tuple[float, float] | None = None,
     orders: Orders | str | None = None,
     state_space: int | Literal["auto"] | None = None,
@@ -59,6 +62,7 @@ def frf(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     tick: Tick | None = None,
 ) -> Measured | Modal:
     """Measure a frequency response from one record, and fit models to it; find the modes of vibration.
@@ -66,6 +70,7 @@ def frf(
     Parameters
     ----------
     record : file, Record, DataFrame, Dataset or dict of arrays
+        Or a file of frequency responses: UFF/UNV dataset 58, or CSV whose first column is a frequency.
     input, output, reference : str or sequence of str, optional
         Names of channels. With references (the loop's outer excitation) the joint method is used, which feedback does
         not bias.
@@ -76,7 +81,7 @@ def frf(
     method : {"auto", "periodic", "random", "local"}, optional
         As in `ambid.signals.frequency_response`. Periodic: leading periods with a transient are left out, and said so.
     hold : {"zoh", "band-limited"}, optional
-        What the inputs do between samples.
+        What the inputs do between samples. Default zoh; band-limited, as a continuous plant, for a file of responses.
     band : (float, float), optional
         Lines that are kept, in Hz.
     orders : str or Mapping[str, int, "auto" or tuple of int], optional
@@ -100,6 +105,8 @@ def frf(
         Part of the record to use, in s.
     rate_hz, gaps, units : optional
         As `ambid.identify`.
+    layout : Mapping of str to str, optional
+        What the file leaves open, as `ambid.read_record`.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
 
@@ -117,7 +124,7 @@ def frf(
     """
     say, clock, channels = tick or silent, Clock(), Channels.of(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
-        rig=rig,
+        rig=rig, layout=layout,
     )  # fmt: skip
     check_band(band)
     bench, wanted = channels.rig, orders_of(orders)
@@ -131,6 +138,21 @@ def frf(
     _check(wanted, state_space, feedthrough, domain, delay, bench)
     _check_modes(modes, estimate)
     known = None if estimate is None else _plant_of(estimate)
+    if is_response_file(record):
+        for word, given in (
+            ("--method", method != "auto"), ("--modes", modes is not None), ("--from", from_s is not None),
+            ("--to", to_s is not None), ("--gaps", gaps is not None), ("units=", units is not None),
+        ):  # fmt: skip
+            if given:
+                raise EstimationError(f"{word} is for records in time; {record} holds frequency responses. Omit it")
+        say("measure")
+        response, about = _from_file(Path(str(record)), channels, hold or "band-limited")
+        response = response if band is None else response.between(*band)
+        clock.lap("read")
+        offsets = Offsets(u=np.zeros(response.n_inputs), y=np.zeros(response.n_outputs))
+        return _judged(
+            response, channels, about, offsets, clock, say, wanted, state_space, feedthrough, domain, delay, modal=None
+        )
     alone = bench is None and not channels.inputs
     if alone and modes is None:
         raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
@@ -148,22 +170,99 @@ def frf(
         clock.lap("modes")
         band = modal.band_hz
     say("measure")
-    response = _measure(data, method, hold, band, leave_out=modes is not None)
+    response = _measure(data, method, hold or "zoh", band, leave_out=modes is not None)
     clock.lap("measure")
+    offsets = Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0))
+    told = replace(channels, references=data.references, open_loop=data.open_loop)
+    return _judged(
+        response, told, data.record, offsets, clock, say, wanted, state_space, feedthrough, domain, delay, modal=modal
+    )
+
+
+def _judged(
+    response: FrequencyResponse, channels: Channels, record: Mapping[str, object], offsets: Offsets, clock: Clock,
+    say: Tick, orders: Orders | None, state_space: int | Literal["auto"] | None, feedthrough: bool,
+    domain: Literal["s", "z"] | None, delay: Delay | None, *, modal: Modal | None,
+) -> Measured:  # fmt: skip
+    """Fit the wanted models to a response, and put the result together."""
     found: BlackBoxFit | None = None
     physical: FrequencyEstimate | None = None
-    if wanted is not None or state_space is not None:
+    if orders is not None or state_space is not None:
         say("fit")
-        found = _fit_model(response, data, wanted, state_space, feedthrough, domain, 0.0 if delay is None else delay)
+        late = 0.0 if delay is None else delay
+        found = _fit_model(response, record, offsets, orders, state_space, feedthrough, domain, late)
         clock.lap("fit")
-    if bench is not None:
+    if channels.rig is not None:
         say("identify")
-        physical = _identify(response, bench, delay)
+        physical = _identify(response, channels.rig, delay)
         clock.lap("identify")
     return Measured(
-        response=response, references=data.references, open_loop=data.open_loop, fit=found, estimate=physical,
-        modal=modal, record=data.record, timing_s=clock.laps,
+        response=response, references=channels.references, open_loop=channels.open_loop, fit=found, estimate=physical,
+        modal=modal, record=record, timing_s=clock.laps,
     )  # fmt: skip
+
+
+def _from_file(path: Path, channels: Channels, hold: Hold) -> tuple[FrequencyResponse, dict[str, object]]:
+    """Read a response from a file; with a rig it is named by role and calibrated, for which a gain is enough."""
+    rig, words = channels.rig, {"references": channels.references, "layout": channels.layout, "hold": hold}
+    rate = channels.rate_hz
+    if rig is None:
+        found, about = read_response(
+            path,
+            inputs=channels.inputs,
+            outputs=channels.outputs,
+            rate_hz=rate,
+            **words,  # type: ignore[arg-type]
+        )
+        return found, about
+    columns = {c.role: c for c in rig.channels}
+    plant = rig.plant
+
+    def named(wanted: Sequence[str], every: Sequence[str]) -> dict[str, str]:
+        roles = {c.column: role for role, c in columns.items() if role in every} | {x: x for x in every}
+        for name in wanted:
+            if name not in roles:
+                raise EstimationError(
+                    f"{name!r} is no channel of the rig's model; it has {', '.join(every)}. Correct it"
+                )
+        return {columns[role].column: role for role in dict.fromkeys([roles[x] for x in wanted] or every)}
+
+    inputs, outputs = named(channels.inputs, plant.inputs), named(channels.outputs, plant.outputs)
+    words["layout"] = {**rig.record.layout, **(channels.layout or {})}
+    found, about = read_response(
+        path,
+        inputs=tuple(inputs),
+        outputs=tuple(outputs),
+        rate_hz=rig.record.rate_hz if rate is None else rate,
+        **words,  # type: ignore[arg-type]
+    )
+    names = inputs | outputs
+    used = [columns[role] for role in names.values()]
+    for c in used:
+        if (c.calibration is not None and c.calibration.raw is not None) or (c.role in plant.outputs and c.delay != 0):
+            raise EstimationError(
+                f"channels.{c.role} has a table or a delay, which no response shows. Give a gain, or omit it"
+            )
+    ramp, told = np.arange(8.0), cast(Mapping[str, str], about["units"])
+    lines = tuple(_ramp(x, told[x], ramp) for x in names)
+    bench = bench_record(Record(rate_hz=found.rate_hz, channels=lines), replace(rig, channels=tuple(used)))
+    gain = {c.name: float(np.ptp(bench[names[c.name]].values) / np.ptp(c.values)) for c in lines}
+    rising = {c.name: float(np.sign(bench[names[c.name]].values[-1] - bench[names[c.name]].values[0])) for c in lines}
+    scale = np.array([[rising[o] * gain[o] / (rising[i] * gain[i]) for i in found.inputs] for o in found.outputs])
+    flat = scale.ravel()
+    units = {role: bench[role].unit for role in names.values()}
+    return replace(
+        found, G=found.G * scale, covariance=found.covariance * flat[:, None] * flat[None, :], units=units,
+        inputs=tuple(names[x] for x in found.inputs), outputs=tuple(names[x] for x in found.outputs),
+    ), about  # fmt: skip
+
+
+def _ramp(name: str, unit: str, ramp: Array) -> Channel:
+    """Return a channel of which a rig shows its gain."""
+    if unit == UNKNOWN:
+        return Channel(name=name, unit=UNKNOWN, values=ramp, source_unit=UNKNOWN)
+    known = parse_unit(unit)
+    return Channel(name=name, unit=known.si, values=known.to_si(ramp), source_unit=known.symbol)
 
 
 def _check(
@@ -240,7 +339,8 @@ def _measure(
 
 def _fit_model(
     response: FrequencyResponse,
-    data: IOData,
+    record: Mapping[str, object],
+    offsets: Offsets,
     orders: Orders | None,
     state_space: int | Literal["auto"] | None,
     feedthrough: bool,
@@ -259,8 +359,8 @@ def _fit_model(
         found = frf_subspace(response, {"n": state_space}, domain=domain or "s", delay=delay, feedthrough=feedthrough)
     return replace(
         found,
-        offsets=Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0)),
-        record={**data.record, **found.record},
+        offsets=offsets,
+        record={**record, **found.record},
         details={**found.details, "offsets": "means of the record; a frequency response does not contain them"},
     )
 
