@@ -1,12 +1,14 @@
 """The ledger on both engines: stored once, all or nothing, by several writers at once, and only what it is."""
 
 import json
+import os
 import signal
 import sqlite3
 import subprocess
 import sys
 import zlib
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -89,6 +91,39 @@ def test_two_writers_at_once_lose_nothing_and_repeat_nothing(place):
         found = [ledger.history(f"B{k}") for k in range(7)]
     assert sorted(e.record for h in found for e in h.estimates) == sorted(f"day{k}.h5" for k in range(750))
     assert sum(h["k_i"].value.size for h in found) == 750
+
+
+def test_an_empty_database_is_one_that_another_writer_is_about_to_fill(tmp_path):
+    sqlite3.connect(tmp_path / "l.db").execute("PRAGMA journal_mode = WAL").close()
+    with open_ledger(tmp_path / "l.db") as ledger:
+        assert len(ledger.add([entry(0)])) == 1
+
+
+@pytest.mark.skipif(not hasattr(os, "seteuid"), reason="file rights as Linux and macOS have them")
+def test_a_ledger_in_a_folder_that_may_not_be_written_to_is_read(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("shared")
+    with open_ledger(folder / "l.db") as ledger:
+        ledger.add([entry(0)])
+    log, who = folder / "l.db-wal", os.geteuid()
+    log.touch()
+    with ExitStack() as stack:
+        for place in (folder, *folder.parents[:3]):
+            stack.callback(place.chmod, place.stat().st_mode)
+            place.chmod(place.stat().st_mode | 0o755)
+        folder.chmod(0o555)
+        if who == 0:  # to whom no right is refused
+            stack.callback(os.seteuid, 0)
+            os.seteuid(65534)
+        with open_ledger(folder / "l.db", write=False) as ledger:
+            assert [b.estimates for b in ledger.bearings()] == [1]
+        with pytest.raises(AmbidError, match="Nothing of this was stored"), open_ledger(folder / "l.db") as ledger:
+            ledger.add([entry(1)])
+        os.seteuid(who)
+        log.write_bytes(b"what a writer left")
+        if who == 0:
+            os.seteuid(65534)
+        with pytest.raises(AmbidError, match="a writer has left"):
+            open_ledger(folder / "l.db", write=False)
 
 
 def test_a_batch_that_fails_in_the_middle_leaves_nothing(place, monkeypatch):

@@ -54,7 +54,7 @@ class Series:
     role: str
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)  # not frozen: a history makes thousands, in a third of the time
 class KnownEstimate:
     """One estimate of a history."""
 
@@ -122,7 +122,7 @@ class History(Result):
 
 def history_of(c: Connection, bearing: str, shown: str) -> History:
     """Read the history of a bearing; `shown`: name of the ledger."""
-    from sqlalchemy import Integer, func, select, type_coerce
+    from sqlalchemy import case, func, select
 
     t = schema.tables().tables
     b, e, v, n = (t[name].c for name in ("bearing", "estimate", "value", "event"))
@@ -140,8 +140,8 @@ def history_of(c: Connection, bearing: str, shown: str) -> History:
     heads = _rows(
         c, select(v.name, func.count(), func.max(v.unit), func.max(v.role)).where(of).group_by(v.name).order_by(v.name)
     )
-    seen = type_coerce(v.identifiable, Integer)
-    numbers = _rows(c, select(v.estimate, v.value, v.sd, seen).where(of).order_by(v.name, v.taken_at, v.estimate))
+    shown_value = case((v.identifiable, v.value))  # else none: less to fetch than the word beside it
+    numbers = _rows(c, select(v.estimate, shown_value, v.sd).where(of).order_by(v.name, v.taken_at, v.estimate))
     events = _rows(c, select(n.at, n.kind, n.text, n.parameter).where(n.bearing == known.id).order_by(n.at))
     notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
     notes += _rig_changes(c, estimates)
@@ -161,14 +161,14 @@ def _series(
     heads: list[tuple[Any, ...]], rows: list[tuple[Any, ...]], ids: list[int], estimates: tuple[KnownEstimate, ...]
 ) -> dict[str, Series]:
     """Divide rows in order of name and time into series; `heads`: name, number of rows, unit and role of each."""
-    table = np.array(rows, dtype=float).reshape(-1, 4)
+    table = np.array(rows, dtype=float).reshape(-1, 3)
     usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
     times = np.array([x.taken_at for x in estimates])
     order = np.argsort(ids)
     of = order[np.searchsorted(np.array(ids)[order], table[:, 0])]
-    seen = table[:, 3] == 1.0
+    seen = ~np.isnan(table[:, 1])
     at = times[of]
-    table[~(seen & usable[of]), 1:3] = np.nan
+    table[~(seen & usable[of]), 1:] = np.nan
     ends = np.cumsum([0, *(head[1] for head in heads)])
     return {
         name: Series(

@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 PATIENCE_S = 120.0  # for which a writer waits for another
 _TRY_S = 0.5  # of it, in which the program hears nothing
 _MANY = 5_000  # keys in one question
+_MAPPED = 1 << 30  # bytes of a file that are read without a copy
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -428,16 +429,11 @@ def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
         raise AmbidError(f"ledger {path}: there is no folder {path.parent}. Make it first, or correct the path")
     if not new:
         _check_file(path)
-    how = "rwc" if write else "ro"
 
     def connect() -> Any:
-        import sqlite3
-
-        found = sqlite3.connect(
-            f"{path.resolve().as_uri()}?mode={how}", uri=True, timeout=_TRY_S, isolation_level=None,
-            check_same_thread=False,
-        )  # fmt: skip
+        found = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S)
         found.execute("PRAGMA foreign_keys = ON")
+        found.execute(f"PRAGMA mmap_size = {_MAPPED}")  # estimates of one bearing lie on as many pages
         if write:
             found.execute("PRAGMA journal_mode = WAL")
         return found
@@ -474,8 +470,10 @@ def _check_file(path: Path) -> None:
         if file.read(16) != b"SQLite format 3\0":
             raise AmbidError(refusal)
     try:
-        found = sqlite3.connect(f"{path.resolve().as_uri()}?mode=ro", uri=True, timeout=PATIENCE_S)
+        found = _read_only(path, PATIENCE_S)
         try:
+            if found.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
+                return  # another writer is about to make the tables
             row = found.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
         finally:
             found.close()
@@ -483,6 +481,34 @@ def _check_file(path: Path) -> None:
         row = None
     if row != (schema.SCHEMA,):
         raise AmbidError(refusal)
+
+
+def _read_only(path: Path, patience_s: float) -> Any:
+    """Open a file for reading, also in a folder that may not be written to, where SQLite cannot index its log."""
+    import sqlite3
+
+    found = _connected(path, "ro", patience_s)
+    try:
+        found.execute("SELECT count(*) FROM sqlite_master").fetchone()
+    except sqlite3.OperationalError:
+        found.close()
+        log = path.with_name(f"{path.name}-wal")
+        if log.exists() and log.stat().st_size:
+            raise AmbidError(
+                f"ledger {path}: a writer has left {log.name}, and its folder may not be written to. Open it once "
+                "from an account that may"
+            ) from None
+        return _connected(path, "ro&immutable=1", patience_s)
+    return found
+
+
+def _connected(path: Path, mode: str, patience_s: float) -> Any:
+    import sqlite3
+
+    return sqlite3.connect(
+        f"{path.resolve().as_uri()}?mode={mode}", uri=True, timeout=patience_s, isolation_level=None,
+        check_same_thread=False,
+    )  # fmt: skip
 
 
 def _make_ready(engine: Engine, shown: str, *, write: bool) -> None:
