@@ -113,14 +113,6 @@ def test_without_a_mapping_every_vector_is_a_channel_of_unknown_unit(tmp_path):
         read_record(tmp_path / "none.mat", rate_hz=1.0)
 
 
-def test_damaged_files(tmp_path, path):
-    whole = path.read_bytes()
-    for name, data in (("zero.mat", b""), ("half.mat", whole[: len(whole) // 2]), ("text.mat", b"time,voltage\n" * 50)):
-        (tmp_path / name).write_bytes(data)
-        with pytest.raises(RecordError, match=name):
-            read_record(tmp_path / name, variables={"voltage": ("u", "V")}, rate_hz=1.0)
-
-
 def test_a_mapping_is_for_mat_files_only(tmp_path):
     with pytest.raises(RecordError, match=r"for \.mat files"):
         read_record(tmp_path / "r.csv", variables={"voltage": ("u", "V")})

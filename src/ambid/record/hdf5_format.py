@@ -19,6 +19,7 @@ import numpy as np
 from ambid.errors import RecordError
 from ambid.record._hdf5_file import new_hdf5
 from ambid.record.record import Channel, Record, Step, file_bytes, sha256_of
+from ambid.record.streams import refuse_claim
 
 SCHEMA = "ambid.record/1"
 
@@ -91,7 +92,10 @@ def read_hdf5(path: str | Path) -> Record:
     try:
         with h5py.File(path, "r") as file:
             _check_schema(file, path)
-            channels = tuple(_channel(file["channels"][str(k)]) for k in range(len(file["channels"])))
+            datasets = [file["channels"][str(k)] for k in range(len(file["channels"]))]
+            for dataset in datasets:
+                refuse_claim(path, dataset.size, dataset.dtype.itemsize, len(data))
+            channels = tuple(_channel(dataset) for dataset in datasets)
             history = tuple(
                 Step(name=s["name"], settings=MappingProxyType(s["settings"]))
                 for s in json.loads(file["history"].asstr()[()])

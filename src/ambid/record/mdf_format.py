@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import logging
+import sys
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -28,7 +30,7 @@ def read_mdf(
     with (
         library(path, "MDF", (b"MDF     ", b"UnFinMF ")) as digest,
         path.open("rb") as file,  # a path would be mapped, and all of it counted as memory
-        asammdf.MDF(file) as mdf,
+        _opened(asammdf, file) as mdf,
     ):
         mdf.configure(read_fragment_size=_FRAGMENT)
         used = {k: g for k, g in enumerate(mdf.groups) if g.channel_group.cycles_nr}
@@ -54,6 +56,21 @@ def read_mdf(
             )  # fmt: skip
         settings = {"format": f"mdf {mdf.version}", "group": group, **({"left_out": left} if left else {})}
         return record_of(path, digest, streams, settings, layout, rate_hz, gaps)
+
+
+def _opened(asammdf: Any, file: Any) -> Any:
+    """Open a file; the half-made object of a damaged one fails once more when it goes, and Python would print that."""
+    usual, failure = sys.unraisablehook, ""
+    sys.unraisablehook = lambda _: None
+    try:
+        return asammdf.MDF(file)
+    except Exception as raised:  # its parser raises whatever it meets in a damaged file
+        failure = f"{type(raised).__name__}: {raised}"
+    finally:
+        if failure:
+            gc.collect()  # it may be in a circle
+        sys.unraisablehook = usual
+    raise ValueError(failure)
 
 
 def _pieces(mdf: Any, group: int, index: int) -> Iterator[np.ndarray]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ambid.errors import RecordError
 from ambid.record.frames import imported
 from ambid.record.record import Record
 from ambid.record.sampling import GapPolicy
@@ -21,7 +23,14 @@ def read_tdms(
 ) -> Record:
     """Read a record from a TDMS file: the channels of one group."""
     nptdms = imported("nptdms", "a TDMS file", "formats")
+    for name in ("nptdms.reader", "nptdms.tdms_segment", "nptdms.base_segment", "nptdms.daqmx"):
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what it says of damage is refused below
     with library(path, "TDMS", (b"TDSm",)) as digest, nptdms.TdmsFile.open(path) as file:
+        if file.file_status.incomplete_final_segment:
+            raise RecordError(
+                f"record {path} is cut off within its last segment: samples are missing at its end. Copy it again, or "
+                "record again where the program that wrote it was stopped"
+            )
         groups = {group.name: group.channels() for group in file.groups() if any(map(len, group.channels()))}
         group = chosen_group(path, {k: [c.name for c in v] for k, v in groups.items()}, layout.get("group"))
         numeric = [c for c in groups[group] if c.dtype.kind in "fiubM"]
