@@ -185,6 +185,10 @@ def test_an_fmu_is_several_plants_that_are_set_kept_and_begun_again(axis, tmp_pa
             plant.step(u, period)
         return plant.outputs()
 
+    for name in ("m", "L", "delay"):
+        assert float({v.name: v.min for v in one.told.modelVariables}[name]) >= 0.0
+        with pytest.raises(Exception, match="SetReal failed"):
+            one.set(k_i=0.0, **{name: -1e-9})
     moved = run(one)
     assert two.outputs() == begin != moved
     kept = one.fmu.getFMUstate()

@@ -6,8 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 from matplotlib.transforms import Bbox
 
+from ambid.errors import AmbidError
 from ambid.estimation.estimate import Check, Delay
 from ambid.report.drawing import save, single
 from ambid.report.figures import figures, measured_beside, overview, responses, unsampled, validation_figure
@@ -205,3 +207,9 @@ def validated(estimate):
         estimate="a.json", record="b.csv", model=estimate.model, samples=3000,
         fit={"position": sizes, "current": sizes}, checks={"residuals_white": Check(passed=False, detail="as it is")},
     )  # fmt: skip
+
+
+def test_a_figure_of_another_format_is_refused(tmp_path):
+    with pytest.raises(AmbidError, match=r"a figure as \.jpg .*is written as \.png, \.svg or \.pdf"):
+        save(Figure(), tmp_path / "a.jpg")
+    assert not list(tmp_path.iterdir())

@@ -42,6 +42,8 @@ typedef struct {
 #define PARAMETERS (sizeof(struct plant_parameters) / sizeof(double))
 #define INPUTS (PLANT_INPUTS + PLANT_DISTURBANCES)
 
+static const double least[PARAMETERS] = {PLANT_LEAST};
+
 enum phase { STARTED, INITIALISING, RUNNING, ENDED, FAILED };
 struct state {
     struct plant plant;
@@ -184,6 +186,10 @@ STATUS(fmi2SetReal, fmi2Component c, const fmi2ValueReference at[], size_t n, co
     for (k = 0; k < n; k++) {
         if (at[k] >= PARAMETERS + INPUTS || !isfinite(values[k]))
             return failed(of, "only parameters and inputs can be set, and only to finite numbers");
+        if (at[k] < PARAMETERS && values[k] < least[at[k]])
+            return failed(of, "a parameter is less than its min in modelDescription.xml");
+    }
+    for (k = 0; k < n; k++) {
         if (at[k] >= PARAMETERS) {
             of->state.input[at[k] - PARAMETERS] = values[k];
         } else {

@@ -18,7 +18,7 @@ from tempfile import TemporaryDirectory
 from xml.sax.saxutils import quoteattr
 
 from ambid.errors import AmbidError
-from ambid.job.plant_source import PlantSource, c_source, read_data
+from ambid.job.plant_source import ANY, PlantSource, c_source, read_data
 
 MARK = "documentation/made-by-ambid.txt"
 """The first entry of each FMU, by which it is known as one of `ambid`."""
@@ -31,7 +31,8 @@ _LONGEST = 60  # letters of an identifier
 
 def write_fmu(of: PlantSource, path: Path, name: str, about: Sequence[str]) -> None:
     """Write a plant; `name`: of the model, as the user gave it; `about`: lines that say what it is."""
-    sources = {"plant.c": c_source(of, about), "fmi2.c": read_data("fmi2.c")}
+    least = ", ".join(repr(x.least) for x in of.numbers)
+    sources = {"plant.c": c_source(of, about), "fmi2.c": f"#define PLANT_LEAST {least}\n{read_data('fmi2.c')}"}
     identifier = _identifier(name)
     seen = sha256("\0".join([identifier, *sources.values()]).encode()).hexdigest()
     guid = "{" + "-".join(seen[a:b] for a, b in ((0, 8), (8, 12), (12, 16), (16, 20), (20, 32))) + "}"
@@ -88,7 +89,7 @@ def model_description(of: PlantSource, name: str, identifier: str, guid: str, ab
               **{k: (unit, 0.0, "disturbance, acts at once") for k, unit in of.disturbances.items()}}  # fmt: skip
     variables = [
         _variable(x.name, x.about, x.unit, f'causality="parameter" variability="{_WHEN[x.tunable]}" initial="exact"',
-                  x.value) for x in of.numbers
+                  x.value, x.least) for x in of.numbers
     ]  # fmt: skip
     variables += [_variable(k, text, unit, 'causality="input" variability="continuous"', start)
                   for k, (unit, start, text) in driven.items()]  # fmt: skip
@@ -120,9 +121,11 @@ def model_description(of: PlantSource, name: str, identifier: str, guid: str, ab
 _WHEN = {True: "tunable", False: "fixed"}
 
 
-def _variable(name: str, about: str, unit: str, kind: str, start: float | None = None) -> str:
+def _variable(
+    name: str, about: str, unit: str, kind: str, start: float | None = None, least: float = ANY
+) -> str:  # fmt: skip
     """Return an entry of the variables, with a place for its number."""
-    begins = "" if start is None else f' start="{start!r}"'
+    begins = ("" if least == ANY else f' min="{least!r}"') + ("" if start is None else f' start="{start!r}"')
     named = f"name={_quoted(name)} description={_quoted(about)}".replace("{", "{{").replace("}", "}}")
     return f'<ScalarVariable {named} valueReference="{{}}" {kind}><Real unit={_quoted(unit)}{begins}/></ScalarVariable>'
 

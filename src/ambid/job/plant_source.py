@@ -9,8 +9,9 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.resources import files
 from typing import Any
 
@@ -22,17 +23,18 @@ from ambid.control.law_files import comment_text
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.physics.bearing_numbers import BEARING_NUMBERS
-from ambid.physics.linear_model import MASS, UNITS, C, R, model
+from ambid.physics.linear_model import MASS, UNITS, C, ParameterSpec, R, model
 from ambid.physics.loop import UNLIMITED, Interval
 from ambid.physics.power_stage import IDEAL
 from ambid.rotor.estimate import RotorEstimate
 from ambid.simulation.rig_bench import enough_steps, plant_of_law
 
+ANY, _POSITIVE = -sys.float_info.max, sys.float_info.min  # least values of what may be anything, and must be positive
 _FREE = 1e300  # where a stop is that there is none
 _ABSENT = {"L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "sigma": 0.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0,
            "v_offset": 0.0, "v_drop": 0.0, "i_drop": IDEAL.i_drop, "g": 0.0, "a": 0.0}  # fmt: skip
 _ALWAYS = {"x_offset": 0.0, "i_offset": 0.0}
-_MEANING = {spec.name: spec.meaning for spec in (*BEARING_NUMBERS, MASS, R, C)}
+_SPECS = {spec.name: spec for spec in (*BEARING_NUMBERS, MASS, R, C)}
 _MATRICES = {  # of `LinearModel.matrices`: entries of A, then of B with the columns of E behind
     "one-axis": {
         "A": {(0, 1): "1.0", (1, 0): "-p->k_x / p->m", (1, 1): "-p->c / p->m", (1, 2): "p->k_i / p->m",
@@ -56,6 +58,7 @@ class Number:
     about: str
     value: float
     tunable: bool = True  # while it runs
+    least: float = ANY  # physics allows nothing less
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -90,7 +93,7 @@ def source_of(result: Any, stops: Interval = UNLIMITED) -> PlantSource:
 def _of_axis(result: Estimate, stops: Interval) -> PlantSource:
     of, at = model(result.model), result.operating_point
     period, units = 1.0 / float(str(result.record["rate_hz"])), of.units
-    numbers = [Number(name=s.name, unit=s.unit, about=s.meaning, value=result[s.name].value) for s in of.parameters]
+    numbers = [_number(s, result[s.name].value) for s in of.parameters]
     shown = dict.fromkeys([*of.outputs, *(s for s in of.states if s == "velocity")])
     rows = np.array([[float(s == o) for s in of.states] for o in shown])
     entries = _MATRICES[of.name]
@@ -130,7 +133,7 @@ def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource
     states = {s: UNITS[s] for s in ("position", "velocity", "current")} | ({"pull": "N"} if result.eddy else {})
     values = {**_ALWAYS, **result.values}
     numbers = [
-        Number(name=name, unit=unit, about=_MEANING[name], value=values[name])
+        _number(replace(_SPECS[name], unit=unit), values[name])
         for name, unit in {**{p.name: p.unit for p in result.parameters}, "x_offset": "m", "i_offset": "A"}.items()
     ]
     strength, length = result.law.names[:2]
@@ -154,6 +157,11 @@ def _of_magnet(result: NonlinearBearingEstimate, stops: Interval) -> PlantSource
     )  # fmt: skip
 
 
+def _number(of: ParameterSpec, value: float) -> Number:
+    least = _POSITIVE if of.positive else 0.0 if of.name in ("sigma", "L_leak", "L_rise") else ANY
+    return Number(name=of.name, unit=of.unit, about=of.meaning, value=value, least=least if value >= least else ANY)
+
+
 def _rests(values: Mapping[str, float]) -> list[Number]:
     about = "at the operating point, where the plant starts"
     return [Number(name=f"{r}_rest", unit=UNITS[r], about=about, value=x, tunable=False) for r, x in values.items()]
@@ -166,7 +174,7 @@ def _stops(stops: Interval, moves: bool) -> list[Number]:
 
 
 def _delay(name: str, value: float) -> Number:
-    return Number(name=name, unit="s", about="by which the input acts late", value=value)
+    return Number(name=name, unit="s", about="by which the input acts late", value=value, least=0.0)
 
 
 def _disturbances(names: Sequence[str]) -> dict[str, str]:

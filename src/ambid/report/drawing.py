@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 import numpy as np
 
 from ambid.arrays import Array
+from ambid.errors import AmbidError
 from ambid.estimation.result import Verdict
 from ambid.report.text import SPREAD, WORDS
 
@@ -171,10 +172,17 @@ def save(figure: Figure, target: str | Path | BinaryIO, *, kind: str | None = No
         ``.png``, ``.svg`` or ``.pdf``.
     kind : str, optional
         Format, where the name does not tell it.
+
+    Raises
+    ------
+    AmbidError
+        If the format is another one.
     """
     # no date inside: equal estimates give equal files
     dates = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}
     ending = kind or Path(str(target)).suffix.lower().removeprefix(".")
+    if ending not in ("png", "svg", "pdf"):
+        raise AmbidError(f"a figure as .{ending} ({target}); it is written as .png, .svg or .pdf. Name it so")
     backend = import_module(f"matplotlib.backends.backend_{'agg' if ending == 'png' else ending}")
     figure.set_dpi(_DPI)
     # `savefig` would draw everything twice
