@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 from scipy.io import savemat
 
-from ambid.errors import RecordError
+from ambid.errors import AmbidError, RecordError
+from ambid.job import compare
 from ambid.record import read_record
+from ambid.rig import draft_rig
 
 N = 40
 TIME = np.arange(N) * 1e-3
@@ -225,3 +227,18 @@ def test_a_layout_is_for_structures(tmp_path):
         read_record(tmp_path / "r.mat", layout={"group": "x"})
     with pytest.raises(RecordError, match="the rig names the variable u"):
         read_record(tmp_path / "r.mat", layout={"group": "x"}, variables={"voltage": ("u", "V")})
+
+
+def test_a_rotors_draft_and_compare_keep_the_layout(tmp_path):
+    """What `ambid init` was told stands in the rig; what needs no rig is told in the call."""
+    time, units = np.arange(200) * 1e-3, {"voltage": "V", "current": "A", "position": "um"}
+    noise = np.random.default_rng(1).standard_normal((6, time.size))
+    names = [(f"{axis}_{what}", unit) for axis in ("ax", "ay") for what, unit in units.items()]
+    axes = [series(name, x, time, units=unit) for (name, unit), x in zip(names, noise, strict=True)]
+    v5(tmp_path / "r.mat", log=axes, other=axes)
+    record = read_record(tmp_path / "r.mat", layout={"group": "log"})
+    assert '[record]\nlayout = { group = "log" }' in draft_rig(record)
+    with pytest.raises(AmbidError, match="has 2 groups"):
+        compare(tmp_path / "r.mat", ["arx:na=1,nb=1,nk=1"], input="ax_voltage", output="ax_current")
+    words = {"input": "ax_voltage", "output": "ax_current", "layout": {"group": "log"}, "open_loop": True}
+    assert compare(tmp_path / "r.mat", ["arx:na=1,nb=1,nk=1"], **words).entries

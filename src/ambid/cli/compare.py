@@ -26,6 +26,7 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     second: opt.SecondRecord = None,
     holdout: Annotated[
         float, opt.switch("--holdout", "Fraction of the record held out for validation, without a second record.")
@@ -44,8 +45,8 @@ def command(
     with Outputs(record, second, json=json, plot=plot, report=report) as outputs, progress("compare") as tick:
         found = compare(
             record, candidates, input=inputs, output=output, reference=reference,
-            open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, validate=second,
-            holdout=holdout, tick=tick,
+            open_loop=open_loop, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, layout=opt.layout_of(layout),
+            validate=second, holdout=holdout, tick=tick,
         )  # fmt: skip
         outputs.give(found, tick)
     outputs.show(found, strict=strict)

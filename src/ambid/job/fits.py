@@ -253,6 +253,7 @@ def compare(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     validate: Source | None = None,
     holdout: float = 0.3,
     tick: Tick | None = None,
@@ -265,7 +266,7 @@ def compare(
     candidates : sequence of str or (str, orders)
         Structures with their orders: ``"arx:na=2,nb=2,nk=1"``, ``"n4sid"`` (orders are chosen), or a name beside
         orders as `fit` takes them.
-    input, output, reference, rig, open_loop, from_s, to_s, rate_hz, gaps, units, tick : optional
+    input, output, reference, rig, open_loop, from_s, to_s, rate_hz, gaps, units, layout, tick : optional
         As `fit`.
     validate : as `record`, optional
         A second record to validate on; without one the last part of the record is held out.
@@ -285,7 +286,7 @@ def compare(
 
     wanted, channels = candidates_of(candidates), Channels.of(
         input=input, output=output, reference=reference, open_loop=open_loop, rate_hz=rate_hz, gaps=gaps, units=units,
-        rig=rig,
+        rig=rig, layout=layout,
     )  # fmt: skip
     for name, _ in wanted:
         _check_use(structure_named(name), channels.inputs, None)

@@ -102,7 +102,7 @@ def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
     for role, column in _turning(record).items():
         lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
     return "\n".join(
-        [*lines, "# What is not named here is free. A weighed rotor:", "# [parameters]",
+        [*lines, *_record_lines(record), "", "# What is not named here is free. A weighed rotor:", "# [parameters]",
          '# m = { value = 6.2, unit = "kg", role = "fixed" }', "# [modes]", '# count = "auto"', ""]
     )  # fmt: skip
 
