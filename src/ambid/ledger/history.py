@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
 SCHEMA = "ambid.history/1"
+_ORDER = ("m", "k_x", "k_i", "R", "L")
 _SHOWN = 3  # lines of a rig that changed
 
 
@@ -170,13 +171,20 @@ def _series(
     at = times[of]
     table[~(seen & usable[of]), 1:] = np.nan
     ends = np.cumsum([0, *(head[1] for head in heads)])
-    return {
+    found = {
         name: Series(
             name=name, unit=unit, role=role, taken_at=at[a:z], value=table[a:z, 1], sd=table[a:z, 2],
             identifiable=seen[a:z], estimate=of[a:z],
         )
         for (name, _, unit, role), (a, z) in zip(heads, pairwise(ends), strict=True)
     }  # fmt: skip
+    return dict(sorted(found.items(), key=_place))
+
+
+def _place(item: tuple[str, Series]) -> tuple[str, int, str]:
+    """Order a model's parameters as the models do, axis by axis."""
+    axis, _, own = item[0].rpartition(".")
+    return axis, _ORDER.index(own) if own in _ORDER else len(_ORDER), own
 
 
 def _rig_changes(c: Connection, estimates: tuple[KnownEstimate, ...]) -> list[Note]:

@@ -96,6 +96,7 @@ class Block:
             for k, a in enumerate(below):
                 if k >= len(column):
                     a.axis("off")
+                    below[len(column) - 1].tick_params(labelbottom=True)  # hidden as of all but the last row
                     continue
                 column[k].draw(a)
                 if self.shared and k + 1 < len(column):
