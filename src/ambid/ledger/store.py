@@ -431,7 +431,7 @@ def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
         _check_file(path)
 
     def connect() -> Any:
-        found = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S)
+        found = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S, "rw")  # leaves no log
         found.execute("PRAGMA foreign_keys = ON")
         found.execute(f"PRAGMA mmap_size = {_MAPPED}")  # estimates of one bearing lie on as many pages
         if write:
@@ -483,11 +483,12 @@ def _check_file(path: Path) -> None:
         raise AmbidError(refusal)
 
 
-def _read_only(path: Path, patience_s: float) -> Any:
+def _read_only(path: Path, patience_s: float, mode: str = "ro") -> Any:
     """Open a file for reading, also in a folder that may not be written to, where SQLite cannot index its log."""
     import sqlite3
 
-    found = _connected(path, "ro", patience_s)
+    found = _connected(path, mode, patience_s)
+    found.execute("PRAGMA query_only = ON")
     try:
         found.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except sqlite3.OperationalError:
