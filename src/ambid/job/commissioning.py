@@ -311,6 +311,8 @@ class _Guide:
         if plan.amplitude_v is not None:
             return judge.excite(look, room, plan, rate_hz, hover)[0]
         small, size = judge.excite(look, room, replace(plan, use=_FIRST * plan.use), rate_hz, hover)
+        if self._stopped():
+            return small
         try:
             if not small.passed:
                 raise EstimationError("; ".join(small.reasons))

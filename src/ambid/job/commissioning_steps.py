@@ -312,8 +312,9 @@ def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> t
     trial = plan.trial(rate_hz, plan.longest_trial_s(rate_hz))
     found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=plan.use, given=plan.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
-    picture = trials_picture(found.trials, plan.use, found.last, rate_hz, room.trips)
-    step = Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=(picture,))
+    trips = room.trips
+    seen = (trials_picture(found.trials, plan.use, found.last, rate_hz, trips),) if found.trials else ()
+    step = Step(name="excite", findings=found.findings, reasons=found.reasons, numbers=numbers, pictures=seen)
     return step, found
 
 

@@ -17,6 +17,10 @@ if TYPE_CHECKING:
     from ambid.report.page import Cell
 
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+_STILL = (
+    "Signals of this page stand still. The record's own page, in which they are zoomed down to the samples, is written "
+    "in this folder by: ambid identify record.h5 --rig rig.toml --report record.html"
+)
 _SEEN = frozenset({"pictures", "text"})  # of the page, not of the file
 
 
@@ -56,7 +60,8 @@ def commission_page(
 
     `names`: of all steps in their order; `more`: by step, sections that follow its own; `rig`: its text.
     """
-    sections = [Section(title="Steps", tables=[_overview(steps, names)])]
+    recorded = any(step.name == "record" for step in steps)
+    sections = [Section(title="Steps", tables=[_overview(steps, names)], note=_STILL if recorded else "")]
     for step in steps:
         sections.append(_section(step, f"{names.index(step.name) + 1}. {step.name}"))
         sections += [
