@@ -150,6 +150,32 @@ def test_a_change_is_found_and_accepted(page, folder):
     assert value == pytest.approx(0.85 * found["k_i"].value, rel=0.01)
 
 
+def test_a_bearing_of_a_ledger_is_drawn_over_time_in_chosen_colours(page, folder):
+    pytest.importorskip("sqlalchemy", reason="the extra [fleet] is not installed")
+    from ambid.ledger import open_ledger
+    from tests.ledger.entries import entry
+
+    with open_ledger(folder / "works.db") as ledger:
+        ledger.add(entry(k, name, verdict="unusable" if k == 2 else "usable") for k in range(4) for name in "AB")
+    page.click("[data-tab=files]")
+    page.click("#list tr:has-text('works.db')")
+    page.wait_for_selector("#history-view h2:has-text('A: Usable')")
+    page.select_option("#history-form [name=bearing]", "B")
+    page.wait_for_selector("#history-view h2:has-text('B: Usable')")
+    assert page.locator("#history-charts .chart").count() == 2
+    assert page.inner_text("#history-charts .chart:has-text('k_i') h3 span") == "79.70 ± 0.50 N/A, 2026-01-04"
+    page.hover("#history-charts .u-over >> nth=0", position={"x": 300, "y": 40})
+    page.select_option("#theme", "dark")
+    page.reload()
+    assert page.evaluate("document.documentElement.hasAttribute('data-dark') && $('history').hidden === false")
+    page.select_option("#theme", "")
+    page.focus("[data-tab=history]")
+    page.keyboard.press("ArrowLeft")
+    page.keyboard.press("Enter")
+    assert page.locator("#commission").is_visible()
+    assert wide(page) == 0
+
+
 def test_commissioning_asks_and_ends_with_its_report(page, folder):
     until(page, "!state.runs.some((r) => r.alive)")
     page.click("[data-tab=commission]")

@@ -1,13 +1,29 @@
-"""The colours of the console's page: text and marks that can be told from what is behind them (WCAG 2.2, AA)."""
+"""Colours of the console's page and of reports: text and marks that stand out from what is behind (WCAG 2.2, AA)."""
 
 import re
 from importlib.resources import files
 
 import pytest
 
-SHEET = files("ambid").joinpath("console", "static", "console.css").read_text(encoding="utf-8")
-LIGHT, DARK = (dict(re.findall(r"(--[\w-]+): (#\w+)", block)) for block in re.findall(r":root \{([^}]*)\}", SHEET))
+
+def sheet(*place):
+    """A style sheet, and its colours in light and dark."""
+    text = files("ambid").joinpath(*place).read_text(encoding="utf-8")
+    light, dark, *_ = (
+        dict(re.findall(r"(--[\w-]+): (#\w+)", block)) for block in re.findall(r":root[^{]*\{([^}]*)\}", text)
+    )
+    return text, (light, {**light, **dark})
+
+
+SHEET, CONSOLE = sheet("console", "static", "console.css")
+REPORT = sheet("data", "report.css")[1]
 BEHIND = ("--page", "--card", "--grid")  # of the page, of cards, of rows under the pointer
+TEXT = [(ink, back) for ink in ("--ink", "--dim", "--accent", "--good", "--doubt", "--bad") for back in BEHIND]
+TEXT += [("--on-stop", "--stop"), ("--page", "--doubt")]  # banners
+MARKS = [("--edge", "--card"), ("--edge", "--page"), ("--stop", "--page")]  # borders of what is operated
+PRINTED = [(ink, "--paper") for ink in ("--ink", "--dim", "--measured", "--good", "--doubt", "--bad", "--predicted")]
+PRINTED += [("--ink", "--shade"), ("--ink", "--warn"), ("--ink", "--second")]
+DRAWN = [(line, "--paper") for line in ("--edge", "--bound")]
 
 
 def luminance(colour):
@@ -28,11 +44,9 @@ def test_the_ratio_is_that_of_the_standard():
     assert contrast("#777777", "#ffffff") == pytest.approx(4.48, abs=0.005)
 
 
-@pytest.mark.parametrize("colours", [LIGHT, {**LIGHT, **DARK}], ids=["light", "dark"])
+@pytest.mark.parametrize("colours", [*CONSOLE, *REPORT], ids=["light", "dark", "report", "dark report"])
 def test_text_and_marks_stand_out(colours):
-    text = [(ink, back) for ink in ("--ink", "--dim", "--accent", "--good", "--doubt", "--bad") for back in BEHIND]
-    text += [("--on-stop", "--stop"), ("--page", "--doubt")]  # banners
-    marks = [("--edge", "--card"), ("--edge", "--page"), ("--stop", "--page")]  # borders of what is operated
-    found = {pair: (contrast(*(colours[c] for c in pair)), 4.5 if pair in text else 3.0) for pair in (*text, *marks)}
-    assert {pair: round(ratio, 2) for pair, (ratio, least) in found.items() if ratio < least} == {}
+    text, marks = (TEXT, MARKS) if "--card" in colours else (PRINTED, DRAWN)
+    found = {pair: contrast(*(colours[c] for c in pair)) for pair in (*text, *marks)}
+    assert {pair: round(x, 2) for pair, x in found.items() if x < (4.5 if pair in text else 3.0)} == {}
     assert not re.search(r"color: #|background: #|solid #", SHEET.split("* {", 1)[1])  # no colour beside these

@@ -152,6 +152,43 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
             assert not (tmp_path / "wrong.toml").exists()
 
 
+def test_a_ledger_is_shown_over_time_without_numbers_that_are_not_known(tmp_path):
+    pytest.importorskip("sqlalchemy", reason="the extra [fleet] is not installed")
+    from ambid.console.history import drawn
+    from ambid.ledger import open_ledger
+    from tests.ledger.entries import entry, parameter
+
+    hidden = (parameter("k_i", 80.0, 0.5), parameter("R", 4.2, 0.1, seen=False), parameter("L", 0.1, 0.0, role="fixed"))
+    bad = [entry(0), entry(1, parameters=hidden), entry(2, verdict="unusable", failed=("white",), rig="two")]
+    with open_ledger(tmp_path / "works.db") as ledger:
+        ledger.add([*bad, entry(0, 'B"; DROP TABLE value')])
+    (tmp_path / "other.db").write_bytes(b"SQLite format 3\0" + bytes(4080))
+    before = sorted(tmp_path.iterdir())
+    with console(tmp_path, "--read-only") as page:
+        page.open()
+
+        def look(name, **more):
+            wish = {"job": "history", "ledger": page.number(name), **more}
+            with page.feed(page.json("POST", "/api/previews", wish)["id"]) as feed:
+                return [m for data in feed for m in json_frames(data)]
+
+        seen = look("works.db", bearing='B"; DROP TABLE value')
+        assert told(seen, "bearings")[0]["names"] == ["A", 'B"; DROP TABLE value']
+        assert told(seen, "history")[0]["bearing"] == 'B"; DROP TABLE value'
+        assert "is not a ledger" in told(look("other.db"), "end")[0]["why"]
+        assert page.ask("POST", "/api/previews", {"job": "history"}).status == 400
+    with open_ledger(tmp_path / "works.db", write=False) as ledger:
+        a = drawn(ledger.history("A"))
+    assert sorted(tmp_path.iterdir()) == before
+    assert [a["bearing"], a["verdict"], len(a["estimates"])] == ["A", "caution", 3]
+    assert a["series"]["k_i"]["value"] == [80.0, 80.0, None]
+    assert a["series"]["R"]["value"] == [4.2, None, None]
+    assert a["series"]["R"]["half"][1:] == [None, None]
+    assert a["series"]["R"]["verdict"] == ["usable", "hidden", "unusable"]
+    assert "L" not in a["series"]
+    assert [e["kind"] for e in a["events"]] == ["rig"]
+
+
 ELSEWHERE = 'model = "one-axis"\n[channels.voltage]\ncolumn = "duty"\ntable = "{}"\n'
 
 

@@ -115,9 +115,9 @@ def spectrum(signals: Array, rate_hz: float) -> tuple[Array, list[Array]]:
     return top, [np.array([lines[p, k].max() for p in places]) for k in range(signals.shape[1])]
 
 
-def rounded(values: Array) -> list[float | None]:
-    """Return numbers to five digits for JSON; None where not finite."""
-    return [float(f"{v:.5g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
+def rounded(values: Array, digits: int = 5) -> list[float | None]:
+    """Return numbers to some digits for JSON; None where not finite."""
+    return [float(f"{v:.{digits}g}") if np.isfinite(v) else None for v in np.asarray(values, dtype=float)]
 
 
 def throttled(every_s: float, tell: Callable[..., object]) -> Callable[..., object]:

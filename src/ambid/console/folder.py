@@ -27,11 +27,12 @@ class Entry:
 
     number: int
     name: str  # relative to the folder
-    kind: str  # record, rig, result, report
+    kind: str  # record, rig, result, report, ledger
     bytes: int
     changed: float  # s since 1970
     schema: str = ""
     verdict: str = ""
+    why: str = ""  # the first reason of the verdict
 
 
 class Folder:
@@ -41,7 +42,7 @@ class Folder:
         self.path = folder
         self.left_out = 0
         self._numbers: dict[str, int] = {}
-        self._seen: dict[str, tuple[float, int, str, str]] = {}
+        self._seen: dict[str, tuple[float, int, tuple[str, str, str]]] = {}
 
     def entries(self) -> list[Entry]:
         """Return records, rigs, results and reports, the newest first; `left_out` tells how many are not listed."""
@@ -106,18 +107,20 @@ class Folder:
         name, kind = str(path.relative_to(self.path)), _kind(path.name)
         known = self._seen.get(name)
         if known is None or known[:2] != (about.st_mtime, about.st_size):
-            schema, verdict = _said(path, kind)
-            self._seen[name] = known = (about.st_mtime, about.st_size, schema, verdict)
-        if not kind or (kind in ("rig", "result") and not known[2]):
+            self._seen[name] = known = (about.st_mtime, about.st_size, _said(path, kind))
+        schema, verdict, why = known[2]
+        if not kind or (kind in _KNOWN and not schema):
             return None
         number = self._numbers.setdefault(name, len(self._numbers) + 1)
         return Entry(
-            number=number, name=name, kind=kind, bytes=about.st_size, changed=about.st_mtime, schema=known[2],
-            verdict=known[3],
+            number=number, name=name, kind=kind, bytes=about.st_size, changed=about.st_mtime, schema=schema,
+            verdict=verdict, why=why,
         )  # fmt: skip
 
 
-_KINDS = {".toml": "rig", ".json": "result", ".html": "report"}
+_KINDS = {".toml": "rig", ".json": "result", ".html": "report", ".db": "ledger"}
+_SQLITE = b"SQLite format 3\0"
+_KNOWN = ("rig", "result", "ledger")  # kinds that are told by what is inside
 
 
 def _kind(name: str) -> str:
@@ -148,20 +151,24 @@ def open_plain(path: Path) -> FileIO:
     return file
 
 
-def _said(path: Path, kind: str) -> tuple[str, str]:
-    """Return schema and verdict of a rig or a result."""
-    if kind not in ("rig", "result"):
-        return "", ""
+def _said(path: Path, kind: str) -> tuple[str, str, str]:
+    """Return what a rig, a result or a ledger says of itself: schema, verdict and its first reason."""
+    if kind not in _KNOWN:
+        return "", "", ""
     try:
         with open_plain(path) as file:
-            data = file.read(4000 if kind == "rig" else _LONGEST + 1)
-        if kind == "rig":
-            return ("ambid.rig/1" if b'"ambid.rig/1"' in data else ""), ""
+            data = file.read(_LONGEST + 1 if kind == "result" else 4000)
+        if kind != "result":
+            schema, mark = {"rig": ("ambid.rig/1", b'"ambid.rig/1"'), "ledger": ("ambid.ledger", _SQLITE)}[kind]
+            return (schema if mark in data else ""), "", ""
         document: Any = json.loads(data) if len(data) <= _LONGEST else None
     except (OSError, ValueError, RecursionError):
-        return "", ""
+        return "", "", ""
     if not isinstance(document, dict) or not str(document.get("schema", "")).startswith("ambid."):
-        return "", ""
+        return "", "", ""
     verdict = document.get("verdict")
-    word = verdict.get("word", "") if isinstance(verdict, dict) else ""
-    return str(document["schema"])[:40], str(word)[:40]
+    said = verdict if isinstance(verdict, dict) else {}
+    reasons = said.get("reasons")
+    first = reasons[0] if isinstance(reasons, list) and reasons else None
+    why = first.get("text", "") if isinstance(first, dict) else first or ""
+    return str(document["schema"])[:40], str(said.get("word", ""))[:40], str(why)[:400]

@@ -36,6 +36,7 @@ from ambid.errors import AmbidError
 
 MOVING = ("live", "commission")
 """Jobs that may move the machine: one client at a time orders them."""
+_LOOKS = ("preview", "history")  # jobs that change nothing
 
 _POLL_S = 0.01  # between two looks at a feed
 _VIEWERS = 16  # feeds that are watched at once
@@ -53,6 +54,7 @@ _WORDS = {"live": ("track", "hold", "accept", "revert"), "commission": ("go", "n
 # of each job: files that it reads, by their kinds; other fields with their types; the ending of what it makes
 _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
     "preview": ({"record": "record"}, {"rate_hz": float}, ""),
+    "history": ({"ledger": "ledger"}, {"bearing": str}, ""),
     "rig": ({}, {"text": str}, ".toml"),
     "identify": ({"record": "record", "rig": "rig"}, {}, ".json"),
     "margins": ({"record": "record", "rig": "rig", "estimate": "result"}, {}, ".json"),
@@ -66,13 +68,13 @@ _FIELDS: Mapping[str, tuple[Mapping[str, str], Mapping[str, Any], str]] = {
         {"rig": "rig"}, {"port": str, "seconds": float, "track_seconds": float, "pace": str, "redesign": bool}, "/",
     ),
 }  # fmt: skip
-_FILES = ("record", "rig", "estimate", "arm")
+_FILES = ("record", "ledger", "rig", "estimate", "arm")
 _CHOICES = {
     "pace": ("real-time", "fastest"),
     "excitation": ("multisine", "schroeder", "prbs", "steps"),
     "method": ("pid", "lqg"),
 }
-_NEEDED = {"preview": ("record",), "identify": ("record", "rig"), "margins": ("rig",),
+_NEEDED = {"preview": ("record",), "history": ("ledger",), "identify": ("record", "rig"), "margins": ("rig",),
            "design": ("rig", "estimate"), "live": ("rig", "port"),
            "commission": ("rig", "port"), "rig": ("text",), "export": ("record", "from_s", "to_s")}  # fmt: skip
 
@@ -168,10 +170,10 @@ class Console:
 
         def start() -> Mapping[str, Any]:
             spec = self._spec(asked)
-            if spec["job"] == "preview":
+            if spec["job"] in _LOOKS:
                 return {"id": self._looks.start(spec).id}
             if request.url.path != "/api/runs":
-                raise AmbidError(f"{spec['job']} is no preview. Reload the page")
+                raise AmbidError(f"{spec['job']} changes the folder. Reload the page")
             if spec["job"] in MOVING:
                 self._take_wheel(request)
                 if any(r.alive and r.spec.get("job") in MOVING for r in self.runs.all()):

@@ -433,9 +433,26 @@ def _commission(worker: Worker) -> None:
             raise KeyboardInterrupt
 
 
+def _history(worker: Worker) -> None:
+    """Tell which bearings a ledger has, and one of them over time: that which is asked for, else the first."""
+    from ambid.console.history import drawn
+    from ambid.ledger import open_ledger
+
+    path = worker.path("ledger")
+    assert path is not None
+    with open_ledger(path, write=False) as ledger:
+        known = ledger.bearings()
+        failed = [{"bearing": f.bearing, "record": f.record, "reason": f.reason} for f in ledger.failures().values()]
+        names = [b.name for b in known]
+        worker.feed.tell("bearings", {"names": names, "failed": failed[-50:], "failures": len(failed)})
+        worker.tick("history")
+        if names:
+            worker.feed.tell("history", drawn(ledger.history(worker.spec.get("bearing", names[0]))))
+
+
 JOBS: Mapping[str, Callable[[Worker], None]] = {
     "preview": _preview, "rig": _rig, "identify": _identify, "margins": _margins, "design": _design,
-    "export": _export, "live": _live, "commission": _commission,
+    "export": _export, "history": _history, "live": _live, "commission": _commission,
 }  # fmt: skip
 
 

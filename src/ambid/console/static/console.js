@@ -65,6 +65,7 @@ function lookOld() {
   const not = refused(!(feed instanceof Live) ? "no live run is shown" : feed.over ? "the run is over" : !feed.following ? "nothing is tracked now" : why && "the run is silent");
   for (const button of document.querySelectorAll("[data-say]")) { button.disabled = not !== ""; button.title = not && `Not now: ${not}`; }
   if (feed?.asked) feed.pose();
+  for (const job of MOVING) $(`${job}-form`).hidden = !!feed && feed.job === job && feed.alive && !feed.over && !feed.lost;  // one run at a time
 }
 const refused = (why) => state.read_only ? "this console is read only" : state.driver === "another page" ? "another page has the machine" : why || "";
 const trouble = (error) => banner(error.message, "note");
@@ -76,6 +77,15 @@ function confirmed(question, yes = "Yes") {
   dialog.returnValue = "no";
   dialog.showModal();
   return new Promise((done) => dialog.addEventListener("close", () => done(dialog.returnValue === "go"), { once: true }));
+}
+
+// Colours: as the machine has them, or as chosen; a cookie, since the port is another one each time.
+const dark = matchMedia("(prefers-color-scheme: dark)");
+function colours() {
+  document.documentElement.toggleAttribute("data-dark", $("theme").value ? $("theme").value === "dark" : dark.matches);
+  palette = {};
+  for (const made of plots) made.box.isConnected ? made.plot.redraw() : plots.delete(made);
+  if (feed?.orbitOf) feed.drawOrbit();
 }
 
 // Tabs.
@@ -99,7 +109,7 @@ async function refresh() {
   $("where").textContent = state.folder + (state.read_only ? " (read only)" : "") + (state.left_out ? `, ${state.left_out} older files not shown` : "");
   const others = state.driver === "another page";
   $("driver").replaceChildren(...(others ? ["another page has the machine ", el("button", { onclick: takeOver }, "Take over")] : state.driver === "you" ? ["this page has the machine"] : []));
-  fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict]);
+  fill($("list").tBodies[0], state.files, (f) => [f.name, f.kind === "result" ? f.schema.replace(/^ambid\.|\/\d+$/g, "") : f.kind, f.verdict, when(f.changed)], choose, (f) => [f.number, f.changed, f.verdict, f.why]);
   fill($("runs").tBodies[0], state.runs, (r) => [`${r.spec.job} ${when(r.began)}`, r.spec.record ?? r.spec.estimate ?? r.spec.rig ?? r.spec.out ?? "", r.alive ? "runs" : r.end], watch, (r) => [r.id, r.alive, r.end]);
   for (const form of ["live-form", "commission-form"]) {
     choices($(form).elements.rig, state.files.filter((f) => f.kind === "rig"));
@@ -107,6 +117,9 @@ async function refresh() {
   }
   const bare = state.read_only ? "This console is read only: runs that others start are shown here." : state.files.some((f) => f.kind === "rig") ? "" : "There is no rig in this folder yet. Choose a record under Files: a rig is drafted from it, checked and written there. ";
   for (const [of, next] of [["live", "Choose a rig and a port, then 'Record and track': simulated is a bench of this machine, replay:NAME a record of the folder, anything else the controller's serial port. Signals, parameters and events appear here."], ["commission", "Choose a rig with [loop] and [daq], and a port, then 'Commission': self-test, rest, polarity, levitation, excitation, record, identification, validation and tracking follow one another; the page asks before the output is switched on."]]) $(`${of}-hint`).textContent = state.read_only ? bare : bare + next;
+  choices($("history-form").elements.ledger, state.files.filter((f) => f.kind === "ledger"));
+  $("history-form").hidden = !$("history-form").elements.ledger.value;
+  $("history-hint").textContent = $("history-form").hidden ? "There is no ledger in this folder yet. 'ambid identify RECORD --ledger works.db' keeps each estimate in one; this page then shows what becomes of a bearing over months." : "";
   choices($("live-form").elements.arm, state.files.filter((f) => f.kind === "rig"), "none");
   choices($("live-form").elements.estimate, state.files.filter((f) => f.schema.startsWith("ambid.estimate")), "from the first seconds");
   $("stop").disabled = state.read_only || !state.runs.some((r) => r.alive && MOVING.includes(r.spec.job));
@@ -124,11 +137,11 @@ function fill(body, things, cells, chosen, key) {
     const pick = () => chosen(thing);
     const row = el("tr", { tabIndex: -1, "data-of": key(thing)[0], onclick: () => { rove(row); pick(); }, onkeydown: (e) => (e.key === "Enter" || e.key === " ") && (e.preventDefault(), pick()) });
     row.append(...cells(thing).map((c, k) => el("td", { className: k ? (c === thing.verdict ? thing.verdict : "") : "name" }, String(c))));
-    if (thing.why) row.lastChild.append(el("div", { className: "hint why", title: thing.why }, thing.why));
+    if (thing.why) (thing.kind ? row.firstChild : row.lastChild).append(el("div", { className: "hint why", title: thing.why }, thing.why));
     return row;
   }));
   const at = [...body.rows].find((r) => r.dataset.of === body.dataset.at) ?? body.rows[0];
-  if (at) { at.tabIndex = 0; if (held) at.focus(); }
+  if (at) { at.tabIndex = 0; at.ariaCurrent = at.dataset.of === body.dataset.at ? "true" : null; if (held) at.focus(); }
 }
 // One row of a list is reached by Tab, the others from it by arrows.
 function rove(row) {
@@ -158,14 +171,21 @@ async function takeOver() {
 const stamp = () => new Date().toISOString().slice(0, 19).replace(/[-:]/g, "").replace("T", "-");
 const stem = (name) => name.split("/").pop().replace(/\.(csv|csv\.gz|h5|hdf5|mat|json|toml|html)$/i, "");
 
+const WORDS = { usable: "Usable", caution: "Use with caution", unusable: "Do not use" };
+
 function choose(file) {
   const detail = $("detail");
   if (file.kind === "report") { window.open(`/reports/${file.number}`, "_blank", "noopener"); return; }
   detail.replaceChildren(el("h2", {}, file.name));
+  detail.scrollIntoView();
   if (file.kind === "result") {
     const report = state.files.find((f) => f.kind === "report" && stem(f.name) === stem(file.name));
-    detail.append(el("p", { className: file.verdict }, file.verdict || "no verdict"), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."));
+    detail.append(el("p", { className: file.verdict }, WORDS[file.verdict] ?? "no verdict", file.why ? `: ${file.why}` : ""), report ? link(report) : el("p", { className: "hint" }, "It has no report beside it."));
     if (file.schema.startsWith("ambid.estimate")) loopForm(file, detail);
+  } else if (file.kind === "ledger") {
+    detail.append(el("p", { className: "hint" }, "A ledger: what became of bearings is shown under History."));
+    $("history-form").elements.ledger.value = file.number;
+    put($("history-form").elements.bearing); open("history"); histories();
   } else if (file.kind === "rig") {
     ask(`/api/rigs/${file.number}`).then((r) => detail.append(el("pre", {}, r.text))).catch(trouble);
   } else preview(file, detail);
@@ -196,13 +216,13 @@ async function job(spec, host, told) {
   host.append(line);
   bar.removeAttribute("value");
   try {
-    const place = spec.job === "preview" ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
+    const place = ["preview", "history"].includes(spec.job) ? "/api/previews" : "/api/runs", { id } = await ask(place, spec);
     cancel.onclick = () => ask(`${place}/${id}/say`, { word: "stop" }).catch(trouble);
     return await new Promise((done, fail) => listen(id, (m) => {
       if (m.kind === "progress") {
         if (m.done === null) bar.removeAttribute("value"); else bar.value = m.done;
         const left = m.done > 0.05 ? `, about ${seconds(m.seconds * (1 / m.done - 1))} left` : "";
-        words.textContent = `${m.stage}: ${seconds(m.seconds)}${m.done === null ? ", of a length that is not known" : left}`;
+        words.textContent = `${m.stage}: ${seconds(m.seconds)}${m.done === null ? ", of a length that is not known" : `, ${Math.round(100 * m.done)} %${left}`}`;
       } else if (m.kind === "end") m.how === "done" ? done() : fail(new Error(m.why));
       else told(m);
     }));
@@ -248,8 +268,7 @@ function identifyForm(file, m, host) {
 async function results(m, host) {
   await refresh();
   const report = state.files.find((f) => f.name === m.report);
-  const words = { usable: "Usable", caution: "Usable with caution", unusable: "Do not use" };
-  const head = el("h2", { className: `${m.verdict} result` }, words[m.verdict] ?? m.verdict);
+  const head = el("h2", { className: `${m.verdict} result` }, WORDS[m.verdict] ?? m.verdict);
   put(host, head, report ? link(report) : null, ...m.reasons.map((r) => el("p", {}, r)), ...(m.pictures ?? []).map(drawn), el("pre", {}, m.text));
   head.scrollIntoView();
 }
@@ -260,15 +279,15 @@ function rigForm(m) {
   const name = el("input", { value: `${stem(m.file)}-rig`, size: 24 });
   const fields = el("div", { className: "fields" });
   const rows = () => {
-    fields.replaceChildren(...["", "value", "unit", "role", "sd"].map((h) => el("span", { className: "hint" }, h)));
+    fields.replaceChildren(...["", "value", "unit", "role", "sd, of a prior", ""].map((h, k) => el("span", { className: k < 5 ? "hint" : "about" }, h)));
     for (const [whole, column] of text.value.matchAll(/^\[channels\.(\w+)\]/gm)) {
-      const at = new RegExp(`(\\[channels\\.${column}\\][\\s\\S]*?^column\\s*=\\s*)"([^"]*)"`, "m"), found = text.value.match(at);
+      const at = new RegExp(`(\\[channels\\.${column}\\]([\\s\\S]*?)^column\\s*=\\s*)"([^"]*)"`, "m"), found = text.value.match(at);
       if (!found) continue;
-      const pick = el("select", {}, ...m.channels.map((c) => el("option", { selected: c.name === found[2] }, c.name)));
+      const pick = el("select", {}, ...m.channels.map((c) => el("option", { selected: c.name === found[3], value: c.name }, `${c.name} [${c.unit}]`)));
       pick.onchange = () => { text.value = text.value.replace(at, (_, a) => `${a}"${pick.value}"`); };
-      fields.append(el("label", { title: whole }, column), pick, el("span", { className: "hint" }, m.channels.find((c) => c.name === found[2])?.unit ?? ""), el("span"), el("span"));
+      fields.append(el("label", { title: whole }, column), el("span", { className: "wide" }, pick), el("span"), el("span", { className: "hint about" }, found[2].match(/# (.*)/)?.[1] ?? ""));
     }
-    for (const [line, key, body] of text.value.matchAll(/^([\w.]+)\s*=\s*\{([^}\n]*)\}/gm)) {
+    for (const [line, key, body, about] of text.value.matchAll(/^([\w.]+)\s*=\s*\{([^}\n]*)\}[ \t]*(#.*)?/gm)) {
       if (!/unit\s*=/.test(body)) continue;
       const get = (k) => body.match(new RegExp(`\\b${k}\\s*=\\s*"?([^",}]*)"?`))?.[1]?.trim() ?? "";
       const value = el("input", { value: get("value"), inputMode: "decimal" }), unit = el("input", { value: get("unit") });
@@ -278,7 +297,8 @@ function rigForm(m) {
         text.value = text.value.split("\n").map((l) => l.match(/^([\w.]+)\s*=\s*\{/)?.[1] === key ? l.replace(/\{[^}]*\}/, `{ ${parts.join(", ")} }`) : l).join("\n");
       };
       for (const x of [value, unit, role, sd]) x.onchange = write;
-      fields.append(el("label", { title: line }, key), value, unit, role, sd);
+      for (const [field, what] of [[value, "value"], [unit, "unit"], [role, "role"], [sd, "standard deviation"]]) field.ariaLabel = `${key}, ${what}`;
+      fields.append(el("label", { title: line }, key), value, unit, role, sd, el("span", { className: "hint about" }, about?.slice(1).trim() ?? ""));
     }
   };
   rows();
@@ -313,11 +333,6 @@ let palette = {};  // colours are looked up when they are drawn, as the page may
 const css = (name) => palette[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const ink = (name, alpha = "") => () => css(name) + alpha;
 const plots = new Set();
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
-  palette = {};
-  for (const made of plots) made.box.isConnected ? made.plot.redraw() : plots.delete(made);
-  if (feed?.orbitOf) feed.drawOrbit();
-});
 function axes(unit, more = {}) {
   const grid = { stroke: ink("--grid"), width: 1 };
   const label = (u, splits) => {
@@ -332,7 +347,7 @@ function axes(unit, more = {}) {
 }
 function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
-  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
+  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, ...(more.utc ? { tzDate: (s) => uPlot.tzDate(new Date(1000 * s), "UTC") } : {}), cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
   const plot = new uPlot(opts, [[], ...series.map(() => [])], host);
   new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1 && plot.setSize({ width: host.clientWidth, height })).observe(host);
   const made = { box, plot, value };
@@ -345,12 +360,14 @@ const BAND = () => [line(ink("--accent"), { width: 1 }), line(ink("--accent"), {
 function strip(title, t, low, high, height = 110, unit = title.match(/\[(.*)\]/)?.[1] ?? "") {
   const made = chart(title, height, BAND(), unit, { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], zoom: true });
   made.plot.setData([t, low, high]);
+  const known = [...low, ...high].filter((v) => v !== null);
+  if (known.length) made.value.textContent = `${shown(known.reduce((a, b) => Math.min(a, b)), unit)} to ${shown(known.reduce((a, b) => Math.max(a, b)), unit)}`;
   return made;
 }
 
 // A run that is watched: it is silent where its process is frozen, also while it only waits.
 class Watched {
-  constructor(run) { Object.assign(this, { id: run.id, alive: run.alive, last: performance.now(), began: false, over: false, lost: false, sampled: Infinity }); }
+  constructor(run) { Object.assign(this, { id: run.id, job: run.spec.job, alive: run.alive, last: performance.now(), began: false, over: false, lost: false, sampled: Infinity }); }
   listen() {
     this.socket = listen(this.id, (m) => {
       this.last = performance.now(); this.began = true;
@@ -372,7 +389,7 @@ class Live extends Watched {
   constructor(run) {
     super(run);
     Object.assign(this, { signals: null, header: null, strips: [], parameters: {}, frozen: false, following: false, marked: null, record: null, wanted: run.spec.seconds ?? Infinity });
-    this.out = new Set(); this.zoom = null;
+    this.out = new Map(); this.zoom = null;
     this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
     $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
@@ -403,7 +420,7 @@ class Live extends Watched {
       $("strips").append(made.box);
       return made;
     });
-    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(["--accent", "--doubt", "--good", "--bad"][k % 4]))), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
+    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(["--accent", "--doubt", "--good", "--bad"][k % 4]))), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, hooks: { draw: [turns] }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
     made.box.querySelector("h3").firstChild.textContent = `spectrum, peak: ${m.names.map((n, k) => `${n} ${m.units[k]}`).join(", ")}`;
     $("spectrum").append(made.box);
     this.lines4 = made;
@@ -452,9 +469,9 @@ class Live extends Watched {
     while ($("events").children.length > 200) $("events").lastChild.remove();
   }
   sensors(m) {  // those that are not used now
-    if (m.what === "excluded") this.out.add(m.parameter);
+    if (m.what === "excluded") this.out.set(m.parameter, m.why);
     if (m.what === "restored") this.out.delete(m.parameter);
-    $("sensors").textContent = this.out.size ? `not used: ${[...this.out].join(", ")}` : "";
+    $("sensors").textContent = this.out.size ? `not used: ${[...this.out].map(([name, why]) => `${name} (${why})`).join(", ")}` : "";
   }
   mark(u) {  // what is dragged over; in a picture that stands still it is shown closer too
     if (!u.select.width) return;
@@ -535,6 +552,20 @@ class Live extends Watched {
     if (this.error) this.error.value.textContent = last.error === null ? "unknown" : last.error.toFixed(2);
   }
 }
+// The speed of the rotor and its multiples in a spectrum.
+function turns(u) {
+  const hz = Number($("speed").value) / 60;
+  for (const k of hz > 0 ? [1, 2, 3] : []) {
+    const x = u.valToPos(k * hz, "x", true);
+    if (x >= u.bbox.left && x <= u.bbox.left + u.bbox.width) upright(u, x, css("--doubt"), `${k}×`);
+  }
+}
+function upright(u, x, colour, text = "", dash = []) {
+  const g = u.ctx;
+  g.save(); g.strokeStyle = g.fillStyle = colour; g.lineWidth = devicePixelRatio; g.setLineDash(dash); g.beginPath();
+  g.moveTo(x, u.bbox.top); g.lineTo(x, u.bbox.top + u.bbox.height); g.stroke();
+  g.textAlign = "left"; g.textBaseline = "top"; g.fillText(text, x + 3 * devicePixelRatio, u.bbox.top); g.restore();
+}
 function pick(values, a, z, step, of) {
   const found = [];
   for (let k = a; k < z; k += step) { const part = values.slice(k, Math.min(z, k + step)).filter((x) => x !== null); found.push(part.length ? of(part) : null); }
@@ -586,6 +617,8 @@ function freeze(live, frozen) {
   $("back").value = $("back").max;
 }
 $("freeze").onclick = () => freeze(feed, !feed.frozen);
+$("speed").value = sessionStorage.speed ?? "";
+$("speed").oninput = () => { sessionStorage.speed = $("speed").value; feed?.lines4?.plot.redraw(); };
 $("back").oninput = $("span").onchange = () => { if (feed?.t) { feed.zoom = null; feed.redraw(); } };
 $("export").onclick = async () => {
   const file = state.files.find((f) => f.name === feed.record);
@@ -609,7 +642,7 @@ addEventListener("keydown", (e) => {
 class Steps extends Watched {
   constructor(run) {
     super(run);
-    this.items = {}; this.done = new Set(); $("commission-hint").hidden = true;
+    this.items = {}; this.done = new Set(); this.out = run.spec.out; $("commission-hint").hidden = true;
     $("steps").replaceChildren();
     this.listen();
   }
@@ -622,8 +655,8 @@ class Steps extends Watched {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
       progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
       step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
-      commissioned: () => { const words = m.passed ? "Commissioned: every step is good enough." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); }).catch(() => {}); },
-      end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); if (m.why) this.append(el("p", { className: m.how, role: "alert" }, m.why)); refresh().catch(() => {}); },
+      commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned: every step is good enough." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); }).catch(() => {}); },
+      end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); const why = m.how === "cancelled" && this.kept ? `Stopped by the operator. The folder ${this.out} and its report keep what was found. To go on, start again with another folder: each step is done anew.` : m.why; if (why) this.append(el("p", { className: m.how, role: "alert" }, why)); refresh().catch(() => {}); },
     }[m.kind];
     how?.();
   }
@@ -652,7 +685,76 @@ class Steps extends Watched {
   }
 }
 
-if (["files", "live", "commission"].includes(location.hash.slice(1))) open(location.hash.slice(1));
+// A bearing over time: points with their band, marks where no number is known, events.
+const date = (s, long) => new Date(1000 * s).toISOString().slice(0, long ? 16 : 10).replace("T", " ");
+const MARKS = { hidden: ["not identifiable", "--dim"], unusable: ["do not use", "--bad"] };
+function overTime(name, s, events, first, last) {
+  const known = s.value.map((v, k) => k).filter((k) => s.value[k] !== null), mid = known.map((k) => s.half[k] ?? 0).sort((a, b) => a - b)[known.length >> 1];
+  const reach = (k) => Math.min(s.half[k] ?? 0, 3 * mid), low = Math.min(...known.map((k) => s.value[k] - reach(k))), high = Math.max(...known.map((k) => s.value[k] + reach(k)));
+  const room = 0.12 * (high - low) || 0.01 * Math.abs(high) || 1, edge = 0.02 * (last - first) || 43200;
+  const only = (verdict) => s.value.map((v, k) => s.verdict[k] === verdict ? v : null);
+  const dots = (colour) => ({ stroke: ink(colour), paths: () => null, points: { show: true, size: 6, fill: ink(colour) } });
+  const band = line("transparent"), say = (k) => s.value[k] === null ? MARKS[s.verdict[k]]?.[0] ?? "unknown" : shown(s.value[k], s.unit, s.sd[k]) + (s.verdict[k] === "caution" ? ", with caution" : "");
+  const marks = (u) => {
+    for (const e of events) {
+      const own = e.parameter === "" || e.parameter === name, x = u.valToPos(e.at, "x", true);
+      if (x >= u.bbox.left && x <= u.bbox.left + u.bbox.width) upright(u, x, e.kind === "rig" ? css("--good") : css("--doubt") + (own ? "" : "55"), e.parameter === name || e.kind === "rig" ? e.kind : "", e.kind === "rig" ? [6, 4] : []);
+    }
+    const g = u.ctx, y = u.bbox.top + 0.95 * u.bbox.height, r = 4 * devicePixelRatio;
+    g.save(); g.lineWidth = 1.5 * devicePixelRatio;
+    s.value.forEach((v, k) => {
+      const x = u.valToPos(s.t[k], "x", true);
+      if (v !== null || x < u.bbox.left || x > u.bbox.left + u.bbox.width) return;
+      g.strokeStyle = css(MARKS[s.verdict[k]]?.[1] ?? "--dim"); g.beginPath();
+      if (s.verdict[k] === "unusable") { g.moveTo(x - r, y - r); g.lineTo(x + r, y + r); g.moveTo(x - r, y + r); g.lineTo(x + r, y - r); } else { g.moveTo(x, y - r); g.lineTo(x, y + r); }
+      g.stroke();
+    });
+    g.restore();
+  };
+  const days = (u, splits, axis, space, step) => splits.map((t) => date(t, step < 86400));
+  const made = chart(name, 170, [band, band, line(ink("--accent")), dots("--accent"), dots("--doubt")], s.unit, {
+    bands: [{ series: [2, 1], fill: ink("--accent", "33") }], zoom: true, utc: true, scale: { time: true, range: (u, a, b) => a === b ? [a - edge, b + edge] : [a, b] },
+    scales: { y: { range: known.length ? [low - 1.4 * room, high + room] : [0, 1] } }, x: days, xaxis: { space: 90 }, yaxis: known.length ? {} : { values: () => [] },
+    hooks: { draw: [marks], setCursor: [(u) => { const k = u.cursor.idx; made.value.textContent = k === null || k === undefined ? latest : `${date(s.t[k], true)}: ${say(k)}`; }] } });
+  const at = known.at(-1), latest = at === undefined ? "never identifiable" : `${say(at)}, ${date(s.t[at])}${at < s.t.length - 1 ? `; ${say(s.t.length - 1)} since` : ""}`;
+  made.value.textContent = latest;
+  made.plot.setData([s.t, s.value.map((v, k) => v === null ? null : v - (s.half[k] ?? 0)), s.value.map((v, k) => v === null ? null : v + (s.half[k] ?? 0)), s.value, only("usable"), only("caution")]);
+  return made.box;
+}
+function showHistory(m, host) {
+  const first = m.estimates[0].taken_at, last = m.estimates.at(-1).taken_at, shownOnes = m.estimates.slice(-200).reverse();
+  put(host, el("h2", { className: `${m.verdict} result` }, `${m.bearing}: ${WORDS[m.verdict] ?? m.verdict}`), ...m.reasons.map((r) => el("p", {}, r)),
+    m.left_out ? el("p", { className: "caution" }, `The latest ${m.estimates.length} estimates are drawn; 'ambid history' draws the ${m.left_out} before too.`) : null,
+    el("p", { className: "hint" }, "Bands are 95 %. A point with caution is coloured; | not identifiable, × do not use: there no number is known. Drag over a chart to see it closer, a double click shows all. Times are UTC."),
+    el("div", { id: "history-charts" }, ...Object.entries(m.series).map(([name, s]) => overTime(name, s, m.events, first, last))),
+    m.events.length ? el("h2", {}, "Events") : null,
+    m.events.length ? el("ol", { className: "scroll" }, ...m.events.slice(-200).reverse().map((e) => el("li", {}, `${date(e.at, true)} ${e.kind}: ${e.parameter ? `${e.parameter}: ` : ""}${e.text}`))) : null,
+    el("h2", {}, m.estimates.length > 200 ? "The latest 200 estimates" : "Estimates"),
+    el("div", { className: "scroll" }, el("table", {}, el("thead", {}, el("tr", {}, ...["taken", "record", "verdict", "because of"].map((h) => el("th", {}, h)))),
+      el("tbody", {}, ...shownOnes.map((e) => el("tr", {}, el("td", {}, date(e.taken_at, true)), el("td", { className: "name" }, e.record), el("td", { className: e.verdict }, WORDS[e.verdict] ?? e.verdict), el("td", {}, e.failed.replaceAll(",", ", "))))))),
+    el("details", {}, el("summary", {}, "As 'ambid history' writes it"), el("pre", {}, m.text)));
+}
+async function histories() {
+  const form = $("history-form").elements, host = $("history-view"), asked = form.bearing.value;
+  put(host);
+  await job({ job: "history", ledger: Number(form.ledger.value), ...(asked && { bearing: asked }) }, host, (m) => {
+    if (m.kind === "bearings") {
+      put(form.bearing, ...m.names.map((n) => el("option", { selected: n === asked }, n)));
+      if (!m.names.length) host.append(el("p", { className: "hint" }, "The ledger has no bearing yet."));
+      if (m.failures) host.append(el("details", {}, el("summary", {}, `${m.failures} records gave no estimate`), ...m.failed.map((f) => el("p", {}, `${f.record || "a record"} (${f.bearing}): ${f.reason}`))));
+    }
+    if (m.kind === "history") showHistory(m, host.appendChild(el("div")));
+  }).catch(wrong(host));
+}
+$("history-form").addEventListener("submit", (e) => { e.preventDefault(); histories(); });
+$("history-form").elements.bearing.onchange = histories;
+$("history-form").elements.ledger.onchange = () => { put($("history-form").elements.bearing); histories(); };
+
+$("theme").value = document.cookie.match(/(?:^|; )ambid_colours=(light|dark)/)?.[1] ?? "";
+$("theme").onchange = () => { document.cookie = `ambid_colours=${$("theme").value}; SameSite=Strict; path=/; max-age=31536000`; colours(); };
+dark.addEventListener("change", colours);
+colours();
+if (["files", "live", "commission", "history"].includes(location.hash.slice(1))) open(location.hash.slice(1));
 refresh().catch(trouble);
 setInterval(() => { if (!document.hidden) refresh().catch(() => {}); }, 2000);
 setInterval(lookOld, 250);
