@@ -2,6 +2,7 @@
 
 import datetime as dt
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -199,3 +200,21 @@ def test_a_missing_library_is_one_line(tmp_path, monkeypatch, name, module):
     (tmp_path / name).write_bytes({"a.tdms": b"TDSm", "a.mf4": b"MDF     ", "a.parquet": b"PAR1"}[name])
     with pytest.raises(RecordError, match=rf"^{module} is not installed, .* ambid\[formats\]$"):
         read_record(tmp_path / name)
+
+
+def test_identify_and_track_take_the_layout_from_the_call_or_the_rig(tmp_path):
+    from ambid import identify, simulate, track
+    from ambid.rig import default_rig
+
+    made = simulate("unstable-bearing", duration=0.4, seed=1)
+    wave = {"wf_increment": 1 / made.rate_hz}
+    columns = [(g, c.name, c.values, {**wave, "unit_string": c.unit}) for g in ("A", "B") for c in made.channels]
+    path = tdms(tmp_path / "a.tdms", columns)
+    with pytest.raises(RecordError, match="2 groups"):
+        identify(path)
+    told = identify(path, layout={"group": "B"})
+    rig = default_rig()
+    known = replace(rig, record=replace(rig.record, layout={"group": "B"}))
+    assert identify(path, known).values == told.values
+    for way in ({"layout": {"group": "B"}}, {"rig": known}):
+        assert track(path, start=told, **way).lines[-1].parameters.keys() >= {"m", "k_i"}

@@ -84,6 +84,7 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     json: opt.JsonFile = None,
     plot: Annotated[
         Path | None,
@@ -115,6 +116,7 @@ def command(
     stop, kept = Stop(), tuple(held or ())
     own: dict[str, Any] = {"magnet": magnet, "eddy": eddy, "drift": drift, "off_below": off_below}
     how: dict[str, Any] = {"from_s": from_s, "to_s": to_s, "rate_hz": rate, "gaps": gaps, "validate": second}
+    how |= {"layout": opt.layout_of(layout)} if layout else {}
     asked = {**how, **own, "nonlinear": nonlinear, "held": len(kept), "speed_rpm": speed, "experiment": experiment}
     with keeping(ledger, [*records, *kept], rig, bearing=bearing, taken_at=taken_at, job="identify", **asked) as store:
         with Outputs(*records, *kept, rig, second, experiment, json=json, plot=plot, report=report) as outputs:

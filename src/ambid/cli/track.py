@@ -75,6 +75,7 @@ def command(
     from_s: opt.From = None,
     to_s: opt.To = None,
     rate: opt.Rate = None,
+    layout: opt.Layout = None,
     json: opt.TrackFile = None,
     plot: Annotated[
         Path | None,
@@ -109,7 +110,8 @@ def command(
     given = {name: value for name, value in settings.items() if value}
     if method == "rpem" and given:
         raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or omit it")
-    asked = {**how, **given, "method": method, "from_s": from_s, "to_s": to_s}
+    told: dict[str, Any] = {"layout": opt.layout_of(layout)} if layout else {}
+    asked = {**how, **given, **told, "method": method, "from_s": from_s, "to_s": to_s}
     with keeping(ledger, [record], rig, bearing=bearing, taken_at=taken_at, job="track", **asked) as store:
         with Outputs(record, rig, start, plot=plot, report=report) as outputs:
             outputs.claim(json_path(json), "--json")
@@ -136,6 +138,7 @@ def command(
                     tick=follower.tick,
                     **how,
                     **given,
+                    **told,
                 )
             )
             if follower.track is not None:

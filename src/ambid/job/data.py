@@ -96,6 +96,7 @@ class Reading(TypedDict, total=False):
     rate_hz: float | None  # sampling rate of a file without a time column
     gaps: GapPolicy | None
     units: Mapping[str, str] | None  # of the columns of a table in memory
+    layout: Mapping[str, str] | None  # of a file, beside the rig's
 
 
 def load_bench(
@@ -107,6 +108,7 @@ def load_bench(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     beside: Sequence[str] = (),
 ) -> Record:
     """Read a record through a rig and cut it to the part that is to be used.
@@ -120,7 +122,7 @@ def load_bench(
         Override the rig's ``record.from`` and ``record.to``; s.
     rate_hz : float, optional
     gaps : {"error", "interpolate", "cut"}, optional
-    units : Mapping of str to str, optional
+    units, layout : Mapping of str to str, optional
     beside : sequence of str, optional
         Columns of the file that are no role of the rig, kept under their own names.
 
@@ -134,7 +136,8 @@ def load_bench(
     AmbidError
         If the file, its columns or the cut break a rule.
     """
-    return _cut_by(rig, read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units, beside=beside), (from_s, to_s))
+    found = read_bench(record, rig, rate_hz=rate_hz, gaps=gaps, units=units, beside=beside, layout=layout)
+    return _cut_by(rig, found, (from_s, to_s))
 
 
 def signals_of(record: Record, plant: LinearModel) -> Signals:

@@ -42,6 +42,7 @@ def identify(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     tick: Tick | None = None,
 ) -> Estimate | RotorEstimate:
     """Identify the physical parameters of a bench from one record, and check the result.
@@ -70,6 +71,8 @@ def identify(
         What to do about missing values; default: as the rig says, else refuse them.
     units : Mapping of str to str, optional
         Unit by column, for tables in memory.
+    layout : Mapping of str to str, optional
+        What the files leave open, as `ambid.read_record`, beside the rig's ``record.layout``.
     tick : callable, optional
         Called with the name of the present stage now and then (progress); may raise to interrupt.
 
@@ -97,7 +100,7 @@ def identify(
     """
     bench, sources = known_rig(rig), sources_of(record)
     planned = None if experiment is None else _planned(experiment)
-    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
     if bench.rotor is not None:
         from ambid.job.rotor import identify_rotor, validated
 
@@ -268,6 +271,7 @@ def identify_nonlinear(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     tick: Tick | None = None,
 ) -> NonlinearBearingEstimate:
     """Identify one nonlinear bearing from several records at several operating points at once.
@@ -290,7 +294,7 @@ def identify_nonlinear(
         Estimate an eddy pole, or a resistance that drifts, where the rig does not say so.
     off_below : float, optional
         Voltage at or below which the power stage is off, V; default: as the rig says.
-    from_s, to_s, rate_hz, gaps, units : optional
+    from_s, to_s, rate_hz, gaps, units, layout : optional
         As `identify`; the part of every record in which the rotor moves.
     tick : callable, optional
         As `identify`.
@@ -314,7 +318,7 @@ def identify_nonlinear(
 
     words = BearingWords(
         magnet=magnet, eddy=eddy, drift=drift, off_below=off_below, from_s=from_s, to_s=to_s, rate_hz=rate_hz,
-        gaps=gaps, units=units,
+        gaps=gaps, units=units, layout=layout,
     )  # fmt: skip
     say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
     taken, second = take_all(sources_of(records), sources_of(held), validate, bench, words, say)

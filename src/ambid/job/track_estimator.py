@@ -85,7 +85,7 @@ def track_estimator(
         made = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
         refuse_given({"--rig": rig, "--start": start, "--start-seconds": start_s}, refusal)
-        whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"))
+        whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"), layout=part.get("layout"))
         span = part.get("from_s"), part.get("to_s")
         used = whole if span == WHOLE else cut(whole, *span)
         data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))

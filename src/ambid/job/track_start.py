@@ -98,7 +98,8 @@ def rows_of(record: Source, known: Rig | None, **reading: Unpack[Reading]) -> Be
         bench, stamps = load_bench(record, rig, **reading), None
     else:
         rate = rate_hz if rate_hz is not None else rig.record.rate_hz
-        rows = read_rows(record, rate_hz=rate, units=reading.get("units"), layout=rig.record.layout)
+        told = {**rig.record.layout, **(reading.get("layout") or {})}
+        rows = read_rows(record, rate_hz=rate, units=reading.get("units"), layout=told)
         from_s, to_s = reading.get("from_s"), reading.get("to_s")
         bench, stamps = _part(
             bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig), rows.time_s,

@@ -68,6 +68,7 @@ def track(
     to_s: float | None = None,
     rate_hz: float | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     on_header: Callable[[TrackHeader], None] | None = None,
     on_line: OnLine | None = None,
     keep: bool = True,
@@ -114,6 +115,8 @@ def track(
         Sampling rate of a record without time.
     units : Mapping of str to str, optional
         Unit by column, for tables in memory.
+    layout : Mapping of str to str, optional
+        What the file leaves open, as `ambid.read_record`, beside the rig's ``record.layout``.
     on_header, on_line : callable, optional
         Called once before the first line, and with each line; flags that `on_line` returns are set.
     keep : bool, optional
@@ -144,7 +147,7 @@ def track(
     if not (rig is None or isinstance(rig, (Rig, str, Path))):
         raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
     given = load_rig(rig) if isinstance(rig, (str, Path)) else rig
-    part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units)
+    part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units, layout=layout)
     if given is not None and given.rotor is not None:
         from ambid.job.track_rotor import track_rotor
 
