@@ -384,6 +384,11 @@ class Watched {
 }
 
 // The live view.
+const COLOURS = ["--accent", "--doubt", "--good", "--bad"];
+function decades(u, axis, low, high) {
+  const a = Math.ceil(Math.log10(low) - 1e-9), z = Math.floor(Math.log10(high) + 1e-9), step = Math.max(1, Math.ceil((z - a) / 5));
+  return Array.from({ length: Math.max(0, Math.floor((z - a) / step) + 1) }, (_, k) => 10 ** (a + k * step));
+}
 let feed = null;
 class Live extends Watched {
   constructor(run) {
@@ -414,14 +419,15 @@ class Live extends Watched {
     if (this.signals) return;
     this.signals = m;
     this.low = m.names.map(() => []); this.high = m.names.map(() => []);
+    const height = innerWidth > 900 ? Math.min(240, Math.max(118, (innerHeight - 140) / m.names.length - 34)) : 118;
     this.strips = m.names.map((name, k) => {
-      const made = chart(name, 118, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], hooks: { setSelect: [(u) => this.mark(u)], drawClear: [(u) => this.shade(u)] } });
+      const made = chart(name, height, BAND(), m.units[k], { bands: [{ series: [2, 1], fill: ink("--accent", "66") }], hooks: { setSelect: [(u) => this.mark(u)], drawClear: [(u) => this.shade(u)] } });
       made.plot.over.addEventListener("dblclick", () => { this.zoom = null; this.redraw(); });
       $("strips").append(made.box);
       return made;
     });
-    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(["--accent", "--doubt", "--good", "--bad"][k % 4]))), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, hooks: { draw: [turns] }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { values: (u, s) => s.map((v) => v === null ? "" : Math.abs(Math.log10(v) % 1) < 1e-6 ? v.toExponential(0) : "") } });
-    made.box.querySelector("h3").firstChild.textContent = `spectrum, peak: ${m.names.map((n, k) => `${n} ${m.units[k]}`).join(", ")}`;
+    const made = chart("spectrum", 140, m.names.map((_, k) => line(ink(COLOURS[k % 4]))), "", { scale: { distr: 3 }, scales: { y: { distr: 3 } }, hooks: { draw: [turns] }, x: (u, s) => s.map((v) => v === null ? null : Math.abs(Math.log10(v) % 1) < 1e-6 ? (v >= 1000 ? `${v / 1000} kHz` : `${v} Hz`) : ""), yaxis: { splits: decades, values: (u, s) => s.map((v) => v === 1 ? "1" : v?.toExponential(0) ?? "") } });
+    put(made.box.querySelector("h3"), "spectrum, peak", el("span", { className: "names" }, ...m.names.map((n, k) => { const name = el("b", {}, ` ${n} [${m.units[k]}]`); name.style.color = `var(${COLOURS[k % 4]})`; return name; })));
     $("spectrum").append(made.box);
     this.lines4 = made;
     const two = m.names.map((n, k) => [n, k]).filter(([n]) => n.endsWith("position"));
