@@ -67,6 +67,7 @@ def test_responses_to_a_reference_are_divided(tmp_path):
     found, _ = read_response(path, inputs=("2Z",), outputs=("1Z",), references=("9Z",))
     assert (found.inputs, found.outputs, found.units["2Z"]) == (("2Z",), ("1Z",), "V")
     assert "joint" in found.method
+    assert "feedback correlates them" in found.details["assumed"]
     assert np.all(np.abs(found.G[:, 0, 0] - G[:, 0]) < 5 * found.sd[:, 0, 0])
 
 

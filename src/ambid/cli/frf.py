@@ -81,7 +81,7 @@ def command(
     report: opt.Report = None,
     strict: opt.Strict = False,
 ) -> None:
-    """Measure a frequency response with its noise and distortion, or take one from a file, and fit models to it.
+    """Measure a frequency response with its noise and distortion, or take one from .uff, .unv or .csv; fit models.
 
     With --reference (the loop's outer excitation) feedback does not bias it. With --rig, physical parameters come out,
     and inputs and outputs are the rig's.

@@ -218,4 +218,6 @@ def _format_of(path: Path) -> str:
             return kind
     if path.is_dir():
         raise RecordError(f"record {path} is a folder; it must be a file. Name the file inside it")
+    if path.suffix.lower() in (".uff", ".unv"):
+        raise RecordError(f"record {path} is a universal file; its frequency responses are for 'ambid frf'. Use that")
     raise RecordError(f"record {path}: its format is not known by its name; known: {', '.join(_SUFFIXES)}. Rename it")

@@ -97,24 +97,30 @@ def read_response(
                 f"{path}: {len(references)} references for {len(inputs)} inputs. Name inputs, and a reference each"
             )
         Z, covariance = ratio(Z, covariance, n_y)
+        both = "errors of the responses to the reference are assumed independent, and feedback correlates them"
+        assumed = f"{assumed}; {both}" if assumed else both
         give, ask = give[:n_y], list(inputs)
+    apart = () if len(give) * len(ask) == 1 else (
+        "a file does not say how errors of its functions are correlated: they are taken as independent",
+    )  # fmt: skip
     coherent = [next((f.coherence for f in functions if f.output == o and f.coherence is not None), None) for o in give]
     rate = _RATE * float(first.frequency_hz[-1]) if rate_hz is None else check_rate(rate_hz)
     if first.frequency_hz[-1] >= 0.5 * rate:
         raise RecordError(f"{path}: lines up to {first.frequency_hz[-1]:g} Hz; --rate {rate:g} Hz shows less than half")
     if rate_hz is None:
         done.append(f"no rate: delays count in samples of {rate:.6g} Hz")
+    if left:
+        done.append(f"{left} other functions left out")
     found = FrequencyResponse(
         frequency_hz=first.frequency_hz, G=Z, covariance=covariance,
         coherence=np.stack(coherent, axis=1) if coherent and all(c is not None for c in coherent) else None,  # type: ignore[arg-type]
         method="file, joint input-output with the reference" if references else "file", inputs=tuple(ask),
         outputs=tuple(give), rate_hz=rate,
         units=MappingProxyType({x: _si(units[x]) for x in (*ask, *give)}),
-        hold=hold, degrees_of_freedom=freedom, details=MappingProxyType({"assumed": assumed} if assumed else {}),
+        hold=hold, degrees_of_freedom=freedom, warnings=(*apart, *done),
+        details=MappingProxyType({"assumed": assumed} if assumed else {}),
         lines_per_independent=1.0 if np.isinf(freedom) else _ALIKE,
     )  # fmt: skip
-    if left:
-        done.append(f"{left} other functions left out")
     record: dict[str, object] = {
         "file": path.name, "sha256": sha256_of(data), "rate_hz": rate, "history": done, "units": units,
     }  # fmt: skip
