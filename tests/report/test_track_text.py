@@ -45,10 +45,10 @@ def test_stale_parameters_and_a_run_that_was_stopped_are_told(track):
 
 
 def test_lost_blocks_are_told(track):
-    latency = Latency(median=1e-4, p99=2e-4, largest=1e-3, overruns=2, late=5)
+    latency = Latency(median=1e-4, p99=2e-4, largest=1e-3, overruns=2, late=5, start=0.3)
     text = track_text(replace(track, totals=replace(track.totals, latency=latency)))
     assert "2 blocks LOST" in text
-    assert "5 late" in text
+    assert "largest 1 ms, 300 ms at the start; 5 late" in text
 
 
 def test_many_events_are_not_all_listed(track):

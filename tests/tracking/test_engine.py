@@ -115,6 +115,7 @@ def test_a_slow_consumer_costs_blocks_never_the_order():
     assert report.latency.overruns > 0
     assert report.latency.largest > 0.1
     assert report.latency.late > 0
+    assert report.latency.start is None  # it never caught up
     for s in sink.stretches:
         np.testing.assert_array_equal(s.values, X[s.first : s.first + len(s.values)])
     assert report.given == 3000 - 100 * report.latency.overruns

@@ -30,6 +30,18 @@ def test_the_summary_holds_median_p99_and_the_exact_largest():
     assert (summary.largest, summary.overruns, summary.late) == (0.5, 3, 4)
 
 
+def test_the_start_is_apart_until_the_work_has_caught_up_once():
+    statistics = filled([0.3, 0.2])
+    statistics.late = 1
+    assert (statistics.summary().start, statistics.summary().largest, statistics.summary().late) == (None, 0.3, 1)
+    statistics.caught_up()
+    statistics.add(0.01)
+    statistics.caught_up()
+    statistics.add(0.02)
+    summary = statistics.summary()
+    assert (summary.start, summary.largest, summary.late, statistics.count) == (0.3, 0.02, 0, 2)
+
+
 @pytest.mark.parametrize("latency", [0.0, -1e-9, 1e-12, 1e-7])
 def test_what_the_clock_cannot_resolve_counts_as_zero(latency):
     assert filled([latency]).quantile(1.0) == 0.0

@@ -132,12 +132,13 @@ class _Lead:
             forcing=None, t0=0.0,
         )  # fmt: skip
 
-    def frames(self, first: int, on_lag: Callable[[float], object]) -> Iterator[Block | Frame]:
+    def frames(self, first: int, on_lag: Callable[[float], object]) -> Iterator[Frame]:
         """Yield what was read, from a number on, and then what comes; what waited for the start counts from now."""
         began = time.perf_counter()
-        yield from self.source.replay.since(first)
+        for block in self.source.replay.since(first):
+            yield Frame(block=block, arrived_s=began)
         for frame in self._frames:
-            yield frame if frame.arrived_s >= began else frame.block
+            yield replace(frame, arrived_s=max(frame.arrived_s, began))
             on_lag(time.perf_counter() - frame.arrived_s)
 
 

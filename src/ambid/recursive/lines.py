@@ -124,7 +124,9 @@ class Latency:
     p99: float
     largest: float
     overruns: int  # blocks that were lost because the ring was full
-    late: int  # blocks whose work ended after the next one had come
+    late: int  # blocks that came before the work on the one before had ended
+    # largest of the first blocks, until the work had caught up, s: the numbers above leave them out. None: it never did
+    start: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

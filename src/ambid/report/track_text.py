@@ -164,8 +164,10 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
     if latency is not None and math.isfinite(latency.median):
         lost = f"; {counted(latency.overruns, 'block')} LOST" if latency.overruns else ""
         median, p99, largest = (sized(x, "s", 3) for x in (latency.median, latency.p99, latency.largest))
+        start = "" if latency.start is None else f", {sized(latency.start, 's', 3)} at the start"
         words = (
-            f"lag from sample to decision: median {median}, 99 % {p99}, largest {largest}; {latency.late} late{lost}"
+            f"lag from sample to decision: median {median}, 99 % {p99}, largest {largest}{start}; "
+            f"{latency.late} late{lost}"
         )
         lines.append(paint(words, "bad" if lost else "dim"))
     return lines

@@ -35,14 +35,26 @@ _DECADES = 11  # up to 10 000 s; what is beyond is in the last bin
 class LatencyStatistics:
     """Counts latencies, overruns and late blocks.
 
-    `count`: blocks; `largest`: s; `overruns`: blocks that were lost because the ring was full; `late`: blocks whose
-    work ended after the next one had come.
+    `count`: blocks; `largest`: s; `overruns`: blocks that were lost because the ring was full; `late`: blocks that came
+    before the work on the one before had ended; `start`: largest latency until `caught_up`, s, which the others leave
+    out; None before.
     """
 
     def __init__(self) -> None:
+        self.overruns = 0
+        self.start: float | None = None
+        self._begin()
+
+    def _begin(self) -> None:
         self._bins = [0] * (_PER_DECADE * _DECADES + 1)
-        self.count = self.overruns = self.late = 0
+        self.count = self.late = 0
         self.largest = 0.0
+
+    def caught_up(self) -> None:
+        """Count from now on; what came before is of the start. Only the first call does something."""
+        if self.start is None and self.count:
+            self.start = self.largest
+            self._begin()
 
     def add(self, latency_s: float) -> None:
         """Count a block."""
@@ -85,6 +97,7 @@ class LatencyStatistics:
             largest=self.largest,
             overruns=self.overruns,
             late=self.late,
+            start=self.start,
         )
 
 
@@ -306,7 +319,10 @@ class _Pump:
     def take(self, frame: Frame) -> None:
         """Work on one frame."""
         began = time.perf_counter()
-        self._statistics.late += frame.arrived_s < self._done
+        if frame.arrived_s < self._done:
+            self._statistics.late += 1
+        else:
+            self._statistics.caught_up()
         self.blocks += 1
         self._arrivals.append(frame.arrived_s)
         self._deliver(self._guard.take(frame.block), self._guard.n_waiting)
