@@ -347,7 +347,7 @@ function axes(unit, more = {}) {
 }
 function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
-  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, ...(more.utc ? { tzDate: (s) => uPlot.tzDate(new Date(1000 * s), "UTC") } : {}), cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
+  const opts = { width: 400, height, series: [{}, ...series], bands: more.bands, axes: axes(unit, more), scales: { x: { time: false, ...(more.scale ?? {}) }, ...(more.scales ?? {}) }, ...(more.utc ? { padding: [null, 56, null, null], tzDate: (s) => uPlot.tzDate(new Date(1000 * s), "UTC") } : {}), cursor: { drag: { x: true, y: false, setScale: more.zoom ?? false }, y: false }, legend: { show: false }, hooks: more.hooks ?? {} };
   const plot = new uPlot(opts, [[], ...series.map(() => [])], host);
   new ResizeObserver(() => host.clientWidth > 50 && Math.abs(host.clientWidth - plot.width) > 1 && plot.setSize({ width: host.clientWidth, height })).observe(host);
   const made = { box, plot, value };
@@ -661,7 +661,7 @@ class Steps extends Watched {
       plan: () => m.steps.forEach((s) => this.item(s)), beginning: () => { this.at = m.name; this.note(m.name, "under way"); },
       progress: () => this.at && !this.done.has(this.at) && this.note(this.at, `${m.stage}${m.done === null ? "" : `, ${Math.round(100 * m.done)} %`}`),
       step: () => this.step(m), note: () => this.append(el("p", { className: "hint" }, m.text)), ask: () => this.question(m), stopping: () => this.at && this.note(this.at, "is being stopped"),
-      commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned: every step is good enough." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); }).catch(() => {}); },
+      commissioned: () => { this.kept = true; const words = m.passed ? "Commissioned: every step is good enough." : `Ended early: ${m.reached}.`; this.append(el("h2", { className: m.verdict }, words)); for (const r of m.reasons) this.append(el("p", {}, r)); refresh().then(() => { const f = state.files.find((x) => x.name === m.report); if (f) this.append(link(f)); $("steps").lastChild.scrollIntoView({ block: "end" }); }).catch(() => {}); },
       end: () => { this.question({}); for (const name of Object.keys(this.items)) if (!this.done.has(name)) this.note(name, name === this.at ? "not finished" : "not reached"); const why = m.how === "cancelled" && this.kept ? `Stopped by the operator. The folder ${this.out} and its report keep what was found. To go on, start again with another folder: each step is done anew.` : m.why; if (why) this.append(el("p", { className: m.how, role: "alert" }, why)); refresh().catch(() => {}); },
     }[m.kind];
     how?.();
@@ -710,17 +710,20 @@ function overTime(name, s, events, first, last) {
     g.save(); g.lineWidth = 1.5 * devicePixelRatio;
     s.value.forEach((v, k) => {
       const x = u.valToPos(s.t[k], "x", true);
-      if (v !== null || x < u.bbox.left || x > u.bbox.left + u.bbox.width) return;
-      g.strokeStyle = css(MARKS[s.verdict[k]]?.[1] ?? "--dim"); g.beginPath();
-      if (s.verdict[k] === "unusable") { g.moveTo(x - r, y - r); g.lineTo(x + r, y + r); g.moveTo(x - r, y + r); g.lineTo(x + r, y - r); } else { g.moveTo(x, y - r); g.lineTo(x, y + r); }
+      if (x < u.bbox.left || x > u.bbox.left + u.bbox.width) return;
+      g.strokeStyle = css(MARKS[s.verdict[k]]?.[1] ?? (v === null ? "--dim" : s.verdict[k] === "caution" ? "--doubt" : "--accent")); g.beginPath();
+      if (v !== null) {  // the band of a point that stands alone is this bar
+        const ends = [v - s.half[k], v + s.half[k]].map((e) => Math.min(Math.max(u.valToPos(e, "y", true), u.bbox.top), u.bbox.top + u.bbox.height));
+        if (known.length <= 400) { g.moveTo(x, ends[0]); g.lineTo(x, ends[1]); }
+      } else if (s.verdict[k] === "unusable") { g.moveTo(x - r, y - r); g.lineTo(x + r, y + r); g.moveTo(x - r, y + r); g.lineTo(x + r, y - r); } else { g.moveTo(x, y - r); g.lineTo(x, y + r); }
       g.stroke();
     });
     g.restore();
   };
   const days = (u, splits, axis, space, step) => splits.map((t) => date(t, step < 86400));
   const made = chart(name, 170, [band, band, line(ink("--accent")), dots("--accent"), dots("--doubt")], s.unit, {
-    bands: [{ series: [2, 1], fill: ink("--accent", "33") }], zoom: true, utc: true, scale: { time: true, range: (u, a, b) => a === b ? [a - edge, b + edge] : [a, b] },
-    scales: { y: { range: known.length ? [low - 1.4 * room, high + room] : [0, 1] } }, x: days, xaxis: { space: 90 }, yaxis: known.length ? {} : { values: () => [] },
+    bands: [{ series: [2, 1], fill: ink("--accent", "33") }], zoom: true, utc: true, scale: { time: true, range: (u, a, b) => first === last ? [first - edge, last + edge] : [a, b] },
+    scales: { y: { range: known.length ? [low - 1.4 * room, high + room] : [0, 1] } }, x: days, xaxis: { space: 120 }, yaxis: known.length ? {} : { values: () => [] },
     hooks: { draw: [marks], setCursor: [(u) => { const k = u.cursor.idx; made.value.textContent = k === null || k === undefined ? latest : `${date(s.t[k], true)}: ${say(k)}`; }] } });
   const at = known.at(-1), latest = at === undefined ? "never identifiable" : `${say(at)}, ${date(s.t[at])}${at < s.t.length - 1 ? `; ${say(s.t.length - 1)} since` : ""}`;
   made.value.textContent = latest;
@@ -734,9 +737,9 @@ function showHistory(m, host) {
     el("p", { className: "hint" }, "Bands are 95 %. A point with caution is coloured; | not identifiable, × do not use: there no number is known. Drag over a chart to see it closer, a double click shows all. Times are UTC."),
     el("div", { id: "history-charts" }, ...Object.entries(m.series).map(([name, s]) => overTime(name, s, m.events, first, last))),
     m.events.length ? el("h2", {}, "Events") : null,
-    m.events.length ? el("ol", { className: "scroll" }, ...m.events.slice(-200).reverse().map((e) => el("li", {}, `${date(e.at, true)} ${e.kind}: ${e.parameter ? `${e.parameter}: ` : ""}${e.text}`))) : null,
+    m.events.length ? el("ol", { className: "scroll", tabIndex: 0 }, ...m.events.slice(-200).reverse().map((e) => el("li", {}, `${date(e.at, true)} ${e.kind}: ${e.parameter ? `${e.parameter}: ` : ""}${e.text}`))) : null,
     el("h2", {}, m.estimates.length > 200 ? "The latest 200 estimates" : "Estimates"),
-    el("div", { className: "scroll" }, el("table", {}, el("thead", {}, el("tr", {}, ...["taken", "record", "verdict", "because of"].map((h) => el("th", {}, h)))),
+    el("div", { className: "scroll", tabIndex: 0 }, el("table", {}, el("thead", {}, el("tr", {}, ...["taken", "record", "verdict", "because of"].map((h) => el("th", {}, h)))),
       el("tbody", {}, ...shownOnes.map((e) => el("tr", {}, el("td", {}, date(e.taken_at, true)), el("td", { className: "name" }, e.record), el("td", { className: e.verdict }, WORDS[e.verdict] ?? e.verdict), el("td", {}, e.failed.replaceAll(",", ", "))))))),
     el("details", {}, el("summary", {}, "As 'ambid history' writes it"), el("pre", {}, m.text)));
 }
@@ -747,7 +750,7 @@ async function histories() {
     if (m.kind === "bearings") {
       put(form.bearing, ...m.names.map((n) => el("option", { selected: n === asked }, n)));
       if (!m.names.length) host.append(el("p", { className: "hint" }, "The ledger has no bearing yet."));
-      if (m.failures) host.append(el("details", {}, el("summary", {}, `${m.failures} records gave no estimate`), ...m.failed.map((f) => el("p", {}, `${f.record || "a record"} (${f.bearing}): ${f.reason}`))));
+      if (m.failures) host.append(el("details", {}, el("summary", {}, `${m.failures} ${m.failures === 1 ? "record" : "records"} without an estimate`), ...m.failed.map((f) => el("p", {}, `${f.record || "a record"} (${f.bearing}): ${f.reason}`))));
     }
     if (m.kind === "history") showHistory(m, host.appendChild(el("div")));
   }).catch(wrong(host));
