@@ -94,7 +94,14 @@ def cut_between_chunks(path, whole):
     path.write_bytes(data)
 
 
+def misshapen(path):
+    """MATLAB 5 with a tag that is zero, at which SciPy's parser ends the program."""
+    v5(path, log=series("u", U, TIME))
+    path.write_bytes(path.read_bytes().replace(struct.pack("<II", 9, 8 * U.size), struct.pack("<II", 0, 8 * U.size)))
+
+
 FOREIGN = {
+    "shape.mat": (lambda p, _: misshapen(p), "an element of type 0"),
     "claims.h5": (lambda p, _: hollow(p, schema=True), "claims 10000000000000 samples"),
     "claims.mat": (lambda p, _: hollow(p, schema=False), "claims 10000000000000 samples"),
     "bomb.csv.gz": (lambda p, _: p.write_bytes(gzip.compress(bytes(1 << 20)) * 260), "unpack"),

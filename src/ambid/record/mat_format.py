@@ -17,6 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
+from ambid.record.mat_check import check_elements
 from ambid.record.mat_structures import Foreign, read_structures, refuse_foreign, structures
 from ambid.record.record import Record, file_bytes, sha256_of
 from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, check_gap_policy, refuse_gaps, seconds, uniform_record
@@ -83,6 +84,7 @@ def _content(path: Path, data: bytes) -> dict[str, Any]:
     from scipy.io import loadmat
 
     try:
+        check_elements(data)
         with warnings.catch_warnings():  # objects are all called None; any other name that occurs twice is a failure
             warnings.filterwarnings("error", message="Duplicate variable")
             warnings.filterwarnings("ignore", message='Duplicate variable name "None"')
@@ -150,7 +152,16 @@ def _content_v73(path: Path) -> dict[str, Any]:
         with h5py.File(path, "r") as file:
             content: dict[str, Any] = taken(file)
             return content
-    except (OSError, RuntimeError, KeyError, ValueError, TypeError, OverflowError, MemoryError) as failure:
+    except (
+        OSError,
+        RuntimeError,
+        LookupError,
+        ValueError,
+        TypeError,
+        AttributeError,
+        ArithmeticError,
+        MemoryError,
+    ) as failure:
         raise RecordError(
             f"record {path} is not a valid MATLAB 7.3 file ({failure}). Save it again from MATLAB"
         ) from None
