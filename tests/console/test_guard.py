@@ -159,6 +159,8 @@ BODIES = [
     json.dumps({"job": "identify", "record": "../../etc/passwd", "rig": 1, "out": "x"}).encode(),
     json.dumps({"job": "identify", "record": True, "rig": 1, "out": "x"}).encode(),
     json.dumps({"job": "preview", "record": 1, "folder": "/etc"}).encode(),
+    json.dumps({"job": "history", "ledger": "../outside/works.db"}).encode(),
+    json.dumps({"job": "history", "ledger": 1, "bearing": ["A"]}).encode(),
     json.dumps({"job": "rig", "text": 'schema = "ambid.rig/1"', "out": "../planted"}).encode(),
     json.dumps({"job": "rig", "text": 'schema = "ambid.rig/1"', "out": "/tmp/planted"}).encode(),
     json.dumps({"job": "rig", "text": 'schema = "ambid.rig/1"', "out": ".hidden"}).encode(),

@@ -213,7 +213,7 @@ def test_tables_of_a_rig_lie_in_the_folder(tmp_path, monkeypatch, name):
 def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
     wish = {"job": "live", "port": "simulated", "seconds": 14.0, "amplitude": 1.4, "excitation": "multisine"}
     run = None
-    for k in range(5):
+    for k in range(3):
         with console(bench) as page:
             page.open()
             if run is None:

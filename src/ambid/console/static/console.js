@@ -714,7 +714,7 @@ function overTime(name, s, events, first, last) {
       g.strokeStyle = css(MARKS[s.verdict[k]]?.[1] ?? (v === null ? "--dim" : s.verdict[k] === "caution" ? "--doubt" : "--accent")); g.beginPath();
       if (v !== null) {  // the band of a point that stands alone is this bar
         const ends = [v - s.half[k], v + s.half[k]].map((e) => Math.min(Math.max(u.valToPos(e, "y", true), u.bbox.top), u.bbox.top + u.bbox.height));
-        if (known.length <= 400) { g.moveTo(x, ends[0]); g.lineTo(x, ends[1]); }
+        if (known.length <= 40 || ((s.value[k - 1] ?? null) === null && (s.value[k + 1] ?? null) === null)) { g.moveTo(x, ends[0]); g.lineTo(x, ends[1]); }
       } else if (s.verdict[k] === "unusable") { g.moveTo(x - r, y - r); g.lineTo(x + r, y + r); g.moveTo(x - r, y + r); g.lineTo(x + r, y - r); } else { g.moveTo(x, y - r); g.lineTo(x, y + r); }
       g.stroke();
     });
