@@ -56,7 +56,7 @@ def test_half_a_frame_waits_for_the_rest(tmp_path):
 
 def test_a_spectrum_shows_the_peak_of_a_sine():
     t = np.arange(4000) / 4000.0
-    hz, (amplitude, other) = spectrum(np.column_stack([3.0 * np.sin(2 * np.pi * 125.0 * t), 0 * t]), 4000.0)
+    hz, (amplitude, other) = spectrum(np.vstack([3.0 * np.sin(2 * np.pi * 125.0 * t), 0 * t]), 4000.0)
     assert amplitude.max() == pytest.approx(3.0, rel=1e-3)
     assert hz[np.argmax(amplitude)] == pytest.approx(125.0, abs=1.0)
     assert other.max() == 0.0

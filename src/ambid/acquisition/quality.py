@@ -36,6 +36,7 @@ _STILL_S = 0.5
 _SNR_DB = 10.0
 _RATE = 0.01
 _SURE = 5.0  # standard deviations
+_TOGETHER_S = 0.1  # of samples that are judged at once
 
 
 class Moments:
@@ -232,8 +233,8 @@ class Quality:
         self._next = 0
         self._whole = False  # whether the sample before the next one was there, and sound
         self._lost = self._gaps = self._repeated = self._damaged = 0
+        self._waiting: list[Array] = []  # consecutive samples, judged together: a block is short, and each costs calls
 
-    @np.errstate(all="ignore")  # what is too large for sums makes them no number: the verdict says so
     def add(self, frame: Frame) -> None:
         """Take the next block.
 
@@ -243,6 +244,7 @@ class Quality:
         if self._first is None:
             self._first = self._next = first
         if first > self._next:
+            self._judge()
             self._gaps += 1
             self._lost += first - self._next
             self._whole = False
@@ -254,6 +256,17 @@ class Quality:
             return
         self._next = first + len(x)
         self._rate.add(frame.arrived_s, self._next)
+        self._waiting.append(x)
+        if sum(map(len, self._waiting)) >= _TOGETHER_S * self._info.rate_hz:
+            self._judge()
+
+    @np.errstate(all="ignore")  # what is too large for sums makes them no number: the verdict says so
+    def _judge(self) -> None:
+        """Judge what waits."""
+        if not self._waiting:
+            return
+        x, self._waiting = np.concatenate(self._waiting), []
+        first = self._next - len(x)
         sound: NDArray[np.bool_] = np.asarray(np.isfinite(x).all(axis=1))
         if sound.all():
             self._take(first, x)
@@ -267,6 +280,7 @@ class Quality:
     @np.errstate(all="ignore")
     def report(self) -> QualityReport:
         """Return how good the stream is so far, with what is not good enough in words."""
+        self._judge()
         measured, sd = self._rate.slope()
         made = QualityReport(
             samples=self._moments.count,

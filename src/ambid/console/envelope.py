@@ -16,7 +16,7 @@ from ambid.acquisition.view import BenchView
 from ambid.arrays import Array
 from ambid.console.feed import FeedWriter
 from ambid.errors import AmbidError
-from ambid.tracking.blocks import Frame
+from ambid.tracking.blocks import Block, Frame
 
 _PER_SECOND = 200  # envelopes of a second
 _EVERY_S = 0.05  # between two frames
@@ -51,23 +51,18 @@ class EnvelopeTap:
     def take(self, frame: Frame) -> None:
         """Take a block."""
         block = frame.block
-        try:
-            values = self._view.block(block).values
-        except AmbidError:  # outside a calibration: nothing to be drawn
-            values = np.full((len(block.values), len(self._view.units)), np.nan)
         if self._origin is None:
             self._origin = self._next = self._first = block.first
         if block.first > self._next:  # a gap is drawn as one
             self._lost += block.first - self._next
             self._flush(frame.arrived_s, 0)
             self._first = block.first
-        self._next = block.first + len(values)
-        self._rows.append(values)
-        self._waiting += len(values)
+        self._next = block.first + len(block.values)
+        self._rows.append(block.values)
+        self._waiting += len(block.values)
         if frame.arrived_s - self._written_s >= _EVERY_S:
             self._flush(frame.arrived_s, self._waiting % self._group)
             self._written_s = frame.arrived_s
-        self._remember(values)
 
     def _flush(self, arrived_s: float, keep: int) -> None:
         """Write what waits, but for the last `keep` samples."""
@@ -77,24 +72,34 @@ class EnvelopeTap:
                 self._rows, self._waiting = [], 0
             return
         rows = np.vstack(self._rows)
-        cut = rows[: n * self._group].reshape(n, self._group, -1)
-        both = np.stack([cut.min(axis=1), cut.max(axis=1)], axis=2).astype("<f4")  # (n, channels, 2)
+        seen = self._seen(rows[: n * self._group])
+        self._remember(seen)
+        cut = seen.reshape(len(seen), n, self._group)
+        both = np.stack([cut.min(axis=2), cut.max(axis=2)], axis=2).transpose(1, 0, 2)  # (n, channels, 2)
         assert self._origin is not None
         end_s = (self._first + n * self._group - self._origin) / self._view.rate_hz
         wall = time.time() - (time.perf_counter() - arrived_s)
-        head = _HEAD.pack(self._first - self._origin, self._lost, n, both.shape[1], self._group, end_s, wall)
+        head = _HEAD.pack(self._first - self._origin, self._lost, n, len(seen), self._group, end_s, wall)
         self._feed.envelope(head + both.tobytes())
         rest = rows[n * self._group :]
         self._first += n * self._group
         self._rows, self._waiting = ([rest] if len(rest) and keep else []), (len(rest) if keep else 0)
 
-    def _remember(self, values: Array) -> None:
+    def _seen(self, rows: Array) -> Array:
+        """Return rows of the device as signals, (n_channels, n_samples), of four bytes each: enough for eyes."""
+        try:
+            values = self._view.block(Block(first=self._first, time_s=0.0, values=rows)).values
+        except AmbidError:  # outside a calibration: nothing to be drawn
+            values = np.full((len(rows), len(self._view.units)), np.nan)
+        return np.ascontiguousarray(values.T, dtype="<f4")
+
+    def _remember(self, seen: Array) -> None:
         """Make a spectrum of each second."""
-        self._recent.append(values)
-        self._recent_n += len(values)
+        self._recent.append(seen)
+        self._recent_n += seen.shape[1]
         if self._recent_n < _SPECTRUM_S * self._view.rate_hz:
             return
-        signals = np.vstack(self._recent)
+        signals = np.hstack(self._recent)
         self._recent, self._recent_n = [], 0
         hz, amplitudes = spectrum(signals, self._view.rate_hz)
         self._feed.tell("spectrum", {"hz": rounded(hz), "amplitudes": [rounded(a) for a in amplitudes]})
@@ -103,16 +108,14 @@ class EnvelopeTap:
 def spectrum(signals: Array, rate_hz: float) -> tuple[Array, list[Array]]:
     """Return about `_LINES` frequencies, Hz, and the largest amplitude of each signal near each of them.
 
-    Amplitudes are peak values of a sine at the frequency (Hann window); `signals`: (n_samples, n_signals).
+    Amplitudes are peak values of a sine at the frequency (Hann window); `signals`: (n_signals, n_samples).
     """
-    n = len(signals)
-    window = np.hanning(n)
-    lines = np.abs(np.fft.rfft((signals - signals.mean(axis=0)) * window[:, None], axis=0)) * (2.0 / window.sum())
-    hz = np.fft.rfftfreq(n, 1.0 / rate_hz)
-    edges = np.unique(np.round(np.geomspace(1, len(hz), _LINES)).astype(int))
-    places = [slice(a, b) for a, b in pairwise(edges.tolist())]
-    top = np.array([hz[p][np.argmax(lines[p, 0])] if p.stop - p.start > 1 else hz[p.start] for p in places])
-    return top, [np.array([lines[p, k].max() for p in places]) for k in range(signals.shape[1])]
+    n = signals.shape[1]
+    window = np.hanning(n).astype(signals.dtype)
+    lines = np.abs(np.fft.rfft((signals - signals.mean(axis=1, keepdims=True)) * window)) * (2.0 / window.sum())
+    edges = np.unique(np.round(np.geomspace(1, lines.shape[1], _LINES)).astype(int))
+    top = [a + int(np.argmax(lines[0, a:b])) for a, b in pairwise(edges.tolist())]
+    return np.array(top) * (rate_hz / n), list(np.maximum.reduceat(lines[:, : edges[-1]], edges[:-1], axis=1))
 
 
 def rounded(values: Array, digits: int = 5) -> list[float | None]:

@@ -199,7 +199,7 @@ class BlockRing:
         # Items of these views are read and written whole: one aligned machine word each.
         self._produced = self._bytes[lines : lines + _LINE].cast("Q")
         self._consumed = self._bytes[lines + _LINE : lines + 2 * _LINE].cast("Q")
-        self._idle_s = min(max(self.block_samples / self.rate_hz / 20, 5e-5), 1e-3)
+        self._idle_s = min(max(self.block_samples / self.rate_hz / 10, 5e-5), 1e-3)
         self.torn = 0
 
     @classmethod
@@ -351,7 +351,7 @@ class BlockRing:
         return None
 
     def _wait(self, ready: Callable[[], object], timeout_s: float) -> bool:
-        """Wait until something holds, looking about twenty times per block."""
+        """Wait until something holds, looking about ten times per block."""
         until = time.perf_counter() + timeout_s
         while not ready():
             left = until - time.perf_counter()
