@@ -31,6 +31,7 @@ _PARTS = {"real": "real", "re": "real", "imag": "imag", "imaginary": "imag", "im
           "sd": "sd"}  # fmt: skip
 _WINDOW = 9  # lines of a local parabola
 _FINEST = 1e-6  # of |G|: digits of single precision, below which no scatter is believed
+_MOST = 1e100  # of frequencies and values, beyond which a number is damage
 _RATE = 2.56  # times the highest frequency: the usual rate of an analyser, where none is told
 _ALIKE = 2.0  # lines with one error where spectra were averaged: 1.94 under a Hann window and noise
 
@@ -72,7 +73,8 @@ def read_response(
         raise RecordError(f"{path}: a held input needs the rate of its converter. Give --rate, or --hold band-limited")
     data = file_bytes(path)
     uff = path.name.lower().endswith(ENDINGS)
-    every, left = read_uff(path, data, told) if uff else (_csv(path, told, inputs, outputs), 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by its line
+        every, left = read_uff(path, data, told) if uff else (_csv(path, told, inputs, outputs), 0)
     functions, done = _checked(path, every, told)
     first = functions[0]
     ask = list(dict.fromkeys(references or inputs or [f.input for f in functions]))
@@ -178,9 +180,9 @@ def _checked(path: Path, functions: Sequence[Function], told: Mapping[str, str])
         if f.frequency_hz.size != grid.size or not np.allclose(f.frequency_hz, grid, rtol=1e-6, atol=0):
             raise RecordError(f"{where} has other frequencies than the first function. Choose: --layout functions=1,…")
         for what, x in (("frequency", f.frequency_hz), ("value", f.values)):
-            bad = np.flatnonzero(~np.isfinite(x))
+            bad = np.flatnonzero(~(np.abs(x) < _MOST))
             if bad.size:
-                raise RecordError(f"{where}: the {what} of line {bad[0] + 1} is not finite. Remove the line")
+                raise RecordError(f"{where}: the {what} of line {bad[0] + 1} is not finite, or absurd. Remove the line")
         if f.sd is not None and not np.all(f.sd > 0):
             raise RecordError(f"{where}: a standard deviation is not positive. Correct the column sd")
         if f.coherence is not None and f.coherence.size != f.frequency_hz.size:
