@@ -189,6 +189,27 @@ def test_the_page_on_the_ledger_runs(tmp_path, monkeypatch, capsys):
     assert {"history.png", "history.html", "tables"} <= {p.name for p in tmp_path.iterdir()}
 
 
+def test_the_page_on_monitoring_runs(tmp_path, monkeypatch, capsys):
+    from ambid.cli.app import run_verb
+    from ambid.ledger import open_ledger
+    from tests.ledger.entries import entry, parameter
+
+    monkeypatch.chdir(tmp_path)
+    page, coil = ROOT / "docs" / "monitoring.md", parameter("R", 6.0, 0.01, unit="ohm")
+    with open_ledger("works.db") as ledger:
+        ledger.add(
+            [entry(k, "pump 1", parameters=(parameter("k_i", 80.0 - 10.0 * (k > 9), 0.2), coil)) for k in range(20)]
+        )
+    Path("rules.toml").write_text(blocks(page, "text")[0], encoding="utf-8")
+    for line in "".join(blocks(page, "sh")).splitlines():
+        if "--mqtt" not in line:  # tests/ledger/test_monitor.py has a broker
+            assert run_verb(shlex.split(line)[1:]) == (3 if "--strict" in line else 0), line
+    capsys.readouterr()
+    exec(compile(blocks(page, "python")[0], "monitoring.md", "exec"), {})
+    assert "pump 1 k_i" in capsys.readouterr().out
+    assert {"alarms.png", "alarms.json", "works.prom"} <= {p.name for p in tmp_path.iterdir()}
+
+
 def test_the_quickstart_has_commands_of_the_readme_and_its_python_runs(tmp_path, monkeypatch, capsys):
     import ambid
 

@@ -611,6 +611,21 @@ def _history() -> View:
     )  # fmt: skip
 
 
+def _watched() -> View:
+    from dataclasses import fields
+
+    from ambid.ledger.monitor import SCHEMA, Alarm
+    from ambid.report.watch_text import watch_figure, watch_text, watch_title
+
+    def table(w: Any) -> Table:
+        return "bearing", {f.name: [getattr(a, f.name) for a in w.alarms] for f in fields(Alarm)}
+
+    return View(
+        text=watch_text, figure=lambda w, _, width: watch_figure(w, watch_title(w), width),
+        document=_fields_of(SCHEMA), table=table, title=watch_title,
+    )  # fmt: skip
+
+
 def _fleet_run() -> View:
     from ambid.ledger.fleet_run import SCHEMA
     from ambid.report.fleet_text import fleet_figure, fleet_text, fleet_title
@@ -650,5 +665,6 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Comparison": _comparison,
     "Commissioned": _commissioned,
     "FleetRun": _fleet_run,
+    "Watched": _watched,
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

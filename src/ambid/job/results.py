@@ -132,6 +132,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     _EXPERIMENT: _whole("control.experiment", "Experiment", "design experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
+    "ambid.alarms/1": _whole("ledger.monitor", "Watched", "history --alarms"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),

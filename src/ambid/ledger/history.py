@@ -102,7 +102,9 @@ class History(Result):
         last = self.estimates[-1]
         if last.verdict == "usable":
             return ()
-        text = f"the latest estimate ({last.record or 'a record'}) is {last.verdict}: {last.failed or last.status}"
+        word = {"caution": "to be used with caution", "unusable": "not to be used"}[last.verdict]
+        why = last.failed.replace(",", ", ") or last.status
+        text = f"the latest estimate ({last.record or 'a record'}) is {word}: {why}"
         never = all(e.verdict == "unusable" for e in self.estimates)
         return (Reason(check="latest", text=f"{text}. Look at it, or take another record", grave=never),)
 

@@ -49,7 +49,7 @@ def history_figure(found: History, title: str, width: float) -> Figure:
         return stacked(title, [said_panel("no parameter was estimated")], width)
     split = -(-len(names) // 2) if len(names) > _MANY else len(names)
     groups = [names[:split], names[split:]] if len(names) > split else [names]
-    columns = [[panel(_parameter, found, name, height=1.7) for name in group] for group in groups]
+    columns = [[panel(draw_parameter, found, name, height=1.7) for name in group] for group in groups]
     return stacked(title, [Block(columns=columns, widths=(1.0,) * len(columns))], width)
 
 
@@ -58,7 +58,8 @@ def dates(at: Array) -> NDArray[np.datetime64]:
     return (1000.0 * at).astype("datetime64[ms]")
 
 
-def _parameter(axes: Axes, found: History, name: str) -> None:
+def draw_parameter(axes: Axes, found: History, name: str) -> float:
+    """Draw a parameter over time, and return the scale of the drawing."""
     from matplotlib import dates as calendar
 
     s = found.measured[name]
@@ -93,6 +94,7 @@ def _parameter(axes: Axes, found: History, name: str) -> None:
     axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
     out = int(known.size - known.sum())
     head(axes, f"{counted(int(known.sum()), 'value')}{f', {out} not known' if out else ''}", good=bool(known.any()))
+    return scale
 
 
 def _limits(axes: Axes, value: Array, half: Array) -> None:

@@ -1,0 +1,162 @@
+"""Alarms over years: found with cause and date, none without a fault, none from what is not usable; rules; telling."""
+
+import socket
+import subprocess
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.errors import AmbidError
+from ambid.ledger import Rule, open_ledger, publish, read_rules, watch, write_metrics
+from tests.ledger.entries import BEGIN, DAY, entry, parameter
+from tests.ledger.simulated import MONTH_S, bearing, fleet, judge
+
+MOSQUITTO = Path("/usr/sbin/mosquitto")
+
+
+@pytest.fixture(scope="module")
+def bearings():
+    return fleet(24, 3)
+
+
+@pytest.fixture(scope="module")
+def watched(bearings):
+    return watch(b.history for b in bearings)
+
+
+def test_faults_are_found_with_cause_and_date_and_nothing_else(bearings):
+    score = judge(bearings)
+    assert score.due >= 6
+    assert (score.found, score.false, score.cause) == (score.due, 0, score.due), score.wrong
+    assert score.dated >= score.due - 1, score.wrong
+
+
+def test_what_is_not_usable_raises_and_clears_nothing(bearings):
+    def without(h, bad):
+        return replace(h, series={n: replace(s, value=np.where(bad, np.nan, s.value)) for n, s in h.series.items()})
+
+    aged = next(b for b in bearings if b.fault == "ageing magnet").history
+    (alarm, *_) = watch([aged]).alarms
+    bad = np.array([e.taken_at >= alarm.at_from - 60 * DAY for e in aged.estimates])
+    assert not watch([without(aged, bad)]).alarms  # all that would raise it is not usable
+    bad = np.array([e.taken_at > alarm.raised for e in aged.estimates])
+    assert [a.cleared for a in watch([without(aged, bad)]).alarms if a.parameter == alarm.parameter] == [None]
+
+
+def test_an_alarm_is_cleared_where_the_level_comes_back():
+    h = bearing("B", "", np.random.default_rng(2)).history
+    s = h.series["k_i"]
+    low = (s.taken_at > h.estimates[120].taken_at) & (s.taken_at < h.estimates[200].taken_at)
+    h = replace(h, series={**h.series, "k_i": replace(s, value=np.where(low, 0.85 * s.value, s.value))})
+    (alarm,) = watch([h]).alarms
+    assert (alarm.parameter, alarm.kind) == ("k_i", "step")
+    assert alarm.at_from <= h.estimates[121].taken_at <= alarm.at_to
+    assert h.estimates[200].taken_at < alarm.cleared < h.estimates[210].taken_at
+    assert "not clear" in alarm.cause  # no single fault moves k_i alone
+    assert watch([h]).passed
+
+
+def test_what_drifts_and_when_it_reaches_the_limit_is_told_with_intervals(tmp_path):
+    rng, n = np.random.default_rng(4), 60
+    ages = [parameter("k_i", 80.0 * (1 - 0.0008 * k + 0.002 * rng.standard_normal()), 0.16) for k in range(n)]
+    flat = [parameter("m", 0.3 * (1 + 0.002 * rng.standard_normal()), 6e-4, unit="kg") for _ in range(n)]
+    with open_ledger(tmp_path / "l.db") as ledger:
+        ledger.add([entry(k, day=15 * k, parameters=(a, b)) for k, (a, b) in enumerate(zip(ages, flat, strict=True))])
+        found = watch([ledger.history("A")], [Rule(parameter="k_i", change=-0.06), Rule(parameter="k_i", change=-0.5)])
+    trends = {t.parameter: t for t in found.trends}
+    assert trends["m"].kind == "none"
+    k_i = trends["k_i"]
+    assert k_i.kind == "drift"
+    assert abs(k_i.per_month + 0.0008 * MONTH_S / (15.0 * DAY)) < 3.0 * k_i.per_month_sd
+    assert set(k_i.limits) == {"k_i -6 %"}  # the other is further ahead than the history is long
+    due = BEGIN + 75 * 15 * DAY
+    early, late = k_i.limits["k_i -6 %"]
+    assert early < due < late
+    assert late - early < 400 * DAY
+
+
+def test_results_are_told_and_come_back_from_their_file(watched, tmp_path):
+    text = watched.summary(width=500)
+    assert "the magnet ages: bias flux" in text
+    assert "the rig was changed then (controller.version 1 became 2); the position sensor's gain stepped" in text
+    assert watched.verdict.word == "caution"
+    watched.save(tmp_path / "a.json")
+    again = ambid.load(tmp_path / "a.json")
+    assert again.alarms == watched.alarms
+    assert again.rules == watched.rules
+    assert len(watched.to_dataframe()) == len(watched.alarms)
+    assert len(watched.plot().axes) > len(again.plot().axes) == 1
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("alarm = 3", "must hold tables [[alarm]]"),
+        ("[[alarms]]\nparameter = 'k_i'", "Did you mean 'alarm'?"),
+        ("[[alarm]]\nparameter = 'k_i'\nchange = '5 %'", "must be signed and in percent"),
+        ("[[alarm]]\nparameter = 'k_i'\nchange = -0.05", "must be signed and in percent"),
+        ("[[alarm]]\nparameter = 'k_i'\nchange = '-5 %'\nconfidence = 99", "between 0.5 and 1"),
+        ("[[alarm]]\nparameter = 'k_i'\nchange = '-5 %'\nsince = 'begin'", '"start", "rig" or a date'),
+        ("[[alarm]]\nparameter = 'k_i'\nchang = '-5 %'", "Did you mean 'change'?"),
+        ("[[alarm]]\nchange = '-5 %'", "parameter must be a name"),
+        ("[[alarm", "cannot be read"),
+    ],
+)
+def test_rules_that_are_none_are_refused(tmp_path, text, said):
+    (tmp_path / "r.toml").write_text(text)
+    with pytest.raises(AmbidError) as refused:
+        read_rules(tmp_path / "r.toml")
+    assert said in str(refused.value)
+
+
+def test_rules_are_read_and_name_what_is_there(tmp_path, bearings):
+    text = (
+        "[[alarm]]\nparameter = 'k_i'\nchange = '-5 %'\nsince = 2026-03-01\n[[alarm]]\nparameter='R'\nchange='+10%'\n"
+    )
+    (tmp_path / "r.toml").write_text(text)
+    a, b = read_rules(tmp_path / "r.toml")
+    assert (a.change, a.since, b.change, b.since) == (-0.05, 1772323200.0, 0.1, "start")
+    with pytest.raises(AmbidError, match="no bearing has a parameter 'k_y'"):
+        watch([bearings[0].history], [Rule(parameter="k_y", change=0.1)])
+
+
+def test_metrics_are_those_of_prometheus(watched, tmp_path):
+    parser = pytest.importorskip("prometheus_client.parser", reason="prometheus-client is not installed")
+    write_metrics(watched, tmp_path / "a.prom")
+    families = parser.text_string_to_metric_families((tmp_path / "a.prom").read_text())
+    found = {f.name: f.samples for f in families}
+    assert len(found["ambid_parameter"]) == 5 * len(watched.bearings)
+    assert sum(x.value for x in found["ambid_alarm"]) == len(watched.standing)
+
+
+@pytest.mark.skipif(not MOSQUITTO.exists(), reason="Debian's package mosquitto, a broker, is not installed")
+def test_a_broker_gets_a_message_for_each_bearing(watched, monkeypatch):
+    subscribe = pytest.importorskip("paho.mqtt.subscribe", reason="paho-mqtt is not installed")
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    broker = subprocess.Popen([MOSQUITTO, "-p", str(port)], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+    try:
+        end = time.monotonic() + 20.0
+        while time.monotonic() < end:
+            try:
+                socket.create_connection(("127.0.0.1", port), timeout=1.0).close()
+                break
+            except OSError:
+                time.sleep(0.05)
+        assert publish(watched, f"127.0.0.1:{port}/works") == len(watched.bearings)
+        name = watched.standing[0].bearing
+        message = subscribe.simple(f"works/{name}", hostname="127.0.0.1", port=port)
+        assert f'"bearing": "{name}"'.encode() in message.payload
+        assert b'"rule"' in message.payload
+    finally:
+        broker.terminate()
+        broker.wait()
+    with pytest.raises(AmbidError, match="Check broker"):
+        publish(watched, f"127.0.0.1:{port}/works")
+    with pytest.raises(AmbidError, match="must be HOST"):
+        publish(watched, "localhost")
