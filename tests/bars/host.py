@@ -25,7 +25,8 @@ DATA = Path(ambid.__file__).parent / "data"
 PING_SAMPLES = 50  # 25 ms at 2 kHz
 PING_S = 0.05  # of the wall clock, where no samples come
 HANG_S = 60.0  # only ends a hang
-ANSWER_S = 2.0
+ANSWER_S = 0.6  # of processor time: some 2 s of the controller's, however busy the machine is
+STILL_S = 15.0  # where it stands still: without pings its time does
 BOOT_S = 0.03  # of processor time: some 0.1 s of the controller's
 _SAMPLE = table().messages["sample"].code
 _HEAD = struct.Struct("<BHB")
@@ -37,12 +38,15 @@ def prototype():
     return load_rig(DATA / "prototype.toml")
 
 
+def _worked_s(pid):
+    return int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11]) / os.sysconf("SC_CLK_TCK")
+
+
 def _let_it_boot(pid):
     """Bytes that come before the firmware listens are lost on hardware: give it its time, measured by its own work."""
     end = time.monotonic() + HANG_S
     while time.monotonic() < end:
-        worked = int(Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[11])
-        if worked / os.sysconf("SC_CLK_TCK") >= BOOT_S:
+        if _worked_s(pid) >= BOOT_S:
             return
         time.sleep(0.005)
 
@@ -119,8 +123,10 @@ class Host:
         end = time.monotonic() + HANG_S
         while time.monotonic() < end:
             self.port.write(data)
-            again = time.monotonic() + ANSWER_S
-            while time.monotonic() < again:
+            worked = written = _worked_s(self.bench.pid)
+            still = time.monotonic() + STILL_S
+            while worked < written + ANSWER_S and time.monotonic() < still:
+                worked = _worked_s(self.bench.pid)  # before reading: what it has answered by then is read
                 self.pump()
                 if number in self.answers:
                     answer = self.answers.pop(number)

@@ -123,8 +123,8 @@ def test_where_no_better_loop_is_found_the_present_one_stays(tmp_path, monkeypat
     plan = replace(SHORT, amplitude_v=1.4, redesign=True)
     with EmulatedDevice(prototype()) as device:
         done = commission(device, prototype(), tmp_path, plan=plan)
-    assert [s.name for s in done.steps] == list(plan.steps)
-    assert done.passed
+    assert [s.name for s in done.steps] == list(plan.steps), done.reasons
+    assert done.passed, done.reasons
     step = next(s for s in done.steps if s.name == "redesign")
     assert step.cautions == ("the present loop stays: no loop keeps the noise. Raise the limit noise",)
     assert not files(tmp_path) & set(REDESIGNED)

@@ -128,7 +128,7 @@ def test_a_long_line_keeps_its_shape_in_fewer_points():
     line = np.column_stack([x, 100 * np.sin(x / 50)])
     kept = _needed(line)
     assert kept.sum() < 400
-    assert np.max(np.abs(np.interp(x, x[kept], line[kept, 1]) - line[:, 1])) < 0.3
+    assert np.max(np.abs(np.interp(x, x[kept], line[kept, 1]) - line[:, 1])) < 0.5  # 0.2 across, where it is steepest
 
 
 def test_no_script_but_its_own_may_run(text):

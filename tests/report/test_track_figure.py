@@ -80,7 +80,7 @@ def test_a_long_track_is_drawn_as_its_extremes():
     assert points.shape[0] < 12_000
     assert points[:, 1].max() == pytest.approx(3.0 + 1.959964 * 0.004)  # one line in 4000 is not smoothed away
     (legend,) = page.legends
-    assert "extremes of 5 lines each" in legend.get_texts()[0].get_text()
+    assert "extremes of 8 lines each" in legend.get_texts()[0].get_text()
 
 
 def test_a_band_that_begins_wide_does_not_hide_the_rest(track):

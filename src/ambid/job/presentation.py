@@ -449,7 +449,8 @@ def _commissioned() -> View:
         if c.estimate is not None:
             known = view(c.estimate)
             assert known.page is not None
-            more["identify"] = [s for s in known.page(c.estimate, c.estimate.used).sections if s.title != "Rig"]
+            sections = known.page(c.estimate, c.estimate.used).sections  # signals: in record.h5, and not here too
+            more["identify"] = [replace(s, signals=()) for s in sections if s.title != "Rig"]
         if c.track is not None:
             caption = "Each parameter with its 95 % band while the bench runs, the model error against its limit."
             more["track"] = [

@@ -24,8 +24,8 @@ _NAMED = {"#ffffff": "paper", "#000000": "ink", "#1a1a1a": "ink", "#4d4d4d": "me
 # fmt: on
 _FIXED = ("#1b1b1b", "#fefefe")  # on coloured cells
 _LONG = 40  # lines of a path from which tenths of a point are enough
-_CLOSE = 0.1  # points by which a long path may leave what it draws
-_READ = 1600  # points of a line, of which a pointer reads no more: they lie closer than it can be placed
+_CLOSE = 0.2  # points by which a long path may leave what it draws
+_READ = 800  # points of a line, of which a pointer reads no more: they lie closer than it can be placed
 _BORDERS = ("border of stability",)  # lines without values
 _LARGEST = 400_000  # letters of an SVG, from which a PNG is smaller
 
