@@ -273,7 +273,7 @@ def opened(
 
     behind, invented = None if bench is None else bench_of_source(bench), port in ("emulated", "simulated")
     complete = with_default_daq(rig) if invented else rig
-    for line in default_daq_notes(rig) if invented else ():
+    for line in default_daq_notes(rig) if invented and rig.rotor is None else ():
         note(line)
     made = open_device(port, rig, bench=behind, pace="real" if pace == "real-time" else "fastest", seed=seed)
     if closes:

@@ -12,7 +12,10 @@ from ambid.acquisition.devices.line_device import SerialDevice
 from ambid.acquisition.devices.replay import ReplayDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, DeviceError
+from ambid.job.acquiring import opened
+from ambid.physics.presets import preset
 from ambid.rig import load_rig
+from ambid.rig.preset_rig import rig_of_preset
 
 PROTOTYPE = load_rig(Path(__file__).parents[3] / "src" / "ambid" / "data" / "prototype.toml")
 
@@ -104,3 +107,17 @@ def test_a_port_s_name_chooses_the_device(record):
     assert isinstance(open_device("/dev/ttyACM0", PROTOTYPE), SerialDevice)
     with pytest.raises(DeviceError, match="bench"):
         open_device("/dev/ttyACM0", PROTOTYPE, bench=PROTOTYPE)
+
+
+@pytest.mark.parametrize(
+    ("port", "remedy"), [("simulated", "--excitation-only"), ("replay:a.h5", "ambid track RECORD")]
+)
+def test_a_rotor_is_told_what_to_do_without_such_a_controller(port, remedy):
+    notes = []
+    rig = rig_of_preset(preset("rmit"))
+    with (
+        pytest.raises(DeviceError, match=f"has 4 axes; this controller drives one.*{remedy}"),
+        opened(port, rig, bench=None, pace="fastest", seed=0, closes=False, note=notes.append),
+    ):
+        pass
+    assert not notes

@@ -26,11 +26,13 @@ def open_device(
     of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
     """
     if rig.rotor is not None:
-        raise DeviceError(
-            f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. Write the excitation by "
-            "'ambid simulate RIG --excitation zippered --excitation-only -o FILE.csv', play it on the rotor's own "
-            "controllers, and read their record"
+        remedy = (
+            "Follow a record by 'ambid track RECORD --rig RIG'"
+            if port.startswith(REPLAY)
+            else "Write the excitation by 'ambid simulate RIG --excitation zippered --excitation-only -o FILE.csv', "
+            "play it on the rotor's own controllers, and give their record to 'ambid identify' or 'ambid track'"
         )
+        raise DeviceError(f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. {remedy}")
     if bench is not None and port not in ("emulated", "simulated"):
         raise DeviceError(f"a bench is chosen for ports emulated and simulated only; {port!r} has its own. Omit it")
     if not port.strip():
