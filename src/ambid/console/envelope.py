@@ -19,7 +19,7 @@ from ambid.errors import AmbidError
 from ambid.tracking.blocks import Block, Frame
 
 _PER_SECOND = 200  # envelopes of a second
-_EVERY_S = 0.05  # between two frames
+_EVERY_S = 0.048  # between two frames, a little less than the 50 ms that five blocks take
 _SPECTRUM_S = 1.0  # of samples a spectrum is made of, and between two of them
 _LINES = 160  # of a spectrum
 _HEAD = struct.Struct("<QQIHHdd")  # first sample, samples lost, envelopes, channels, samples of each, end s, wall clock

@@ -375,12 +375,13 @@ def _number(x: float) -> float | None:
 
 
 def _summary(made: Any) -> Mapping[str, Any]:
+    from ambid.estimation.estimate import fields_json
     from ambid.job.presentation import text
 
     latency = made.track.totals.latency
     return {
         "verdict": made.track.verdict.word, "text": text(made.track, width=110), "overruns": made.overruns,
-        "latency": None if latency is None else {"median": latency.median, "p99": latency.p99, "late": latency.late},
+        "latency": latency and fields_json(latency),
     }  # fmt: skip
 
 
