@@ -33,6 +33,7 @@ VERBS = {
     "identify": ("identify", "r.csv", "--json"),
     "validate": ("validate", "e.json", "r.csv", "--json"),
     "fleet run": ("fleet", "run", "r.csv", "--ledger", "fleet.db", "--workers", "1", "--job", "info", "--json"),
+    "fleet simulate": ("fleet", "simulate", "thesis", "--runs", "1", "--duration", "0.05", "--workers", "1", "--json"),
     "history": ("history", "A", "--ledger", "l.db", "--json"),
     "margins": ("margins", "r.csv", "--rig", "rig.toml", "--estimate", "e.json", "--json"),
     "design experiment": ("design", "experiment", "e.json", "--rig", "rig.toml", "--seconds", "0.3", "--json"),

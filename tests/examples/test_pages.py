@@ -189,6 +189,22 @@ def test_the_page_on_the_ledger_runs(tmp_path, monkeypatch, capsys):
     assert {"history.png", "history.html", "tables"} <= {p.name for p in tmp_path.iterdir()}
 
 
+def test_the_page_on_fleets_runs(tmp_path, monkeypatch, capsys):
+    from ambid.cli.app import run_verb
+
+    monkeypatch.chdir(tmp_path)
+    page = ROOT / "docs" / "fleets.md"
+    for name in ("pump1", "pump2"):
+        (Path("records") / name).mkdir(parents=True)
+        Path("rigs").mkdir(exist_ok=True)
+        assert run_verb(["init", "--preset", "thesis", "-o", f"rigs/{name}.toml"]) == 0
+        assert run_verb(["simulate", "thesis", "--duration", "0.1", "-o", f"records/{name}/2026-03-01T06.h5"]) == 0
+    Path("map.csv").write_text(blocks(page, "text")[0], encoding="utf-8")
+    for line in "".join(blocks(page, "sh")).splitlines():
+        assert run_verb(shlex.split(line)[1:]) == 0, line
+    assert "2 known before" not in capsys.readouterr().out  # other settings, another job
+
+
 def test_the_page_on_monitoring_runs(tmp_path, monkeypatch, capsys):
     from ambid.cli.app import run_verb
     from ambid.ledger import open_ledger

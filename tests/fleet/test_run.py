@@ -83,7 +83,7 @@ def test_a_run_is_read_back_and_shown(runs, tmp_path):
 def test_other_settings_are_another_result(folder, runs):
     """The ledger's key holds the settings."""
     again = run_fleet([f"{folder}/records/a/*T0[0-4].txt"], job=judge, settings={"add": 0.5}, ledger=folder / "f.db",
-                      workers=1)  # fmt: skip
+                      taken_at="file", workers=1)  # fmt: skip
     assert [r.values["m"][0] for r in again.rows] == [0.5, 2.5, 4.5, 6.5, 8.5]
 
 
@@ -94,7 +94,7 @@ def test_records_in_memory_give_a_table():
 
 
 def test_it_ends_when_it_is_told_to_and_goes_on_later(folder):
-    where = {"ledger": folder / "g.db", "job": judge, "workers": 1}
+    where = {"ledger": folder / "g.db", "job": judge, "workers": 1, "taken_at": "file"}
     told = []
 
     def tick(stage, done=None, /):
@@ -168,7 +168,8 @@ def test_urls_are_fetched(folder, tmp_path):
     with found[0].here(found[0].digest()) as path:
         assert path.read_text() == "10"
     assert not path.exists()
-    assert found[0].when() > 1.7e9
+    assert found[0].when() is None  # nobody says it, and the file's time is never taken unasked
+    assert items([f"file://{folder}/records/a/*T05.txt"], None, "file")[0].when() > 1.7e9
     with pytest.raises(AmbidError, match="changed while the fleet ran"), found[0].here("0"):
         pass
     ambid.write_record(ambid.simulate("thesis", duration=0.01), tmp_path / "r.h5")

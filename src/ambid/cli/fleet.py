@@ -57,6 +57,13 @@ def run(
             "pattern, rig and perhaps bearing, taken_at.",
         ),
     ] = None,
+    taken_at: Annotated[
+        str | None,
+        option(
+            "--taken-at TIME|file",
+            "When those were taken that say it neither themselves nor by {taken_at} or table; file: time of the file.",
+        ),
+    ] = None,
     job: JobName = "identify",
     settings: Set = None,
     again: Annotated[str | None, option("--again failed", "Do records again that failed before.")] = None,
@@ -84,7 +91,50 @@ def run(
         with signals(stop.take), progress("fleet") as show:
             found = run_fleet(
                 records, rig, job=job, settings=_settings(settings), ledger=ledger, workers=workers, limit_s=limit,
-                again=again is not None, scheduler=scheduler, dask=_local(dask), stopped=stop.wished, tick=show,
+                again=again is not None, taken_at=taken_at, scheduler=scheduler, dask=_local(dask),
+                stopped=stop.wished, tick=show,
+            )  # fmt: skip
+        outputs.give(found)
+    outputs.show(found)
+    if stop.wished():
+        raise typer.Exit(stop.code)
+    end(failed=strict and not found.passed)
+
+
+@group.command("simulate", short_help="judge a job on many simulated records of a rig")
+def simulate(
+    rig: Annotated[
+        str, opt.argument("RIG", "Rig file, or preset by its name; each parameter has a value: that is the truth.")
+    ],
+    runs: Annotated[int, option("--runs N", "Number of records.", True, min=1)] = 100,
+    seed: Annotated[int, option("--seed N", "Seed of the first; the others follow.", True, min=0)] = 1,
+    duration: Annotated[
+        float | None, option("--duration S", "Length of each record, in s.", "as ambid simulate")
+    ] = None,
+    amplitude: Annotated[float | None, option("--amplitude V", "Peak of the excitation.", "as ambid simulate")] = None,
+    nonlinear: Annotated[bool, option("--nonlinear", "Simulate the nonlinear magnet.")] = False,
+    job: JobName = "identify",
+    settings: Set = None,
+    workers: Workers = None,
+    limit: Limit = 600.0,
+    json: opt.JsonFile = None,
+    plot: opt.Plot = None,
+    report: opt.Report = None,
+    strict: opt.Strict = False,
+) -> None:
+    """Judge a job on many simulated records: bias, spread, and how often 95 % intervals hold the truth.
+
+    The job gets the rig without the values of parameters that are free. Ctrl-C keeps what is done.
+    """
+    from ambid.fleet.monte_carlo import monte_carlo
+
+    given = {"duration": duration, "amplitude": amplitude, "nonlinear": nonlinear or None}
+    stop = Stop()
+    with Outputs(Path(rig) if Path(rig).is_file() else None, json=json, plot=plot, report=report) as outputs:
+        with signals(stop.take), progress("fleet") as show:
+            found = monte_carlo(
+                rig, runs=runs, seed=seed, job=job, simulated={n: x for n, x in given.items() if x is not None},
+                workers=workers, limit_s=limit, stopped=stop.wished, tick=show, **_settings(settings),
             )  # fmt: skip
         outputs.give(found)
     outputs.show(found)

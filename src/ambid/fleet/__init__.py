@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
+    from ambid.fleet.monte_carlo import monte_carlo as monte_carlo
     from ambid.fleet.run import fleet as fleet
 
 _exported, __dir__, __all__ = exports(__name__)

@@ -248,6 +248,7 @@ def run_fleet(
     workers: int | None = None,
     limit_s: float = LIMIT_S,
     again: bool = False,
+    taken_at: str | None = None,
     scheduler: str | None = None,
     dask: int | None = None,
     stopped: Callable[[], bool] = lambda: False,
@@ -259,7 +260,7 @@ def run_fleet(
         if n is not None:
             check_whole({name: n}, 1, 1024)
     made = job_of(job, settings or {}, stored=ledger is not None)
-    fleet, begin, say = items(records, rigs), time.monotonic(), tick or silent
+    fleet, begin, say = items(records, rigs, taken_at), time.monotonic(), tick or silent
     kept = None if ledger is None else open_ledger(ledger)
     try:
         run = _Run(made, fleet, kept, again=again)
@@ -294,6 +295,7 @@ def fleet(
     *,
     job: Job = "identify",
     ledger: str | Path | None = None,
+    taken_at: str | None = None,
     workers: int | None = None,
     limit_s: float = LIMIT_S,
     scheduler: str | None = None,
@@ -318,6 +320,8 @@ def fleet(
         rig and settings, that gives a `Result` or numbers by name.
     ledger : str or Path, optional
         File or URL of a ledger: what stands there is not done again.
+    taken_at : str, optional
+        When records were taken that neither say so themselves nor by name or table; ``"file"``: time of the file.
     workers : int, optional
         Processes; default one for each processor.
     limit_s : float, optional
@@ -350,6 +354,6 @@ def fleet(
     (['done', 'done'], [0.1, 0.1])
     """
     return run_fleet(
-        records, rigs, job=job, settings=settings, ledger=ledger, workers=workers, limit_s=limit_s,
+        records, rigs, job=job, settings=settings, ledger=ledger, taken_at=taken_at, workers=workers, limit_s=limit_s,
         scheduler=scheduler, dask=dask, tick=tick,
     ).to_dataframe()  # fmt: skip

@@ -36,7 +36,8 @@ class Item:
     name: str
     rig: Rig
     bearing: str
-    taken_at: float | None  # s since 1970, UTC; None: nobody says so
+    taken_at: float | None  # s since 1970, UTC; None: the record says so itself
+    by_file: bool = False  # whether the time of its file counts instead
 
     @property
     def remote(self) -> bool:
@@ -55,18 +56,16 @@ class Item:
         with opened(self.source) as file:
             return hashlib.file_digest(file, "sha256").hexdigest()
 
-    def when(self) -> float:
-        """Return when the record was taken: as it is said, else the time of its file."""
-        if self.taken_at is None and isinstance(self.source, str):
+    def when(self) -> float | None:
+        """Return when the record was taken; None where it says so itself, or nobody does."""
+        if self.by_file and isinstance(self.source, (str, Path)):
             if not self.remote:
                 return Path(self.source).stat().st_mtime
-            system, path = _system(self.source)
+            system, path = _system(str(self.source))
             try:
                 return float(system.modified(path).timestamp())
             except (NotImplementedError, AttributeError):
-                pass
-        if self.taken_at is None:
-            raise AmbidError(f"{self.name}: nobody says when it was taken. Name it by {{taken_at}}, or give a table")
+                raise AmbidError(f"{self.name} has no time of its file. Name it by {{taken_at}}") from None
         return self.taken_at
 
     @contextmanager
@@ -112,8 +111,11 @@ def opened(url: str) -> Iterator[Any]:
         raise RecordError(f"record {url} cannot be read: {failure.strerror or failure}. Check the path") from None
 
 
-def items(records: Source | Sequence[Source], rigs: Rigs) -> list[Item]:
-    """Return the records that are meant, each with its rig; all is looked at before anything runs."""
+def items(records: Source | Sequence[Source], rigs: Rigs, taken_at: str | None = None) -> list[Item]:
+    """Return the records that are meant, each with its rig; all is looked at before anything runs.
+
+    `taken_at`: where neither name nor table says it; ``"file"``: the time of the file.
+    """
     given = list(records) if isinstance(records, (list, tuple)) else [records]
     apart = list(rigs) if isinstance(rigs, (list, tuple)) else None
     if apart is not None and len(apart) != len(given):
@@ -126,13 +128,15 @@ def items(records: Source | Sequence[Source], rigs: Rigs) -> list[Item]:
             name = str(one) if isinstance(one, (str, Path)) else f"record {len(found) + 1}"
             row = {"rig": apart[k]} if apart is not None else table.row(name) if table else {}
             rig, bearing, at = (_filled(row.get(x), words, name) or words.get(x) for x in _COLUMNS[1:])
+            at = at or taken_at
             known = rig if isinstance(rig, (str, Path)) or rig is None else id(rig)
             if known not in loaded:
                 loaded[known] = known_rig(rig)
             found.append(
                 Item(
                     source=one, name=name, rig=loaded[known], bearing=bearing or loaded[known].name,
-                    taken_at=None if at is None else moment(at, f"taken_at of {name}"),
+                    taken_at=None if at in (None, "file") else moment(str(at), f"taken_at of {name}"),
+                    by_file=at == "file",
                 )
             )  # fmt: skip
     return found

@@ -612,6 +612,23 @@ def _history() -> View:
     )  # fmt: skip
 
 
+def _coverage() -> View:
+    from ambid.report.coverage_text import coverage_figure, coverage_text, coverage_title
+    from ambid.validation.coverage import SCHEMA
+
+    def table(c: Any) -> Table:
+        columns: dict[str, list[object]] = {n: [getattr(t, n) for t in c.trials] for n in ("seed", "verdict", "reason")}
+        for name in c.truth:
+            for k, what in enumerate((name, f"{name} sd")):
+                columns[what] = [t.values.get(name, (None, None))[k] for t in c.trials]
+        return "seed", columns
+
+    return View(
+        text=coverage_text, figure=lambda c, _, width: coverage_figure(c, coverage_title(c), width),
+        document=_fields_of(SCHEMA), table=table, title=coverage_title,
+    )  # fmt: skip
+
+
 def _watched() -> View:
     from dataclasses import fields
 
@@ -667,5 +684,6 @@ _VIEWS: Mapping[str, Callable[[], View]] = {
     "Commissioned": _commissioned,
     "FleetRun": _fleet_run,
     "Watched": _watched,
+    "Coverage": _coverage,
 }
 """By the name of the result's class: what shows it is imported when one is shown."""

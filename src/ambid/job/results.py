@@ -132,6 +132,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     _EXPERIMENT: _whole("control.experiment", "Experiment", "design experiment"),
     "ambid.design/1": _whole("control.design", "Design", "design controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
+    "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet simulate"),
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "history --alarms"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
