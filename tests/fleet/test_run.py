@@ -68,6 +68,18 @@ def test_what_is_done_is_not_done_again(runs):
     assert runs[1].failures == runs[0].failures
 
 
+def test_what_the_ledger_knows_stands_in_the_table_again(tmp_path):
+    records = []
+    for k in (1, 2):
+        ambid.write_record(ambid.simulate("thesis", duration=0.05, seed=k), tmp_path / f"{k}.h5")
+        records.append(tmp_path / f"{k}.h5")
+    where = {"ledger": tmp_path / "l.db", "taken_at": "file", "workers": 1}
+    first, again = (ambid.fleet(records, **where) for _ in range(2))
+    assert again["state"].tolist() == ["known", "known"]
+    same = ["verdict", "checks", "k_i", "k_i sd", "R"]
+    assert again[same].equals(first[same])
+
+
 def test_failed_ones_are_done_again_where_that_is_wished(runs):
     assert runs[2].counts == {"done": 1, "failed": 2, "known": 37, "left": 0}
 

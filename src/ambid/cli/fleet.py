@@ -126,7 +126,7 @@ def simulate(
 
     The job gets the rig without the values of parameters that are free. Ctrl-C keeps what is done.
     """
-    from ambid.fleet.monte_carlo import monte_carlo
+    from ambid.fleet.trials import monte_carlo
 
     given = {"duration": duration, "amplitude": amplitude, "nonlinear": nonlinear or None}
     stop = Stop()

@@ -12,8 +12,10 @@ from typing import TYPE_CHECKING, Any
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.fleet.monte_carlo import monte_carlo as monte_carlo
     from ambid.fleet.run import fleet as fleet
+    from ambid.fleet.trials import monte_carlo as monte_carlo
+    from ambid.validation.coverage import Coverage as Coverage
+    from ambid.validation.coverage import Covered as Covered
 
 _exported, __dir__, __all__ = exports(__name__)
 

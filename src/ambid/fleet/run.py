@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import json
 import sys
 import time
 from collections import Counter
@@ -79,11 +80,13 @@ class JobOf:
             result = self.of(record, item.rig)
         entry = None
         if self.stored:
+            from ambid.job.presentation import document
+
             if not isinstance(result, Result):
                 raise AmbidError(f"{self.name} gives no result that a ledger keeps. Run it without one")
             entry = entry_of(
                 result, bearing=item.bearing, taken_at=item.when(), sha=task.sha, rig=item.rig, settings=self.said,
-                job=self.name,
+                job=self.name, document=document(result) if isinstance(self.job, str) else "",
             )  # fmt: skip
         values, units = numbers_of(result)
         return _Found(judged=_judged(result), values=values, units=units, entry=entry)
@@ -184,15 +187,31 @@ class _Run:
                     self.put(at, item, "failed", reason=str(refusal))
                     continue
                 keyed[at] = (key_of(task.sha, task.rig_sha, self.job.said), task)
-            done = self.ledger.done(key for key, _ in keyed.values())
+            done = self.ledger.documents(key for key, _ in keyed.values())
             for at, (key, task) in keyed.items():
-                if key in done or key in self._keys:
+                if key in done:
+                    self.put(at, task.item, "known", **self.kept(*done[key]))
+                elif key in self._keys:  # the same as one before it
                     self.put(at, task.item, "known")
                 elif key in self._failed:
                     self.put(at, task.item, "failed", reason=self._failed[key].reason)
                 else:
                     self._keys.add(key)
                     yield task
+
+    def kept(self, status: str, verdict: str, failed: str, text: str) -> dict[str, Any]:
+        """Return the fields of a row whose result the ledger keeps."""
+        values = {}
+        for name, p in (json.loads(text).get("parameters") or {} if text else {}).items():
+            if p["role"] != "fixed":
+                values[name] = (p["value"], p["sd"]) if p["identifiable"] else (None, None)
+                self.units[name] = p["unit"]
+        return {
+            "status": status,
+            "verdict": verdict,
+            "checks": tuple(filter(None, failed.split(","))),
+            "values": values,
+        }
 
     def put(self, at: int, item: Item, state: Any, **more: Any) -> None:
         """Put down what is known of a record."""

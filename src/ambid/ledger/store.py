@@ -175,6 +175,32 @@ class Ledger:
         with self._reading() as c:
             return frozenset(self._there(c, list(keys)))
 
+    def documents(self, keys: Iterable[str]) -> Mapping[str, tuple[str, str, str, str]]:
+        """Return status, verdict, failed checks and JSON of estimates that are there, by key.
+
+        Parameters
+        ----------
+        keys : iterable of str
+
+        Returns
+        -------
+        Mapping of str to tuple of str
+            The JSON is empty where none was stored.
+        """
+        from sqlalchemy import select
+
+        t = schema.tables().tables
+        e, d = t["estimate"].c, t["document"].c
+        asked = select(e.key, e.status, e.verdict, e.failed, d.json).join_from(
+            t["estimate"], t["document"], isouter=True
+        )
+        with self._reading() as c:
+            return {
+                row.key: (row.status, row.verdict, row.failed, zlib.decompress(row.json).decode() if row.json else "")
+                for some in _chunks(list(keys))
+                for row in c.execute(asked.where(e.key.in_(some)))
+            }
+
     def failures(self) -> Mapping[str, Failure]:
         """Return by key what failed and has no estimate since.
 
