@@ -6,7 +6,7 @@ import pytest
 
 import ambid
 from ambid.errors import AmbidError
-from ambid.fleet.run import run_fleet
+from ambid.fleet.run import job_of, run_fleet
 from ambid.fleet.sources import items
 from ambid.ledger import open_ledger
 from ambid.rig import default_rig, write_rig
@@ -97,6 +97,21 @@ def test_other_settings_are_another_result(folder, runs):
     again = run_fleet([f"{folder}/records/a/*T0[0-4].txt"], job=judge, settings={"add": 0.5}, ledger=folder / "f.db",
                       taken_at="file", workers=1)  # fmt: skip
     assert [r.values["m"][0] for r in again.rows] == [0.5, 2.5, 4.5, 6.5, 8.5]
+
+
+def test_another_function_of_the_same_name_is_another_job(monkeypatch):
+    first = job_of(judge, {}).said
+    assert job_of(judge, {}).said == first
+    monkeypatch.setattr("inspect.getsource", lambda _: "def judge(record, rig): ...")
+    assert job_of(judge, {}).said != first
+
+
+def test_a_cluster_gives_the_same_to_the_last_digit():
+    pytest.importorskip("distributed", reason="Dask's distributed is not installed")
+    records = [ambid.simulate("thesis", duration=0.05, seed=k) for k in (1, 2)]
+    table, here = ambid.fleet(records, dask=1), ambid.fleet(records, workers=1)
+    assert table["state"].tolist() == ["done", "done"]
+    assert table[["k_i", "k_i sd", "R", "verdict"]].equals(here[["k_i", "k_i sd", "R", "verdict"]])
 
 
 def test_records_in_memory_give_a_table():

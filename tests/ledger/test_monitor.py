@@ -60,6 +60,14 @@ def test_an_alarm_is_cleared_where_the_level_comes_back():
     assert watch([h]).passed
 
 
+def test_what_is_near_zero_has_no_relative_change():
+    h = bearing("B", "", np.random.default_rng(5)).history
+    s = h.series["L"]
+    offset = replace(s, value=s.value - np.nanmean(s.value))
+    found = watch([replace(h, series={"L": offset})])
+    assert (found.alarms, found.trends) == ((), ())
+
+
 def test_what_drifts_and_when_it_reaches_the_limit_is_told_with_intervals(tmp_path):
     rng, n = np.random.default_rng(4), 60
     ages = [parameter("k_i", 80.0 * (1 - 0.0008 * k + 0.002 * rng.standard_normal()), 0.16) for k in range(n)]
@@ -104,6 +112,7 @@ def test_results_are_told_and_come_back_from_their_file(watched, tmp_path):
         ("[[alarm]]\nparameter = 'k_i'\nchang = '-5 %'", "Did you mean 'change'?"),
         ("[[alarm]]\nchange = '-5 %'", "parameter must be a name"),
         ("[[alarm", "cannot be read"),
+        ("[[alarm]]\nparameter = 'k_i'\nchange = '-5 %'\n" * 2, "the same thing twice"),
     ],
 )
 def test_rules_that_are_none_are_refused(tmp_path, text, said):
@@ -120,6 +129,7 @@ def test_rules_are_read_and_name_what_is_there(tmp_path, bearings):
     (tmp_path / "r.toml").write_text(text)
     a, b = read_rules(tmp_path / "r.toml")
     assert (a.change, a.since, b.change, b.since) == (-0.05, 1772323200.0, 0.1, "start")
+    assert [str(a), str(b)] == ["k_i -5 % since 2026-03-01T00:00", "R +10 %"]
     with pytest.raises(AmbidError, match="no bearing has a parameter 'k_y'"):
         watch([bearings[0].history], [Rule(parameter="k_y", change=0.1)])
 
@@ -160,3 +170,6 @@ def test_a_broker_gets_a_message_for_each_bearing(watched, monkeypatch):
         publish(watched, f"127.0.0.1:{port}/works")
     with pytest.raises(AmbidError, match="must be HOST"):
         publish(watched, "localhost")
+    with pytest.raises(AmbidError, match="takes no user or password") as refused:
+        publish(watched, "me:secret@127.0.0.1/works")
+    assert "secret" not in str(refused.value)

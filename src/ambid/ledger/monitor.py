@@ -12,6 +12,7 @@ import math
 import tomllib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Literal
 
@@ -28,9 +29,11 @@ MONTH_S = 365.25 / 12 * 86400.0
 _FEW = 3  # values below which nothing is compared
 _WINDOW = 5  # values whose median is a level
 _BESIDE = 15  # values on each side of a change, from which its cause is judged
+_FAR = 5.0  # standard deviations of the first level from zero, from which changes are relative to it
 _BACK = 0.8  # of the limit, below which an alarm is cleared
 _CLEAR = 6.0  # by which chi-squared a cause must be likelier than the next
 _BAI = 11.0  # 95 % of the date's error in samples, times (step / spread)^2
+_PLAIN = 25.0  # chi-squared above chance from which a trend is told: slow wander looks like small ones
 _STEEP = 8.0  # standard deviations of a slope that fixes the date of a drift
 _NORMAL_95 = 1.959963984540054
 
@@ -64,7 +67,7 @@ class Rule:
     confidence : float
         With which the change has to be beyond that.
     since : str or float
-        "start" of the history, the latest change of the "rig", or a time, s since 1970.
+        "start" of the history; "rig": its latest change, the start where there was none; or a time, s since 1970.
     """
 
     parameter: str
@@ -73,7 +76,9 @@ class Rule:
     since: str | float = "start"
 
     def __str__(self) -> str:
-        return f"{self.parameter} {100 * self.change:+.3g} %"
+        sure = "" if self.confidence == 0.99 else f" at {100 * self.confidence:.6g} %"
+        since = self.since if isinstance(self.since, str) else datetime.fromtimestamp(self.since, UTC).isoformat()[:16]
+        return f"{self.parameter} {100 * self.change:+.3g} %{sure}{'' if since == 'start' else f' since {since}'}"
 
     def of(self, name: str) -> bool:
         """Whether it is about a parameter.
@@ -233,7 +238,10 @@ def read_rules(path: str | Path) -> tuple[Rule, ...]:
     if other or not isinstance(rules, list) or not rules or not all(isinstance(r, dict) for r in rules):
         said = f"{other[0]!r} is unknown.{nearest(other[0], ['alarm'])} " if other else ""
         raise AmbidError(f"alarm rules {path}: {said}It must hold tables [[alarm]] and nothing else. Correct it")
-    return tuple(_rule(r, f"alarm rules {path}, rule {k}") for k, r in enumerate(rules, 1))
+    found = tuple(_rule(r, f"alarm rules {path}, rule {k}") for k, r in enumerate(rules, 1))
+    if len(set(found)) < len(found):
+        raise AmbidError(f"alarm rules {path} say the same thing twice. Remove one of the two")
+    return found
 
 
 def _rule(given: Mapping[str, Any], where: str) -> Rule:
@@ -352,6 +360,14 @@ def _level(v: _Values) -> tuple[float, float]:
     return float(np.median(v.y)), 1.2533 * float(np.sqrt(np.mean(v.sd**2) / v.y.size))
 
 
+def _comparable(v: _Values) -> bool:
+    """Whether there are values enough, over some time, whose first level is far enough from zero for a ratio."""
+    if v.t.size < 2 * _FEW or not np.ptp(v.t):
+        return False
+    base, sd = _base(v)
+    return abs(base) > _FAR * sd
+
+
 def _base(v: _Values) -> tuple[float, float]:
     """Return the first level and its standard deviation."""
     return _level(v[slice(0, min(_WINDOW, v.t.size // 2))])
@@ -377,7 +393,7 @@ def _alarms(h: History, s: Series, rule: Rule) -> Iterable[Alarm]:
     from scipy.special import ndtri
 
     v = _values(h, s, rule.since)
-    if v.t.size < 2 * _FEW:
+    if not _comparable(v):
         return
     change, sd, first = _changes(v)
     base, _ = _base(v)
@@ -503,8 +519,10 @@ def _date(v: _Values, rule: Rule) -> tuple[Literal["drift", "step"], float, floa
         near = slice(max(0, k + 1 - half), k + 1 + half)
         (a, b), cov, chi = _line(f.x[near], f.y[near], f.w[near])
         cov = cov * max(1.0, chi / max(f.x[near].size - 2, 1))
-        if abs(b) > _STEEP * math.sqrt(cov[1, 1]) or half >= v.t.size:
+        if (b and abs(b) > _STEEP * math.sqrt(cov[1, 1])) or half >= v.t.size:
             break
+    if not b:  # nothing leads to the limit
+        return "drift", float(v.t[k]), float(v.t[0]), float(v.t[-1])
     base, base_sd = _base(v)
     at = (rule.change - a) / b
     row = np.array([1.0, at])
@@ -517,10 +535,12 @@ def _date(v: _Values, rule: Rule) -> tuple[Literal["drift", "step"], float, floa
 def _trend(h: History, s: Series, rules: Sequence[Rule]) -> Iterable[Trend]:
     """Yield what a parameter did; nothing of one that was seldom seen."""
     v = _values(h, s)
-    if v.t.size < 2 * _FEW or not np.ptp(v.t):
+    if not _comparable(v):
         return
     f = _fits(v)
     kind = f.best("level", "line", "bend", "step")
+    if f.chi["level"] - f.chi[kind] < _PLAIN * f.scale:
+        kind = "level"
     of: dict[str, Any] = {"bearing": h.bearing, "parameter": s.name, "unit": s.unit, "values": int(v.t.size)}
     if kind == "step":
         size, sd, at, begin, to = _step(v, f)

@@ -86,6 +86,8 @@ def publish(found: Watched, where: str) -> int:
         from paho.mqtt.enums import CallbackAPIVersion
     except ImportError:
         raise AmbidError("paho-mqtt is not installed, and --mqtt needs it. Install ambid[mqtt]") from None
+    if "@" in where:
+        raise AmbidError("--mqtt takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead")
     plain = where.removeprefix("mqtts://")
     address, _, topic = plain.removeprefix("mqtt://").partition("/")
     host, _, port = address.partition(":")
