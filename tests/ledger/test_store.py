@@ -251,20 +251,6 @@ def test_a_writer_killed_in_the_middle_leaves_nothing_of_its_batch(place):
         assert len(ledger.add([entry(k) for k in range(200)])) == 199
 
 
-def test_a_ledger_in_a_folder_that_may_not_be_written_can_be_read(tmp_path):
-    folder = tmp_path / "archive"
-    folder.mkdir()
-    with open_ledger(folder / "l.db") as ledger:
-        ledger.add([entry(0)])
-    (folder / "l.db").chmod(0o444)
-    folder.chmod(0o555)
-    try:
-        with open_ledger(folder / "l.db", write=False) as ledger:
-            assert len(ledger.history("A").estimates) == 1
-    finally:
-        folder.chmod(0o755)
-
-
 def test_the_key_counts_what_was_asked_for_and_nothing_else():
     assert settings_text("identify", from_s=None, nonlinear=False, held=()) == settings_text("identify")
     assert (
