@@ -39,7 +39,7 @@ def test_the_same_estimate_counts_once(place):
     with open_ledger(place) as ledger:
         first = ledger.add([entry(0), entry(1), entry(1)])
         again = ledger.add([entry(1), entry(2)])
-        assert first == ledger.done([entry(0).key, entry(1).key, "none"])
+        assert first == set(ledger.documents([entry(0).key, entry(1).key, "none"]))
         assert again == {entry(2).key}
         assert ledger.history("A")["k_i"].value.size == 3
         assert ledger.add([]) == frozenset()
@@ -135,7 +135,7 @@ def test_a_batch_that_fails_in_the_middle_leaves_nothing(place, monkeypatch):
         with pytest.raises(AmbidError, match="Nothing of this was stored"):
             ledger.add([entry(k, "new", document="{}") for k in range(1, 5)])
         assert [b.name for b in ledger.bearings()] == ["A"]
-        assert ledger.done([entry(k, "new").key for k in range(5)]) == frozenset()
+        assert ledger.documents([entry(k, "new").key for k in range(5)]) == {}
 
 
 def test_a_newer_ledger_is_refused_and_an_older_one_brought_up(place, monkeypatch):

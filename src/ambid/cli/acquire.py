@@ -94,6 +94,7 @@ def command(
     (a simulated bench alone), or 'replay:FILE'. What is recorded is in a journal at once: see 'ambid recover'.
     """
     from ambid.job.acquiring import Request, acquire, ready
+    from ambid.physics.presets import preset_of
     from ambid.report.device_text import progress_line
     from ambid.rig import load_rig
 
@@ -103,7 +104,7 @@ def command(
     outputs = Outputs(rig, start_file, replayed, arm, json=None if track else json, plot=plot, report=report)
     outputs.claim(record, "-o", _ENDINGS, force=force)
     outputs.claim(json_path(json) if track else None, "--json")
-    known, stop, behind = load_rig(rig), Stop(), None if bench is None else opt.preset_of(bench) or bench
+    known, stop, behind = load_rig(rig), Stop(), None if bench is None else preset_of(bench) or bench
     settings: dict[str, Any] = {
         "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
         "settle": settle, "seed": seed, "stopped": stop.wished, "arm": None if arm is None else load_rig(arm),

@@ -65,6 +65,7 @@ def command(
     from ambid.job.acquiring import opened
     from ambid.job.commissioning import check_folder
     from ambid.job.commissioning_steps import Plan
+    from ambid.physics.presets import preset_of
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
@@ -89,7 +90,7 @@ def command(
         check_folder(folder)
     last: list[Step] = []
     begun: list[StepName] = []
-    behind = None if bench is None else opt.preset_of(bench) or bench
+    behind = None if bench is None else preset_of(bench) or bench
     opening = opened(port, known, bench=behind, pace=pace, seed=seed, closes=not force, note=say_note)
     shelf = partial(
         keeping, ledger, [folder / "record.h5"], rig, bearing=bearing, job="commission", taken_now=True,

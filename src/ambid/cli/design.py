@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 import typer
 
 from ambid.cli import options as opt
-from ambid.cli.options import argument, band_of, option, preset_of, switch
+from ambid.cli.options import argument, band_of, option, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
@@ -69,6 +69,7 @@ def experiment(
     """
     from ambid.job import design_experiment
     from ambid.job.experiment_design import one_period
+    from ambid.physics.presets import preset_of
     from ambid.record import write_record
 
     known = None if source.lower().endswith(".json") else preset_of(source)

@@ -14,6 +14,7 @@ from ambid.cli.options import option
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
+from ambid.estimation.result import Result
 
 group = typer.Typer(
     rich_markup_mode=None,
@@ -95,10 +96,7 @@ def run(
                 stopped=stop.wished, tick=show,
             )  # fmt: skip
         outputs.give(found)
-    outputs.show(found)
-    if stop.wished():
-        raise typer.Exit(stop.code)
-    end(failed=strict and not found.passed)
+    _show(outputs, found, stop, strict=strict)
 
 
 @group.command("simulate", short_help="judge a job on many simulated records of a rig")
@@ -137,6 +135,11 @@ def simulate(
                 workers=workers, limit_s=limit, stopped=stop.wished, tick=show, **_settings(settings),
             )  # fmt: skip
         outputs.give(found)
+    _show(outputs, found, stop, strict=strict)
+
+
+def _show(outputs: Outputs, found: Result, stop: Stop, *, strict: bool) -> None:
+    """Print what was found, and end with the code of the signal where one ended the work."""
     outputs.show(found)
     if stop.wished():
         raise typer.Exit(stop.code)

@@ -4,16 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any, Literal
 
 import typer
 
 from ambid.cli.completion import values_of
 from ambid.errors import AmbidError, check_band
 from ambid.errors import check_positive as check_positive
-
-if TYPE_CHECKING:
-    from ambid.physics.presets import Preset
 
 
 def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> Any:
@@ -132,15 +129,6 @@ def share_of(text: str, name: str) -> float:
         return float(number) / (100.0 if percent else 1.0)
     except ValueError:
         raise AmbidError(f"{name} is {text!r}; it must be a share such as 0.01 or 1%. Correct it") from None
-
-
-def preset_of(name: str) -> Preset | None:
-    """Take a word for a preset if it is one, or cannot be a file; None for a path."""
-    from ambid.physics.presets import preset, preset_names
-
-    if name in preset_names() or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
-        return preset(name)
-    return None
 
 
 def refuse_twice(records: Sequence[Path]) -> None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from ambid.cli.options import ForceLoop, argument, band_of, option, preset_of, switch
+from ambid.cli.options import ForceLoop, argument, band_of, option, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import counted, refuse_given
@@ -97,6 +97,7 @@ def command(
     With --scenario something changes on the way, and the record holds the truth of it in columns true_...
     """
     from ambid.job.simulation import only_references, simulate_used
+    from ambid.physics.presets import preset_of
     from ambid.record import write_record
 
     preset = preset_of(rig)

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ambid.console.envelope import rounded
+from ambid.estimation.result import NORMAL_95
 from ambid.ledger import History, Series
-from ambid.report.drawing import NORMAL_95
 
 _MOST = 2000  # estimates that are drawn, the latest
 

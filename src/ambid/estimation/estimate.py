@@ -24,10 +24,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, nearest
-from ambid.estimation.result import Linear, Predicting, Reason, Result, Simulating
+from ambid.estimation.result import NORMAL_95, Linear, Predicting, Reason, Result, Simulating
 from ambid.physics.linear_model import LinearModel, Parameter, model
 
-_NORMAL_95 = 1.959963984540054
 _ROUNDING = 1e-9  # samples
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
 
@@ -73,7 +72,7 @@ class EstimatedParameter:
             unit=p.unit,
             value=value,
             sd=spread,
-            ci95=(value - _NORMAL_95 * spread, value + _NORMAL_95 * spread),
+            ci95=(value - NORMAL_95 * spread, value + NORMAL_95 * spread),
             role=p.role,
             identifiable=seen.get(p.name, True),
             data_share=share,
@@ -202,7 +201,7 @@ class FittedModel(Parametric, Judged, Predicting, Simulating):
         spread = np.full(model.theta.size, np.nan) if self.sd is None else self.sd
         return tuple(
             EstimatedParameter(
-                name=name, unit="1", value=x, sd=sd, ci95=(x - _NORMAL_95 * sd, x + _NORMAL_95 * sd),
+                name=name, unit="1", value=x, sd=sd, ci95=(x - NORMAL_95 * sd, x + NORMAL_95 * sd),
                 role="fixed" if sd == 0 else "free", identifiable=bool(sd <= _SEEN * abs(x)),
             )
             for name, x, sd in zip(model.names, model.theta.tolist(), spread.tolist(), strict=True)

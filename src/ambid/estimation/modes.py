@@ -16,9 +16,9 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Judged
+from ambid.estimation.result import NORMAL_95
 from ambid.estimation.stable_poles import TrialPole, assurance
 
-NORMAL_95 = 1.959963984540054
 _SEEN = 0.25  # relative standard deviation up to which data show a number, as for parameters
 
 

@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
     from ambid.arrays import Array
 
+NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
+
 
 def _shown(name: str) -> Any:
     """Return a function that shows results."""

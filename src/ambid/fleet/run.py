@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import inspect
-import json
 import sys
 import time
 from collections import Counter
@@ -22,6 +21,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, Done, cores, work
 from ambid.fleet.sources import Item, Rigs, items
+from ambid.job.results import result_of
 from ambid.ledger.entry import Entry, entry_of, key_of, rig_sha_of, settings_text, sha_of
 from ambid.ledger.fleet_run import FleetRow, FleetRun
 from ambid.ledger.store import Failure, Ledger, open_ledger
@@ -206,17 +206,10 @@ class _Run:
 
     def kept(self, status: str, verdict: str, failed: str, text: str) -> dict[str, Any]:
         """Return the fields of a row whose result the ledger keeps."""
-        values = {}
-        for name, p in (json.loads(text).get("parameters") or {} if text else {}).items():
-            if p["role"] != "fixed":
-                values[name] = (p["value"], p["sd"]) if p["identifiable"] else (None, None)
-                self.units[name] = p["unit"]
-        return {
-            "status": status,
-            "verdict": verdict,
-            "checks": tuple(filter(None, failed.split(","))),
-            "values": values,
-        }
+        values, units = numbers_of(result_of(text, Path(self.job.name))) if text else ({}, {})
+        self.units |= units
+        checks = tuple(filter(None, failed.split(",")))
+        return {"status": status, "verdict": verdict, "checks": checks, "values": values}
 
     def put(self, at: int, item: Item, state: Any, **more: Any) -> None:
         """Put down what is known of a record."""

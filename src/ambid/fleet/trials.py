@@ -8,15 +8,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ambid.errors import AmbidError, check_whole, nearest
+from ambid.errors import AmbidError, check_whole
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, work
 from ambid.fleet.run import Job, JobOf, job_of, numbers_of
-from ambid.job.simulation import simulate
+from ambid.job.simulation import bench_of_source, simulate
 from ambid.ledger.entry import settings_text
-from ambid.physics.presets import preset, preset_names
-from ambid.rig import Rig, load_rig, rig_of_preset
+from ambid.physics.presets import Preset
+from ambid.rig import Rig, rig_of_preset
 from ambid.validation.coverage import Coverage, Trial
 
 
@@ -96,7 +96,8 @@ def monte_carlo(
     """
     check_whole({"--runs": runs}, 1, 1_000_000)
     check_whole({"--seed": seed}, 0)
-    truth = _rig_of(rig)
+    source = bench_of_source(rig)
+    truth = rig_of_preset(source) if isinstance(source, Preset) else source
     lacks = [p.name for p in truth.parameters if p.value is None]
     if lacks:
         raise AmbidError(f"rig {truth.name!r} has no value of {lacks[0]}, and a simulation needs it. Give it")
@@ -126,22 +127,9 @@ def monte_carlo(
         gives = f"gives {', '.join(sorted(seen)[:5])}: none is" if seen else "gives no number that is"
         raise AmbidError(f"{made.name} {gives} a parameter of the rig. Choose another job")
     return Coverage(
-        rig=str(rig) if str(rig) in preset_names() else truth.name, job=made.name,
+        rig=source.name, job=made.name,
         settings=settings_text(made.name, runs=runs, seed=seed, **given, **settings),
         truth={n: x for n, x in values.items() if n in seen or not seen},
         units={p.name: p.unit for p in truth.parameters}, trials=tuple(sorted(trials, key=lambda t: t.seed)),
         asked=runs, seconds=time.monotonic() - begin,
     )  # fmt: skip
-
-
-def _rig_of(given: Rig | str | Path) -> Rig:
-    if isinstance(given, Rig):
-        return given
-    if str(given) in preset_names():
-        return rig_of_preset(preset(str(given)))
-    if not Path(given).is_file():
-        raise AmbidError(
-            f"{given} is neither a rig file nor a preset; presets are {', '.join(preset_names())}."
-            f"{nearest(str(given), preset_names())} Correct it"
-        )
-    return load_rig(Path(given))

@@ -6,7 +6,7 @@ The methods of `ambid.estimation.result.Result` and the verbs come here; nothing
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -612,16 +612,21 @@ def _history() -> View:
     )  # fmt: skip
 
 
+def _value_columns(rows: Sequence[Any], names: Iterable[str]) -> dict[str, list[object]]:
+    """Return value and standard deviation of each name, as rows hold them in `values`."""
+    return {
+        what: [row.values.get(name, (None, None))[k] for row in rows]
+        for name in names for k, what in enumerate((name, f"{name} sd"))
+    }  # fmt: skip
+
+
 def _coverage() -> View:
     from ambid.report.coverage_text import coverage_figure, coverage_text, coverage_title
     from ambid.validation.coverage import SCHEMA
 
     def table(c: Any) -> Table:
         columns: dict[str, list[object]] = {n: [getattr(t, n) for t in c.trials] for n in ("seed", "verdict", "reason")}
-        for name in c.truth:
-            for k, what in enumerate((name, f"{name} sd")):
-                columns[what] = [t.values.get(name, (None, None))[k] for t in c.trials]
-        return "seed", columns
+        return "seed", columns | _value_columns(c.trials, c.truth)
 
     return View(
         text=coverage_text, figure=lambda c, _, width: coverage_figure(c, coverage_title(c), width),
@@ -652,10 +657,7 @@ def _fleet_run() -> View:
         names = ("record", "bearing", "rig", "taken_at", "state", "status", "verdict", "checks", "reason", "seconds")
         columns: dict[str, list[object]] = {name: [getattr(row, name) for row in f.rows] for name in names}
         columns["checks"] = [", ".join(row.checks) for row in f.rows]
-        for name in dict.fromkeys(name for row in f.rows for name in row.values):
-            for k, what in enumerate((name, f"{name} sd")):
-                columns[what] = [row.values.get(name, (None, None))[k] for row in f.rows]
-        return "record", columns
+        return "record", columns | _value_columns(f.rows, dict.fromkeys(name for row in f.rows for name in row.values))
 
     return View(
         text=fleet_text, figure=lambda f, _, width: fleet_figure(f, fleet_title(f), width),

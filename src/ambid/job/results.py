@@ -62,6 +62,11 @@ def load(path: str | Path) -> Any:
     text = _text(path, "estimate")
     if f'"{TRACK}"' in text[:_BEGIN]:
         return read_track(path)
+    return result_of(text, path)
+
+
+def result_of(text: str, path: Path) -> Any:
+    """Read a result that is no track from its JSON; `path`: where it is from, for messages."""
     document = _object(text, path, "estimate", "identify")
     read: Callable[[Mapping[str, Any], str], Any] = _READERS.get(str(document.get("schema")), _estimate)
     return read(document, str(path))

@@ -27,7 +27,7 @@ from ambid.estimation.estimate import Estimate
 from ambid.job.results import experiment_of, load, rig_of
 from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Loop
-from ambid.physics.presets import Preset, preset, preset_names
+from ambid.physics.presets import Preset, preset_of
 from ambid.record import Channel, Record
 from ambid.rig import Rig, RigMagnet, load_rig, rig_of_preset
 from ambid.signals import excitation as make_excitation
@@ -258,8 +258,9 @@ def only_references(record: Record) -> Record:
 
 def bench_of_source(source: BenchSource) -> Rig | Preset:
     """Return the preset or rig that a name, a file or an estimate stands for."""
-    if isinstance(source, str) and source in preset_names():
-        return preset(source)
+    named = preset_of(source) if isinstance(source, str) else None
+    if named is not None:
+        return named
     if isinstance(source, (str, Path)) and str(source).lower().endswith(".json"):
         path, source = source, load(source)
         if not isinstance(source, Estimate | NonlinearBearingEstimate):

@@ -20,7 +20,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, counted, nearest
-from ambid.estimation.result import Reason, Result
+from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.ledger.entry import moment
 from ambid.ledger.history import History, Series
 
@@ -35,7 +35,6 @@ _CLEAR = 6.0  # by which chi-squared a cause must be likelier than the next
 _BAI = 11.0  # 95 % of the date's error in samples, times (step / spread)^2
 _PLAIN = 25.0  # chi-squared above chance from which a trend is told: slow wander looks like small ones
 _STEEP = 8.0  # standard deviations of a slope that fixes the date of a drift
-_NORMAL_95 = 1.959963984540054
 
 # what changes of one thing do to m, k_x, k_i, R and L, as powers of its factor (docs/monitoring.md)
 _NAMES = ("m", "k_x", "k_i", "R", "L")
@@ -330,6 +329,11 @@ class _Values:
     def __getitem__(self, of: slice) -> _Values:
         return _Values(self.t[of], self.y[of], self.sd[of], self.scatter)
 
+    @property
+    def first(self) -> int:
+        """Number of values that make the first level."""
+        return min(_WINDOW, self.t.size // 2)
+
     def then(self) -> Array:
         """Return what the scatter was at each value, from those before it: as it was known when that came."""
         jumps = np.abs(np.diff(self.y)) / np.hypot(self.sd[1:], self.sd[:-1]) * self.scatter
@@ -370,12 +374,12 @@ def _comparable(v: _Values) -> bool:
 
 def _base(v: _Values) -> tuple[float, float]:
     """Return the first level and its standard deviation."""
-    return _level(v[slice(0, min(_WINDOW, v.t.size // 2))])
+    return _level(v[slice(0, v.first)])
 
 
 def _changes(v: _Values) -> tuple[Array, Array, int]:
     """Return relative changes of the level since the first values, their spreads, and the index of the first."""
-    first = min(_WINDOW, v.t.size // 2)
+    first = v.first
     base, base_sd = _base(v)
     later = v[slice(first, None)]
     level = np.array([_level(later[slice(0, k)]) for k in range(_FEW, min(_WINDOW, later.t.size + 1))]).reshape(-1, 2)
@@ -527,7 +531,7 @@ def _date(v: _Values, rule: Rule) -> tuple[Literal["drift", "step"], float, floa
     at = (rule.change - a) / b
     row = np.array([1.0, at])
     sd = math.sqrt(row @ cov @ row + ((1.0 + rule.change) * base_sd / base) ** 2) / abs(b)
-    when = [float(v.t[0] + MONTH_S * x) for x in (at, at - _NORMAL_95 * sd, at + _NORMAL_95 * sd)]
+    when = [float(v.t[0] + MONTH_S * x) for x in (at, at - NORMAL_95 * sd, at + NORMAL_95 * sd)]
     low, high = float(v.t[0]), float(v.t[-1])
     return "drift", *(float(min(max(x, low), high)) for x in when)  # type: ignore[return-value]
 
@@ -563,8 +567,8 @@ def _ahead(v: _Values, f: _Fits, a: float, b: float, cov: Array, rule: Rule) -> 
     ahead = np.linspace(now, 2.0 * now, 400)
     sign = math.copysign(1.0, rule.change)
     line = a + b * ahead
-    band = _NORMAL_95 * np.sqrt(cov[0, 0] + 2.0 * cov[0, 1] * ahead + cov[1, 1] * ahead**2)
-    if sign * line[0] >= abs(rule.change) or sign * b <= _NORMAL_95 * math.sqrt(cov[1, 1]):
+    band = NORMAL_95 * np.sqrt(cov[0, 0] + 2.0 * cov[0, 1] * ahead + cov[1, 1] * ahead**2)
+    if sign * line[0] >= abs(rule.change) or sign * b <= NORMAL_95 * math.sqrt(cov[1, 1]):
         return None  # it is there, or does not go there
     early, late = (np.flatnonzero(sign * line + d >= abs(rule.change)) for d in (band, -band))
     if not late.size:

@@ -160,21 +160,6 @@ class Ledger:
                 c.execute(delete(t).where(t.c.key.in_(keys)))
             self._insert(c, t, list(rows.values()))
 
-    def done(self, keys: Iterable[str]) -> frozenset[str]:
-        """Return those of the keys whose estimate is there.
-
-        Parameters
-        ----------
-        keys : iterable of str
-            `Entry.key`, or `key_of`.
-
-        Returns
-        -------
-        frozenset of str
-        """
-        with self._reading() as c:
-            return frozenset(self._there(c, list(keys)))
-
     def documents(self, keys: Iterable[str]) -> Mapping[str, tuple[str, str, str, str]]:
         """Return status, verdict, failed checks and JSON of estimates that are there, by key.
 

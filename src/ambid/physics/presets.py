@@ -5,6 +5,8 @@ What a source prints is given with its source; everything else is chosen, and `P
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from ambid.errors import ModelError, nearest
 from ambid.physics.loop import Limits, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
@@ -204,3 +206,10 @@ def preset(name: str) -> Preset:
             f"preset {name!r} is unknown; known: {', '.join(known)}.{nearest(name, known)} Give one of them"
         )
     return _MAKERS[name]()
+
+
+def preset_of(name: str) -> Preset | None:
+    """Take a word for a preset if it is one, or cannot be a file; None for a path."""
+    if name in _MAKERS or not (Path(name).exists() or Path(name).suffix or len(Path(name).parts) > 1):
+        return preset(name)
+    return None

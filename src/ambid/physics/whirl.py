@@ -287,9 +287,9 @@ def _circular(poles: Complex, shapes: Complex) -> Complex:
     n = shapes.shape[0] // 2
     turn = np.kron(np.array([[0.0, 1j], [-1j, 0.0]]), np.eye(n))  # v^H turn v is the direction of v
     found = shapes.copy()
-    for pole in poles:
+    for k, pole in enumerate(poles):
         alike = np.abs(poles - pole) < _EQUAL * np.abs(pole)
-        if alike.sum() > 1:
+        if alike.sum() > 1 and not alike[:k].any():
             basis, spread, _ = np.linalg.svd(shapes[:, alike], full_matrices=False)
             if spread[-1] > _EQUAL:  # else they are one shape
                 found[:, alike] = basis @ np.linalg.eigh(basis.conj().T @ turn @ basis)[1]

@@ -12,11 +12,10 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.result import Reason, Result
+from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.physics.linear_model import model_names
 
 _VAGUE = 0.25  # relative standard deviation above which data do not show a parameter
-NORMAL_95 = 1.959963984540054  # sd on either side of the mean that hold 95 % of a normal distribution
 
 State = Literal["tracking", "frozen", "changed", "hold"]
 EventKind = Literal[

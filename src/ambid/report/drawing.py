@@ -28,7 +28,6 @@ if TYPE_CHECKING:
 MEASURED, PREDICTED, BAND, BOUND = "#4d4d4d", "#0072b2", "#a9d1ec", "#d55e00"
 GREEN, ORANGE, PURPLE, SKY = "#009e73", "#e69f00", "#cc79a7", "#56b4e9"
 CYCLE = (PREDICTED, ORANGE, GREEN, PURPLE, SKY, BOUND, MEASURED)
-NORMAL_95 = 1.959963984540054
 STYLES = {"good": "#1b7837", "doubt": "#b35900", "bad": "#b2182b"}
 WIDE = 11.0  # inches of a page
 _DPI = 130  # of a PNG

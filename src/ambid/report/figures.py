@@ -20,12 +20,12 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.likelihood import prediction_error
 from ambid.estimation.linear import one_thread
+from ambid.estimation.result import NORMAL_95
 from ambid.physics.linear_model import discretise, model
 from ambid.report.drawing import (
     BOUND,
     CYCLE,
     MEASURED,
-    NORMAL_95,
     WIDE,
     Block,
     Panel,

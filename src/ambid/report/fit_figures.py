@@ -18,13 +18,13 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import TransferModel, pole_covariance, zero_covariance
 from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, innovations_form, one_step, plant_form, simulation
 from ambid.errors import counted
+from ambid.estimation.result import NORMAL_95
 from ambid.nonlinear.fit import NonlinearFit
 from ambid.report.drawing import (
     BAND,
     BOUND,
     CYCLE,
     MEASURED,
-    NORMAL_95,
     PREDICTED,
     WIDE,
     Block,

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import counted
+from ambid.estimation.result import NORMAL_95
 from ambid.ledger.entry import Note
 from ambid.ledger.history import History, Series
 from ambid.report.drawing import (
@@ -20,7 +21,6 @@ from ambid.report.drawing import (
     BOUND,
     GREEN,
     MEASURED,
-    NORMAL_95,
     ORANGE,
     PREDICTED,
     PURPLE,

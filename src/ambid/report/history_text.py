@@ -22,6 +22,11 @@ def day(at: float) -> str:
     return datetime.fromtimestamp(at, UTC).strftime("%Y-%m-%d %H:%M")
 
 
+def percent(value: float, sd: float) -> str:
+    """Write a relative change."""
+    return f"{quantity(100 * value, 100 * sd, '1').text} %"
+
+
 def history_text(found: History, *, width: int = WIDTH, paint: Paint = plain) -> str:
     """Write a history, below its verdict: the latest number of each parameter, and what happened."""
     first, last = found.estimates[0], found.estimates[-1]
@@ -52,8 +57,7 @@ def _row(s: Series, n: int) -> tuple[str, ...]:
     said = quantity(float(s.value[z]), float(s.sd[z]), s.unit).text
     change = ""
     if a != z and s.value[a]:
-        sd = 100 * math.hypot(s.sd[a], s.sd[z]) / abs(float(s.value[a]))
-        change = f"{quantity(100 * float(s.value[z] / s.value[a] - 1), sd, '1').text} %"
+        change = percent(float(s.value[z] / s.value[a] - 1), math.hypot(s.sd[a], s.sd[z]) / abs(float(s.value[a])))
     return s.name, said, day(float(s.taken_at[z])), change, seen
 
 

@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import Measured, ModelResponse, model_responses
-from ambid.estimation.modes import NORMAL_95, Modal, Mode
+from ambid.estimation.modes import Modal, Mode
+from ambid.estimation.result import NORMAL_95
 from ambid.estimation.stable_poles import PoleCluster, TrialPole
 from ambid.report.drawing import (
     BAND,

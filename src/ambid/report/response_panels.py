@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse
+from ambid.estimation.result import NORMAL_95
 from ambid.report.drawing import (
     BAND,
     BOUND,
     MEASURED,
-    NORMAL_95,
     PREDICTED,
     Block,
     Panel,

@@ -10,13 +10,13 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.modes import Mode
+from ambid.estimation.result import NORMAL_95
 from ambid.physics.shaft import FreeRotor, Shaft
 from ambid.physics.whirl import Campbell
 from ambid.report.drawing import (
     BOUND,
     GREEN,
     MEASURED,
-    NORMAL_95,
     ORANGE,
     PREDICTED,
     SKY,

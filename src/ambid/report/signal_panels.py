@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.estimation.result import NORMAL_95
 from ambid.report.drawing import (
     BAND,
     BOUND,
     GREEN,
     MEASURED,
-    NORMAL_95,
     ORANGE,
     PREDICTED,
     PURPLE,

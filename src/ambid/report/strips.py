@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.report.drawing import NORMAL_95
+from ambid.estimation.result import NORMAL_95
 from ambid.report.numbers import prefixed
 from ambid.report.picture import Arrays
 from ambid.report.signal_panels import Traces, worst_stretch

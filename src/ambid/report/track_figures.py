@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
+from ambid.estimation.result import NORMAL_95
 from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
 from ambid.report.drawing import (
     BAND,
     BOUND,
     GREEN,
     MEASURED,
-    NORMAL_95,
     PIXELS,
     PREDICTED,
     SKY,

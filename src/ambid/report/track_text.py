@@ -9,8 +9,8 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ambid.errors import counted
-from ambid.estimation.result import Verdict
-from ambid.recursive.lines import NORMAL_95, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.estimation.result import NORMAL_95, Verdict
+from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 from ambid.report.numbers import quantity, sized
 from ambid.report.text import (
     USABLE,

@@ -10,8 +10,7 @@ from ambid.errors import counted
 from ambid.ledger.monitor import Alarm, Trend, Watched
 from ambid.report.drawing import BOUND, ORANGE, Block, head, panel, said_panel, stacked
 from ambid.report.history_figures import dates, draw_parameter
-from ambid.report.history_text import day
-from ambid.report.numbers import quantity
+from ambid.report.history_text import day, percent
 from ambid.report.text import WIDTH, Paint, columns, hanging, joined, plain
 
 if TYPE_CHECKING:
@@ -20,11 +19,6 @@ if TYPE_CHECKING:
 
 _SHOWN = 40  # trends
 _PANELS = 8
-
-
-def percent(value: float, sd: float) -> str:
-    """Write a relative change."""
-    return f"{quantity(100 * value, 100 * sd, '1').text} %"
 
 
 def watch_text(found: Watched, *, width: int = WIDTH, paint: Paint = plain) -> str:

@@ -16,9 +16,9 @@ from typing import Any, Self, TextIO, TypeVar
 
 from ambid.errors import AmbidError, RecordError
 from ambid.estimation.estimate import fields_json, plain_json, read_as
-from ambid.estimation.result import Verdict
+from ambid.estimation.result import NORMAL_95, Verdict
 from ambid.record.record import file_bytes
-from ambid.recursive.lines import NORMAL_95, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 
 T = TypeVar("T")
 

@@ -11,10 +11,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import counted
-from ambid.estimation.result import Reason, Result
+from ambid.estimation.result import NORMAL_95, Reason, Result
 
 SCHEMA = "ambid.coverage/1"
-_NORMAL_95 = 1.959963984540054
 _FEW = 20  # runs below which nothing is judged
 _SURE = 0.01  # chance of a false alarm of the whole table
 _BIAS = 0.3  # of a standard deviation, below which a bias is not worth telling
@@ -148,7 +147,7 @@ class Coverage(Result):
         z = (value - truth) / sd
         spread, said = float(np.std(value, ddof=1)), float(np.sqrt(np.mean(sd**2)))
         low, high = (math.sqrt(float(chi2.ppf(p, n - 1)) / (n - 1)) for p in (0.025, 0.975))
-        inside = int(np.sum(np.abs(z) < _NORMAL_95))
+        inside = int(np.sum(np.abs(z) < NORMAL_95))
         return Covered(
             name=name, truth=truth, runs=n, unknown=unknown, bias=float(np.mean(value) - truth),
             bias_sd=spread / math.sqrt(n), spread=spread, said=said,
@@ -189,6 +188,6 @@ class Coverage(Result):
 
 def wilson(inside: int, n: int) -> tuple[float, float]:
     """Return the 95 % interval of a share, Wilson (1927)."""
-    z2 = _NORMAL_95**2
-    middle, half = inside + z2 / 2, _NORMAL_95 * math.sqrt(inside * (n - inside) / n + z2 / 4)
+    z2 = NORMAL_95**2
+    middle, half = inside + z2 / 2, NORMAL_95 * math.sqrt(inside * (n - inside) / n + z2 / 4)
     return max(0.0, (middle - half) / (n + z2)), min(1.0, (middle + half) / (n + z2))

@@ -27,6 +27,7 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.linear import column_sizes, directions, triangle_of
+from ambid.estimation.result import NORMAL_95
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
 
 P_LEAST = 1e-3  # 99.9 % bounds
@@ -40,7 +41,6 @@ _WHITE_LAGS = (1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 13, 16, 20, 25)
 _PRODUCT_LAGS = (1, 2, 3, 4, 5, 6, 8, 10, 13, 16, 20)
 _INPUT_LAGS, _LONGEST = 16, 400
 _LOOP_LAGS, _OWN_LAGS = 10, 20
-_NORMAL_95 = 1.959963984540054
 
 Sizes = list[dict[str, float]]
 """Of each output: ``fit``, 1 - |e| / |y - mean|, and ``rmse``, SI."""
@@ -388,7 +388,7 @@ def correlations(
                 one.append((f"e of {output}, e × {name}", _score(of, o, mixed, lags)))
             one.append((f"e² of {output}, {name}²", _variance(of, o, u2, lags)))
         found += [
-            Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=_NORMAL_95 * s.sd)
+            Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=NORMAL_95 * s.sd)
             for t, s in one
         ]
     return found
