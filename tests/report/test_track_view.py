@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import io
 import math
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
 
 from ambid.recursive.lines import Event
-from ambid.report.track_text import TrackView, interval_bar, live_view, sparkline
+from ambid.report.track_text import interval_bar, live_view, sparkline
+from ambid.tracking.live_state import LiveState
 from tests.tracking.tracks import track_of
 
 
@@ -18,30 +20,22 @@ def track():
     return track_of(seconds=12.0, every_s=0.05)
 
 
-def shown(view, width=80, ascii_only=False):
+def shown(state, width=80, **more):
     console = Console(width=width, file=io.StringIO(), legacy_windows=False)
-    console.print(live_view(view, ascii_only=ascii_only))
+    console.print(live_view(state, wall_s=0.5, **more))
     return console.file.getvalue()
 
 
-def view_of(track, k, **more):
-    lines = track.lines[: k + 1]
-    start = track.header.start
-    return TrackView(
-        header=track.header,
-        line=lines[-1],
-        errors=tuple(x.error for x in lines),
-        decisions=tuple(e for x in lines for e in x.events),
-        ranges={n: (v.value - 0.2 * abs(v.value), v.value + 0.2 * abs(v.value)) for n, v in start.items()},
-        length_s=12.0,
-        wall_s=0.5,
-        **more,
-    )
+def state_of(track, k):
+    state = LiveState(replace(track.header, record={**track.header.record, "samples": 12 * track.header.rate_hz}))
+    for line in track.lines[: k + 1]:
+        state.add(line)
+    return state
 
 
 def test_everything_that_an_operator_needs_is_there(track):
     k = next(k for k, x in enumerate(track.lines) if x.state == "changed") + 1
-    text = shown(view_of(track, k, keys=True, pressed="hold", open_changes=1, rejected=14, behind_s=0.003))
+    text = shown(state_of(track, k), pressed="hold", behind_s=0.003)
     for words in (
         "loop.csv: model one-axis, rpem",
         "changed",
@@ -50,7 +44,7 @@ def test_everything_that_an_operator_needs_is_there(track):
         "limit 1.5",
         "change k_i: k_i fell",
         "1 open change",
-        "14 samples rejected",
+        "0 samples rejected",
         "times real time",
         "h hold",
         "(pressed: hold)",
@@ -58,29 +52,48 @@ def test_everything_that_an_operator_needs_is_there(track):
         assert words in text, words
     for name in track.header.units:
         assert any(row.startswith(f"{name} ") and "±" in row and "●" in row for row in text.splitlines()), name
-    assert "h hold" not in shown(view_of(track, k))
+    assert "h hold" not in shown(state_of(track, k))
+    assert "14 samples rejected" in shown(state_of(track, len(track.lines) - 1))
 
 
 def test_it_fits_into_80_columns_and_plain_letters(track):
-    view = view_of(track, 200, keys=True)
-    assert max(map(len, shown(view).splitlines())) <= 80
-    plain = shown(view, ascii_only=True)
+    state = state_of(track, 200)
+    assert max(map(len, shown(state, pressed="").splitlines())) <= 80
+    plain = shown(state, pressed="", ascii_only=True)
     assert set(plain) - {"±", "…"} <= set(map(chr, range(10, 127)))
 
 
 def test_stale_parameters_are_marked(track):
     k = next(k for k, x in enumerate(track.lines) if x.state == "frozen")
-    assert shown(view_of(track, k)).count("STALE") == 5
-    assert "STALE" not in shown(view_of(track, k - 10))
+    assert shown(state_of(track, k)).count("STALE") == 5
+    assert "STALE" not in shown(state_of(track, k - 10))
 
 
 def test_only_the_last_decisions_are_shown(track):
-    view = view_of(track, 5)
-    many = tuple(Event(kind="accepted", t=float(k), why=f"number {k}.") for k in range(20))
-    text = shown(TrackView(header=view.header, line=view.line, decisions=many))
+    state = LiveState(track.header)
+    for k in range(20):
+        event = Event(kind="change", t=float(k), why=f"number {k}.")
+        state.add(replace(track.lines[0], t=float(k), events=(event,)))
+    text = shown(state)
     assert "number 13." not in text
     assert "number 14." in text
     assert "number 19." in text
+
+
+def test_changes_are_kept_with_what_was_decided_on_them_and_of_routine_the_last(track):
+    state = LiveState(track.header)
+    kinds = ["accepted", "accepted", "change", "refused", "accepted", "accepted", "excluded"]
+    for k, kind in enumerate(kinds):
+        state.add(replace(track.lines[0], t=float(k), events=(Event(kind=kind, t=float(k), why=""),)))
+    assert [e.t for e in state.events] == [2.0, 3.0, 4.0, 5.0, 6.0]  # the acceptance at 5 s replaced that at 1 s
+    ends = [state.widened()["k_i"]]
+    value = state.line.parameters["k_i"]
+    for factor in (2.0, 1.0):
+        moved = replace(value, value=factor * value.value)
+        state.add(replace(state.line, parameters={**state.line.parameters, "k_i": moved}, events=()))
+        ends.append(state.widened()["k_i"])
+    assert ends[1][1] > ends[0][1]
+    assert ends[2] == ends[1]  # they stay
 
 
 def test_a_bar_shows_value_interval_and_start_to_scale():
@@ -101,8 +114,6 @@ def test_a_spark_shows_the_largest_of_each_stretch_against_the_limit():
 
 
 def test_an_error_that_is_not_known_is_no_good_error(track):
-    from dataclasses import replace
-
-    view = view_of(track, 3)
-    text = shown(replace(view, line=replace(view.line, error=math.nan)))
-    assert "model error   ?" in text
+    state = state_of(track, 3)
+    state.add(replace(track.lines[4], error=math.nan))
+    assert "model error   ?" in shown(state)

@@ -15,7 +15,7 @@ from dataclasses import replace
 from pathlib import Path
 from threading import Event as Signal
 from threading import Thread
-from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import typer
 
@@ -25,21 +25,18 @@ from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine, TrackSummary
-    from ambid.report.track_figures import TrackHistory
-    from ambid.report.track_text import TrackView
-    from ambid.tracking.lines_file import Tally
+    from rich.console import Group
 
-T = TypeVar("T")
+    from ambid.recursive.lines import Track, TrackHeader, TrackLine, TrackSummary
+    from ambid.report.track_figures import TrackHistory
+    from ambid.tracking.live_state import LiveState
+
 Flag = Literal["track", "hold", "accept", "revert"]
 
 _FLAGS: dict[str, Flag] = {"h": "hold", "t": "track", "a": "accept", "r": "revert"}
 _FRAME_S = 0.1  # between two pictures at the least
 _SHARE = 0.02  # of the time may go into drawing
 _SLICE_S = 0.05  # after which the drawing thread looks whether the run has ended
-_RECENT = 600  # lines whose error is shown
-_TOLD = 200  # events that are kept for the table
-_NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; of the others the last of its kind
 
 
 class Stopped(KeyboardInterrupt):
@@ -65,8 +62,7 @@ class Follower:
         self.record: Path | None = None  # which may hold the truth, and its rate where it has no time
         self.rate_hz: float | None = None
         self.path, self.table = json_path(json), json != "-"
-        self.header: TrackHeader | None = None
-        self.last: TrackLine | None = None
+        self.state: LiveState | None = None
         self.history: TrackHistory | None = None
         self.track: Track | None = None  # what came of it
         self.code = 0
@@ -74,17 +70,10 @@ class Follower:
         self._writer = None if target is None else TrackWriter(target)
         self._live = not quiet and sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
         self._keep, self._real_time = keep, real_time
-        self._tally: Tally | None = None
-        self._notable: deque[Event] = deque(maxlen=_TOLD)
-        self._latest: dict[str, Event] = {}
-        self._unanswered = False
-        self._errors: deque[float] = deque(maxlen=_RECENT)
-        self._ranges: dict[str, tuple[float, float]] = {}
         self._flags: deque[Flag] = deque()
         self._pressed = ""
         self._stop: int | None = None
-        self._begin_wall = self._begin_s = 0.0
-        self.lag_s: float | None = None  # of the block before, from its last sample to the end of its work
+        self._begin_wall = 0.0
         self._before_header = ExitStack()
         self._say: Callable[[str], object] = str  # says nothing until there is a line of progress
         self._picture: _Picture | None = None
@@ -107,23 +96,25 @@ class Follower:
                 if not interrupts(error):
                     self._abandon()
                     raise
-                if self.header is None:
+                if self.state is None:
                     raise
                 self.code = error.code if isinstance(error, Stopped) else INTERRUPTED
             finally:
                 if self._picture is not None:
                     self._picture.end()
                     self._picture = None
-        if found is None and self._tally is not None:
+        if self.state is None:
+            return
+        if found is None:
             taken = float("nan") if self._real_time else time.perf_counter() - self._begin_wall
-            found = self._tally.summary(computing_s=taken, complete=False)
-        if self._writer is not None and self._writer.begun and found is not None:
+            found = self.state.tally.summary(computing_s=taken, complete=False)
+        if self._writer is not None and self._writer.begun:
             self._writer.summary(found)
             self._writer.close()
-        if self.header is not None and self.last is not None and found is not None and self._tally is not None:
-            found = replace(found, unanswered=self._tally.open_changes)
-            used = Followed(record=self.record, rate_hz=self.rate_hz, history=self.history, events=self.events)
-            self.track = Track(header=self.header, lines=(self.last,), totals=found, used=used)
+        if self.state.line is not None:
+            found = replace(found, unanswered=self.state.tally.open_changes)
+            used = Followed(record=self.record, rate_hz=self.rate_hz, history=self.history, events=self.state.events)
+            self.track = Track(header=self.state.header, lines=(self.state.line,), totals=found, used=used)
 
     def finish(
         self,
@@ -163,51 +154,33 @@ class Follower:
 
     def _abandon(self) -> None:
         """After an error: leave a file that says that it is not complete, if it can still be written."""
-        if self._writer is not None and self._writer.begun and self._tally is not None:
+        if self._writer is not None and self._writer.begun and self.state is not None:
             with suppress(AmbidError, OSError, ValueError):
-                self._writer.summary(self._tally.summary(complete=False))
+                self._writer.summary(self.state.tally.summary(complete=False))
             with suppress(OSError, ValueError):
                 self._writer.close()
-
-    @property
-    def events(self) -> tuple[Event, ...]:
-        """Events in their order: changes with what was decided on each, and of routine decisions the last."""
-        notable = _copy_of(self._notable)
-        routine = [e for e in self._latest.copy().values() if e not in notable]
-        return tuple(sorted([*notable, *routine], key=lambda e: e.t))
-
-    def _take(self, event: Event) -> None:
-        if event.kind in _NOTABLE:
-            self._unanswered = self._unanswered or event.kind == "change"
-            self._notable.append(event)
-        elif self._unanswered and event.kind in ("accepted", "refused"):
-            self._unanswered = event.kind == "refused"
-            self._notable.append(event)
-        else:
-            self._latest[event.kind] = event
 
     def tick(self, stage: str, done: float | None = None) -> None:
         """Take a sign of life from the job."""
         del done
         if self._stop is not None:
             raise Stopped(self._stop)
-        if self.header is None:
+        if self.state is None:
             self._say(stage)
 
     def on_header(self, header: TrackHeader) -> None:
         """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
         one.
         """
-        from ambid.tracking.lines_file import Tally
+        from ambid.tracking.live_state import LiveState
 
         self._before_header.close()
-        self._tally = Tally(header)
         if self._keep:
             from ambid.report.track_figures import TrackHistory
 
             self.history = TrackHistory(header)
         self._begin_wall = time.perf_counter()
-        self.header = header
+        self.state = LiveState(header)
         if self._live:
             self._picture = _Picture(self._view, self._key)
 
@@ -216,23 +189,16 @@ class Follower:
 
         Returns flags that the operator has set since the last line.
         """
-        assert self.header is not None
-        assert self._tally is not None
+        assert self.state is not None
         if self._writer is not None:
             if not self._writer.begun:
                 if self.path is not None and self.path.exists() and self.path.stat().st_size:
                     print(f"{self.path.name} is replaced", file=sys.stderr)
-                self._writer.header(self.header)
+                self._writer.header(self.state.header)
             self._writer.line(line)
-        if self.last is None:
-            self._begin_s = line.t - self.header.every_s
-        self._tally.add(line)
+        self.state.add(line)
         if self.history is not None:
             self.history.add(line)
-        self._errors.append(line.error)
-        self.last = line
-        for event in line.events:
-            self._take(event)
         if self._stop is not None:
             raise Stopped(self._stop)
         if not self._flags:
@@ -241,11 +207,12 @@ class Follower:
 
     def on_lag(self, lag_s: float) -> None:
         """Take the time from the last sample of a block to the end of its work."""
-        self.lag_s = lag_s
+        if self.state is not None:
+            self.state.lag_s = lag_s
 
     def _signalled(self, number: int) -> None:
         """Stop after the present line; at once where there is none yet, or when asked a second time."""
-        if self.header is None or self._stop is not None:
+        if self.state is None or self._stop is not None:
             self.code = 128 + number
             raise KeyboardInterrupt
         self._stop = 128 + number
@@ -258,49 +225,25 @@ class Follower:
             self._flags.append(_FLAGS[key])
             self._pressed = _FLAGS[key]
 
-    def _view(self, keys: bool) -> TrackView | None:
-        """What is shown now; None before the first line. Called by the drawing thread."""
-        from ambid.report.track_text import TrackView
+    def _view(self, keys: bool, ascii_only: bool) -> Group | None:
+        """Draw what is shown now; None before the first line. Called by the drawing thread."""
+        from ambid.report.track_text import live_view
 
-        header, line, tally = self.header, self.last, self._tally
-        if header is None or line is None or tally is None:
+        state = self.state
+        if state is None or state.line is None:
             return None
-        self._widen(line)
         wall = time.perf_counter() - self._begin_wall
-        samples = header.record.get("samples")
-        behind = self.lag_s
+        behind = state.lag_s
         if behind is None and self._real_time:
-            behind = wall - (line.t - self._begin_s)
-        return TrackView(
-            header=header, line=line, errors=_copy_of(self._errors), decisions=self.events, ranges=dict(self._ranges),
-            begin_s=self._begin_s,
-            length_s=samples / header.rate_hz if isinstance(samples, (int, float)) else None,
-            wall_s=wall, behind_s=behind, rejected=tally.rejected_samples, updates=tally.updates,
-            open_changes=len(tally.open_changes), keys=keys, pressed=self._pressed,
-        )  # fmt: skip
-
-    def _widen(self, line: TrackLine) -> None:
-        """Keep the ends of the bars where they are, and move them out where an interval passes them."""
-        for name, v in {**line.parameters, **line.extra}.items():
-            reach = max(2.5 * v.sd, 0.02 * abs(v.value))
-            low, high = v.value - reach, v.value + reach
-            if not (low < high < float("inf")):
-                continue
-            before = self._ranges.get(name, (low - reach, high + reach))
-            self._ranges[name] = (min(before[0], low), max(before[1], high))
-
-
-def _copy_of(things: deque[T]) -> tuple[T, ...]:
-    """Copy what the other thread adds to meanwhile."""
-    while True:
-        with suppress(RuntimeError):
-            return tuple(things)
+            behind = wall - (state.line.t - state.begin_s)
+        pressed = self._pressed if keys else None
+        return live_view(state, wall_s=wall, behind_s=behind, pressed=pressed, ascii_only=ascii_only)
 
 
 class _Picture:
     """The thread that draws the live view and reads keys."""
 
-    def __init__(self, view: Callable[[bool], TrackView | None], key: Callable[[str], None]) -> None:
+    def __init__(self, view: Callable[[bool, bool], Group | None], key: Callable[[str], None]) -> None:
         self._view, self._key = view, key
         self._done = Signal()
         self._failure: Exception | None = None
@@ -323,8 +266,6 @@ class _Picture:
         from rich.console import Console
         from rich.live import Live
 
-        from ambid.report.track_text import live_view
-
         console = Console(stderr=True)
         ascii_only = console.options.ascii_only
         # standard output is left alone: lines of JSON may go there
@@ -333,9 +274,9 @@ class _Picture:
             wait_s = 0.0
             while not self._wait(keys, wait_s):
                 begin = time.perf_counter()
-                view = self._view(keys.available)
+                view = self._view(keys.available, ascii_only)
                 if view is not None:
-                    live.update(live_view(view, ascii_only=ascii_only), refresh=True)
+                    live.update(view, refresh=True)
                 wait_s = max(_FRAME_S, (time.perf_counter() - begin) / _SHARE)
 
     def _wait(self, keys: Keys, seconds: float) -> bool:

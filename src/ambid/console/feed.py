@@ -12,7 +12,7 @@ import json
 import os
 import struct
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from io import FileIO
 from pathlib import Path
 from typing import Any
@@ -35,19 +35,23 @@ class FeedWriter:
         self._folder, self._size, self._kept = folder, part_bytes, kept
         self._lock = threading.Lock()
         self._sticky: dict[str, bytes] = {}
+        self._states: dict[str, Callable[[], Mapping[str, Any]]] = {}
         self._number = next_part(folder)
         self._file: FileIO | None = None
         self._missed, self._closed = 0, False
 
     def tell(self, kind: str, content: Mapping[str, Any], *, sticky: str | None = None) -> None:
         """Append a JSON frame of a `kind`; the last one under each name `sticky` begins each later part."""
-        assert "kind" not in content
-        text = json.dumps({"kind": kind, **content}, ensure_ascii=False, allow_nan=False, default=str)
-        frame = _framed(b"J", text.encode())
+        frame = _json_frame(kind, content)
         with self._lock:
             if sticky is not None:
                 self._sticky[sticky] = frame
             self._append(frame)
+
+    def keep(self, kind: str, content: Callable[[], Mapping[str, Any]]) -> None:
+        """Begin each later part with a JSON frame of what is known by then."""
+        with self._lock:
+            self._states[kind] = content
 
     def envelope(self, payload: bytes) -> None:
         """Append an envelope of signals; see `Envelope`."""
@@ -72,7 +76,9 @@ class FeedWriter:
                 note = {"kind": "note", "text": f"{self._missed} messages of this view are missing: the disk took none"}
                 frame = _framed(b"J", json.dumps(note).encode()) + frame
             if not at:
-                frame = b"".join((*(f for f in self._sticky.values() if not frame.endswith(f)), frame))
+                known = [f for f in self._sticky.values() if not frame.endswith(f)]
+                known += [_json_frame(kind, content()) for kind, content in self._states.items()]
+                frame = b"".join((*known, frame))
             if file.write(frame) < len(frame):
                 file.truncate(file.seek(at))
                 raise OSError(errno.ENOSPC, "no space left")
@@ -171,6 +177,12 @@ def next_part(folder: Path) -> int:
 
 def _numbers(folder: Path) -> list[int]:
     return [int(p.stem.removeprefix("feed-")) for p in folder.glob("feed-[0-9]*.bin") if p.stem[5:].isdecimal()]
+
+
+def _json_frame(kind: str, content: Mapping[str, Any]) -> bytes:
+    assert "kind" not in content
+    text = json.dumps({"kind": kind, **content}, ensure_ascii=False, allow_nan=False, default=str)
+    return _framed(b"J", text.encode())
 
 
 def _framed(kind: bytes, payload: bytes) -> bytes:

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -26,6 +26,10 @@ from ambid.console.folder import plain
 from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
 from ambid.record.calibration import INSIDE
+
+if TYPE_CHECKING:
+    from ambid.recursive.lines import Event
+    from ambid.tracking.live_state import LiveState
 
 _LISTEN_S = 0.02
 _BEAT_S = 0.5  # between two signs of life
@@ -336,8 +340,12 @@ class _Lines:
 
     def __init__(self, worker: Worker) -> None:
         self._worker, self._lag, self._last = worker, 0.0, float("-inf")
+        self._state: LiveState | None = None
 
     def header(self, header: Any) -> None:
+        from ambid.tracking.live_state import LiveState
+
+        self._state = state = LiveState(header)
         start = {n: {"value": _number(v.value), "sd": _number(v.sd)} for n, v in header.start.items()}
         self._worker.feed.tell(
             "header",
@@ -345,29 +353,37 @@ class _Lines:
              "start": start, "warnings": list(header.warnings)},
             sticky="header",
         )  # fmt: skip
+        self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events], "out": state.excluded})
         self._worker.follow(on=True)
 
     def lag(self, lag_s: float) -> None:
         self._lag = max(lag_s, self._lag)
 
     def line(self, line: Any) -> Sequence[Any] | None:
-        from ambid.tracking.lines_file import event_json
-
-        feed, now = self._worker.feed, time.perf_counter()
+        feed, now, state = self._worker.feed, time.perf_counter(), self._state
+        assert state is not None
+        state.add(line)
         for event in line.events:
-            feed.tell("event", {"what" if k == "kind" else k: x for k, x in event_json(event).items()})
+            feed.tell("event", _told(event))
         if now - self._last >= _LINE_S:
             self._last = now
             values = {n: [_number(v.value), _number(v.sd), v.stale] for n, v in line.parameters.items()}
             feed.tell(
                 "line",
                 {"t": round(line.t, 4), "values": values, "error": _number(line.error), "state": line.state,
-                 "lag_s": round(self._lag, 5)},
+                 "lag_s": round(self._lag, 5), "updates": state.tally.updates,
+                 "rejected": state.tally.rejected_samples, "open": len(state.tally.open_changes)},
                 sticky="line",
             )  # fmt: skip
             self._lag = 0.0
         flags = self._worker.flags
         return [flags.popleft() for _ in range(len(flags))] if flags else None
+
+
+def _told(event: Event) -> Mapping[str, Any]:
+    from ambid.tracking.lines_file import event_json
+
+    return {"what" if k == "kind" else k: x for k, x in event_json(event).items()}
 
 
 def _number(x: float) -> float | None:

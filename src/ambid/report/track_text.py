@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from types import MappingProxyType
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from ambid.errors import counted
@@ -29,6 +27,8 @@ from ambid.report.text import (
 if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
+
+    from ambid.tracking.live_state import LiveState
 
 STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
 KEYS = "h hold   t track   a accept   r revert   q end"
@@ -187,64 +187,49 @@ def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> s
     return f"{pace} samples/s, {seconds_of_record / computing_s:.3g} times real time"
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrackView:
-    """What a live view shows."""
-
-    header: TrackHeader
-    line: TrackLine  # the last one
-    errors: tuple[float, ...] = ()  # model errors of recent lines, oldest first
-    decisions: tuple[Event, ...] = ()  # recent events, oldest first
-    # between which its bar is drawn, SI
-    ranges: Mapping[str, tuple[float, float]] = field(default_factory=lambda: MappingProxyType({}))
-    begin_s: float = 0.0  # begin of the first reporting interval, s of record
-    length_s: float | None = None  # of the record, s; None where it is not known
-    wall_s: float = 0.0  # since tracking began, s
-    behind_s: float | None = None  # from a sample to what is decided on it, in real time, s
-    rejected: int = 0
-    updates: int = 0
-    open_changes: int = 0  # changes that are not answered by accepted values
-    keys: bool = False  # whether the operator can press keys
-    pressed: str = ""  # the flag that the operator set last; empty without
-
-
 Parts = list[str | tuple[str, str]]  # of a line, those with a style of their own as pairs
 
 
-def live_view(view: TrackView, *, ascii_only: bool = False) -> Group:
-    """Make what is shown.
+def live_view(
+    state: LiveState, *, wall_s: float, behind_s: float | None = None, pressed: str | None = None,
+    ascii_only: bool = False,
+) -> Group:  # fmt: skip
+    """Make what is shown of a run that has a line.
 
-    `ascii_only`: for a terminal whose encoding has no blocks. Returns about 80 columns wide.
+    `wall_s`: since tracking began, s; `behind_s`: from a sample to what is decided on it in real time, s; `pressed`:
+    the flag that the operator set last, None where there are no keys; `ascii_only`: for a terminal whose encoding has
+    no blocks. Returns about 80 columns wide.
     """
     from rich.console import Group
     from rich.text import Text
 
-    after = [_error(view, ascii_only), _counts(view), *_decisions(view)]
-    if view.keys:
-        pressed = f"   (pressed: {view.pressed})" if view.pressed else ""
-        after += [[], [(f"keys: {KEYS}{pressed}", "dim")]]
-    first, *rest = (Text.assemble(*x, no_wrap=True, overflow="ellipsis") for x in (_head(view, ascii_only), *after))
-    return Group(first, Text(), _parameters(view, ascii_only), Text(), *rest)
+    line = state.line
+    assert line is not None
+    after = [_error(state, line, ascii_only), _counts(state, line, wall_s), *_decisions(state)]
+    if pressed is not None:
+        after += [[], [(f"keys: {KEYS}{f'   (pressed: {pressed})' if pressed else ''}", "dim")]]
+    head = _head(state, line, behind_s, ascii_only)
+    first, *rest = (Text.assemble(*x, no_wrap=True, overflow="ellipsis") for x in (head, *after))
+    return Group(first, Text(), _parameters(state, line, ascii_only), Text(), *rest)
 
 
-def _head(view: TrackView, ascii_only: bool) -> Parts:
-    h, t = view.header, view.line.t
+def _head(state: LiveState, line: TrackLine, behind_s: float | None, ascii_only: bool) -> Parts:
+    h, length = state.header, state.length_s
     mark = "*" if ascii_only else "●"
-    state = (f"{mark} {view.line.state:<9}", STATE_STYLES[view.line.state])
-    parts: Parts = [(str(h.record.get("file") or "record"), "bold"), f": model {h.model}, {h.method}\n", state]
-    parts.append(f" t {t:.2f} s")
-    if view.length_s:
-        share = min(max((t - view.begin_s) / view.length_s, 0.0), 1.0)
+    word = (f"{mark} {line.state:<9}", STATE_STYLES[line.state])
+    parts: Parts = [(str(h.record.get("file") or "record"), "bold"), f": model {h.model}, {h.method}\n", word]
+    parts.append(f" t {line.t:.2f} s")
+    if length:
+        share = min(max((line.t - state.begin_s) / length, 0.0), 1.0)
         full = round(20 * share)
         on, off = ("#", ".") if ascii_only else ("█", "░")
-        parts.append(f" of {view.begin_s + view.length_s:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
-    if view.behind_s is not None:
-        late = view.behind_s > LATE_S
-        parts.append((f"  {sized(max(view.behind_s, 0.0), 's')} behind", "bold red" if late else ""))
+        parts.append(f" of {state.begin_s + length:.4g} s  {on * full}{off * (20 - full)} {100 * share:.0f} %")
+    if behind_s is not None:
+        parts.append((f"  {sized(max(behind_s, 0.0), 's')} behind", "bold red" if behind_s > LATE_S else ""))
     return parts
 
 
-def _parameters(view: TrackView, ascii_only: bool) -> Table:
+def _parameters(state: LiveState, line: TrackLine, ascii_only: bool) -> Table:
     from rich.table import Table
     from rich.text import Text
 
@@ -252,15 +237,15 @@ def _parameters(view: TrackView, ascii_only: bool) -> Table:
     for column in range(5):
         table.add_column(justify="right" if column == 2 else "left", no_wrap=True)
     table.add_row("", "value ± sd", "from start", "95 % interval", "", style="dim")
-    numbers = {**view.line.parameters, **view.line.extra}
+    numbers, ranges = {**line.parameters, **line.extra}, state.widened()
     for name, v in numbers.items():
-        start = view.header.start.get(name)
-        low, high = view.ranges.get(name, (math.nan, math.nan))
+        start = state.header.start.get(name)
+        low, high = ranges.get(name, (math.nan, math.nan))
         bar = interval_bar(v.value, v.sd, math.nan if start is None else start.value, low, high, ascii_only=ascii_only)
         style = "yellow" if v.stale else ""
         table.add_row(
             Text(name, style="bold"),
-            Text(value_words(v, view.header.units.get(name, ""))[0], style=style),
+            Text(value_words(v, state.header.units.get(name, ""))[0], style=style),
             Text(change_words(v, start), style=style),
             Text(bar, style="yellow" if v.stale else "cyan"),
             Text("STALE", style="bold yellow") if v.stale else Text(),
@@ -319,32 +304,35 @@ def sparkline(values: Sequence[float], limit: float, *, width: int = _SPARK, asc
     return "".join(letters)
 
 
-def _error(view: TrackView, ascii_only: bool) -> Parts:
-    error, limit = view.line.error, view.header.limit
+def _error(state: LiveState, line: TrackLine, ascii_only: bool) -> Parts:
+    error, limit, errors = line.error, state.header.limit, state.errors
     shown = "  ?  " if math.isnan(error) else f"{error:5.3g}"
     over = (_PLAIN_BLOCKS if ascii_only else _BLOCKS)[4:]
-    spark = sparkline(view.errors, limit, ascii_only=ascii_only)
+    spark = sparkline(errors, limit, ascii_only=ascii_only)
     return [
         "model error ",
         (shown, "bold red" if error > limit else "bold green"),
         f"  limit {limit:g}  ",
         *((letter, "red" if letter in over else "green") for letter in spark),
-        (f"  last {sized(len(view.errors) * view.header.every_s, 's')}" if len(view.errors) > 1 else "", "dim"),
+        (f"  last {sized(len(errors) * state.header.every_s, 's')}" if len(errors) > 1 else "", "dim"),
     ]
 
 
-def _counts(view: TrackView) -> Parts:
-    done = view.line.t - view.begin_s
-    parts: Parts = [f"{view.updates} updates, {view.rejected} samples rejected"]
-    if view.open_changes:
-        parts.append((f", {counted(view.open_changes, 'open change')}", "bold red"))
-    speed = speed_words(round(done * view.header.rate_hz), done, view.wall_s)
+def _counts(state: LiveState, line: TrackLine, wall_s: float) -> Parts:
+    done, tally = line.t - state.begin_s, state.tally
+    parts: Parts = [f"{tally.updates} updates, {tally.rejected_samples} samples rejected"]
+    if tally.open_changes:
+        parts.append((f", {counted(len(tally.open_changes), 'open change')}", "bold red"))
+    if state.excluded:
+        parts.append((f"\nnot used: {', '.join(state.excluded)}", "bold red"))
+    speed = speed_words(round(done * state.header.rate_hz), done, wall_s)
     return [*parts, (f"\n{speed}", "dim")] if speed else parts
 
 
-def _decisions(view: TrackView) -> list[Parts]:
-    lines: list[Parts] = [[]] if view.decisions else []
-    for e in view.decisions[-_DECISIONS:]:
+def _decisions(state: LiveState) -> list[Parts]:
+    events = state.events
+    lines: list[Parts] = [[]] if events else []
+    for e in events[-_DECISIONS:]:
         who = f" {e.parameter}" if e.parameter else ""
         what = (f"{e.kind}{who}: ", "bold red" if e.kind in _BAD else "bold")
         lines.append([(f"{e.t:10.3f} s  ", "dim"), what, " ".join(e.why.split())])

@@ -399,7 +399,7 @@ class Live extends Watched {
     $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
     $("summary").hidden = true;
-    for (const host of ["lag", "count", "lost", "sensors"]) put($(host));  // nothing of the run before stands as this one's
+    for (const host of ["lag", "count", "lost", "tally", "sensors"]) put($(host));  // nothing of the run before stands as this one's
     freeze(this, false);
     this.unmark();
     this.listen();
@@ -408,7 +408,7 @@ class Live extends Watched {
   }
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
-      event: () => { this.sensors(m); this.event(m.t, m.what, m.why); }, device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
+      event: () => { this.heard = true; this.sensors(m); this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
@@ -468,11 +468,18 @@ class Live extends Watched {
     if (this.lines.length > 12_000) this.lines.splice(0, 2000);
     $("state").textContent = m.state; $("state").className = `badge ${m.state}`;
     $("lag").textContent = `lag ${seconds(m.lag_s)}`; $("lag").className = m.lag_s > LATE_S ? "late" : "";
+    put($("tally"), `${m.updates} updates, ${m.rejected} samples rejected`, m.open ? el("b", { className: "late" }, `, ${m.open} open change${m.open === 1 ? "" : "s"}`) : "");
     this.dirtyLines = true;
   }
   event(t, what, why) {
     $("events").prepend(el("li", { className: what === "change" || what === "fault" ? "refused" : "" }, `${t === null || t === undefined ? "" : `${t.toFixed(2)} s `}${what}: ${why}`));
     while ($("events").children.length > 200) $("events").lastChild.remove();
+  }
+  before(m) {  // events that were told before this page came
+    if (this.heard || this.lines.length) return;
+    this.heard = true;
+    for (const e of m.events) this.event(e.t, e.what, e.why);
+    for (const [parameter, why] of Object.entries(m.out)) this.sensors({ what: "excluded", parameter, why });
   }
   sensors(m) {  // those that are not used now
     if (m.what === "excluded") this.out.set(m.parameter, m.why);
@@ -504,8 +511,8 @@ class Live extends Watched {
   redraw() { if (this.t.length) { this.drawStrips(...this.window()); if (this.lines.length) this.drawLines(...this.window()); } }
   draw() {
     if (feed !== this) return;
-    if (!this.frozen && !$("live").hidden && (this.dirty || this.dirtyLines)) {
-      if (this.dirty || this.dirtyLines) this.drawStrips(...this.window());
+    if (!this.frozen && !$("live").hidden) {
+      if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines(...this.window());
       this.dirty = this.dirtyLines = false;
     }
