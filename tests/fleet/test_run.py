@@ -1,6 +1,7 @@
 """A job on many records: which rig belongs to which, what a ledger knows, what is refused before anything runs."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -10,6 +11,7 @@ from ambid.fleet.run import job_of, run_fleet
 from ambid.fleet.sources import items
 from ambid.ledger import open_ledger
 from ambid.rig import default_rig, write_rig
+from ambid.rig.preset_rig import rig_of_preset
 from tests.fleet.jobs import count, judge
 
 
@@ -17,7 +19,7 @@ from tests.fleet.jobs import count, judge
 def folder(tmp_path_factory):
     """40 records, of which one kills, one hangs, one is refused; one holds what another one holds."""
     made = tmp_path_factory.mktemp("fleet")
-    words = {7: "kill", 21: "hang", 33: "nothing", 39: "38"}
+    words = {5: "4", 7: "kill", 21: "hang", 33: "nothing"}
     for k in range(40):
         place = made / "records" / "ab"[k % 2]
         place.mkdir(parents=True, exist_ok=True)
@@ -48,6 +50,8 @@ def test_all_but_the_poison_are_done_and_stored(runs, folder):
     row = of(first, "done")["a/2026-03-01T02.txt"]
     assert (row.values["m"], row.bearing, row.taken_at) == ((4.0, 0.1), "a", 1772330400.0)
     assert of(first, "done")["a/2026-03-01T16.txt"].values["m"] == (None, None)  # 32: not shown by the record
+    same, as_it = (of(first, state)[f"{at}/2026-03-01T02.txt"] for state, at in (("known", "b"), ("done", "a")))
+    assert (same.values, same.verdict) == (as_it.values, as_it.verdict)
     with open_ledger(folder / "f.db", write=False) as ledger:
         assert [(b.name, b.estimates) for b in ledger.bearings()] == [("a", 20), ("b", 17)]
 
@@ -78,6 +82,17 @@ def test_what_the_ledger_knows_stands_in_the_table_again(tmp_path):
     assert again["state"].tolist() == ["known", "known"]
     same = ["verdict", "checks", "k_i", "k_i sd", "R"]
     assert again[same].equals(first[same])
+
+
+def test_margins_of_many_records_are_kept_over_time(tmp_path):
+    rig = rig_of_preset(ambid.preset("rmit-axis"))
+    ambid.write_record(ambid.simulate(rig, duration=0.5, seed=1), tmp_path / "1.h5")
+    where = {"job": "margins", "ledger": tmp_path / "l.db", "taken_at": "file", "workers": 1}
+    table = ambid.fleet(tmp_path / "1.h5", replace(rig, name="A"), **where)
+    with open_ledger(tmp_path / "l.db", write=False) as ledger:
+        peak = ledger.history("A")["x.sensitivity"]
+    assert (peak.unit, peak.value[0]) == ("dB", table["x.sensitivity"].iloc[0])
+    assert 6.0 < peak.value[0] < 7.5
 
 
 def test_failed_ones_are_done_again_where_that_is_wished(runs):

@@ -3,6 +3,7 @@
 import json
 import re
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -277,3 +278,16 @@ def test_a_measured_record_is_never_written_over(results, tmp_path):
     with pytest.raises(AmbidError, match=r"must end in \.html"):
         results["fit"].report(taken)
     assert taken.read_text(encoding="utf-8") == "voltage [V]\n1\n"
+
+
+def test_the_layout_of_a_file_reaches_its_reader(results, record, tmp_path):
+    path, estimate = tmp_path / "r.csv", results["estimate"]
+    values = zip(*(c.values for c in record.channels), strict=True)
+    rows = [";".join(f"{x:.9g}".replace(".", ",") for x in row) for row in values]
+    path.write_text("\n".join([";".join(f"{c.name} [{c.unit}]" for c in record.channels), *rows]))
+    for verb in (partial(ambid.validate, estimate), partial(ambid.margins, estimate=estimate)):
+        with pytest.raises(AmbidError, match="layout decimal='coma'"):
+            verb(path, rate_hz=record.rate_hz, layout={"decimal": "coma"})
+    same = ambid.validate(estimate, path, rate_hz=record.rate_hz, layout={"decimal": "comma"})
+    shares = [x.fit["current"]["simulation"] for x in (same, results["validation"])]
+    assert shares[0] == pytest.approx(shares[1], rel=1e-6)

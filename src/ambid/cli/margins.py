@@ -27,6 +27,7 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
@@ -42,7 +43,7 @@ def command(
     with Outputs(record, rig, estimate, json=json, plot=plot, report=report) as outputs, progress("margins") as show:
         found = margins(
             record, rig, estimate=estimate, reference=reference, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps,
-            tick=show,
+            layout=opt.layout_of(layout) or None, tick=show,
         )  # fmt: skip
         outputs.give(found, show)
     outputs.show(found, strict=strict)

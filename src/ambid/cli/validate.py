@@ -18,6 +18,7 @@ def command(
     to_s: opt.To = None,
     rate: opt.Rate = None,
     gaps: opt.Gaps = None,
+    layout: opt.Layout = None,
     json: opt.JsonFile = None,
     plot: opt.Plot = None,
     report: opt.Report = None,
@@ -30,6 +31,8 @@ def command(
     from ambid.job.results import validate
 
     with Outputs(estimate, record, rig, json=json, plot=plot, report=report) as outputs, progress("validate") as show:
-        found = validate(estimate, record, rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps)
+        found = validate(
+            estimate, record, rig, from_s=from_s, to_s=to_s, rate_hz=rate, gaps=gaps, layout=opt.layout_of(layout)
+        )
         outputs.give(found, show)
     outputs.show(found, strict=strict)

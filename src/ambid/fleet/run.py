@@ -171,7 +171,8 @@ class _Run:
         self.units: dict[str, str] = {}
         self.counts = Counter[str]()
         self._failed = {} if ledger is None or again else ledger.failures()
-        self._keys = set[str]()
+        self._first: dict[str, int] = {}  # of each key, the record that is done for it
+        self._same: dict[int, list[tuple[int, Item]]] = {}  # and others of the same contents
         self._rigs = {id(i.rig): rig_sha_of(i.rig) for i in {id(i.rig): i for i in fleet}.values()} if ledger else {}
         self._entries: list[Entry] = []
         self._failures: list[Failure] = []
@@ -196,12 +197,13 @@ class _Run:
             for at, (key, task) in keyed.items():
                 if key in done:
                     self.put(at, task.item, "known", **self.kept(*done[key]))
-                elif key in self._keys:  # the same as one before it
-                    self.put(at, task.item, "known")
+                elif key in self._first:
+                    self._same.setdefault(self._first[key], []).append((at, task.item))
+                    self._like(self._first[key])
                 elif key in self._failed:
                     self.put(at, task.item, "failed", reason=self._failed[key].reason)
                 else:
-                    self._keys.add(key)
+                    self._first[key] = at
                     yield task
 
     def kept(self, status: str, verdict: str, failed: str, text: str) -> dict[str, Any]:
@@ -243,8 +245,19 @@ class _Run:
                         settings=self.job.said, version=version("ambid"), reason=done.failure,
                     )
                 )  # fmt: skip
+        self._like(task.at)
         if time.monotonic() - self._stored > _STORE_S or len(self._entries) >= _MOST:
             self.store()
+
+    def _like(self, first: int) -> None:
+        """Put down what is known of the records that hold the same as one that has its row."""
+        row = self.rows.get(first)
+        for at, item in self._same.pop(first, []) if row is not None else []:
+            assert row is not None
+            state = "known" if row.state == "done" else row.state
+            self.put(
+                at, item, state, **{x: getattr(row, x) for x in ("status", "verdict", "checks", "reason", "values")}
+            )
 
     def store(self) -> None:
         """Store what has come since the last time."""

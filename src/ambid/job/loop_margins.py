@@ -52,6 +52,7 @@ def margins(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
     tick: Tick | None = None,
 ) -> Margins:
     """Say how much margin the loop of a record has: sensitivity by ISO 14839-3, gain, phase, delay, compliance.
@@ -69,7 +70,7 @@ def margins(
         The plant; default: identified from the record first.
     reference : str, optional
         Of one axis: column of the excitation, in any unit; default: the rig's ``[channels.reference]``, if any.
-    from_s, to_s, rate_hz, gaps, units : optional
+    from_s, to_s, rate_hz, gaps, units, layout : optional
         As `ambid.identify`.
     tick : callable, optional
         Called with the name of the present stage; may raise to interrupt.
@@ -95,13 +96,13 @@ def margins(
     ('A', 'usable')
     """
     say, clock, source = tick or silent, Clock(), cast(Source, record)
-    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
     used: Record | None = None
     if isinstance(record, Numbers) or (isinstance(record, str | Path) and Path(record).suffix == ".json"):
         if estimate is not None or reference is not None or any(x is not None for x in reading.values()):
             raise EstimationError(
                 "margins of an estimate alone take nothing but the rig; --estimate, --reference, --from, --to, --rate, "
-                "--gaps and units are of a record. Omit them, or give a record"
+                "--gaps, --layout and units are of a record. Omit them, or give a record"
             )
         known, bench = given(record, rig)
         bench = replace(bench, open_loop=False)  # so were its records; here its [loop] is closed

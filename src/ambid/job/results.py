@@ -216,6 +216,7 @@ def validate(
     rate_hz: float | None = None,
     gaps: GapPolicy | None = None,
     units: Mapping[str, str] | None = None,
+    layout: Mapping[str, str] | None = None,
 ) -> Validation:
     """Judge an estimate or a fit on another record of the same bench: nothing is fitted but offsets and initial state.
 
@@ -227,7 +228,7 @@ def validate(
         Of a rotor that moves; for a rotor on many axes with periodic excitation.
     rig : Rig, str or Path, optional
         Through which the record is read; default: the rig that the estimate was made with.
-    from_s, to_s, rate_hz, gaps, units : optional
+    from_s, to_s, rate_hz, gaps, units, layout : optional
         As `ambid.identify`.
 
     Returns
@@ -241,7 +242,7 @@ def validate(
     """
     known = load(estimate) if isinstance(estimate, str | Path) else estimate
     name = Path(estimate).name if isinstance(estimate, str | Path) else ""
-    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units)
+    reading = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
     data = data_of(known, record, None if rig is None else known_rig(rig), where=name or "the estimate", **reading)
     if isinstance(known, BlackBoxFit | NonlinearFit):
         fit = fit_validation(known, data)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
-from itertools import islice, pairwise, zip_longest
+from itertools import chain, islice, pairwise, starmap, zip_longest
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 SCHEMA = "ambid.history/1"
 _ORDER = ("m", "k_x", "k_i", "R", "L")
+_NONE = float("inf")  # for a number that is not there; none that is there is infinite
 _SHOWN = 3  # lines of a rig that changed
 
 
@@ -125,61 +126,55 @@ class History(Result):
 
 def history_of(c: Connection, bearing: str, shown: str) -> History:
     """Read the history of a bearing; `shown`: name of the ledger."""
-    from sqlalchemy import case, func, select
-
-    t = schema.tables().tables
-    b, e, v, n = (t[name].c for name in ("bearing", "estimate", "value", "event"))
-    known = c.execute(select(b.id, b.name, b.plant).where(b.name == bearing)).first()
-    if known is None:
-        names = [row.name for row in c.execute(select(b.name).order_by(b.name))]
+    known = _rows(c, "SELECT id, name, plant FROM bearing WHERE name = ?", bearing)
+    if not known:
+        names = [name for (name,) in _rows(c, "SELECT name FROM bearing ORDER BY name")]
         raise AmbidError(
             f"ledger {shown} has no bearing {bearing!r}.{nearest(bearing, names)} 'ambid history --ledger {shown}' "
             "lists them"
         )
-    asked = [getattr(e, name) for name in KnownEstimate.__slots__]
-    rows = _rows(c, select(*asked, e.id).where(e.bearing == known.id).order_by(e.taken_at, e.id))
-    estimates = tuple(KnownEstimate(*row[:-1]) for row in rows)
-    of = v.bearing == known.id
-    heads = _rows(
-        c, select(v.name, func.count(), func.max(v.unit), func.max(v.role)).where(of).group_by(v.name).order_by(v.name)
-    )
-    shown_value = case((v.identifiable, v.value))  # else none: less to fetch than the word beside it
-    numbers = _rows(c, select(v.estimate, shown_value, v.sd).where(of).order_by(v.name, v.taken_at, v.estimate))
-    events = _rows(c, select(n.at, n.kind, n.text, n.parameter).where(n.bearing == known.id).order_by(n.at))
+    ((of, name, plant),) = known
+    asked = ", ".join(KnownEstimate.__slots__)
+    rows = _rows(c, f"SELECT {asked}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of)
+    estimates = tuple(starmap(KnownEstimate, (row[:-1] for row in rows)))
+    events = _rows(c, "SELECT at, kind, text, parameter FROM event WHERE bearing = ? ORDER BY at", of)
     notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
     notes += _rig_changes(c, estimates)
     return History(
-        bearing=known.name, plant=known.plant, ledger=shown, estimates=estimates,
-        series=_series(heads, numbers, [row[-1] for row in rows], estimates),
-        events=tuple(sorted(notes, key=lambda x: x.at)),
+        bearing=name, plant=plant, ledger=shown, estimates=estimates,
+        series=_series(c, of, [row[-1] for row in rows], estimates), events=tuple(sorted(notes, key=lambda x: x.at)),
     )  # fmt: skip
 
 
-def _rows(c: Connection, asked: Any) -> list[tuple[Any, ...]]:
-    """Return rows as the driver has them: a history is thousands."""
-    return list(c.execute(asked).cursor.fetchall())
+def _rows(c: Connection, asked: str, *of: object) -> list[tuple[Any, ...]]:
+    """Return rows as the driver has them, asked for by it: SQLAlchemy would take as long again for a history."""
+    text = asked if c.dialect.name == "sqlite" else asked.replace("?", "%s")
+    return list(c.exec_driver_sql(text, of).cursor.fetchall())
 
 
-def _series(
-    heads: list[tuple[Any, ...]], rows: list[tuple[Any, ...]], ids: list[int], estimates: tuple[KnownEstimate, ...]
-) -> dict[str, Series]:
-    """Divide rows in order of name and time into series; `heads`: name, number of rows, unit and role of each."""
-    table = np.array(rows, dtype=float).reshape(-1, 3)
+def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstimate, ...]) -> dict[str, Series]:
+    """Read the series of a bearing, name by name: the key leads from one to the next."""
     usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
-    times = np.array([x.taken_at for x in estimates])
-    order = np.argsort(ids)
-    of = order[np.searchsorted(np.array(ids)[order], table[:, 0])]
-    seen = ~np.isnan(table[:, 1])
-    at = times[of]
-    table[~(seen & usable[of]), 1:] = np.nan
-    ends = np.cumsum([0, *(head[1] for head in heads)])
-    found = {
-        name: Series(
-            name=name, unit=unit, role=role, taken_at=at[a:z], value=table[a:z, 1], sd=table[a:z, 2],
-            identifiable=seen[a:z], estimate=of[a:z],
-        )
-        for (name, _, unit, role), (a, z) in zip(heads, pairwise(ends), strict=True)
-    }  # fmt: skip
+    times, all_of_them = np.array([x.taken_at for x in estimates]), np.arange(len(ids))
+    named, found, name = "FROM value WHERE bearing = ? AND name = ?", {}, ""
+    while head := _rows(
+        c, "SELECT name, unit FROM value WHERE bearing = ? AND name > ? ORDER BY name LIMIT 1", of, name
+    ):
+        ((name, unit),) = head
+        numbers = f"SELECT CASE WHEN identifiable THEN value ELSE ? END, coalesce(sd, ?) {named}"
+        rows = _rows(c, f"{numbers} ORDER BY taken_at, estimate", _NONE, _NONE, of, name)
+        table = np.fromiter(chain.from_iterable(rows), float, 2 * len(rows)).reshape(-1, 2)
+        place = all_of_them
+        if len(rows) < len(ids):
+            there = set(chain.from_iterable(_rows(c, f"SELECT estimate {named}", of, name)))
+            place = np.array([k for k, x in enumerate(ids) if x in there])
+        seen = table[:, 0] != _NONE
+        table[~(seen & usable[place])] = np.nan
+        role = _rows(c, f"SELECT role {named} AND role <> 'fixed' LIMIT 1", of, name)
+        found[name] = Series(
+            name=name, unit=unit, role=role[0][0] if role else "fixed", taken_at=times[place], value=table[:, 0],
+            sd=table[:, 1], identifiable=seen, estimate=place,
+        )  # fmt: skip
     return dict(sorted(found.items(), key=_place))
 
 
