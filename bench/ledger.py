@@ -10,6 +10,9 @@ import sys
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from ambid.ledger import open_ledger
 from tests.ledger.entries import entry, parameter
@@ -32,14 +35,28 @@ def measure(place: str, n: int, bearings: int) -> None:
             )
         taken, used = time.perf_counter() - begin, time.process_time() - cpu
     print(f"{n} estimates: {n / taken:.0f}/s ({n / used:.0f} a second of this process's computing time)")
+    whole, plain = [], []
     with open_ledger(place, write=False) as ledger:
-        for k in range(5):
-            begin, cpu = time.perf_counter(), time.process_time()
+        for k in range(min(bearings, 60)):
+            begin = time.perf_counter()
             found = ledger.history(f"B{k}")
-            taken, used = time.perf_counter() - begin, time.process_time() - cpu
-            print(
-                f"  history of {len(found.estimates)} estimates: {1e3 * taken:.1f} ms ({1e3 * used:.1f} ms computing)"
-            )
+            whole.append(time.perf_counter() - begin)
+            begin = time.perf_counter()
+            rows = one_series(ledger, k + 1)
+            plain.append(time.perf_counter() - begin)
+            assert len(rows) == len(found["k_i"].value)
+    history, query = (1e3 * np.percentile(x, (5, 50)) for x in (whole, plain))
+    print(
+        f"  history of {len(found.estimates)} estimates: {history[1]:.1f} ms (5 %: {history[0]:.1f}); the query of "
+        f"one of its {len(NAMES)} series: {query[1]:.2f} ms ({query[0]:.2f}); ratio {history[1] / query[1]:.1f}"
+    )
+
+
+def one_series(ledger: Any, number: int) -> Any:
+    """Ask the driver for one number over time."""
+    asked = f"SELECT taken_at, value FROM value WHERE bearing = {number} AND name = 'k_i' ORDER BY taken_at"
+    with ledger._reading() as connection:
+        return connection.exec_driver_sql(asked).cursor.fetchall()
 
 
 def main(n: int, bearings: int) -> None:
