@@ -9,6 +9,7 @@ from ambid.acquisition.device import Column
 from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.acquisition.view import BenchView, as_record
 from ambid.errors import AmbidError
+from ambid.record.calibration import Calibration
 from ambid.rig import rig_from_text
 from ambid.tracking.blocks import Block
 from tests.job.benches import PLAIN, prototype
@@ -31,8 +32,22 @@ def test_counts_become_units_in_the_order_of_the_roles(info):
     assert view.rate_hz == 2000.0
 
 
-def test_a_block_looks_the_same_as_the_record_that_is_read(info):
-    view = BenchView(info, prototype(), ("voltage", "position", "current"))
+def of_position(rig, **what):
+    return replace(rig, channels=tuple(replace(c, **what) if c.role == "position" else c for c in rig.channels))
+
+
+TABLE = Calibration(unit_in="1", unit_out="m", raw=np.array([0.0, 50.0, 1023.0]), out=np.array([0.0, 1e-4, 1e-3]))
+RIGS = {
+    "gains": (prototype(), {}),
+    "a table": (prototype(), {"calibration": TABLE}),
+    "a declared unit": (rig_from_text(PLAIN, "plain.toml"), {"unit": "mm"}),
+}
+
+
+@pytest.mark.parametrize(("rig", "what"), RIGS.values(), ids=RIGS)
+def test_a_block_looks_the_same_as_the_record_that_is_read(rig, what):
+    info = SimulatedDevice(rig).info
+    view = BenchView(info, of_position(rig, **what), ("voltage", "position", "current"))
     counts = np.arange(20.0 * len(info.columns)).reshape(20, -1)
     record = view.record(counts, start_s=2.0)
     assert record.start_s == 2.0

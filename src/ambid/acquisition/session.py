@@ -181,8 +181,9 @@ class _Run:
         if block.first >= end:
             return True
         kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
+        passed = frame if kept is frame.block else replace(frame, block=kept)
         for tap in self._taps:
-            tap.take(replace(frame, block=kept))
+            tap.take(passed)
         made.samples += len(kept.values)
         made.lost += max(0, kept.first - made.after)
         made.after = max(made.after, kept.first + len(kept.values))

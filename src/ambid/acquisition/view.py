@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from types import MappingProxyType
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.acquisition.device import Column, DeviceInfo
 from ambid.arrays import Array
@@ -46,15 +47,36 @@ class BenchView:
         spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
         seen = self.record(np.array([spare]))  # so that what does not fit is told at once
         self.units = {role: seen.channel(role).unit for role in roles}
+        self._lines = self._linear()
 
     def block(self, raw: Block) -> Block:
         """Return a block in the order of the roles.
 
         `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
         """
-        seen = self.record(raw.values)
-        values = np.column_stack([seen[role].values for role in self.units])
+        if self._lines is None:
+            seen = self.record(raw.values)
+            values = np.column_stack([seen[role].values for role in self.units])
+        else:
+            columns, gain, offset = self._lines
+            values = np.ascontiguousarray(gain * raw.values[:, columns] + offset)
         return Block(first=raw.first, time_s=raw.time_s, values=values)
+
+    def _linear(self) -> tuple[NDArray[np.int64], Array, Array] | None:
+        """Return columns, gains and offsets of the roles, which take a tenth of the time of a record.
+
+        None where a table or a declared unit asks for more.
+        """
+        columns = {c.name: k for k, c in enumerate(self._columns)}
+        channels = {c.role: c for c in self._rig.channels}
+        found = []
+        for c in (channels[role] for role in self.units):
+            k, of = columns[c.column], c.calibration
+            if c.unit not in (None, self._columns[k].unit) or (of is not None and of.raw is not None):
+                return None
+            found.append((k, 1.0, 0.0) if of is None else (k, of.gain, of.offset))
+        k, gain, offset = np.array(found).T
+        return k.astype(int), gain, offset
 
     def record(self, values: Array, *, start_s: float = 0.0) -> Record:
         """Return samples as a record whose channels are named by role.

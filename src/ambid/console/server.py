@@ -38,7 +38,7 @@ MOVING = ("live", "commission")
 """Jobs that may move the machine: one client at a time orders them."""
 _LOOKS = ("preview", "history")  # jobs that change nothing
 
-_POLL_S = 0.01  # between two looks at a feed
+_POLL_S = 0.02  # between two looks at a feed
 _VIEWERS = 16  # feeds that are watched at once
 _BACKLOG = 1 << 20  # bytes a viewer may be behind before it is given the numbers without the signals
 _PATIENCE_S = 20.0  # with a viewer that takes nothing

@@ -162,6 +162,8 @@ class Worker:
             if time.perf_counter() - beat >= _BEAT_S:  # a frozen process falls silent, one that waits does not
                 beat = time.perf_counter()
                 self.feed.tell("beat", {})
+                if not self.run.place.exists():  # nobody can stop it from now on
+                    self.wished.set()
             for said in heard:
                 word = said.get("word")
                 if word == "stop":
@@ -173,8 +175,6 @@ class Worker:
                     self.note(f"{word} came while nothing was tracked; it did nothing")
                 elif word in ("go", "no") and said.get("number") == self._asked:
                     self._answers.append(word)
-            if not self.run.place.exists():  # nobody can stop it from now on
-                self.wished.set()
             time.sleep(_LISTEN_S)
 
 

@@ -100,7 +100,7 @@ def track_live(
         job = partial(run, device, course, taps=(*taps, ring_tap), on_event=on_event)  # who records is never behind
         runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
-            lead = _Lead(ring, runner, wanted_s, view, device.info.port)
+            lead = _Lead(_frames(ring, ring_tap.fresh), runner, wanted_s, view, device.info.port)
             begin = start_of(lead.source, rig, given=start, start_s=lead_s, rig_speaks=True)
             track = follow(lead.frames(begin.first, on_lag), lead.source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
@@ -109,8 +109,8 @@ def track_live(
 class _Lead:
     """The beginning of the stream: read before tracking begins, and tracked with the rest."""
 
-    def __init__(self, ring: BlockRing, runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
-        self._frames, read = _frames(ring), list[Block]()
+    def __init__(self, frames: Iterator[Frame], runner: LiveRun, wanted_s: float, view: BenchView, port: str) -> None:
+        self._frames, read = frames, list[Block]()
         wanted = round(wanted_s * view.rate_hz) + 1
         while not read or read[-1].first + len(read[-1].values) < wanted:
             frame = next(self._frames, None)
@@ -142,14 +142,17 @@ class _Lead:
             on_lag(time.perf_counter() - frame.arrived_s)
 
 
-def _frames(ring: BlockRing) -> Iterator[Frame]:
-    """Yield the frames of a ring until it has ended and is empty."""
+def _frames(ring: BlockRing, fresh: Signal) -> Iterator[Frame]:
+    """Yield the frames of a ring until it has ended and is empty; `fresh` wakes, where a ring would be looked at."""
     while True:
-        frame = ring.read(LOOK_S)
+        frame = ring.read(0.0)
         if frame is not None:
             yield frame
-        elif ring.ended and not ring.filled:
+        elif ring.ended:
             return
+        else:
+            fresh.wait(LOOK_S)
+            fresh.clear()
 
 
 def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
@@ -174,13 +177,13 @@ class RingTap:
 
     `view`: of device and rig; `waits`: whether the device may be held up.
 
-    `over`: set when nobody reads the ring any more.
+    `over`: set when nobody reads the ring any more; `fresh`: set when a block was put into it.
     """
 
     def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
         self._ring, self._view, self._waits = ring, view, waits
         self._origin: int | None = None
-        self.over = Signal()
+        self.over, self.fresh = Signal(), Signal()
 
     def take(self, frame: Frame) -> None:
         """Put a block into the ring.
@@ -192,7 +195,10 @@ class RingTap:
             self._origin = block.first
         while self._waits and not self.over.is_set() and not self._ring.wait_for_room(LOOK_S):
             pass
-        self._ring.put(replace(block, first=block.first - self._origin), frame.arrived_s)
+        self._ring.put(
+            Block(first=block.first - self._origin, time_s=block.time_s, values=block.values), frame.arrived_s
+        )
+        self.fresh.set()
 
     def _seen(self, raw: Block) -> Block:
         try:
@@ -265,3 +271,4 @@ class LiveRun:
             self._failure = failure
         finally:
             self._ring.end()
+            self._ring_tap.fresh.set()
