@@ -1,6 +1,6 @@
 """Measure ambid beside straightforward SciPy and beside peers: ``make bench``, or ``make bench BENCH="speed records"``.
 
-Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about fifty
+Writes bench/results/latest.json and, once it holds all parts, docs/benchmarks.md; all parts take about 75
 minutes, the physical one three minutes.
 """
 
@@ -18,7 +18,18 @@ HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results" / "latest.json"
 PAGE = HERE.parent / "docs" / "benchmarks.md"
 ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS")
-PARTS = ("physical", "montecarlo", "speed", "records", "tracking", "acquisition", "selection", "nonlinear", "rotor")
+PARTS = (
+    "physical",
+    "montecarlo",
+    "speed",
+    "records",
+    "tracking",
+    "acquisition",
+    "selection",
+    "nonlinear",
+    "rotor",
+    "works",
+)
 
 
 def main(wanted: list[str]) -> None:
@@ -97,6 +108,10 @@ def _measured(part: str) -> Iterator[Any]:
         from nonlinear import nonlinear_tables
 
         return nonlinear_tables()
+    if part == "works":
+        from works import works_tables
+
+        return works_tables()
     if part == "rotor":
         from itertools import chain
 

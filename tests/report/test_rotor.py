@@ -1,5 +1,6 @@
 """What is shown of a rotor: tables by bearing, figures, page; and that it comes back from its file."""
 
+import base64
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -14,6 +15,7 @@ from ambid.job.rotor import replays_of
 from ambid.report.drawing import single
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
 from ambid.report.rotor_page import rotor_page
+from ambid.report.strips import record_strips
 from ambid.rig import draft_rig, rig_from_text
 from tests.report.rotor_record import estimate, record, rig
 
@@ -110,6 +112,22 @@ def test_figure_and_page_of_a_rotor_show_its_record() -> None:
     assert {"Response in plane x", "Coils", "Residuals", "Poles", "Noise", "Rig"} <= {s.title for s in page.sections}
     assert e.to_dataframe().loc["ax.k_i", "value"] == e["ax.k_i"].value
     assert all(s.figure is not None for s in page.sections if s.title in ("Coils", "Residuals", "Poles"))
+
+
+def test_the_page_of_a_rotor_holds_its_signals_as_extremes_and_a_stretch_in_full(tmp_path: Path) -> None:
+    whole, close = record_strips(record()).packed()
+    assert [x["title"] for x in whole["strips"]] == list(record().names)
+    for strip in whole["strips"]:
+        low, high = (
+            np.frombuffer(base64.b64decode(whole["arrays"][strip["lines"][0][end]]), "<f4") for end in ("low", "high")
+        )
+        values = record()[strip["title"]].values.astype("f4")
+        assert (low.min(), high.max()) == (values.min(), values.max())
+        assert low.size * whole["every"] >= record().n_samples
+    assert (close["every"], close["samples"]) == (1, 20_000 // len(record().names))
+    assert record_strips(record(), 4).packed()[1]["samples"] == 5_000 // len(record().names)
+    estimate().report(tmp_path / "r.html")
+    assert "Signals" in (tmp_path / "r.html").read_text(encoding="utf-8")
 
 
 def test_an_estimate_holds_on_another_record_of_its_rotor_and_not_on_one_of_another() -> None:

@@ -136,6 +136,7 @@
       more: ["+", "+", () => by(2, 0)], less: ["−", "-", () => by(0.5, 0)],
       left: ["◀", "ArrowLeft", () => by(1, -0.25)], right: ["▶", "ArrowRight", () => by(1, 0.25)],
     };
+    if (data.worst[0] === data.worst[1]) delete moves.close;
     const titles = { more: "zoom in", less: "zoom out", left: "earlier", right: "later" };
     for (const [name, [text, key, move]] of Object.entries(moves)) {
       const button = made("button", "", text);

@@ -522,7 +522,9 @@ def _rotor() -> View:
             return None
 
     def evidence(e: Any, used: Any) -> RotorEvidence:
-        return RotorEvidence(estimate=e, runs=() if used is None else replays_of(e, used), shaft=shaft(e))
+        taken = () if used is None else tuple(used)
+        runs = () if used is None else replays_of(e, used)
+        return RotorEvidence(estimate=e, runs=runs, shaft=shaft(e), records=taken)
 
     return View(
         text=lambda e, **how: rotor_text(e, shaft=shaft(e), **how),

@@ -15,6 +15,7 @@ from ambid.physics.drawn_rotor import free_rotor_of, whirl_sd
 from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.physics.shaft import Shaft
 from ambid.physics.whirl import campbell
+from ambid.record import Record
 from ambid.report.drawing import (
     MEASURED,
     PREDICTED,
@@ -65,6 +66,7 @@ class RotorEvidence:
     estimate: RotorEstimate
     runs: tuple[RotorReplay, ...] = ()  # its records with periodic excitation; without any the model alone is drawn
     shaft: Shaft | None = None  # its drawing
+    records: tuple[Record, ...] = ()  # whose signals a page shows
 
     @property
     def title(self) -> str:

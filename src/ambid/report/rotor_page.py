@@ -13,6 +13,7 @@ from ambid.report.orbit_panels import unbalance_rows, vibration_rows
 from ambid.report.page import Page, Section, check_table
 from ambid.report.rotor_figures import RotorEvidence
 from ambid.report.rotor_text import TURN, bearing_rows, machine, mode_rows, taken
+from ambid.report.strips import record_strips
 from ambid.report.text import other_warnings, parameter_rows
 from ambid.rotor.estimate import RotorEstimate
 
@@ -25,6 +26,7 @@ _LINES = (
     "gives. Points: at lines where this axis is excited; the part of the other axes is taken out as the model says it, "
     "and the 95 % intervals come from the scatter between periods."
 )
+_SIGNALS = "The signals of each record as they were sampled; the synchronous part is in them."
 _CAPTIONS: Mapping[str, tuple[str, str]] = {
     "response_x": ("Response in plane x", _LINES),
     "response_y": ("Response in plane y", _LINES),
@@ -66,6 +68,7 @@ def rotor_page(evidence: RotorEvidence) -> Page:
     """Return the page of a rotor's estimate, with its figures."""
     e = evidence.estimate
     drawn = evidence.drawings()
+    signals = [record_strips(r, len(evidence.records)) for r in evidence.records]
     sections = [
         _parameters(e),
         *([Section(title="Bending modes", tables=[mode_rows(e, evidence.shaft)])] if e.modes else []),
@@ -74,6 +77,7 @@ def rotor_page(evidence: RotorEvidence) -> Page:
         Section(title="Checks", tables=[check_table(e.checks)]),
         *([] if e.validation is None else [second_section(e.validation)]),
         *(Section(title=t, caption=c, figure=partial(single, drawn[n])) for n, t, c in _titles(drawn, e)),
+        *([Section(title="Signals", caption=_SIGNALS, signals=signals, folded=True)] if signals else []),
         Section(title="Noise", caption="Levels of white sources, rms of samples.", tables=[noise_rows(e)]),
         Section(
             title="Correlations of the estimated numbers", tables=[correlations(e.covariance_names, e.covariance)],

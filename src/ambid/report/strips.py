@@ -10,14 +10,15 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.result import NORMAL_95
+from ambid.record import Record
 from ambid.report.numbers import prefixed
 from ambid.report.picture import Arrays
 from ambid.report.signal_panels import Traces, worst_stretch
 
 CLOSE = "Each sample predicted from all samples before it. Shaded: the stretch with the largest errors."
 EVERY_SAMPLE = 50_000  # samples of a record, to which a page holds all of them
-_STRETCHES = 5_000  # of a longer record, extremes of as many stretches are held
-_CLOSE = 5_000  # and as many samples around its largest errors
+_STRETCHES = 5_000  # of a longer record, extremes of as many stretches are held, and as many samples around its errors
+_VALUES = 20_000  # of all strips of records of many channels
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,15 +50,18 @@ class Strips:
     title: str
     time_s: Array  # (n_samples,), evenly spaced
     strips: Sequence[Strip]
-    worst: tuple[int, int]  # samples of the largest errors: first, and behind the last
+    worst: tuple[int, int]  # samples of the largest errors: first, and behind the last; equal where there are none
+    every_sample: int = EVERY_SAMPLE
+    stretches: int = _STRETCHES
 
     def packed(self) -> list[dict[str, Any]]:
         """Return what the page's script draws: every sample; of long records extremes, and a stretch in full."""
         n = self.time_s.size
-        if n <= EVERY_SAMPLE:
+        if n <= self.every_sample:
             return [self._packed(0, n, 1)]
-        first = max(0, min(sum(self.worst) // 2 - _CLOSE // 2, n - _CLOSE))
-        return [self._packed(0, n, -(-n // _STRETCHES)), self._packed(first, first + _CLOSE, 1)]
+        close = self.stretches
+        first = max(0, min(sum(self.worst) // 2 - close // 2, n - close))
+        return [self._packed(0, n, -(-n // self.stretches)), self._packed(first, first + close, 1)]
 
     def _packed(self, first: int, last: int, every: int) -> dict[str, Any]:
         arrays, near = Arrays(), slice(first, last)
@@ -82,6 +86,22 @@ class Strips:
             "title": self.title, "start_s": float(self.time_s[first]), "step_s": step, "samples": last - first,
             "every": every, "worst": [x - first for x in self.worst], "strips": strips, "arrays": arrays.packed,
         }  # fmt: skip
+
+
+def record_strips(record: Record, records: int = 1) -> Strips:
+    """Return the channels of one of so many records as strips."""
+    strips = []
+    for c in record.channels:
+        scale, unit = prefixed(float(np.nanmax(np.abs(c.values))), c.unit)
+        line = Line(label="measured", color="measured", values=c.values)
+        strips.append(Strip(title=c.name, unit=unit, scale=scale, lines=[line]))
+    n = record.n_samples
+    time_s = record.start_s + np.arange(n) / record.rate_hz
+    title = str(record.provenance.get("file") or "")
+    room = _VALUES // (len(strips) * records)
+    return Strips(
+        title=title, time_s=time_s, strips=strips, worst=(n // 2, n // 2), every_sample=3 * room, stretches=room
+    )
 
 
 def strips_of(traces: Traces) -> Strips:
