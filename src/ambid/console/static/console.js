@@ -333,6 +333,10 @@ let palette = {};  // colours are looked up when they are drawn, as the page may
 const css = (name) => palette[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const ink = (name, alpha = "") => () => css(name) + alpha;
 const plots = new Set();
+function room(u, labels) {  // as wide as the longest label, so that none is cut off; not narrower from one picture to the next
+  const longest = Math.max(0, ...(labels ?? []).map((s) => s.length));
+  return u.room = Math.max(u.room ?? 74, 7 * longest + 16);
+}
 function axes(unit, more = {}) {
   const grid = { stroke: ink("--grid"), width: 1 };
   const label = (u, splits) => {
@@ -343,7 +347,7 @@ function axes(unit, more = {}) {
     return splits.map((s, k) => (s / p).toFixed(digits) + (k === splits.length - 1 && name ? ` ${name}` : ""));
   };
   return [{ stroke: ink("--dim"), grid, ticks: grid, size: 26, values: more.x ?? ((u, s) => s.map((v, k) => +v.toPrecision(6) + (k === s.length - 1 ? " s" : ""))) , ...(more.xaxis ?? {}) },
-          { stroke: ink("--dim"), grid, ticks: grid, size: 74, space: 15, values: label, ...(more.yaxis ?? {}) }];
+          { stroke: ink("--dim"), grid, ticks: grid, size: room, space: 15, values: label, ...(more.yaxis ?? {}) }];
 }
 function chart(title, height, series, unit, more = {}) {
   const value = el("span"), host = el("div"), box = el("div", { className: "chart" }, el("h3", {}, title, value), host);
