@@ -265,16 +265,6 @@ def _late(u: Array, by: NDArray[np.intp]) -> Array:
     return out
 
 
-def _freed(fit: Fit, free: tuple[int, ...]) -> tuple[PredictorProblem, Array]:
-    """Return the fit's problem with delays as further numbers, and its vector there."""
-    old = fit.problem
-    searched = old.model
-    assert isinstance(searched, Searched)
-    more = replace(searched, unknowns=replace(searched.unknowns, free_delays=free))
-    loose = replace(old, model=more, fractional=True, late=free, joint_priors=_joint_priors(more))
-    return loose, np.insert(fit.vector, old.n_physical, np.zeros(len(free)))
-
-
 def _rotor_of(fit: Fit) -> RotorModel:
     """Return the rotor of a fit, with its modes."""
     searched = fit.problem.model
