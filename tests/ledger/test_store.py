@@ -197,6 +197,27 @@ def test_a_foreign_database_on_a_server_is_refused(postgres):
     assert "secret" not in str(refused.value)
 
 
+def test_a_server_that_ends_the_connection_is_told(postgres):
+    import psycopg
+
+    from ambid.ledger.history import history_of
+    from tests.ledger.server import new_database
+
+    url = new_database(postgres, "ended")
+
+    def read_while_the_server_ends_it():
+        with ledger._reading() as connection:
+            with psycopg.connect(url, autocommit=True) as other:
+                others = "pg_stat_activity WHERE pid <> pg_backend_pid() AND datname = current_database()"
+                other.execute(f"SELECT pg_terminate_backend(pid) FROM {others}")
+            history_of(connection, "A", "it")
+
+    with open_ledger(url) as ledger:
+        ledger.add([entry(0)])
+        with pytest.raises(AmbidError, match=r"ledger postgresql://.*terminat"):
+            read_while_the_server_ends_it()
+
+
 def test_a_full_disk_leaves_what_was_there(tmp_path):
     with open_ledger(tmp_path / "l.db") as ledger:
         ledger.add([entry(0)])

@@ -148,8 +148,11 @@ def history_of(c: Connection, bearing: str, shown: str) -> History:
 
 def _rows(c: Connection, asked: str, *of: object) -> list[tuple[Any, ...]]:
     """Return rows as the driver has them, asked for by it: SQLAlchemy would take as long again for a history."""
-    text = asked if c.dialect.name == "sqlite" else asked.replace("?", "%s")
-    return list(c.exec_driver_sql(text, of).cursor.fetchall())
+    if c.dialect.name == "sqlite":
+        return list(c.exec_driver_sql(asked, of).cursor.fetchall())
+    driver: Any = c.connection.driver_connection
+    with driver.cursor(binary=True) as cursor:  # numbers as they are, not as text
+        return list(cursor.execute(asked.replace("?", "%s"), of).fetchall())
 
 
 def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstimate, ...]) -> dict[str, Series]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 import time
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -568,9 +569,10 @@ def _told(shown: str) -> Iterator[None]:
 
     from sqlalchemy.exc import DBAPIError
 
+    drivers = [DBAPIError, sqlite3.Error, *(m.Error for m in [sys.modules.get("psycopg")] if m is not None)]
     try:
         yield
-    except (DBAPIError, sqlite3.Error) as failure:
+    except tuple(drivers) as failure:
         said = str(getattr(failure, "orig", None) or failure).strip().splitlines()[0]
         if "locked" in said:
             said = f"another program has been writing to it for {PATIENCE_S:.0f} s"
