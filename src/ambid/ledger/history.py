@@ -160,10 +160,12 @@ def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstima
     usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
     times, all_of_them = np.array([x.taken_at for x in estimates]), np.arange(len(ids))
     named, found, name = "FROM value WHERE bearing = ? AND name = ?", {}, ""
-    while head := _rows(
-        c, "SELECT name, unit FROM value WHERE bearing = ? AND name > ? ORDER BY name LIMIT 1", of, name
-    ):
-        ((name, unit),) = head
+    asked = (
+        "SELECT v.name, v.unit, (SELECT o.role FROM value AS o WHERE o.bearing = v.bearing AND o.name = v.name AND "
+        "o.role <> 'fixed' LIMIT 1) FROM value AS v WHERE v.bearing = ? AND v.name > ? ORDER BY v.name LIMIT 1"
+    )
+    while head := _rows(c, asked, of, name):
+        ((name, unit, role),) = head
         numbers = f"SELECT CASE WHEN identifiable THEN value ELSE ? END, coalesce(sd, ?) {named}"
         rows = _rows(c, f"{numbers} ORDER BY taken_at, estimate", _NONE, _NONE, of, name)
         table = np.fromiter(chain.from_iterable(rows), float, 2 * len(rows)).reshape(-1, 2)
@@ -173,9 +175,8 @@ def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstima
             place = np.array([k for k, x in enumerate(ids) if x in there])
         seen = table[:, 0] != _NONE
         table[~(seen & usable[place])] = np.nan
-        role = _rows(c, f"SELECT role {named} AND role <> 'fixed' LIMIT 1", of, name)
         found[name] = Series(
-            name=name, unit=unit, role=role[0][0] if role else "fixed", taken_at=times[place], value=table[:, 0],
+            name=name, unit=unit, role=role or "fixed", taken_at=times[place], value=table[:, 0],
             sd=table[:, 1], identifiable=seen, estimate=place,
         )  # fmt: skip
     return dict(sorted(found.items(), key=_place))
