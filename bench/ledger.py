@@ -47,7 +47,7 @@ def measure(place: str, n: int, bearings: int) -> None:
             found = ledger.history(f"B{k}")
             whole.append(time.perf_counter() - begin)
             begin = time.perf_counter()
-            rows = one_series(ledger, k + 1)
+            rows = one_series(ledger, f"B{k}")
             plain.append(time.perf_counter() - begin)
             assert len(rows) == len(found["k_i"].value)
     history, query = (1e3 * np.percentile(x, (5, 50)) for x in (whole, plain))
@@ -57,9 +57,10 @@ def measure(place: str, n: int, bearings: int) -> None:
     )
 
 
-def one_series(ledger: Any, number: int) -> Any:
-    """Ask the driver for one number over time."""
-    asked = f"SELECT taken_at, value FROM value WHERE bearing = {number} AND name = 'k_i' ORDER BY taken_at"
+def one_series(ledger: Any, name: str) -> Any:
+    """Ask the driver for one number of a bearing over time."""
+    of = f"(SELECT id FROM bearing WHERE name = '{name}')"
+    asked = f"SELECT taken_at, value FROM value WHERE bearing = {of} AND name = 'k_i' ORDER BY taken_at"
     with ledger._reading() as connection:
         return connection.exec_driver_sql(asked).cursor.fetchall()
 

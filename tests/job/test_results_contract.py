@@ -285,7 +285,8 @@ def test_the_layout_of_a_file_reaches_its_reader(results, record, tmp_path):
     values = zip(*(c.values for c in record.channels), strict=True)
     rows = [";".join(f"{x:.9g}".replace(".", ",") for x in row) for row in values]
     path.write_text("\n".join([";".join(f"{c.name} [{c.unit}]" for c in record.channels), *rows]))
-    for verb in (partial(ambid.validate, estimate), partial(ambid.margins, estimate=estimate)):
+    verbs = [partial(ambid.validate, results[name]) for name in ("estimate", "fit")]
+    for verb in (*verbs, partial(ambid.margins, estimate=estimate)):
         with pytest.raises(AmbidError, match="layout decimal='coma'"):
             verb(path, rate_hz=record.rate_hz, layout={"decimal": "coma"})
     same = ambid.validate(estimate, path, rate_hz=record.rate_hz, layout={"decimal": "comma"})

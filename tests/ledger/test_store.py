@@ -81,6 +81,22 @@ def writer(*words):
     return subprocess.Popen([sys.executable, "-c", WRITER, *map(str, words)], stdout=subprocess.PIPE, text=True)
 
 
+def test_a_number_that_some_estimates_lack_stands_at_the_times_of_the_others(place):
+    with open_ledger(place) as ledger:
+        for k in range(8):
+            names = ("k_i", "k_x") if k % 3 else ("k_i",)
+            numbers = tuple(parameter(n, 100.0 + k, 0.5, role="prior" if k == 7 else "free") for n in names)
+            ledger.add([entry(k, day=k // 2, parameters=numbers)])  # two records of each day
+        found = ledger.history("A")
+    for name, there in (("k_i", range(8)), ("k_x", (1, 2, 4, 5, 7))):
+        s = found[name]
+        records = [found.estimates[at].record for at in s.estimate]
+        assert sorted(records) == [f"day{k}.h5" for k in there]
+        assert [f"day{x - 100:.0f}.h5" for x in s.value] == records
+        assert s.taken_at.tolist() == [found.estimates[at].taken_at for at in s.estimate]
+        assert s.role == "prior"  # as the last one
+
+
 def test_two_writers_at_once_lose_nothing_and_repeat_nothing(place):
     """Both begin where there is no ledger yet."""
     runs = [writer(place, first) for first in (0, 250)]

@@ -125,7 +125,7 @@ def test_the_page_of_a_rotor_holds_its_signals_as_extremes_and_a_stretch_in_full
         assert (low.min(), high.max()) == (values.min(), values.max())
         assert low.size * whole["every"] >= record().n_samples
     assert (close["every"], close["samples"]) == (1, 20_000 // len(record().names))
-    assert record_strips(record(), 4).packed()[1]["samples"] == 5_000 // len(record().names)
+    assert record_strips(record(), 4).packed()[1]["samples"] == 400  # at the least
     estimate().report(tmp_path / "r.html")
     assert "Signals" in (tmp_path / "r.html").read_text(encoding="utf-8")
 

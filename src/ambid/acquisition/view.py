@@ -63,7 +63,7 @@ class BenchView:
         return Block(first=raw.first, time_s=raw.time_s, values=values)
 
     def _linear(self) -> tuple[NDArray[np.int64], Array, Array] | None:
-        """Return columns, gains and offsets of the roles, which take a tenth of the time of a record.
+        """Return columns, gains and offsets of the roles; applying them takes a tenth of the time of making a record.
 
         None where a table or a declared unit asks for more.
         """

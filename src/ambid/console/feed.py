@@ -76,8 +76,8 @@ class FeedWriter:
                 note = {"kind": "note", "text": f"{self._missed} messages of this view are missing: the disk took none"}
                 frame = _framed(b"J", json.dumps(note).encode()) + frame
             if not at:
-                known = [f for f in self._sticky.values() if not frame.endswith(f)]
-                known += [_json_frame(kind, content()) for kind, content in self._states.items()]
+                known = [_json_frame(kind, content()) for kind, content in self._states.items()]  # before any line
+                known += [f for f in self._sticky.values() if not frame.endswith(f)]
                 frame = b"".join((*known, frame))
             if file.write(frame) < len(frame):
                 file.truncate(file.seek(at))

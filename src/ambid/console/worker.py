@@ -353,7 +353,7 @@ class _Lines:
              "start": start, "warnings": list(header.warnings)},
             sticky="header",
         )  # fmt: skip
-        self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events], "out": state.excluded})
+        self._worker.feed.keep("told", lambda: {"events": [_told(e) for e in state.events]})
         self._worker.follow(on=True)
 
     def lag(self, lag_s: float) -> None:
@@ -362,9 +362,9 @@ class _Lines:
     def line(self, line: Any) -> Sequence[Any] | None:
         feed, now, state = self._worker.feed, time.perf_counter(), self._state
         assert state is not None
-        state.add(line)
         for event in line.events:
             feed.tell("event", _told(event))
+        state.add(line)  # after that: a part of the feed that begins between the two tells each once
         if now - self._last >= _LINE_S:
             self._last = now
             values = {n: [_number(v.value), _number(v.sd), v.stale] for n, v in line.parameters.items()}

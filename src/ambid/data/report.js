@@ -160,7 +160,7 @@
       const said = made("p", "said"), box = made("div", "strip");
       box.tabIndex = 0;
       box.setAttribute("role", "img");
-      box.setAttribute("aria-label", `${strip.title} over time; 0, e, +, − and arrows zoom`);
+      box.setAttribute("aria-label", `${strip.title} over time; ${moves.close ? "0, e" : "0"}, +, − and arrows zoom`);
       place.append(said, box);
       const series = [{}], columns = [time], bands = [], keys = [];
       for (const line of strip.lines) {

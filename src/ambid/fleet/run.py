@@ -252,12 +252,12 @@ class _Run:
     def _like(self, first: int) -> None:
         """Put down what is known of the records that hold the same as one that has its row."""
         row = self.rows.get(first)
-        for at, item in self._same.pop(first, []) if row is not None else []:
-            assert row is not None
-            state = "known" if row.state == "done" else row.state
-            self.put(
-                at, item, state, **{x: getattr(row, x) for x in ("status", "verdict", "checks", "reason", "values")}
-            )
+        if row is None:
+            return
+        for at, item in self._same.pop(first, []):
+            same = {x: getattr(row, x) for x in ("status", "verdict", "checks", "values")}
+            reason = row.reason.replace(row.record, item.name)  # which may name its file
+            self.put(at, item, "known" if row.state == "done" else row.state, reason=reason, **same)
 
     def store(self) -> None:
         """Store what has come since the last time."""

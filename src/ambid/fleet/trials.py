@@ -96,7 +96,7 @@ def monte_carlo(
     """
     check_whole({"--runs": runs}, 1, 1_000_000)
     check_whole({"--seed": seed}, 0)
-    source = bench_of_source(rig)
+    source = bench_of_source(str(rig) if isinstance(rig, Path) else rig)
     truth = rig_of_preset(source) if isinstance(source, Preset) else source
     lacks = [p.name for p in truth.parameters if p.value is None]
     if lacks:

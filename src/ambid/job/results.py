@@ -191,7 +191,7 @@ def data_of(
             raise EstimationError(f"{where} is a black-box fit, which has no rig. Omit --rig")
         channels = Channels(
             inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps"),
-            units=reading.get("units"),
+            units=reading.get("units"), layout=reading.get("layout"),
         )  # fmt: skip
         data = channels.read(record, (reading.get("from_s"), reading.get("to_s")))
         check_same_bench(known.units, known.dt, data)

@@ -143,7 +143,7 @@ class _Lead:
 
 
 def _frames(ring: BlockRing, fresh: Signal) -> Iterator[Frame]:
-    """Yield the frames of a ring until it has ended and is empty; `fresh` wakes, where a ring would be looked at."""
+    """Yield the frames of a ring until it has ended and is empty; `fresh` is set with each block: nothing polls."""
     while True:
         frame = ring.read(0.0)
         if frame is not None:

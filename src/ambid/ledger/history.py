@@ -162,18 +162,19 @@ def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstima
     named, found, name = "FROM value WHERE bearing = ? AND name = ?", {}, ""
     asked = (
         "SELECT v.name, v.unit, (SELECT o.role FROM value AS o WHERE o.bearing = v.bearing AND o.name = v.name AND "
-        "o.role <> 'fixed' LIMIT 1) FROM value AS v WHERE v.bearing = ? AND v.name > ? ORDER BY v.name LIMIT 1"
+        "o.role <> 'fixed' ORDER BY o.taken_at DESC, o.estimate DESC LIMIT 1) "
+        "FROM value AS v WHERE v.bearing = ? AND v.name > ? ORDER BY v.name, v.taken_at, v.estimate LIMIT 1"
     )
     while head := _rows(c, asked, of, name):
         ((name, unit, role),) = head
-        numbers = f"SELECT CASE WHEN identifiable THEN value ELSE ? END, coalesce(sd, ?) {named}"
+        numbers = f"SELECT coalesce(CASE WHEN identifiable THEN value END, ?), coalesce(sd, ?) {named}"
         rows = _rows(c, f"{numbers} ORDER BY taken_at, estimate", _NONE, _NONE, of, name)
         table = np.fromiter(chain.from_iterable(rows), float, 2 * len(rows)).reshape(-1, 2)
         place = all_of_them
         if len(rows) < len(ids):
             there = set(chain.from_iterable(_rows(c, f"SELECT estimate {named}", of, name)))
             place = np.array([k for k, x in enumerate(ids) if x in there])
-        seen = table[:, 0] != _NONE
+        seen = (table != _NONE).all(axis=1)
         table[~(seen & usable[place])] = np.nan
         found[name] = Series(
             name=name, unit=unit, role=role or "fixed", taken_at=times[place], value=table[:, 0],

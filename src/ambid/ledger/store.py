@@ -275,7 +275,8 @@ class Ledger:
 
     @contextmanager
     def _reading(self) -> Iterator[Connection]:
-        with _told(self.shown), self._engine.connect().execution_options(reads=True) as c:
+        one = {"isolation_level": "REPEATABLE READ"} if self._postgres else {}  # all questions see the same rows
+        with _told(self.shown), self._engine.connect().execution_options(reads=True, **one) as c:
             yield c
 
     @property

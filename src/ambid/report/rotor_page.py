@@ -26,7 +26,7 @@ _LINES = (
     "gives. Points: at lines where this axis is excited; the part of the other axes is taken out as the model says it, "
     "and the 95 % intervals come from the scatter between periods."
 )
-_SIGNALS = "The signals of each record as they were sampled; the synchronous part is in them."
+_SIGNALS = "Each record as it was sampled, with its synchronous part; of a long one extremes, and a stretch in full."
 _CAPTIONS: Mapping[str, tuple[str, str]] = {
     "response_x": ("Response in plane x", _LINES),
     "response_y": ("Response in plane y", _LINES),

@@ -19,6 +19,7 @@ CLOSE = "Each sample predicted from all samples before it. Shaded: the stretch w
 EVERY_SAMPLE = 50_000  # samples of a record, to which a page holds all of them
 _STRETCHES = 5_000  # of a longer record, extremes of as many stretches are held, and as many samples around its errors
 _VALUES = 20_000  # of all strips of records of many channels
+_FEWEST = 400  # stretches of a record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -81,9 +82,12 @@ class Strips:
             {"title": s.title, "unit": s.unit, "scale": s.scale, "bound": s.bound, "lines": [shown(x) for x in s.lines]}
             for s in self.strips
         ]
+        title, whole = self.title, (first, last) == (0, self.time_s.size)
+        if not whole and self.worst[0] == self.worst[1]:
+            title = f"{title or 'record'}, from {self.time_s[first]:.4g} to {self.time_s[last - 1]:.4g} s"
         step = (float(self.time_s[-1]) - float(self.time_s[0])) / max(self.time_s.size - 1, 1)
         return {
-            "title": self.title, "start_s": float(self.time_s[first]), "step_s": step, "samples": last - first,
+            "title": title, "start_s": float(self.time_s[first]), "step_s": step, "samples": last - first,
             "every": every, "worst": [x - first for x in self.worst], "strips": strips, "arrays": arrays.packed,
         }  # fmt: skip
 
@@ -98,7 +102,7 @@ def record_strips(record: Record, records: int = 1) -> Strips:
     n = record.n_samples
     time_s = record.start_s + np.arange(n) / record.rate_hz
     title = str(record.provenance.get("file") or "")
-    room = _VALUES // (len(strips) * records)
+    room = max(_FEWEST, _VALUES // (max(len(strips), 1) * records))
     return Strips(
         title=title, time_s=time_s, strips=strips, worst=(n // 2, n // 2), every_sample=3 * room, stretches=room
     )

@@ -323,8 +323,6 @@ def _counts(state: LiveState, line: TrackLine, wall_s: float) -> Parts:
     parts: Parts = [f"{tally.updates} updates, {tally.rejected_samples} samples rejected"]
     if tally.open_changes:
         parts.append((f", {counted(len(tally.open_changes), 'open change')}", "bold red"))
-    if state.excluded:
-        parts.append((f"\nnot used: {', '.join(state.excluded)}", "bold red"))
     speed = speed_words(round(done * state.header.rate_hz), done, wall_s)
     return [*parts, (f"\n{speed}", "dim")] if speed else parts
 

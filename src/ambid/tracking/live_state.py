@@ -23,7 +23,7 @@ class LiveState:
 
     `header`: of the track; `line`: the last one, None before the first; `tally`: what was counted; `lag_s`: time from
     the last sample of a block to the end of its work, s, None where it is not measured; `begin_s`: begin of the first
-    reporting interval, s of record; `excluded`: sensors that are not used now, with the reason.
+    reporting interval, s of record.
     """
 
     def __init__(self, header: TrackHeader) -> None:
@@ -31,7 +31,6 @@ class LiveState:
         self.line: TrackLine | None = None
         self.lag_s: float | None = None
         self.begin_s = 0.0
-        self.excluded: dict[str, str] = {}
         self._notable: deque[Event] = deque(maxlen=_TOLD)
         self._latest: dict[str, Event] = {}
         self._unanswered = False
@@ -49,10 +48,6 @@ class LiveState:
         self.line = line
 
     def _tell(self, event: Event) -> None:
-        if event.kind == "excluded":
-            self.excluded[str(event.parameter)] = event.why
-        elif event.kind == "restored":
-            self.excluded.pop(str(event.parameter), None)
         if event.kind in _NOTABLE:
             self._unanswered = self._unanswered or event.kind == "change"
             self._notable.append(event)

@@ -333,9 +333,9 @@ let palette = {};  // colours are looked up when they are drawn, as the page may
 const css = (name) => palette[name] ??= getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 const ink = (name, alpha = "") => () => css(name) + alpha;
 const plots = new Set();
-function room(u, labels) {  // as wide as the longest label, so that none is cut off; not narrower from one picture to the next
-  const longest = Math.max(0, ...(labels ?? []).map((s) => s.length));
-  return u.room = Math.max(u.room ?? 74, 7 * longest + 16);
+let roomy = 74;  // of all charts, so that their times stand below each other
+function room(u, labels) {  // as wide as the longest label: none is cut off
+  return roomy = Math.max(roomy, ...(labels ?? []).map((s) => 7 * s.length + 16));
 }
 function axes(unit, more = {}) {
   const grid = { stroke: ink("--grid"), width: 1 };
@@ -398,12 +398,12 @@ class Live extends Watched {
   constructor(run) {
     super(run);
     Object.assign(this, { signals: null, header: null, strips: [], parameters: {}, frozen: false, following: false, marked: null, record: null, wanted: run.spec.seconds ?? Infinity });
-    this.out = new Map(); this.zoom = null;
+    this.zoom = null; roomy = 74;
     this.t = []; this.low = []; this.high = []; this.lines = []; this.lags = [];
     $("live-view").hidden = false; $("live-hint").hidden = true;
     for (const host of ["strips", "parameters", "error", "spectrum", "orbit", "events"]) $(host).replaceChildren();
     $("summary").hidden = true;
-    for (const host of ["lag", "count", "lost", "tally", "sensors"]) put($(host));  // nothing of the run before stands as this one's
+    for (const host of ["lag", "count", "lost", "tally"]) put($(host));  // nothing of the run before stands as this one's
     freeze(this, false);
     this.unmark();
     this.listen();
@@ -412,7 +412,7 @@ class Live extends Watched {
   }
   tell(m) {
     const how = { signals: () => this.begin(m), following: () => { this.following = m.on; }, stopping: () => { this.sampled = Infinity; }, header: () => this.start(m), line: () => this.take(m), spectrum: () => { this.spectrum = m; },
-      event: () => { this.heard = true; this.sensors(m); this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
+      event: () => { this.heard = true; this.event(m.t, m.what, m.why); }, told: () => this.before(m), device: () => this.event(null, m.what, m.text), note: () => this.event(null, "note", m.text),
       progress: () => { if (!this.header) { $("state").textContent = m.stage; $("state").className = "badge"; } },
       summary: () => { $("summary").textContent = m.text; $("summary").hidden = false; },
       recorded: () => { this.sampled = Infinity; this.record = m.name; this.event(null, "record", `${m.name}: ${m.samples} samples, ${m.lost} lost${m.fault ? `; the controller tripped: ${m.fault}` : ""}`); },
@@ -483,12 +483,6 @@ class Live extends Watched {
     if (this.heard || this.lines.length) return;
     this.heard = true;
     for (const e of m.events) this.event(e.t, e.what, e.why);
-    for (const [parameter, why] of Object.entries(m.out)) this.sensors({ what: "excluded", parameter, why });
-  }
-  sensors(m) {  // those that are not used now
-    if (m.what === "excluded") this.out.set(m.parameter, m.why);
-    if (m.what === "restored") this.out.delete(m.parameter);
-    $("sensors").textContent = this.out.size ? `not used: ${[...this.out].map(([name, why]) => `${name} (${why})`).join(", ")}` : "";
   }
   mark(u) {  // what is dragged over; in a picture that stands still it is shown closer too
     if (!u.select.width) return;
@@ -518,6 +512,7 @@ class Live extends Watched {
     if (!this.frozen && !$("live").hidden) {
       if (this.dirty) this.drawStrips(...this.window());
       if (this.dirtyLines) this.drawLines(...this.window());
+      if (this.spectrum && this.lines4) this.drawSpectrum();
       this.dirty = this.dirtyLines = false;
     }
     requestAnimationFrame(this.draw);
@@ -539,13 +534,16 @@ class Live extends Watched {
       s.plot.batch(() => { s.plot.setData([t, low, high], false); s.plot.setScale("x", { min: from, max: Math.max(end, from + 0.1) }); });
       s.value.textContent = `${shown(this.low[k].at(-1), this.signals.units[k])} to ${shown(this.high[k].at(-1), this.signals.units[k])}`;
     });
-    if (this.spectrum) { const floor = (a) => a.map((v) => v > 0 ? v : null); this.lines4.plot.setData([this.spectrum.hz, ...this.spectrum.amplitudes.map(floor)]); this.spectrum = null; }
     if (this.orbitOf) this.drawOrbit(a);
     if (this.frozen) return;
     $("count").textContent = `${end.toFixed(1)} s, ${this.samples} samples`;
     $("lost").textContent = this.lost ? `${this.lost} samples LOST` : "0 lost"; $("lost").className = this.lost ? "late" : "";
     this.lags.push(Date.now() / 1000 - this.fresh); if (this.lags.length > 2000) this.lags.shift();
     this.updates = (this.updates ?? 0) + 1;
+  }
+  drawSpectrum() {
+    const floor = (a) => a.map((v) => v > 0 ? v : null);
+    this.lines4.plot.setData([this.spectrum.hz, ...this.spectrum.amplitudes.map(floor)]); this.spectrum = null;
   }
   drawOrbit(a = this.t.length - 400) {
     const [x, y] = this.orbitOf.map((k) => this.low[k].slice(Math.max(a, this.t.length - 400)).map((v, i) => (v + this.high[k][Math.max(a, this.t.length - 400) + i]) / 2));
