@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import chain, islice, pairwise, starmap, zip_longest
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,22 @@ if TYPE_CHECKING:
     from sqlalchemy import Connection
 
 SCHEMA = "ambid.history/1"
+_HEADS = """
+    WITH RECURSIVE
+        own(id) AS (SELECT CAST(? AS integer)),
+        head(name) AS (
+            SELECT ''
+            UNION ALL
+            SELECT (SELECT min(v.name) FROM value AS v WHERE v.bearing = own.id AND v.name > head.name)
+            FROM head, own WHERE head.name IS NOT NULL
+        )
+    SELECT
+        name,
+        (SELECT v.unit FROM value AS v WHERE v.bearing = own.id AND v.name = head.name
+         ORDER BY v.taken_at, v.estimate LIMIT 1),
+        (SELECT v.role FROM value AS v WHERE v.bearing = own.id AND v.name = head.name AND v.role <> 'fixed'
+         ORDER BY v.taken_at DESC, v.estimate DESC LIMIT 1)
+    FROM head, own WHERE name <> ''"""  # from name to name by the key, without reading what lies between
 _ORDER = ("m", "k_x", "k_i", "R", "L")
 _NONE = float("inf")  # for a number that is not there; none that is there is infinite
 _SHOWN = 3  # lines of a rig that changed
@@ -126,53 +143,61 @@ class History(Result):
 
 def history_of(c: Connection, bearing: str, shown: str) -> History:
     """Read the history of a bearing; `shown`: name of the ledger."""
-    known = _rows(c, "SELECT id, name, plant FROM bearing WHERE name = ?", bearing)
+    (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
     if not known:
-        names = [name for (name,) in _rows(c, "SELECT name FROM bearing ORDER BY name")]
+        names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
         raise AmbidError(
             f"ledger {shown} has no bearing {bearing!r}.{nearest(bearing, names)} 'ambid history --ledger {shown}' "
             "lists them"
         )
     ((of, name, plant),) = known
     asked = ", ".join(KnownEstimate.__slots__)
-    rows = _rows(c, f"SELECT {asked}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of)
+    heads, events, rows = _rows(
+        c,
+        (_HEADS, of),
+        ("SELECT at, kind, text, parameter FROM event WHERE bearing = ? ORDER BY at", of),
+        (f"SELECT {asked}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of),
+    )
     estimates = tuple(starmap(KnownEstimate, (row[:-1] for row in rows)))
-    events = _rows(c, "SELECT at, kind, text, parameter FROM event WHERE bearing = ? ORDER BY at", of)
     notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
     notes += _rig_changes(c, estimates)
     return History(
         bearing=name, plant=plant, ledger=shown, estimates=estimates,
-        series=_series(c, of, [row[-1] for row in rows], estimates), events=tuple(sorted(notes, key=lambda x: x.at)),
+        series=_series(c, of, heads, [row[-1] for row in rows], estimates),
+        events=tuple(sorted(notes, key=lambda x: x.at)),
     )  # fmt: skip
 
 
-def _rows(c: Connection, asked: str, *of: object) -> list[tuple[Any, ...]]:
-    """Return rows as the driver has them, asked for by it: SQLAlchemy would take as long again for a history."""
+def _rows(c: Connection, *questions: tuple[Any, ...]) -> Iterator[list[tuple[Any, ...]]]:
+    """Yield the rows of each question as the driver has them: SQLAlchemy would take as long again for a history.
+
+    A server hears all questions at once: it answers the next while the rows of one are made into objects.
+    """
     if c.dialect.name == "sqlite":
-        return list(c.exec_driver_sql(asked, of).cursor.fetchall())
+        yield from (list(c.exec_driver_sql(asked, tuple(of)).cursor.fetchall()) for asked, *of in questions)
+        return
     driver: Any = c.connection.driver_connection
-    with driver.cursor(binary=True) as cursor:  # numbers as they are, not as text
-        return list(cursor.execute(asked.replace("?", "%s"), of).fetchall())
+    with driver.pipeline() if len(questions) > 1 else nullcontext():
+        cursors = [driver.cursor(binary=True).execute(asked.replace("?", "%s"), of) for asked, *of in questions]
+        yield from (cursor.fetchall() for cursor in cursors)
 
 
-def _series(c: Connection, of: int, ids: list[int], estimates: tuple[KnownEstimate, ...]) -> dict[str, Series]:
-    """Read the series of a bearing, name by name: the key leads from one to the next."""
+def _series(
+    c: Connection, of: int, heads: list[tuple[Any, ...]], ids: list[int], estimates: tuple[KnownEstimate, ...]
+) -> dict[str, Series]:
+    """Read the series of a bearing; `heads`: name, unit and role of each."""
     usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
     times, all_of_them = np.array([x.taken_at for x in estimates]), np.arange(len(ids))
-    named, found, name = "FROM value WHERE bearing = ? AND name = ?", {}, ""
-    asked = (
-        "SELECT v.name, v.unit, (SELECT o.role FROM value AS o WHERE o.bearing = v.bearing AND o.name = v.name AND "
-        "o.role <> 'fixed' ORDER BY o.taken_at DESC, o.estimate DESC LIMIT 1) "
-        "FROM value AS v WHERE v.bearing = ? AND v.name > ? ORDER BY v.name, v.taken_at, v.estimate LIMIT 1"
-    )
-    while head := _rows(c, asked, of, name):
-        ((name, unit, role),) = head
-        numbers = f"SELECT coalesce(CASE WHEN identifiable THEN value END, ?), coalesce(sd, ?) {named}"
-        rows = _rows(c, f"{numbers} ORDER BY taken_at, estimate", _NONE, _NONE, of, name)
+    named, found = "FROM value WHERE bearing = ? AND name = ?", {}
+    numbers = f"SELECT coalesce(CASE WHEN identifiable THEN value END, ?), coalesce(sd, ?) {named}"
+    ordered = f"{numbers} ORDER BY taken_at, estimate"
+    for (name, unit, role), rows in zip(
+        heads, _rows(c, *((ordered, _NONE, _NONE, of, name) for name, *_ in heads)), strict=True
+    ):
         table = np.fromiter(chain.from_iterable(rows), float, 2 * len(rows)).reshape(-1, 2)
         place = all_of_them
         if len(rows) < len(ids):
-            there = set(chain.from_iterable(_rows(c, f"SELECT estimate {named}", of, name)))
+            there = {x for rows in _rows(c, (f"SELECT estimate {named}", of, name)) for (x,) in rows}
             place = np.array([k for k, x in enumerate(ids) if x in there])
         seen = (table != _NONE).all(axis=1)
         table[~(seen & usable[place])] = np.nan

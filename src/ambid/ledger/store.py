@@ -277,7 +277,12 @@ class Ledger:
     def _reading(self) -> Iterator[Connection]:
         one = {"isolation_level": "REPEATABLE READ"} if self._postgres else {}  # all questions see the same rows
         with _told(self.shown), self._engine.connect().execution_options(reads=True, **one) as c:
-            yield c
+            try:
+                yield c
+            except Exception:
+                if self._postgres:
+                    c.invalidate()  # given back to the pool, a lost connection would be told with a traceback
+                raise
 
     @property
     def _postgres(self) -> bool:
