@@ -11,6 +11,7 @@ from ambid.fleet import monte_carlo
 from ambid.physics.presets import preset
 from ambid.rig import rig_of_preset
 from ambid.validation.coverage import Coverage, Trial, wilson
+from tests.fleet.jobs import known_mass
 
 TRUTH = {"k_i": 80.0, "R": 4.0}
 
@@ -78,6 +79,13 @@ def test_records_are_simulated_and_identified_without_the_truth():
     assert {r.name for r in found.rows} == {"k_x", "k_i", "R", "L"}  # m is fixed there
     assert max(r.largest_z for r in found.rows) < 5.0
     assert not found.trials[0].reason
+
+
+def test_the_truth_of_a_drawn_rotor_is_that_of_its_drawing():
+    few = {"duration": 0.1, "periods": 1, "excitation": "zippered"}
+    found = monte_carlo("central-mass", runs=2, job=known_mass, simulated=few, workers=1)
+    assert found.truth == {"m": pytest.approx(4.224, abs=0.01), "ax.k_i": pytest.approx(31.227, abs=0.001)}
+    assert [t.values["m"] for t in found.trials] == [(4.0, None)] * 2  # the job does not see it
 
 
 def test_what_cannot_be_simulated_or_compared_is_refused():

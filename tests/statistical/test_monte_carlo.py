@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
+from ambid.fleet import monte_carlo
 from tests.bearing.benches import run
 from tests.estimation.kalman import cramer_rao_sd
 from tests.statistical.runs import EXCITATION_SEED, NAMES, many
@@ -18,7 +19,7 @@ N_SAMPLES = 4000
 
 @pytest.fixture(scope="module")
 def runs():
-    return many(N_RUNS, n=N_SAMPLES, auto=False)
+    return many(N_RUNS, n=N_SAMPLES)
 
 
 @pytest.fixture(scope="module")
@@ -93,20 +94,20 @@ def test_residual_tests_are_calibrated_under_feedback(runs, test):
 
 
 def test_what_is_not_given_is_found():
-    # delay searched, start values from the data alone
-    found = many(60, n=N_SAMPLES, auto=True)
-    assert all(r.converged for r in found)
-    assert all(r.delay_right for r in found)
-    z = np.array([(r.estimate - 1) / r.sd for r in found])
-    assert np.abs(z).max() < 4.5
-    assert np.all(np.abs(z.mean(axis=0)) < 3.3 / np.sqrt(60)), named(z.mean(axis=0))
-    # 15 of 300 expected beyond 1.96; those of one run are correlated
-    assert np.sum(np.abs(z) > 1.959964) <= 30
+    # the whole job: delay searched, start values from the data alone
+    found = monte_carlo("unstable-bearing", runs=60, simulated={"duration": 0.2}, workers=1)
+    assert found.counts["failed"] == found.counts["unusable"] == 0
+    assert {r.name: (r.runs, r.unknown) for r in found.rows} == dict.fromkeys(("k_x", "k_i", "R", "L"), (60, 0))
+    for row in found.rows:
+        assert row.largest_z < 4.5
+        assert abs(row.bias) < 3.3 * row.bias_sd
+        assert row.inside >= 51  # 57 of 60 expected, with a standard deviation of 1.7
+        assert 0.7 < row.said / row.spread < 1.4  # 60 runs know a spread to 9 %
 
 
 def test_a_short_record_is_not_overconfident():
     # 50 ms: the noise levels themselves are hardly known, and maximum likelihood takes them for too small
-    found = many(75, n=1000, auto=False)
+    found = many(75, n=1000)
     estimates, sds = np.array([r.estimate for r in found]), np.array([r.sd for r in found])
     # 75 runs know a coverage of 0.95 to 0.025; more than it promises is no harm here
     inside = np.mean(np.abs(estimates - 1) < 1.959964 * sds, axis=0)

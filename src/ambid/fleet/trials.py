@@ -17,6 +17,7 @@ from ambid.job.simulation import bench_of_source, simulate
 from ambid.ledger.entry import settings_text
 from ambid.physics.presets import Preset
 from ambid.rig import Rig, rig_of_preset
+from ambid.simulation.rotor_bench import RotorBench
 from ambid.validation.coverage import Coverage, Trial
 
 
@@ -98,6 +99,9 @@ def monte_carlo(
     check_whole({"--seed": seed}, 0)
     source = bench_of_source(str(rig) if isinstance(rig, Path) else rig)
     truth = rig_of_preset(source) if isinstance(source, Preset) else source
+    if truth.rotor is not None:  # whose drawing gives numbers of the rigid motion
+        drawn = RotorBench.of(truth, None, None).plant.parameters
+        truth = replace(truth, parameters=tuple(replace(p, value=drawn[p.name]) for p in truth.parameters))
     lacks = [p.name for p in truth.parameters if p.value is None]
     if lacks:
         raise AmbidError(f"rig {truth.name!r} has no value of {lacks[0]}, and a simulation needs it. Give it")
