@@ -9,11 +9,14 @@ import os
 import random
 import resource
 import signal
+import socket
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +25,14 @@ from ambid.fleet import fleet
 from ambid.ledger import open_ledger
 from tests.fleet.jobs import count, judge
 
+ALLOWED = {"DASK_DISTRIBUTED__SCHEDULER__ALLOWED_FAILURES": "2", "DASK_LOGGING__DISTRIBUTED": "critical"}
 PARENT = """
 import sys
 from ambid.fleet.run import run_fleet
 from bench.fleet import slowly
 if __name__ == "__main__":
-    folder, workers = sys.argv[1], {"dask": 2} if sys.argv[2] == "dask" else {"workers": 2}
+    folder, how = sys.argv[1:]
+    workers = {"scheduler": how} if "://" in how else {how: 2}
     run_fleet([folder + "/*.txt"], ledger=folder + "/f.db", job=slowly, taken_at="file", limit_s=5.0, **workers)
 """
 
@@ -68,33 +73,54 @@ def beside_a_loop(n: int, folder: Path) -> None:
 
 
 def under_kills(kills: int, folder: Path, how: str) -> None:
+    """Kill processes at random: the parent, its workers, and where they are services of their own the scheduler."""
     poison = {50: "kill", 150: "hang", 250: "nothing"}
     for k in range(300):
         (folder / f"{k:03}.txt").write_text(poison.get(k, str(k)))
-    rng, left, starts = random.Random(1), kills, 0
-    while starts < kills + 5:
-        run = subprocess.Popen([sys.executable, "-c", PARENT, str(folder), how], stderr=subprocess.DEVNULL)
-        starts += 1
-        time.sleep(3.0)
-        while run.poll() is None:
-            time.sleep(rng.uniform(0.2, 0.6))
-            if left:
-                children = _descendants(run.pid)
-                victim = run.pid if rng.random() < 0.2 or not children else rng.choice(children)
-                left -= 1
-                try:
-                    os.kill(victim, signal.SIGKILL)
-                except ProcessLookupError:
-                    left += 1
-        if run.returncode == 0:
-            break
+    rng, victims, starts = random.Random(1), Counter[str](), 0
+    with ExitStack() as stack:
+        services = {}
+        if how == "scheduler":
+            with socket.socket() as free:
+                free.bind(("127.0.0.1", 0))
+                where = f"tcp://127.0.0.1:{free.getsockname()[1]}"
+            how = where
+            services = {"scheduler": ("dask_scheduler", "--host", where)}
+            services |= dict.fromkeys(("worker 1", "worker 2"), ("dask_worker", where, "--nthreads", "1"))
+        running: dict[str, subprocess.Popen[bytes]] = {}
+        stack.callback(lambda: [p.kill() for p in running.values()])
+        while starts < kills + 5:
+            run = subprocess.Popen([sys.executable, "-c", PARENT, str(folder), how], stderr=subprocess.DEVNULL)
+            starts += 1
+            begin = time.monotonic()
+            while run.poll() is None:
+                for name, (module, *words) in services.items():
+                    if name not in running or running[name].poll() is not None:
+                        running[name] = subprocess.Popen(
+                            [sys.executable, "-m", f"distributed.cli.{module}", *words, "--no-dashboard"],
+                            stderr=subprocess.DEVNULL, env=os.environ | ALLOWED,
+                        )  # fmt: skip
+                time.sleep(rng.uniform(0.2, 0.6))
+                if time.monotonic() - begin < 3.0 or victims.total() == kills:
+                    continue
+                workers = [x for name in services if name != "scheduler" for x in _descendants(running[name].pid)]
+                choice = {"worker": workers or _descendants(run.pid)} | {
+                    name: [p.pid] for name, p in {"parent": run, **running}.items() if "worker" not in name
+                }
+                role = rng.choices(list(choice), [3] + [1] * (len(choice) - 1))[0]
+                if choice[role]:
+                    with suppress(ProcessLookupError):
+                        os.kill(rng.choice(choice[role]), signal.SIGKILL)
+                        victims[role] += 1
+            if run.returncode == 0:
+                break
     with open_ledger(folder / "f.db", write=False) as ledger:
         shas = [e.sha for b in ledger.bearings() for e in ledger.history(b.name).estimates]
         failed = {Path(f.record).name: f.reason for f in ledger.failures().values()}
     times = sum(len(path.read_text().splitlines()) for path in folder.glob("*.begun"))
     sound = sqlite3.connect(folder / "f.db").execute("PRAGMA integrity_check").fetchone()[0]
-    print(f"{how}: {kills - left} kills, {starts} starts: {len(shas)} of 297 done, {len(set(shas))} of them different; "
-          f"begun {times} times; ledger {sound}; failed: {failed}")  # fmt: skip
+    print(f"{how}: killed {dict(victims)}, {starts} starts: {len(shas)} of 297 done, {len(set(shas))} of them "
+          f"different; begun {times} times; ledger {sound}; failed: {failed}")  # fmt: skip
 
 
 def _descendants(pid: int) -> list[int]:
@@ -113,7 +139,7 @@ def _descendants(pid: int) -> list[int]:
 def main(n: int, kills: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         beside_a_loop(n, Path(folder))
-    for how in ("pool", "dask"):
+    for how in ("workers", "dask", "scheduler"):
         with tempfile.TemporaryDirectory() as folder:
             under_kills(kills, Path(folder), how)
 
