@@ -66,6 +66,8 @@ def _answers(
         try:
             ready = distributed.wait(list(on_their_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
+            if client.cluster is not None and len(client.nthreads()) < len(client.cluster.worker_spec):
+                client.cluster.scale(len(client.cluster.worker_spec))  # one that dies as it starts is not started again
             continue
         for future in ready:
             task, alone = on_their_way.pop(future)
@@ -120,12 +122,14 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
             with client:
                 yield client
             return
-        with (
-            one_thread_each(),
-            distributed.LocalCluster(
-                n_workers=local, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
-                worker_dashboard_address=None, silence_logs=logging.CRITICAL,
-            ) as cluster,
-            distributed.Client(cluster) as client,
-        ):  # fmt: skip
-            yield client
+        with one_thread_each():
+            try:
+                cluster = distributed.LocalCluster(
+                    n_workers=local, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+                    worker_dashboard_address=None, silence_logs=logging.CRITICAL,
+                    scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},  # any port
+                )  # fmt: skip
+            except RuntimeError as failure:  # a worker that ends while it starts
+                raise AmbidError(f"the workers did not start ({failure}). Run again") from None
+            with cluster, distributed.Client(cluster) as client:
+                yield client
