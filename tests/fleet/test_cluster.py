@@ -11,13 +11,21 @@ pytest.importorskip("distributed", reason="Dask's distributed is not installed")
 psutil = pytest.importorskip("psutil")  # which distributed needs
 
 PARENT = """
+import os
+import signal
 import distributed
+from ambid.fleet import cluster
 from ambid.fleet.cluster import _answers, _client
+cluster._GONE_S = 2.0
 from tests.fleet.jobs import double
+async def fails():
+    raise RuntimeError("killed as it started")
 if __name__ == "__main__":
     with _client(distributed, None, 1) as client:
         if {gone}:
-            client.retire_workers(list(client.nthreads()), close_workers=True)
+            for nanny in client.cluster.workers.values():
+                nanny.instantiate = fails
+                os.kill(nanny.pid, signal.SIGKILL)
         print(sorted(d.value for d in _answers(distributed, client, double, iter(range(5)), 10.0, lambda: False)))
 """
 

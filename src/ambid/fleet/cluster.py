@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import time
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import contextmanager
@@ -16,6 +17,7 @@ from ambid.fleet.pool import Done, attempt, one_thread_each
 
 ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
 _AHEAD = 3  # tasks on their way for each worker
+_GONE_S = 30.0  # without a worker, after which a cluster on this machine gets new ones
 _LOOK_S = 0.2  # how often a wait looks whether it should end
 
 
@@ -53,6 +55,8 @@ def _answers(
 ) -> Iterator[Done]:
     suspects: deque[Any] = deque()
     on_their_way: dict[Any, tuple[Any, bool]] = {}  # with whether they are run alone
+    seen = time.monotonic()  # when there was a worker
+    n_workers = 0 if client.cluster is None else len(client.cluster.worker_spec)
     while True:
         room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
         while room > 0 and (task := next(tasks, None)) is not None:
@@ -66,8 +70,14 @@ def _answers(
         try:
             ready = distributed.wait(list(on_their_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
-            if client.cluster is not None and len(client.nthreads()) < len(client.cluster.worker_spec):
-                client.cluster.scale(len(client.cluster.worker_spec))  # one that dies as it starts is not started again
+            if client.nthreads() or client.cluster is None:
+                seen = time.monotonic()
+            elif time.monotonic() - seen > _GONE_S:  # a worker that dies as it starts is not started again
+                if client.cluster.workers:
+                    client.cluster.scale(0)  # which forgets them, after a while
+                else:
+                    client.cluster.scale(n_workers)
+                    seen = time.monotonic()
             continue
         for future in ready:
             task, alone = on_their_way.pop(future)
