@@ -94,23 +94,26 @@ def _greybox(
     def follow(candidates: Sequence[Candidate]) -> Fit:
         return _follow(candidates, tick, noise, search_delay=delay == "auto")
 
+    def tried(candidates: Sequence[Candidate]) -> Fit:
+        return _follow(candidates, tick, noise, search_delay=delay == "auto", trial=True)
+
     refuse_silent(model, signals)
     try:
         candidates = starts(model, signals, parameters, delay, tick=tick)
     except EstimationError as failure:
-        refuse_mistaken(model, signals, parameters, delay, np.inf, follow)
+        refuse_mistaken(model, signals, parameters, delay, np.inf, tried)
         fit = rescue(None, str(failure), model, signals, parameters, delay, how, follow, tick)
         if fit is None:
             raise
         return fit
     as_is = candidates[0].criterion / candidates[0].problem.n_used
-    refuse_mistaken(model, signals, parameters, delay, as_is, follow)
+    refuse_mistaken(model, signals, parameters, delay, as_is, tried)
     start_s = perf_counter() - begun
     fit = follow(candidates)
     why = reason(fit) if how.evaluations else ""
     if as_is < POOR and (why or fit.problem.parameters(fit.vector).get("R", 1.0) <= 0.0):
         as_is = fit.criterion / fit.problem.n_used if fit.status != "failed" else np.inf
-        refuse_mistaken(model, signals, parameters, delay, as_is, follow, searched=True)
+        refuse_mistaken(model, signals, parameters, delay, as_is, tried, searched=True)
     if why and not late(model, signals):  # no plant explains a channel that lags
         fit = rescue(fit, why, model, signals, parameters, delay, how, follow, tick) or fit
     return replace(fit, start_s=start_s)
@@ -122,8 +125,12 @@ def _follow(
     noise: Literal["auto", "levels", "gain"],
     *,
     search_delay: bool,
+    trial: bool = False,
 ) -> Fit:
-    """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay."""
+    """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay.
+
+    `trial`: give up where no search converges, as those of a wrong record do, in hundreds of steps each.
+    """
     fit: Fit | None = None
     for candidate in candidates:
         found = _search(candidate, tick, with_disturbances=noise != "auto")
@@ -131,6 +138,8 @@ def _follow(
         if found.status == "converged":
             break
     assert fit is not None
+    if trial and fit.status != "converged":
+        return fit
     if search_delay:
         fit = _with_fraction(fit, tick)
         if noise == "auto":
