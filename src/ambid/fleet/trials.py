@@ -101,7 +101,7 @@ def monte_carlo(
     truth = rig_of_preset(source) if isinstance(source, Preset) else source
     if truth.rotor is not None:  # whose drawing gives numbers of the rigid motion
         drawn = RotorBench.of(truth, None, None).plant.parameters
-        truth = replace(truth, parameters=tuple(replace(p, value=drawn[p.name]) for p in truth.parameters))
+        truth = replace(truth, parameters=tuple(replace(p, value=drawn.get(p.name, p.value)) for p in truth.parameters))
     lacks = [p.name for p in truth.parameters if p.value is None]
     if lacks:
         raise AmbidError(f"rig {truth.name!r} has no value of {lacks[0]}, and a simulation needs it. Give it")
