@@ -119,6 +119,7 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
         "distributed.scheduler.worker-saturation": 1.0,  # what waits on the scheduler is not blamed for a death
         "distributed.logging.distributed": "critical",
         "distributed.diagnostics.nvml": False,
+        "distributed.worker.profile.enabled": False,  # looks at the stack a hundred times a second
     }
     with dask.config.set(quiet):
         if scheduler is not None:
