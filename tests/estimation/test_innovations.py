@@ -96,3 +96,11 @@ def test_an_unseen_unstable_state_has_no_gain():
     a, c = np.diag([1.2, 0.5]), np.array([[0.0, 1.0]])
     with pytest.raises(np.linalg.LinAlgError):
         predictor_gain(a, c, np.eye(2), np.eye(1))
+
+
+def test_a_gain_that_is_far_off_does_not_settle_and_warns_of_nothing():
+    from ambid.estimation.predictor import _newton
+
+    A, C, one = np.array([[0.5, 0.1], [0.0, 0.4]]), np.array([[0.0, 0.0]]), np.eye(2)
+    assert _newton(A, C, one, np.eye(1), np.full((2, 1), 1e200)) is None  # its covariance is no number
+    assert _newton(A, C, one, np.eye(1), np.zeros((2, 1))) is not None

@@ -275,11 +275,12 @@ def _stable_subspace(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
 
 def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | None = None) -> Array | None:
     """Iterate Newton-Kleinman from a stabilising gain; None where it does not settle in a few steps."""
-    for _ in range(8):
-        P = solve_lyapunov(A - K @ C, Q + K @ R @ K.T)
-        if before is not None and np.abs(P - before).max() <= _STEP * np.abs(P).max():
-            return P
-        K, before = _gain_of(A, C, P, R), P
+    with np.errstate(over="ignore", invalid="ignore"):  # a start that is far off runs away, and does not settle
+        for _ in range(8):
+            P = solve_lyapunov(A - K @ C, Q + K @ R @ K.T)
+            if before is not None and np.abs(P - before).max() <= _STEP * np.abs(P).max():
+                return P
+            K, before = _gain_of(A, C, P, R), P
     return None
 
 
