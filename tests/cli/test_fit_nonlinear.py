@@ -40,7 +40,7 @@ def at(records, monkeypatch, tmp_path):
 def test_several_records_to_file_figure_and_table(at, ambid) -> None:
     out, figure = at / "fit.json", at / "fit.png"
     found = ambid(
-        "fit", "r0.csv", "r1.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0,degree=2", "--validate",
+        "fit", "r0.csv", "r1.csv", "--structure", "narmax", *WORDS, "--orders", "ne=0,degree=2", "--validate",
         "r2.csv", "--json", out, "--plot", figure, "--strict",
     )  # fmt: skip
     assert found.code == 0, found.out
@@ -63,14 +63,10 @@ def test_several_records_to_file_figure_and_table(at, ambid) -> None:
     assert "outside the training data" in shown.out
 
 
-def test_orders_are_another_name_for_settings(at, ambid) -> None:
-    by = [
-        json.loads(ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, name, "ne=0,ny=1", "--json", "-").out)
-        for name in ("--orders", "--settings")
-    ]
-    assert by[0]["model"] == by[1]["model"]
-    both = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--orders", "ny=1", "--settings", "ny=1")
-    assert both.code == 2
+def test_the_former_name_of_orders_says_the_new_one(at, ambid) -> None:
+    refused = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ny=1")
+    assert refused.code == 2
+    assert "orders now" in refused.err
 
 
 @pytest.mark.parametrize(
@@ -78,12 +74,11 @@ def test_orders_are_another_name_for_settings(at, ambid) -> None:
     [
         (("--structure", "narmax", "--at-rest"), "--at-rest is for linear structures"),
         (("--structure", "narmax", "--criterion", "aic"), "--criterion is for linear"),
-        (("--structure", "narmax", "--settings", "degree"), "not NAME=VALUE"),
-        (("--structure", "narmax", "--settings", "ny=1,ny=2"), "ny is given twice"),
-        (("--structure", "narmax", "--settings", "degree=high"), "degree"),
-        (("--structure", "narmax", "--settings", "dgree=2"), "Did you mean 'degree'"),
+        (("--structure", "narmax", "--orders", "degree"), "not NAME=VALUE"),
+        (("--structure", "narmax", "--orders", "ny=1,ny=2"), "ny is given twice"),
+        (("--structure", "narmax", "--orders", "degree=high"), "degree"),
+        (("--structure", "narmax", "--orders", "dgree=2"), "Did you mean 'degree'"),
         (("--structure", "arx", "--seed", "1"), "--seed is for nonlinear structures"),
-        (("--structure", "arx", "--settings", "na=1"), "--settings is for nonlinear structures"),
         (("--structure", "narmaxx"), "Did you mean 'narmax'"),
         (("r1.csv", "--structure", "arx"), "takes one record"),
         (("--structure", "narmax", "--plot", "fit.txt"), "must end in"),
@@ -161,7 +156,7 @@ def test_settings_as_they_are_written() -> None:
 
 
 def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
-    words = ("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0")
+    words = ("fit", "r0.csv", "--structure", "narmax", *WORDS, "--orders", "ne=0")
     for more, said in (
         (("./r0.csv",), "record r0.csv is given twice and would count twice. Omit one"),
         (("--validate", "r0.csv"), "--validate r0.csv is used for fitting too"),
@@ -176,7 +171,7 @@ def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
 @pytest.mark.parametrize(("place", "value"), [(("units",), []), (("model", "cloud", "marks", 0, 1), float("nan"))])
 def test_a_damaged_fit_is_refused_in_one_line(at, ambid, place, value) -> None:
     out = at / "fit.json"
-    assert ambid("fit", "r0.csv", "--structure", "narx", *WORDS, "--settings", "iterations=1", "--json", out).code == 0
+    assert ambid("fit", "r0.csv", "--structure", "narx", *WORDS, "--orders", "iterations=1", "--json", out).code == 0
     document = inside = json.loads(out.read_text())
     for key in place[:-1]:
         inside = inside[key]
@@ -193,7 +188,7 @@ def test_strict_looks_at_the_second_record(at, ambid) -> None:
     table = np.column_stack([np.arange(300) / 100, u, y])
     np.savetxt(at / "noise.csv", table, delimiter=",", header="time [s],u [V],y [m]", comments="")
     fit = at / "held.json"
-    told = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ne=0,degree=2", "--json", fit,
+    told = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--orders", "ne=0,degree=2", "--json", fit,
                  "--validate", at / "noise.csv", "--strict")  # fmt: skip
     assert told.code == 3
     assert "it does not hold on the second record: one-step errors of y" in told.out

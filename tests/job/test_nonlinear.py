@@ -34,7 +34,7 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
         [folder / "r0.csv", read_record(folder / "r1.csv")],
         **CHANNELS,
         structure="narmax",
-        settings={"ne": 0},
+        orders={"ne": 0},
         open_loop=True,
         from_s=0.5,
         validate=folder / "r2.csv",
@@ -71,7 +71,7 @@ def test_an_interrupted_search_keeps_the_best_so_far_and_is_judged(folder) -> No
 def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -> None:
     settings = {"ny": 1, "nu": 2, "neurons": 3, "starts": 2, "iterations": 8}
     fits = [
-        fit([folder / "r0.csv"], **CHANNELS, structure="narx", settings=settings, open_loop=True, seed=seed)
+        fit([folder / "r0.csv"], **CHANNELS, structure="narx", orders=settings, open_loop=True, seed=seed)
         for seed in (4, 4, 5)
     ]
     thetas = [f.model.theta for f in fits if f.model is not None]
@@ -87,7 +87,7 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
     ("changes", "said"),
     [
         ({"structure": "narmx"}, "Did you mean 'narmax'"),
-        ({"settings": {"degre": 2}}, "Did you mean 'degree'"),
+        ({"orders": {"degre": 2}}, "Did you mean 'degree'"),
         ({"seed": -1}, "seed"),
         ({"validate_from_s": 1.0}, "--validate"),
         ({"output": "z"}, "z"),

@@ -50,7 +50,7 @@ def results(record, tmp_path_factory):
         "estimate": estimate,
         "bearing": by_hand({"one.csv": seen(1)}),
         "fit": fit,
-        "nonlinear fit": ambid.fit(record, structure="narmax", settings=settings, **words),
+        "nonlinear fit": ambid.fit(record, structure="narmax", orders=settings, **words),
         "validation": ambid.validate(estimate, record),
         "validation of a fit": ambid.validate(fit, record),
         "response": ambid.frf(record, band=(20.0, 1500.0), orders={"nf": 2, "nb": 2}, open_loop=True, **words),

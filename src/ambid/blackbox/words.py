@@ -1,4 +1,4 @@
-"""Orders, settings and coefficients as they are written: on the command line, in notebooks, in tests."""
+"""Orders and coefficients as they are written: on the command line, in notebooks, in tests."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Candidate = str | tuple[str, "Orders | str | None"]
 """A structure to compare: ``"arx:na=2,nb=2"``, ``"n4sid"``, or its name beside its orders."""
 
 
-def orders_of(given: Orders | str | None) -> Orders | None:
+def orders_of(given: Mapping[str, Any] | str | None) -> Orders | None:
     """Return orders by name; None where all are to be chosen."""
     if not isinstance(given, str):
         return given and by_name(given, "--orders")
@@ -44,12 +44,12 @@ def candidates_of(given: Sequence[Candidate]) -> list[tuple[str, Orders | None]]
 
 
 def settings_of(given: Mapping[str, Any] | str | None) -> dict[str, Any]:
-    """Return settings by name; what is ``auto`` is left to the method."""
+    """Return the orders of a nonlinear structure by name; what is ``auto`` is left to the method."""
     if given is None or not isinstance(given, str):
-        return dict(by_name(given, "--settings"))
+        return dict(by_name(given, "--orders"))
     if given.strip() in ("auto", ""):
         return {}
-    where = f"--settings {given!r}"
+    where = f"--orders {given!r}"
     pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
     return {name: _read_first(x, _whole_numbers, int, float) for name, x in pairs.items() if x != "auto"}
 

@@ -34,17 +34,12 @@ def command(
         str,
         option(
             "--orders na=2,nb=2,nk=1",
-            "Orders; nb=2/3 for two inputs with different orders, nk=auto to find the delay, auto to choose all.",
+            "Orders; nb=2/3 for two inputs with different orders, nk=auto to find the delay, auto to choose all. Of a "
+            "nonlinear structure its settings, such as ny=2,degree=3; 'ambid models' lists them.",
             True,
         ),
     ] = "auto",
-    settings: Annotated[
-        str | None,
-        option(
-            "--settings ny=2,nu=2,degree=3",
-            "Settings of a nonlinear structure (--orders does the same); 'ambid models' lists them.",
-        ),
-    ] = None,
+    settings: Annotated[str | None, option("--settings", "Former name of --orders.", hidden=True)] = None,
     seed: Annotated[int | None, option("--seed N", "Seed of all randomness in a nonlinear structure.", "0")] = None,
     criterion: Annotated[
         str, switch("--criterion", "Criterion that chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.")

@@ -42,8 +42,8 @@ def fit(
     input: Names | None = None,  # noqa: A002 - the words of the command
     output: Names | None = None,
     reference: Names | None = None,
-    orders: Orders | str | None = "auto",
-    settings: Settings | str | None = None,
+    orders: Orders | Settings | str | None = "auto",
+    settings: object = None,
     seed: int | None = None,
     criterion: str = "bic",
     fix: Mapping[str, float] | Sequence[str] | str | None = None,
@@ -74,9 +74,10 @@ def fit(
         References are the loop's outer excitation, for methods that use it.
     orders : str or Mapping[str, int, "auto" or tuple of int], optional
         Orders of a linear structure: ``"na=2,nb=2,nk=1"`` as in the command, or by name, with a tuple where inputs
-        differ. "auto": all are chosen by `criterion`.
-    settings : str or Mapping, optional
-        Settings of a nonlinear structure, as ``ambid models`` lists them; the method chooses those left out.
+        differ. "auto": all are chosen by `criterion`. Of a nonlinear structure its settings, as ``ambid models`` lists
+        them (``"ny=2,degree=3"``); the method chooses those left out.
+    settings : optional
+        Former name of the orders of a nonlinear structure; refused.
     seed : int, optional
         Seed of all randomness in a nonlinear structure, 0 or more; equal seeds give equal results.
     criterion : str, optional
@@ -125,21 +126,17 @@ def fit(
         rig=rig, layout=layout,
     )  # fmt: skip
     sources = sources_of(records)
-    nonlinear, wanted, fixed = structure in NONLINEAR_STRUCTURES, orders_of(orders), fixed_of(fix)
-    chosen = settings_of(settings)
+    if settings is not None:
+        raise EstimationError("settings of a nonlinear structure are its orders now. Give them as orders")
+    nonlinear, fixed = structure in NONLINEAR_STRUCTURES, fixed_of(fix)
+    wanted: Any = settings_of(orders) if nonlinear else orders_of(orders)
     if nonlinear:
-        if orders is not None and orders != "auto":
-            if settings is not None:
-                raise EstimationError(
-                    "--orders and --settings mean the same for a nonlinear structure. Give one of them"
-                )
-            chosen = settings_of(orders)
         linear_only = {"--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
                        "--criterion": criterion != "bic"}  # fmt: skip
         refuse_given(linear_only, f"{{}} is for linear structures; {structure} does not use it. Omit it")
-        _check_settings(structure, sources, chosen, seed or 0)
+        _check_settings(structure, sources, wanted, seed or 0)
     else:
-        _check_linear(structure, sources, {"--settings": settings, "--seed": seed is not None})
+        _check_linear(structure, sources, {"--seed": seed is not None})
         _check_criterion(criterion, wanted)
         taken = channels.inputs if channels.rig is None else channels.inputs or channels.rig.plant.inputs
         _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
@@ -157,7 +154,7 @@ def fit(
     options |= {"at_rest": True} if at_rest else {}
     with one_thread():
         found: Any = (
-            _estimate_nonlinear(structure, data, second, chosen, seed or 0, clock, say)
+            _estimate_nonlinear(structure, data, second, wanted, seed or 0, clock, say)
             if nonlinear
             else _estimate_linear(structure_named(structure), data[0], second, wanted, criterion, options, clock, say)
         )

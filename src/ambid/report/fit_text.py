@@ -178,7 +178,7 @@ def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
     if fit.sd is not None:
         known = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
     elif "uncertainty" in fit.settings:
-        known += " (--settings uncertainty=... gives them)"
+        known += " (--orders uncertainty=... gives them)"
     size = fit.model.theta.size
     lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{'' if shown else '; --json has them all'}"]
     effective = fit.details.get("effective_parameters")
