@@ -16,7 +16,6 @@ from ambid.recursive.joint import JointEkf, JointStart, JointUkf
 from ambid.recursive.kalman import constant_velocity
 from ambid.tracking.evidence import Samples
 from ambid.tracking.rpem import PhysicalRpem
-from ambid.tracking.window import MovingWindow
 from peers import Array, Bench
 from tracking_benches import PHYSICAL, RATE, preset_bench, start_of
 from tracking_job import Job, Same
@@ -26,7 +25,6 @@ N, N_JOINT = 200_000, 8_000
 SPREAD = 0.02  # of the start of the joint filters, relative
 WIDE = np.array([1e-3, 1.0, 1.0])  # m, m/s, A
 OFFSET = np.array([10.0, 0.5])  # N, V
-WINDOW = 4000
 
 
 @cache
@@ -40,7 +38,6 @@ def bearing_jobs() -> Iterator[Job]:
         yield _rpem(memory)
     yield _joint("joint EKF, 5 physical parameters, 3 states, 2 offsets", JointEkf, "filterpy, EKF", "ekf")
     yield _joint("joint UKF, 5 physical parameters, 3 states, 2 offsets", JointUkf, "filterpy, UKF", "ukf")
-    yield _window()
     yield _fusion()
 
 
@@ -147,13 +144,6 @@ def _beside(ours: Array, sd: Array, found: dict[str, Array]) -> Same:
             "rms_error": float(mine), "peer_rms_error": float(theirs), "apart_sd": apart,
             "sd": sd.tolist(), "peer_sd": found["sd"].tolist(),
         },
-    )  # fmt: skip
-
-
-def _window() -> Job:
-    return _on_record(
-        f"moving window of {WINDOW}, Gauss-Newton every 1000", N // 2,
-        lambda: MovingWindow(start_of(NAME), window=WINDOW, every=1000),
     )  # fmt: skip
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 
 from ambid.tracking.rpem import PhysicalRpem
-from ambid.tracking.window import MovingWindow
 from tests.recursive.cases import Case
 from tests.tracking.starts import bearing, bearing_start, columns
 
@@ -38,12 +37,5 @@ CASES = [
             n=_N,
         )
         for memory in ("auto", "all", 0.5)
-    ),
-    Case(
-        name="physical moving window",
-        make=lambda: MovingWindow(_start(), window=1500, every=500),
-        signals=_signals,
-        quiet=_quiet,
-        n=_N,
     ),
 ]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.streaming import PassiveLowpass, ScalarKalman, kalman_bucy_gain
+from ambid.recursive.kalman import PassiveLowpass, ScalarKalman, kalman_bucy_gain
 
 RATE = 1000.0
 

@@ -9,7 +9,6 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.recursive.arx import RecursiveArx as RecursiveArx
     from ambid.recursive.arx import RecursiveIvArx as RecursiveIvArx
-    from ambid.recursive.blocks import OnlineThreeBlocks as OnlineThreeBlocks
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
     from ambid.recursive.fusion import FusedSensor as FusedSensor
     from ambid.recursive.fusion import SensorFusion as SensorFusion
@@ -18,7 +17,10 @@ if TYPE_CHECKING:
     from ambid.recursive.joint import JointUkf as JointUkf
     from ambid.recursive.kalman import KalmanFilter as KalmanFilter
     from ambid.recursive.kalman import LinearState as LinearState
+    from ambid.recursive.kalman import PassiveLowpass as PassiveLowpass
+    from ambid.recursive.kalman import ScalarKalman as ScalarKalman
     from ambid.recursive.kalman import constant_velocity as constant_velocity
+    from ambid.recursive.kalman import kalman_bucy_gain as kalman_bucy_gain
     from ambid.recursive.kalman import linear_state as linear_state
     from ambid.recursive.lines import Event as Event
     from ambid.recursive.lines import Track as Track
@@ -28,9 +30,5 @@ if TYPE_CHECKING:
     from ambid.recursive.regression import Nlms as Nlms
     from ambid.recursive.regression import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares
-    from ambid.recursive.streaming import PassiveLowpass as PassiveLowpass
-    from ambid.recursive.streaming import ScalarKalman as ScalarKalman
-    from ambid.recursive.streaming import SynchronousFilter as SynchronousFilter
-    from ambid.recursive.streaming import kalman_bucy_gain as kalman_bucy_gain
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -1,12 +1,14 @@
-"""Discrete Kalman filter of a linear state over the square-root core, for samples and blocks with gaps.
+"""Kalman filters over the square-root core, for samples and blocks with gaps: of a linear state, and of a scalar.
 
 x⁺ = A x + B u + w, y = C x + v. The covariance is carried in factors, so that it is symmetric and positive by
-construction however long it runs.
+construction however long it runs. The scalar Kalman-Bucy filter (thesis eq. 5.3) of x' = a x + w·noise of intensity q,
+measured as y = c x + noise of intensity r, is stationary and is fed with held samples; so is the passive low-pass.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import exp, expm1, isfinite, pi, sqrt
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -152,9 +154,12 @@ class KalmanFilter(Copied):
         self._n, self._m, self._n_u = n, m, n_u
         parts = (model.A, model.B, model.C, root_of(model.Q), model.R)
         self._model = np.concatenate([np.ravel(part) for part in parts])
+        x = np.array(np.zeros(n) if start is None else start, dtype=np.float64).reshape(-1)
+        if x.size != n or not np.isfinite(x).all():
+            raise EstimationError(f"Kalman filter: start has {x.size} numbers for {n} states; give {n} that are finite")
         self._memory = np.zeros(n * n + n + m * (2 * n + m + 2))
-        self._memory[: n * n] = factors_of(_start(model, start_covariance)).ravel()
-        self._memory[n * n :][:n] = 0.0 if start is None else _vector(start, n)
+        self._memory[: n * n] = factors_of(_start_covariance(model, start_covariance)).ravel()
+        self._memory[n * n :][:n] = x
         self._work = np.zeros(3 * n * n + 3 * n)
         self._tally = np.zeros(2)
         self._none = np.empty((1, 0))
@@ -186,12 +191,20 @@ class KalmanFilter(Copied):
             y[0, 0] = measurement
             self._run(y, self._none, out)
             return out[0].copy()
-        given = np.asarray(measurement, dtype=np.float64)
-        y = as_block(given, self._m, "Kalman filter")
-        out = np.empty((y.shape[0], self._n))
-        self._run(y, self._inputs(inputs, y.shape[0]), out)
-        alone = given.ndim == 0 or (given.ndim == 1 and self._m > 1)
-        return out[0] if alone else out
+        raw = np.asarray(measurement, dtype=np.float64)
+        y, u = as_block(raw, self._m, "Kalman filter"), self._none
+        n = y.shape[0]
+        if self._n_u or inputs is not None:
+            given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
+            if given.size != n * self._n_u or not np.isfinite(given).all():
+                raise EstimationError(
+                    f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are "
+                    "needed. Give all of them"
+                )
+            u = as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
+        out = np.empty((n, self._n))
+        self._run(y, u, out)
+        return out[0] if raw.ndim == 0 or (raw.ndim == 1 and self._m > 1) else out
 
     def _run(self, y: Array, u: Array, out: Array) -> None:
         kernels("kalman").state_scan(y, u, out, self._model, self._memory, self._work, self._tally)
@@ -212,19 +225,8 @@ class KalmanFilter(Copied):
         """Single measured values that were missing."""
         return int(self._tally[1])
 
-    def _inputs(self, inputs: ArrayLike | None, n: int) -> Array:
-        if self._n_u == 0 and inputs is None:
-            return self._none
-        given = np.asarray([] if inputs is None else inputs, dtype=np.float64)
-        if given.size != n * self._n_u or not np.isfinite(given).all():
-            raise EstimationError(
-                f"Kalman filter: inputs of shape {given.shape}; {n} samples of {self._n_u} finite inputs are "
-                "needed. Give all of them"
-            )
-        return as_block(given.reshape(n, self._n_u), self._n_u, "Kalman filter")
 
-
-def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
+def _start_covariance(model: LinearState, covariance: ArrayLike | None) -> Array:
     """Return the covariance (n_states, n_states) to begin with, the stationary one where none is given."""
     if covariance is None:
         from ambid.estimation.predictor import predictor_gain
@@ -252,8 +254,158 @@ def _start(model: LinearState, covariance: ArrayLike | None) -> Array:
     return P
 
 
-def _vector(start: ArrayLike, n: int) -> Array:
-    x = np.array(start, dtype=np.float64).reshape(-1)
-    if x.size != n or not np.isfinite(x).all():
-        raise EstimationError(f"Kalman filter: start has {x.size} numbers for {n} states; give {n} that are finite")
-    return x
+class StreamingFilter(Copied):
+    """A first-order filter x⁺ = decay x + forward y that runs on each of several channels alone.
+
+    Splitting a stream into samples and blocks in another way does not change any number. A value that is not finite is
+    missing: x⁺ = alone x, and `n_missing` counts it. `first` is the state over the first value, where none is given.
+    """
+
+    def __init__(
+        self, name: str, channels: int, start: float | None, *, decay: float, forward: float, alone: float, first: float
+    ) -> None:
+        self.name, self.channels = name, channels
+        self.n_samples = self.n_missing = 0
+        self._state = np.full(channels, np.nan if start is None else float(start))
+        self._constants = np.array([decay, forward, alone, first])
+
+    @property
+    def state(self) -> Array:
+        """A copy of the estimate that is ready for the next sample, shape (channels,)."""
+        return self._state.copy()
+
+    def update(self, measurement: ArrayLike) -> Array | float:
+        """Take in one sample or a block and return it filtered.
+
+        `measurement`: (channels,), or (n_samples, channels) for a block.
+        """
+        y = np.asarray(measurement, dtype=np.float64)
+        block = as_block(y, self.channels, self.name)
+        out = np.empty(block.shape)
+        self.n_missing += kernels("kalman").hold_scan(block, out, self._state, self._constants)
+        self.n_samples += block.shape[0]
+        return float(out[0, 0]) if y.ndim == 0 else out.reshape(y.shape)
+
+
+def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float = 60.0, r: float = 1.0) -> float:
+    """Return the stationary gain L = S C/R of the scalar filter.
+
+    S is the positive root of the Riccati equation 2 A S - S² C²/R + W² Q = 0 (thesis 5.3.2, with W Q Wᵀ where it
+    prints W Q Cᵀ). The defaults are the thesis's: L = √60 = 7.746 1/s.
+
+    Parameters
+    ----------
+    a : float
+        A in 1/s.
+    c : float
+        C, unit of the measurement per unit of the state; not 0.
+    w : float
+        W, unit of the state per second and unit of w.
+    q : float
+        Intensity (two-sided density) of w, its unit squared times s; at least 0.
+    r : float
+        Intensity of the measurement noise, its unit squared times s; over 0. White noise of variance σ² sampled at f
+        Hz has σ²/f.
+
+    Returns
+    -------
+    float
+        L in state unit per measurement unit and second.
+
+    Raises
+    ------
+    EstimationError
+        If C is 0, Q negative or R not positive, or A and W² Q are both 0 (the stationary gain would be 0).
+    """
+    for label, value in {"A": a, "C": c, "W": w, "Q": q, "R": r}.items():
+        if not isfinite(value):
+            raise EstimationError(f"Kalman-Bucy filter: {label} is {value}; it must be finite. Give a number")
+    if c == 0.0 or q < 0.0 or r <= 0.0:
+        raise EstimationError(
+            f"Kalman-Bucy filter: C = {c:g}, Q = {q:g}, R = {r:g}; C must not be 0, Q not negative and R positive. "
+            "Give others"
+        )
+    if a == 0.0 and w * w * q == 0.0:
+        raise EstimationError(
+            "Kalman-Bucy filter: A = 0 without process noise has no stationary gain but 0. Give Q > 0"
+        )
+    s = (a + sqrt(a * a + c * c * w * w * q / r)) * r / (c * c)
+    return s * c / r
+
+
+class ScalarKalman(StreamingFilter):
+    """Stationary Kalman-Bucy filter of one or several channels that have nothing to do with each other.
+
+    x̂' = A x̂ + L (y - C x̂) is solved exactly, each sample of y held until the next; what comes out is x̂ at the sampling
+    instants, from the samples before. The defaults are the thesis's (5.3.2):
+    A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 = 7.746 1/s. `KalmanFilter` has the discrete and the varying form.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    a, c, w, q, r : float
+        As in `kalman_bucy_gain`: intensities, not variances of samples. White noise of variance σ² in
+        samples of f Hz has r = σ²/f.
+    start : float, optional
+        Estimate before the first sample; y/c of the first sample by default.
+    channels : int
+
+    Raises
+    ------
+    EstimationError
+        If a number is out of range, or there is no stationary filter.
+    """
+
+    def __init__(
+        self,
+        rate_hz: float,
+        *,
+        a: float = 0.0,
+        c: float = 1.0,
+        w: float = 1.0,
+        q: float = 60.0,
+        r: float = 1.0,
+        start: float | None = None,
+        channels: int = 1,
+    ) -> None:
+        check_channels("scalar Kalman filter", rate_hz, channels)
+        self.gain = kalman_bucy_gain(a=a, c=c, w=w, q=q, r=r)
+        pole = a - self.gain * c
+        super().__init__(
+            "scalar Kalman filter", channels, start,
+            decay=exp(pole / rate_hz), forward=self.gain * expm1(pole / rate_hz) / pole, alone=exp(a / rate_hz),
+            first=1.0 / c,
+        )  # fmt: skip
+
+
+class PassiveLowpass(StreamingFilter):
+    """First-order RC low-pass, x' = (y - x)/τ with τ = 1/(2π corner), discretised exactly; y held over a sample.
+
+    Gives the voltage over the capacitor at the sampling instants. Over a missing value it stays where it is.
+
+    Parameters
+    ----------
+    rate_hz : float
+        Sampling rate in Hz.
+    corner_hz : float
+        Frequency of -3 dB in Hz, over 0.
+    start : float, optional
+        Value before the first sample; the first sample by default.
+    channels : int
+
+    Raises
+    ------
+    EstimationError
+        If a number is not positive.
+    """
+
+    def __init__(self, rate_hz: float, *, corner_hz: float, start: float | None = None, channels: int = 1) -> None:
+        check_channels("passive low-pass", rate_hz, channels)
+        if not (isfinite(corner_hz) and corner_hz > 0):
+            raise EstimationError(f"passive low-pass: the corner is {corner_hz} Hz; it must be positive. Give another")
+        self.corner_hz = corner_hz
+        step = -2.0 * pi * corner_hz / rate_hz
+        super().__init__(
+            "passive low-pass", channels, start, decay=exp(step), forward=-expm1(step), alone=1.0, first=1.0
+        )

@@ -5,13 +5,13 @@ A value that is not finite is missing: the filter predicts over it.
 
 from __future__ import annotations
 
-from math import cos, isfinite, sin, sqrt
+from math import isfinite, sqrt
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.compiled import compiled
-from ambid.recursive.square_root_kernels import project, propagate, shrink, variance, widen
+from ambid.recursive.square_root_kernels import project, propagate, shrink, variance
 
 _SAME = 2e-15  # relative change of a root of a covariance that is rounding
 
@@ -162,53 +162,3 @@ def _steady(k: int, y: Array, out: Array, A: Array, C: Array, x: Array, rest: Ar
     x[last] = p1
     x[0] = p0
     return k
-
-
-@compiled(fastmath={"contract"})
-def synchronous_scan(y: Array, phase: Array, out: Array, state: Array, constants: Array) -> int:
-    """Follow cos φ, sin φ and an offset, all in random walks, and take the rotation off.
-
-    `state` (m, 18): cosine, sine, offset; factors of their covariance over that of the noise (row by row, 9); sums of
-    cos φ e and sin φ e over a batch, samples in it; noise density at the rotation; batches; samples seen.
-    """
-    walk, most, longest, start = constants[0], constants[1], constants[2], constants[3]
-    taper = constants[4:]  # against leakage of stronger noise at other frequencies
-    h, f, gain, one = np.ones(3), np.empty(3), np.empty(3), 1.0
-    missing = 0
-    for j in range(y.shape[1]):
-        s = state[j]
-        F = s[3:12].reshape(3, 3)
-        for k in range(y.shape[0]):
-            v, c, d = y[k, j], cos(phase[k]), sin(phase[k])
-            if not (isfinite(v) and isfinite(c)):
-                out[k, j] = v if not isfinite(v) else np.nan
-                missing += 1
-                continue
-            if s[17] == 0.0:
-                s[2] = v
-                s[3], s[7], s[11] = start, start, start
-            s[17] += 1.0
-            out[k, j] = v - s[0] * c - s[1] * d
-            e = out[k, j] - s[2]
-            h[0], h[1] = c, d
-            project(F, h, f)
-            alpha = shrink(F, f, one, gain)
-            for i in range(3):
-                s[i] += gain[i] * (e / alpha)
-            e *= taper[int(s[14])] / sqrt(alpha)
-            s[12] += c * e
-            s[13] += d * e
-            s[14] += 1.0
-            if s[14] >= taper.size:  # the mean squared sum is the density of the noise around the rotation
-                s[16] = min(s[16] + 1.0, longest)
-                s[15] += ((s[12] * s[12] + s[13] * s[13]) / s[14] - s[15]) / s[16]
-                s[12], s[13], s[14] = 0.0, 0.0, 0.0
-            total = 0.0
-            for i in range(3):
-                total += variance(F, i)
-            if total < most:  # without rotation nothing bounds the covariance but this
-                for i in range(3):
-                    f[:] = 0.0
-                    f[i] = 1.0
-                    widen(F, f[: i + 1], walk)
-    return missing

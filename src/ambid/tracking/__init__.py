@@ -9,6 +9,5 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.tracking.lines_file import read_track as read_track
     from ambid.tracking.rpem import PhysicalRpem as PhysicalRpem
-    from ambid.tracking.window import MovingWindow as MovingWindow
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -13,10 +13,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.recursive.lines import Event
-from ambid.tracking.evidence import Evidence, RecentSamples
+from ambid.tracking.evidence import Evidence, EvidenceStream, RecentSamples, Samples, linearise
+from ambid.tracking.numbers import TrackedNumbers
 from ambid.tracking.rpem import ParameterFilter, PhysicalRpem
-from ambid.tracking.window import Refined, evidence_of, refine
 
 _LEAST_SD = 0.3  # of a number that has moved, relative to its magnitude
 _STRAY = 3.0  # moves that the detector's estimate of a move may be off by
@@ -28,6 +29,72 @@ _LEFT = 2.0  # times the usual variance of innovations that a right explanation 
 _TOLD = 25.0  # by which a number has to lessen the misfit to be named where the alarm named none
 _VAGUE = 0.1  # relative standard deviation above which nothing is said to have been found
 _QUIET = 3.0  # standard deviations of chi-squared under which what was known before explains a stretch
+_WHOLE = 1 << 40  # samples: a stretch is one block
+_ITERATIONS = 6
+_SETTLED = 0.05  # in standard deviations: the search has converged where the next step is shorter
+_HALVINGS = 4
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Refined:
+    """Numbers found from a stretch."""
+
+    filter: ParameterFilter  # estimate and covariance, what was known before included
+    stream: EvidenceStream  # the predictor at the estimate, at the end of the stretch
+    evidence: Evidence  # of the stretch, linearised where the last step began
+    # squared distance of the estimate from what was known before and from the stretch: chi-squared with p degrees of
+    # freedom if both are right
+    misfit: float
+    converged: bool
+    iterations: int
+
+
+def refine(
+    numbers: TrackedNumbers,
+    before: ParameterFilter,
+    samples: Samples,
+    *,
+    first: int = 0,
+    block: int = 1,
+    noise: float = 1.0,
+    gain: Array | None = None,
+) -> Refined | None:
+    """Find the numbers that explain a stretch, given what is known from before it.
+
+    `before`: what is known without the stretch; the search starts there; `samples`: the stretch; its first part settles
+    the predictor; `first`: number of its first sample in the stream; `block`: samples of one evidence of the stream
+    that is given back; `noise`: variance of the evidence's residual; `gain`: (n_states, n_outputs), a predictor gain
+    near the one looked for. Returns none where the stretch is too short to settle, or no step leads to a predictor.
+    """
+    q, near, last = before.q.copy(), gain, 0.0
+    for iteration in range(1, _ITERATIONS + 1):
+        at = linearise(numbers, q, near)
+        for _ in range(_HALVINGS):
+            if at is not None:
+                break
+            q = 0.5 * (q + before.q)
+            at = linearise(numbers, q, near)
+        if at is None:
+            return None
+        near = at.gain
+        stream = EvidenceStream(numbers, at, _WHOLE)
+        stream.restart(first)
+        stream.feed(samples)
+        evidence = stream.close(block)
+        if evidence is None:
+            return None
+        found = before.copy()
+        misfit = found.absorb(evidence, noise)
+        step = float(np.max(np.abs(found.q - q) / found.sd))
+        # steps shrink at least as fast as they have: what the next one would be needs no look
+        left, last = step * min(1.0, step / last) if last else step, step
+        if left < _SETTLED or iteration == _ITERATIONS:
+            return Refined(
+                filter=found, stream=stream, evidence=evidence, misfit=misfit, converged=left < _SETTLED,
+                iterations=iteration,
+            )  # fmt: skip
+        q = found.q.copy()
+    return None
 
 
 def begin(
@@ -103,11 +170,14 @@ class Recovery:
             self.onset += (recent.last - self.onset) // 2
         self.onset = max(self.onset, recent.first)
         self.ready = recent.last + max(recent.last - self.onset, 1)
-        best: tuple[Refined | None, tuple[str, ...]] | None = None
         samples = recent.since(self.onset)
-        evidence = None if samples is None else evidence_of(rpem.numbers, rpem.stream.at, samples, first=self.onset)
-        if evidence is not None:
-            best = self._explanation(rpem, recent, evidence)
+        if samples is None:
+            return None
+        stream = EvidenceStream(rpem.numbers, rpem.stream.at, _WHOLE)
+        stream.restart(self.onset)
+        stream.feed(samples)
+        evidence = stream.close(1)
+        best = None if evidence is None else self._explanation(rpem, samples, evidence)
         if best is None:
             return None
         return Recovered(refined=best[0], moved=best[1], computing_s=time.thread_time() - begun)
@@ -122,30 +192,26 @@ class Recovery:
         self.attempts = max(self.attempts - 1, 0)
 
     def _explanation(
-        self, rpem: PhysicalRpem, recent: RecentSamples, evidence: Evidence
+        self, rpem: PhysicalRpem, samples: Samples, evidence: Evidence
     ) -> tuple[Refined | None, tuple[str, ...]] | None:
         """What explains the samples since the onset, if anything does: nothing has moved, one number has, or all."""
         p = rpem.numbers.start.size
-        before = self._unmoved(rpem, evidence)
+        before = self.before.copy().absorb(evidence, rpem.noise)  # chi-squared if nothing has moved
         if self.short and self.attempts == 1 and before < p + _QUIET * np.sqrt(2.0 * p):
             return None, ()
         numbers = rpem.numbers
         choices = [(name,) for name in self._likeliest(rpem, evidence)]
         if self.event.kind != "change" or self.attempts > 1:  # it may have been a load after all
             choices.append(tuple(numbers.names[j] for j in numbers.places("offset", "unbalance")))
-        best = self._best(rpem, recent, choices)
+        best = self._best(rpem, samples, choices)
         if best is None or best[0].misfit >= _MISFIT * p:
             every = tuple(numbers.names[j] for j in numbers.places("parameter"))
-            best = self._best(rpem, recent, [every])
+            best = self._best(rpem, samples, [every])
         if best is None or best[0].misfit >= _MISFIT * p:
             return None
         if self.event.kind != "change" and before - best[0].misfit < _TOLD and before < _MISFIT * p:
             return None, ()
         return best
-
-    def _unmoved(self, rpem: PhysicalRpem, evidence: Evidence) -> float:
-        """Misfit of what was known before: chi-squared with p degrees of freedom if nothing has moved."""
-        return self.before.copy().absorb(evidence, rpem.noise)
 
     def _likeliest(self, rpem: PhysicalRpem, evidence: Evidence) -> tuple[str, ...]:
         """Of many suspects those few that explain the stretch best to first order."""
@@ -160,36 +226,24 @@ class Recovery:
         return tuple(self.suspects[j] for j in np.argsort(-gain)[:_FEW])
 
     def _best(
-        self, rpem: PhysicalRpem, recent: RecentSamples, choices: Sequence[tuple[str, ...]]
+        self, rpem: PhysicalRpem, samples: Samples, choices: Sequence[tuple[str, ...]]
     ) -> tuple[Refined, tuple[str, ...]] | None:
         """Of several sets of numbers that may be freed, the one that explains the stretch best."""
-        found = [(self._search(rpem, recent, freed), freed) for freed in choices]
-        return min(
-            ((refined, freed) for refined, freed in found if refined is not None),
-            key=lambda pair: pair[0].misfit,
-            default=None,
-        )
-
-    def _search(self, rpem: PhysicalRpem, recent: RecentSamples, freed: tuple[str, ...]) -> Refined | None:
-        samples = recent.since(self.onset)
-        if samples is None:
-            return None
-        begin = self.before.copy()
-        for name in freed:
-            place = rpem.numbers.names.index(name)
-            begin.active[place] = True
-            begin.widen(place, max(_LEAST_SD, _STRAY * abs(self.size)))
-        found = refine(
-            rpem.numbers,
-            begin,
-            samples,
-            first=self.onset,
-            block=rpem.block_samples,
-            noise=rpem.noise,
-            gain=rpem.stream.at.gain,
-        )
-        if found is None or not found.converged:
-            return None
-        left = found.evidence.rest / found.evidence.freedom if found.evidence.freedom else 1.0
-        vague = max(found.filter.sd[rpem.numbers.names.index(name)] for name in freed) > _VAGUE
-        return None if vague or left > _LEFT * max(rpem.noise_level, 1.0) else found
+        numbers, best = rpem.numbers, None
+        for freed in choices:
+            start, places = self.before.copy(), [numbers.names.index(name) for name in freed]
+            for place in places:
+                start.active[place] = True
+                start.widen(place, max(_LEAST_SD, _STRAY * abs(self.size)))
+            refined = refine(
+                numbers, start, samples, first=self.onset, block=rpem.block_samples, noise=rpem.noise,
+                gain=rpem.stream.at.gain,
+            )  # fmt: skip
+            if refined is None or not refined.converged:
+                continue
+            left = refined.evidence.rest / refined.evidence.freedom if refined.evidence.freedom else 1.0
+            if max(refined.filter.sd[places]) > _VAGUE or left > _LEFT * max(rpem.noise_level, 1.0):
+                continue
+            if best is None or refined.misfit < best[0].misfit:
+                best = refined, freed
+        return best

@@ -241,39 +241,7 @@ _LOWEST_NOISE = 0.25  # of the level at identification: less is not believed
 _OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of which nothing is known before
 
 
-class PhysicalEstimator:
-    """What every estimator of a bench's physical parameters has: numbers to track, a filter of them and a predictor."""
-
-    def __init__(self, start: Estimate | TrackedNumbers) -> None:
-        self.numbers = numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
-        at = linearise(numbers, numbers.start)
-        if at is None:
-            raise EstimationError("the start estimate gives no stable predictor. Identify the bench again")
-        self.filter = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
-        self.stream = EvidenceStream(numbers, at, 1)
-        self.n_used = self.n_rejected = 0
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the physical parameters."""
-        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
-
-    @property
-    def estimate(self) -> Array:
-        """Physical parameters, SI, shape (n_parameters,)."""
-        return self.numbers.physical(self.filter.q)
-
-    @property
-    def covariance(self) -> Array:
-        """Their covariance, SI, shape (n_parameters, n_parameters)."""
-        return self.numbers.physical_covariance(self.filter.covariance)
-
-    def copy(self) -> Self:
-        """Return an independent estimator in the same state."""
-        return copy.deepcopy(self, {id(self.numbers): self.numbers})
-
-
-class PhysicalRpem(PhysicalEstimator):
+class PhysicalRpem:
     """Recursive estimator of a bench's physical parameters, started from an off-line estimate.
 
     Parameters
@@ -310,20 +278,43 @@ class PhysicalRpem(PhysicalEstimator):
     """
 
     def __init__(self, start: Estimate | TrackedNumbers, *, memory: Memory = "auto", block: int | None = None) -> None:
-        super().__init__(start)
-        numbers = self.numbers
+        self.numbers = numbers = start if isinstance(start, TrackedNumbers) else tracked_numbers(start)
+        at = linearise(numbers, numbers.start)
+        if at is None:
+            raise EstimationError("the start estimate gives no stable predictor. Identify the bench again")
+        self.n_used = self.n_rejected = 0
         fewest = -(-_ROWS_PER_NUMBER * numbers.start.size // len(numbers.problem.model.outputs))
         size = max(round(BLOCK_S * numbers.rate_hz), fewest) if block is None else block
         if size < 1:
             raise EstimationError(f"a block has {counted(size, 'sample')}; it needs at least 1. Give a larger block")
         self.block_samples, self.block_s = size, size / numbers.rate_hz
+        self.filter = ParameterFilter(numbers.start, numbers.covariance, numbers.positive)
         self.filter.active[numbers.places("gain")] = False
-        self.stream = EvidenceStream(numbers, self.stream.at, size)
+        self.stream = EvidenceStream(numbers, at, size)
         self.drift = _rates(numbers, memory, self.block_s)
         self.n_linearised = self.n_unreached = 0
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the physical parameters."""
+        return tuple(self.numbers.names[j] for j in self.numbers.places("parameter"))
+
+    @property
+    def estimate(self) -> Array:
+        """Physical parameters, SI, shape (n_parameters,)."""
+        return self.numbers.physical(self.filter.q)
+
+    @property
+    def covariance(self) -> Array:
+        """Their covariance, SI, shape (n_parameters, n_parameters)."""
+        return self.numbers.physical_covariance(self.filter.covariance)
+
+    def copy(self) -> Self:
+        """Return an independent estimator in the same state."""
+        return copy.deepcopy(self, {id(self.numbers): self.numbers})
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
         """Take in one sample or a block.
