@@ -7,6 +7,7 @@ the files after them need is compiled by then, and not by both processes.
 from __future__ import annotations
 
 import gc
+import signal
 from itertools import groupby
 
 import pytest
@@ -49,6 +50,8 @@ LONGEST = (
 
 
 def pytest_configure(config: pytest.Config) -> None:
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell (``nohup make test &``) or CI:
+        signal.signal(signal.SIGINT, signal.default_int_handler)  # tests of Ctrl-C, and what they start, need it
     gc.set_threshold(100_000, 50, 100)  # as the command does: what is imported stays to the end
     if hasattr(config.option, "loadscopereorder"):  # else the files with most tests would begin first
         config.option.loadscopereorder = False

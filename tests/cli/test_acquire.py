@@ -307,15 +307,19 @@ def test_a_full_disk_is_told_at_once_and_ends_with_2(acquire, monkeypatch):
 
 @pytest.mark.parametrize(("what", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_keeps_what_came(acquire, monkeypatch, what, code):
-    if signal.getsignal(what) is signal.SIG_IGN:  # these tests were started by nohup, which the command respects
+    usual = signal.getsignal(what)
+    if usual is signal.SIG_IGN:  # SIGHUP, where these tests were started by nohup, which the command respects
         signal.signal(what, signal.SIG_DFL)
     before = signal.getsignal(what)
-    signalled(monkeypatch, 40, what)
-    done = acquire("--seconds", "600")
-    assert done.code == code
-    assert f"ambid: interrupted; o.h5 holds the {samples()} samples before it" in done.err
-    assert 780 <= samples() <= 840
-    assert signal.getsignal(what) is before
+    try:
+        signalled(monkeypatch, 40, what)
+        done = acquire("--seconds", "600")
+        assert done.code == code
+        assert f"ambid: interrupted; o.h5 holds the {samples()} samples before it" in done.err
+        assert 780 <= samples() <= 840
+        assert signal.getsignal(what) is before
+    finally:
+        signal.signal(what, usual)
 
 
 def test_a_second_signal_says_where_what_came_is(acquire, monkeypatch, place):

@@ -154,12 +154,19 @@ def test_linear_algebra_gets_one_thread_unless_told_otherwise():
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="signals as POSIX has them")
-def test_ctrl_c_ends_cleanly(bench, ambid):
+@pytest.mark.parametrize("usual", [signal.SIG_DFL, signal.SIG_IGN], ids=["foreground", "nohup"])
+def test_ctrl_c_ends_cleanly(bench, ambid, usual):
     # long enough that the interrupt comes in the middle of the work
     assert ambid("simulate", "unstable-bearing", "-o", "long.csv", "--duration", "10", "--amplitude", "20").code == 0
     before = sorted(p.name for p in bench.iterdir())
     words = ["identify", "long.csv", "--json", "found.json", "--plot", "found.png"]
-    job = subprocess.Popen([*AMBID, *words], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    job = subprocess.Popen(
+        [*AMBID, *words],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, usual),
+    )
     time.sleep(1.2)
     job.send_signal(signal.SIGINT)
     out, err = job.communicate(timeout=60)

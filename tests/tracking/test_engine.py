@@ -163,13 +163,11 @@ def test_a_source_that_cannot_be_sent_is_refused():
 
 @pytest.mark.parametrize("producer", EVERYWHERE)
 def test_an_interrupt_ends_with_everything_up_to_then_delivered(producer):
-    def endless():
-        k = 0
-        while True:
+    def long():
+        for k in range(0, 400_000, 100):
             yield Block(first=k, time_s=k / RATE, values=X[:100] + k)
-            k += 100
 
-    source = replay(noise(400_000), 100) if producer == "process" else endless()
+    source = replay(noise(400_000), 100) if producer == "process" else long()
     sink = Sink(at=5000, do=lambda: signal.raise_signal(signal.SIGINT))
     report = engine(source, sink, producer=producer)
     assert report.interrupted

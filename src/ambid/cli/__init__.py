@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from typing import NoReturn, TextIO
 
-from ambid.cli.interrupts import INTERRUPTED, interrupts
+from ambid.cli.interrupts import INTERRUPTED, heed_interrupts, interrupts
 from ambid.compiled import THREADS
 
 BROKEN_PIPE = 141
@@ -38,6 +38,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     if not sys.warnoptions:
         # Warnings of numerical libraries speak to programmers; what concerns the user is said in results and errors.
         warnings.simplefilter("ignore")
+    heed_interrupts()
     _hold_standard_files()
     if sys.stderr is not None:
         sys.stderr = _BestEffort.of(sys.stderr)

@@ -15,11 +15,19 @@ if TYPE_CHECKING:
 INTERRUPTED = 130  # exit code
 
 
+def heed_interrupts() -> None:
+    """Let Ctrl-C reach a command that was started with it ignored: a shell without job control does that to whatever it
+    puts into the background (``nohup ... &``), and ``kill -INT`` is then the only way to end a run in order.
+    """
+    if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
 @contextmanager
 def signals(take: Callable[[int], None]) -> Iterator[None]:
     """Give Ctrl-C, the signal to terminate and that of a closed terminal to a function; as before afterwards.
 
-    What is ignored stays so: a program under ``nohup`` outlives its terminal.
+    A closed terminal that is ignored stays so: a program under ``nohup`` outlives it.
 
     Returns while signals are taken.
     """
