@@ -14,7 +14,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import minimize
 
 from ambid.arrays import Array, Complex
 from ambid.control.information import Information
@@ -96,6 +95,8 @@ def _search(
     information: Information, limited: Limited, start: Complex, samples: float, p: float, steps: int
 ) -> Complex:
     """Return the amplitudes of least criterion, the use taken as a p-norm."""
+    from scipy.optimize import minimize
+
     n = start.size
     share = np.abs(start) ** 2 / np.sum(np.abs(start) ** 2)
     own = np.maximum((share - BROADBAND / n) / (1.0 - BROADBAND), _LEAST)
