@@ -12,8 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.blackbox.data import IOData
-from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.structures import nonlinear_structure
+from ambid.nonlinear.fit import NonlinearFit, nonlinear_structure
 from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
 from ambid.simulation import simulate_preset

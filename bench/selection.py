@@ -10,8 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ambid.nonlinear.polynomial import Term, lagged, products
-from ambid.nonlinear.selection import Selection, candidates, select_terms
+from ambid.nonlinear.polynomial import Selection, Term, candidates, lagged, products, select_terms
 from peers import Array, Bench, bench
 from table import Table
 from timing import quantity

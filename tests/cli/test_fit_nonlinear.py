@@ -12,7 +12,7 @@ import pytest
 
 from ambid.blackbox.words import settings_of
 from ambid.cli import fit as verb
-from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
 
 WORDS = ("--input", "u", "--output", "y", "--open-loop")
 

@@ -245,7 +245,7 @@ def test_the_quickstart_has_commands_of_the_readme_and_its_python_runs(tmp_path,
 
 
 def test_the_page_on_nonlinear_models_names_every_structure():
-    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
 
     text = (ROOT / "docs" / "nonlinear.md").read_text(encoding="utf-8")
     assert {f"| `{name}` |" for name in NONLINEAR_STRUCTURES} <= set(re.findall(r"\| `\w+` \|", text))

@@ -8,7 +8,7 @@ import pytest
 from ambid.errors import AmbidError, EstimationError
 from ambid.job import fit
 from ambid.job.results import load
-from ambid.nonlinear.fit_file import nonlinear_fit_text
+from ambid.nonlinear.fit import nonlinear_fit_text
 from ambid.record import read_record
 
 CHANNELS = {"input": "u", "output": "y"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.nonlinear.cloud import Cloud, cloud_of
+from ambid.nonlinear.records import Cloud, cloud_of
 
 
 def test_middle_edge_and_outside() -> None:

@@ -12,15 +12,18 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
-from ambid.nonlinear.fit_file import (
+from ambid.nonlinear.fit import (
     MODEL_KINDS,
+    NONLINEAR_STRUCTURES,
+    NonlinearFit,
+    NonlinearModel,
+    NonlinearStructure,
     model_from_json,
     model_to_json,
     nonlinear_fit_from_json,
     nonlinear_fit_text,
+    nonlinear_structure,
 )
-from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, NonlinearStructure, nonlinear_structure
 from tests.nonlinear.systems import SETTINGS, runaway, smooth
 
 ALL = list(NONLINEAR_STRUCTURES.values())

@@ -9,13 +9,12 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.nonlinear.blocks import Block, Terms
-from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit_file import model_from_json, model_to_json
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, Rows, lags
+from ambid.nonlinear.fit import model_from_json, model_to_json
+from ambid.nonlinear.lagged import Block, LaggedFunction, LaggedModel, Regressors, Rows, Terms, lags
 from ambid.nonlinear.lagged_problem import problem_at
 from ambid.nonlinear.narx import NarxFunction
 from ambid.nonlinear.rbf import RbfFunction
+from ambid.nonlinear.records import cloud_of
 from tests.nonlinear.rbf.systems import network
 
 METRIC = np.array([[1.0, -1.0, 0.0, 0.5], [0.3, 0.0, 2.0, 0.0]])

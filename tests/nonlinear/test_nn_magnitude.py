@@ -7,7 +7,7 @@ import pytest
 
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.nonlinear.fit_file import model_from_json, model_to_json
+from ambid.nonlinear.fit import model_from_json, model_to_json
 from ambid.nonlinear.nn import nn
 from ambid.nonlinear.state_network import StateNetwork
 from ambid.nonlinear.state_start import grid_starts

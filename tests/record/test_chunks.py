@@ -192,21 +192,21 @@ def test_a_handler_that_raises_waits_for_the_library(tmp_path, record, number):
 INTERRUPTED = """
 import os, signal, sys
 import numpy as np
-from ambid.record import Channel, Record, _hdf5_file
+from ambid.record import Channel, Record, hdf5_format
 from ambid.record.hdf5_format import write_hdf5
 
 def handler(*_):
     raise KeyboardInterrupt
 
 signal.signal(signal.SIGINT, handler)
-write, number = _hdf5_file._Unfailing.write, iter(range(10**9))
+write, number = hdf5_format._Unfailing.write, iter(range(10**9))
 
 def interrupted(self, data):
     if next(number) == int(sys.argv[2]):
         os.kill(os.getpid(), signal.SIGINT)
     return write(self, data)
 
-_hdf5_file._Unfailing.write = interrupted
+hdf5_format._Unfailing.write = interrupted
 record = Record(channels=(Channel(name="a", unit="m", values=np.arange(5000.0)),), rate_hz=1.0)
 try:
     write_hdf5(record, sys.argv[1])

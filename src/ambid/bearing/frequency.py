@@ -2,7 +2,7 @@
 
 Minimises the sum of e^H C^-1 e between the measured response and that of the model, exactly sampled where the input is
 held, with exact derivatives; starts come from the response itself. Consistent under feedback as far as the response is:
-take it with the reference (`ambid.signals.frf`).
+take it with the reference (`ambid.signals.response`).
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterable
 
 def _structures() -> Iterable[str]:
     from ambid.blackbox.fit import STRUCTURES
-    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
 
     return (*STRUCTURES, *NONLINEAR_STRUCTURES)
 

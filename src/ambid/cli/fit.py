@@ -95,7 +95,7 @@ def command(
     Ctrl-C during a nonlinear fit keeps the best model so far (exit code 130).
     """
     from ambid.job import fit, physics
-    from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+    from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
     from ambid.rig import load_rig
 
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)

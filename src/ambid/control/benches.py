@@ -28,8 +28,7 @@ from ambid.rig.rig import Rig, RigMagnet
 from ambid.simulation.bench import VaryingLoop
 from ambid.simulation.plant import LinearPlant, closed_loop_poles
 from ambid.simulation.rig_bench import enough_steps, plant_of_rig, rest_of_rig
-from ambid.simulation.rotor_bench import RotorBench
-from ambid.simulation.rotor_magnets import Poles, poles_of
+from ambid.simulation.rotor_bench import Poles, RotorBench, poles_of
 
 
 class Answer(NamedTuple):

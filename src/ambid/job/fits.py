@@ -18,7 +18,7 @@ from ambid.errors import EstimationError, nearest, refuse_given
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
 from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig, sources_of
-from ambid.nonlinear.structures import NONLINEAR_STRUCTURES, nonlinear_structure
+from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model
 from ambid.record import GapPolicy
 from ambid.rig import Rig
@@ -68,7 +68,7 @@ def fit(
     records : file, Record, DataFrame, Dataset or dict of arrays, or sequence of these
         Several: for nonlinear structures, of one bench, with the same channels and rate.
     structure : str
-        As in `ambid.blackbox.fit` or `ambid.nonlinear.structures`.
+        As in `ambid.blackbox.fit` or `ambid.nonlinear.fit`.
     input, output, reference : str or sequence of str, optional
         Names of channels; no input for a time series. With a rig its roles or columns, by default all of its model.
         References are the loop's outer excitation, for methods that use it.

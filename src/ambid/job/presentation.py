@@ -253,7 +253,7 @@ def _of_evidence(evidence: Callable[[Any, Any], Any], title: Callable[[Any], str
 def _fit() -> View:
     from ambid.blackbox.fit import BlackBoxFit
     from ambid.blackbox.fit_file import fit_text as linear_document
-    from ambid.nonlinear.fit_file import nonlinear_fit_text
+    from ambid.nonlinear.fit import nonlinear_fit_text
     from ambid.report.fit_figures import fit_overview, traces_of
     from ambid.report.fit_text import fit_text
 

@@ -16,9 +16,7 @@ from ambid.errors import AmbidError, EstimationError, path_of
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
 from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
-from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.fit_file import nonlinear_fit_from_json
-from ambid.nonlinear.structures import NONLINEAR_STRUCTURES
+from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, NonlinearFit, nonlinear_fit_from_json
 from ambid.physics.linear_model import model
 from ambid.record import GapPolicy, read_record
 from ambid.record.record import file_bytes, utf8_text

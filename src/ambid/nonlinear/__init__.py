@@ -9,6 +9,6 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.nonlinear.fit import NonlinearFit as NonlinearFit
     from ambid.nonlinear.fit import NonlinearModel as NonlinearModel
-    from ambid.nonlinear.selection import select_terms as select_terms
+    from ambid.nonlinear.polynomial import select_terms as select_terms
 
 __getattr__, __dir__, __all__ = exports(__name__)

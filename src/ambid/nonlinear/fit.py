@@ -1,18 +1,34 @@
-"""What every nonlinear model is to those who use it, and the result of every nonlinear estimator."""
+"""Nonlinear models, fits, their files (schema ``ambid.fit/1``), their settings, and the register of structures.
+
+An estimator is a function ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit``: `records` a sequence
+of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.estimate.Tick`) called now and
+then with the name of the stage and the share of the whole search that is over; it may raise KeyboardInterrupt, upon
+which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers that are not finite, end
+in status ``failed`` with the reason, never in an exception; an exception is a request that makes no sense. The
+estimator leaves `fit`, `criteria` and `checks` to `ambid.validation.fits`. It is imported only when it is asked for.
+`tests/nonlinear/test_conformance.py` runs on every entry.
+
+Settings are one frozen dataclass a family, whose fields, made by `whole`, `number`, `choice` or `text`, say what they
+are and what they may be. What is left out, or ``auto`` where a field has no default of its own, the method chooses.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from importlib import import_module
+from operator import attrgetter
 from time import perf_counter
-from typing import Any, Literal, Protocol
+from types import MappingProxyType
+from typing import Any, Literal, Protocol, TypeVar
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
-from ambid.estimation.estimate import FittedModel
+from ambid.errors import EstimationError, nearest
+from ambid.estimation.estimate import FittedModel, fit_document, json_text, only_outputs, read_as, read_fit
 from ambid.estimation.search import Found
 
 Settings = Mapping[str, int | float | str | tuple[int, ...]]
@@ -27,7 +43,7 @@ class NonlinearModel(Protocol):
     Attributes
     ----------
     kind : str
-        Under which `nonlinear.fit_file` writes and finds it.
+        Under which `nonlinear.fit` writes and finds it.
     dt : float
         Sampling interval in s.
     n_inputs, n_outputs : int
@@ -139,7 +155,7 @@ class NonlinearModel(Protocol):
         ...
 
     def as_json(self) -> dict[str, Any]:
-        """Return all that `nonlinear.fit_file` needs to read it back; numbers survive bit by bit."""
+        """Return all that `nonlinear.fit` needs to read it back; numbers survive bit by bit."""
         ...
 
 
@@ -162,7 +178,7 @@ class NonlinearFit(FittedModel):
     Attributes
     ----------
     structure : str
-        Name in `ambid.nonlinear.structures`.
+        Name in `ambid.nonlinear.fit`.
     settings : Mapping[str, object]
         As used, nothing left open.
     model : NonlinearModel or None
@@ -302,3 +318,269 @@ class Attempt:
             warnings=tuple(self.warnings), timing_s=dict(self.timing_s), details=dict(self.details),
             **provenance(records), **found,
         )  # fmt: skip
+
+
+S = TypeVar("S")
+
+
+@dataclass(frozen=True, slots=True)
+class _Rule:
+    """What a setting may be, and the line that the register of structures has for it."""
+
+    says: str
+    low: float = 0.0
+    high: float = 0.0
+    whole: bool = False
+    options: tuple[str, ...] = ()
+    name: bool = False
+
+    def check(self, structure: str, name: str, value: object) -> None:
+        """Refuse what it may not be."""
+        if self.options:
+            if value not in self.options:
+                near = nearest(str(value), list(self.options))
+                raise EstimationError(
+                    f"{structure}: {name} is {value!r}; it must be one of {', '.join(self.options)}.{near}"
+                )
+            return
+        if self.name:
+            return
+        number = isinstance(value, int if self.whole else (int, float)) and not isinstance(value, bool)
+        if not number or not self.low <= value <= self.high:  # type: ignore[operator]
+            kind = "whole number" if self.whole else "number"
+            raise EstimationError(
+                f"{structure}: {name} is {value!r}; it must be a {kind} from {self.low} to {self.high}"
+            )
+
+
+def whole(says: str, low: int, high: int, default: int | None = None) -> Any:
+    """Return a field for a whole number from `low` to `high`; without a default the method chooses."""
+    return field(default=default, metadata={"rule": _Rule(says, low, high, whole=True)})
+
+
+def number(says: str, low: float, high: float, default: float | None = None) -> Any:
+    """Return a field for a number from `low` to `high`; without a default the method chooses."""
+    return field(default=default, metadata={"rule": _Rule(says, low, high)})
+
+
+def choice(says: str, *options: str, default: str = "") -> Any:
+    """Return a field for one of some words; the first of them is the default where nothing else is said."""
+    return field(default=default or options[0], metadata={"rule": _Rule(says, options=options)})
+
+
+def text(says: str, default: str) -> Any:
+    """Return a field for a name, which whoever reads it checks."""
+    return field(default=default, metadata={"rule": _Rule(says, name=True)})
+
+
+def rules(settings: type) -> dict[str, _Rule]:
+    """Return the rule of each setting."""
+    return {f.name: f.metadata["rule"] for f in fields(settings)}
+
+
+def read_settings(settings: type[S], structure: str, given: Mapping[str, object]) -> S:
+    """Check what was given by name, and complete it."""
+    known = rules(settings)
+    default = {f.name: f.default for f in fields(settings)}  # type: ignore[arg-type]
+    taken: dict[str, object] = {}
+    for name, value in given.items():
+        if name not in known:
+            raise EstimationError(
+                f"{structure}: setting {name!r} is unknown; known: {', '.join(known)}.{nearest(name, list(known))}"
+            )
+        if value == "auto" and default[name] is None:
+            continue
+        known[name].check(structure, name, value)
+        taken[name] = value
+    return settings(**taken)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NonlinearStructure:
+    """One nonlinear structure."""
+
+    name: str  # for lists
+    summary: str
+    options: str  # ``module:class`` of its settings
+    home: str  # ``module:function`` of its estimator
+    # what feedback does to it: nothing; bias; nothing as long as its noise model holds the true one
+    feedback: Literal["consistent", "biased", "with noise model"]
+
+    @property
+    def estimator(self) -> Callable[..., NonlinearFit]:
+        """The function that fits it."""
+        found: Callable[..., NonlinearFit] = _load(self.home)
+        return found
+
+    @property
+    def settings(self) -> Mapping[str, str]:
+        """Settings by name, each with a line that says what it is and what is chosen without it."""
+        return {name: rule.says for name, rule in rules(_load(self.options)).items()}
+
+
+def _load(home: str) -> Any:
+    """What ``module:name`` says."""
+    module, name = home.split(":")
+    return getattr(import_module(module), name)
+
+
+_ENTRIES: tuple[NonlinearStructure, ...] = (
+    NonlinearStructure(
+        name="narmax",
+        summary="polynomial or rational difference equation; terms by orthogonal least squares; noise model",
+        options="ambid.nonlinear.narmax_choice:NarmaxSettings",
+        home="ambid.nonlinear.narmax:narmax",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="nn",
+        summary="state-space network whose weights are A and B (thesis fig. 5.9), with a network G(x, u)",
+        options="ambid.nonlinear.nn:NnSettings",
+        home="ambid.nonlinear.nn:nn",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="narx",
+        summary="neural NARX: linear part and one hidden layer of tanh units on lagged outputs and inputs",
+        options="ambid.nonlinear.narx:NarxSettings",
+        home="ambid.nonlinear.narx:narx",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="lpv",
+        summary="linear model whose coefficients follow a scheduling signal such as the set point; error model",
+        options="ambid.nonlinear.lpv:LpvSettings",
+        home="ambid.nonlinear.lpv:lpv",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="hybrid",
+        summary="polynomial, network for its residual, noise model C (thesis eqs 3.23-3.24)",
+        options="ambid.nonlinear.hybrid:HybridSettings",
+        home="ambid.nonlinear.hybrid:hybrid",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="hammerstein",
+        summary="static polynomial of each input, then a linear difference equation",
+        options="ambid.nonlinear.hammerstein:HammersteinSettings",
+        home="ambid.nonlinear.hammerstein:hammerstein",
+        feedback="with noise model",
+    ),
+    NonlinearStructure(
+        name="rbf",
+        summary="radial basis functions of lagged outputs and inputs, with a linear part (thesis eqs 1.13-1.14)",
+        options="ambid.nonlinear.rbf:RbfSettings",
+        home="ambid.nonlinear.rbf:rbf",
+        feedback="with noise model",
+    ),
+)
+
+NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _ENTRIES}
+
+
+def nonlinear_structure(name: str) -> NonlinearStructure:
+    """Return a nonlinear structure of the register by name, such as ``"narmax"``."""
+    if name not in NONLINEAR_STRUCTURES:
+        known = ", ".join(NONLINEAR_STRUCTURES)
+        raise EstimationError(
+            f"structure {name!r} is unknown; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
+        )
+    return NONLINEAR_STRUCTURES[name]
+
+
+def nonlinear_fit_text(fit: NonlinearFit) -> str:
+    """Return the JSON text of a nonlinear fit; equal fits give equal text."""
+    return json_text(nonlinear_fit_to_json(fit))
+
+
+def nonlinear_fit_to_json(fit: NonlinearFit) -> dict[str, Any]:
+    """Return a nonlinear fit in the form of schema ``ambid.fit/1``.
+
+    ``orders`` and ``settings`` are the same: readers of linear fits look for the former. ``parameters`` lists the
+    numbers of ``model`` by name, and ``sd`` has one entry for each of them; all three are null for a failed fit.
+    """
+    model, noise = fit.model, fit.noise_covariance
+    more = {
+        "orders": fit.settings,
+        "model": None if model is None else model_to_json(model),
+        "parameters": None if model is None else {"names": model.names, "values": model.theta},
+        "sd": fit.sd,
+        "covariance": None if fit.covariance is None else {"from": fit.covariance_from, "matrix": fit.covariance},
+        "noise_variance": noise[0, 0] if len(fit.outputs) == 1 else noise,
+        "dt_s": fit.dt,
+    }
+    return fit_document(fit, more, without=("covariance_from",))
+
+
+def nonlinear_fit_from_json(document: Mapping[str, Any], where: str) -> NonlinearFit:
+    """Read a nonlinear fit back; `where` is the name of its file, for messages."""
+    return read_fit(_from_json, document, where)
+
+
+def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
+    nonlinear_structure(d["structure"])
+    model, spread = None if d["model"] is None else model_from_json(d["model"]), d["covariance"]
+    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in d["settings"].items()}
+    fit = read_as(
+        NonlinearFit,
+        {
+            **only_outputs(d, tuple(d["outputs"])),
+            "model": model,
+            "settings": settings,
+            "covariance": None if spread is None else spread["matrix"],
+            "covariance_from": "" if spread is None else spread["from"],
+            "dt": d["dt_s"],
+        },
+    )
+    if (fit.model is None) != (fit.status == "failed"):
+        raise ValueError("a failed fit has no model, every other has one")
+    return fit
+
+
+MODEL_KINDS: Mapping[str, str] = MappingProxyType(
+    {
+        "narmax": "ambid.nonlinear.polynomial:PolynomialFunction.read_model",
+        "hybrid": "ambid.nonlinear.hybrid:HybridFunction.read_model",
+        "rbf": "ambid.nonlinear.rbf:RbfFunction.read_model",
+        "nn": "ambid.nonlinear.state_network:StateNetwork.from_json",
+        "nn-magnitude": "ambid.nonlinear.state_network:StateNetwork.from_json",
+        "narx": "ambid.nonlinear.narx:NarxFunction.read_model",
+        "hammerstein": "ambid.nonlinear.hammerstein:HammersteinFunction.read_model",
+        "lpv": "ambid.nonlinear.lpv_model:LpvModel.from_json",
+    }
+)
+"""Who reads a model, ``module:function`` by `NonlinearModel.kind`; imported only when one of that kind is read."""
+
+
+def model_to_json(model: NonlinearModel) -> dict[str, Any]:
+    """Return a model as JSON-able values, its kind beside what the model itself writes.
+
+    Returns ``kind`` and what `NonlinearModel.as_json` returns.
+    """
+    _home(model.kind)
+    return {"kind": model.kind, **model.as_json()}
+
+
+def model_from_json(found: Mapping[str, Any]) -> NonlinearModel:
+    """Read a model back.
+
+    `found`: that `model_to_json` made.
+    """
+    if not isinstance(found, Mapping) or not isinstance(found.get("kind"), str):
+        raise EstimationError("the model has no kind; a file of a nonlinear fit names it. Write the file again")
+    module, name = _home(found["kind"]).split(":")
+    read: Callable[[dict[str, Any]], NonlinearModel] = attrgetter(name)(import_module(module))
+    try:
+        return read({k: v for k, v in found.items() if k != "kind"})
+    except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise EstimationError(
+            f"no model of kind {found['kind']} ({type(error).__name__}: {error}). Write the file again"
+        ) from error
+
+
+def _home(kind: str) -> str:
+    if kind not in MODEL_KINDS:
+        known = ", ".join(MODEL_KINDS)
+        raise EstimationError(f"model kind {kind!r} is unknown; known: {known}.{nearest(kind, list(MODEL_KINDS))}")
+    return MODEL_KINDS[kind]

@@ -20,9 +20,8 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.blocks import Block, Mask, Table, Terms
-from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, Regressors, lags
+from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, failed_fit, read_settings, whole
+from ambid.nonlinear.lagged import Block, LaggedFunction, Mask, Regressors, Table, Terms, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     finish,
@@ -32,7 +31,6 @@ from ambid.nonlinear.lagged_problem import (
     refine,
 )
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import choice, read_settings, whole
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

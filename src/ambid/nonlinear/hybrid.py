@@ -30,9 +30,18 @@ from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import penalty
-from ambid.nonlinear.blocks import Block, Linear, Table, Tanh
-from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Regressors, channel_names, lags
+from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit, number, read_settings, whole
+from ambid.nonlinear.lagged import (
+    Block,
+    LaggedFunction,
+    LaggedModel,
+    Linear,
+    Regressors,
+    Table,
+    Tanh,
+    channel_names,
+    lags,
+)
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
@@ -63,7 +72,6 @@ from ambid.nonlinear.polynomial import (
     unit_of,
 )
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
-from ambid.nonlinear.settings import number, read_settings, whole
 
 MOST_NOISE = 4  # largest order of C that is tried where it is left open
 _NEURONS = (0, 1, 2, 4, 8)

@@ -20,11 +20,9 @@ from ambid.estimation.linear import information_inverse, least_squares, triangle
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import sandwich
-from ambid.nonlinear.blocks import Mask
-from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import Attempt, NonlinearFit
-from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Rows
-from ambid.nonlinear.records import Parts, Scaled
+from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Mask, Rows
+from ambid.nonlinear.records import Parts, Scaled, cloud_of
 
 _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled

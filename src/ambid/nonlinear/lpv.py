@@ -25,8 +25,7 @@ from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import information
-from ambid.nonlinear.cloud import cloud_of
-from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, failed_fit
+from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, choice, failed_fit, number, read_settings, text, whole
 from ambid.nonlinear.lagged_problem import guarded
 from ambid.nonlinear.lpv_model import (
     LEVEL,
@@ -42,8 +41,7 @@ from ambid.nonlinear.lpv_model import (
     part_of,
     regressors,
 )
-from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import choice, number, read_settings, text, whole
+from ambid.nonlinear.records import Scaled, cloud_of, scaled_records
 
 DIVERGED = "no finite one-step predictor was found; lower degree, order or error_order, or check the columns"
 UNSTABLE = (

@@ -313,7 +313,7 @@ def _back(z: Array, first: int, lag: int) -> Array:
 
 def _pass_on(out: Array, gain: Array, rows: Array) -> None:
     """Fill the last rows of `out` with some rows and what is passed on to each, by lag, from those before it."""
-    from ambid.nonlinear.lagged_kernels import propagate
+    from ambid.nonlinear.kernels import propagate
 
     first, lags = out.shape[0] - rows.shape[0], np.arange(1, gain.shape[1] + 1)
     out[first:] = rows
@@ -558,7 +558,7 @@ class LpvModel(ScaledModel):
 
     def simulate(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.simulate`."""
-        from ambid.nonlinear.lagged_kernels import scheduled_run
+        from ambid.nonlinear.kernels import scheduled_run
 
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)

@@ -17,9 +17,8 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions
-from ambid.nonlinear.blocks import Terms
 from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import Rows
+from ambid.nonlinear.lagged import Rows, Terms
 from ambid.nonlinear.lagged_problem import Draft, finish, guarded, laplace
 from ambid.nonlinear.narmax_choice import (
     Choice,

@@ -32,11 +32,22 @@ from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, guessed, part_of
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import CRITERIA, information, penalty
+from ambid.nonlinear.fit import choice, read_settings, whole
 from ambid.nonlinear.lagged_problem import LaggedProblem, column_gains, problem_at
-from ambid.nonlinear.polynomial import OUTPUTS, Factor, PolynomialFunction, Term, lagged, products
+from ambid.nonlinear.polynomial import (
+    OUTPUTS,
+    Candidates,
+    Factor,
+    MatrixCandidates,
+    PolynomialFunction,
+    Selection,
+    Term,
+    candidates,
+    lagged,
+    products,
+    select_terms,
+)
 from ambid.nonlinear.records import Parts
-from ambid.nonlinear.selection import Candidates, MatrixCandidates, Selection, candidates, select_terms
-from ambid.nonlinear.settings import choice, read_settings, whole
 from ambid.nonlinear.state_start import rank_grid
 
 _ENOUGH = 1e-3  # gain, in the errors' variance, that ends a search: a step of 0.03 standard deviations

@@ -23,9 +23,8 @@ from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import bootstrapped
-from ambid.nonlinear.blocks import Block, Linear, Tanh
-from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags
+from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, failed_fit, number, read_settings, whole
+from ambid.nonlinear.lagged import Block, LaggedFunction, Linear, Regressors, Tanh, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
@@ -45,7 +44,6 @@ from ambid.nonlinear.lagged_problem import (
     train_watched,
 )
 from ambid.nonlinear.records import Parts, Scaled, scaled_records
-from ambid.nonlinear.settings import choice, number, read_settings, whole
 
 _LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
 _DRAWS = 5  # of the hidden layer of a start

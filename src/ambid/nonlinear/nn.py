@@ -19,9 +19,8 @@ import numpy as np
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions, silent
-from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.fit import NonlinearFit, Settings, choice, read_settings, whole
 from ambid.nonlinear.records import Scaled, scaled_records
-from ambid.nonlinear.settings import choice, read_settings, whole
 from ambid.nonlinear.state_start import (
     LARGEST,
     NO_START,

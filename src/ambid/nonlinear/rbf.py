@@ -30,9 +30,18 @@ from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick, portions
-from ambid.nonlinear.blocks import Block, Linear, Radial
-from ambid.nonlinear.fit import NO_WEIGHTS, LearningCurve, NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import LaggedFunction, Regressors, channel_names, lags
+from ambid.nonlinear.fit import (
+    NO_WEIGHTS,
+    LearningCurve,
+    NonlinearFit,
+    Settings,
+    choice,
+    failed_fit,
+    number,
+    read_settings,
+    whole,
+)
+from ambid.nonlinear.lagged import Block, LaggedFunction, Linear, Radial, Regressors, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     LaggedProblem,
@@ -50,7 +59,6 @@ from ambid.nonlinear.lagged_problem import (
     train_watched,
 )
 from ambid.nonlinear.records import Parts, Scaled, finite, scaled_records
-from ambid.nonlinear.settings import choice, number, read_settings, whole
 
 _NEURONS = (2, 4, 8, 16, 32, 48)  # that are compared
 _WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
@@ -258,7 +266,10 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
             "neurons and width"
         )
     data = scaled_records("rbf", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
-    work = _linear(s, data)
+    # a model without units: something to hand over when the very next thing is an interruption
+    function = _function(s, data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, 0)
+    theta = linear_start(function, data.parts, function.n_theta)
+    work = _Work(function=function, theta=theta, start=theta, prior=np.ones(function.p))
     failed = guarded(
         lambda: _identify(s, data, work, seed, tick), work,
         lambda why: failed_fit("rbf", records, asdict(s), seed, why, work.timing_s),
@@ -282,13 +293,6 @@ def _measured(function: LaggedFunction, parts: Parts) -> tuple[Array, Array]:
     """Regressors and outputs of all parts."""
     rows = [function.rows(y, u) for y, u in parts]
     return np.concatenate([r.x for r in rows]), np.concatenate([r.y for r in rows])
-
-
-def _linear(s: RbfSettings, data: Scaled) -> _Work:
-    """A model without units: something to hand over when the very next thing is an interruption."""
-    function = _function(s, data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, 0)
-    theta = linear_start(function, data.parts, function.n_theta)
-    return _Work(function=function, theta=theta, start=theta, prior=np.ones(function.p))
 
 
 def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick | None) -> None:
@@ -382,18 +386,15 @@ class Placing:
 
     def start(self, neurons: int, width: float) -> tuple[RbfFunction, Array]:
         """Return units with weights of zero; fewer than asked for where the data have no place for more."""
-        C = self._centres(neurons, width)
+        neurons = min(neurons, max((self.x.shape[0] - self.function.n_line) // 2, 0))  # two samples for each
+        C = np.empty((0, self.function.units.n_seen))
+        if neurons and C.shape[1]:
+            C = self.by_means(neurons) if self.s.centres == "kmeans" else self.by_ols(width)[:neurons]
         function = replace(self.function, neurons=C.shape[0])
         widths = np.full(C.shape[0], width * self.size)
         if self.s.centres == "kmeans":
             widths = width * neighbour_widths(C, _NEIGHBOURS, self.size)
         return function, np.concatenate([np.zeros(function.n_weights), C.ravel(), np.log(widths)])
-
-    def _centres(self, neurons: int, width: float) -> Array:
-        neurons = min(neurons, max((self.x.shape[0] - self.function.n_line) // 2, 0))  # two samples for each
-        if not neurons or not self.function.units.n_seen:
-            return np.empty((0, self.function.units.n_seen))
-        return self.by_means(neurons) if self.s.centres == "kmeans" else self.by_ols(width)[:neurons]
 
     def _order(self, width: float) -> Array:
         n, rng = self.x.shape[0], np.random.default_rng([self.seed, 2])
@@ -585,7 +586,7 @@ def train_by_sample(
 
     `pull` (n_outputs, n_features) is the errors' standard deviation over that of the prior.
     """
-    from ambid.nonlinear.lagged_kernels import descent_pass
+    from ambid.nonlinear.kernels import descent_pass
 
     F = np.ascontiguousarray(of.features(theta, x))
     (N, d), W = F.shape, np.zeros((of.p, F.shape[1]))

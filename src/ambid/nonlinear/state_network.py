@@ -75,7 +75,7 @@ class Matrices:
 
         `u` has a last column of ones, `x0` is the first state.
         """
-        from ambid.nonlinear.state_kernels import run_states
+        from ambid.nonlinear.kernels import run_states
 
         X, E = np.empty((u.shape[0] + 1, x0.size)), np.empty((u.shape[0], self.heads.size))
         X[0] = x0
@@ -87,7 +87,7 @@ class Matrices:
 
         `s` (width, n_columns) is changed from the first state's slopes to the last's.
         """
-        from ambid.nonlinear.state_kernels import slope_states
+        from ambid.nonlinear.kernels import slope_states
 
         out = np.empty((u.shape[0], self.heads.size, s.shape[1]))
         used = np.any(self.D != 0.0, axis=2).astype(np.int64)
@@ -455,7 +455,7 @@ class StateNetwork(ScaledModel):
         return whole
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`, of predicted states and inputs (see `nonlinear.cloud`)."""
+        """As `NonlinearModel.novelty`, of predicted states and inputs (see `nonlinear.records`)."""
         out = np.full(np.asarray(u).shape[0], np.nan)
         out[self.lag :] = self.cloud.novelty(self.regressors(u, y))
         return out

@@ -18,10 +18,9 @@ from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped, explained_by_past
-from ambid.nonlinear.cloud import cloud_of
 from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit, failed_fit
 from ambid.nonlinear.lagged_problem import sandwich_at
-from ambid.nonlinear.records import Scaled
+from ambid.nonlinear.records import Scaled, cloud_of
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards

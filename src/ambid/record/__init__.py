@@ -10,8 +10,7 @@ from typing import Any, Protocol
 from ambid.errors import RecordError, nearest
 from ambid.record.csv_format import read_csv, read_csv_rows, write_csv
 from ambid.record.record import Channel, Record, Step, cut
-from ambid.record.rows import Rows
-from ambid.record.sampling import GapPolicy, check_gap_policy, checked
+from ambid.record.sampling import GapPolicy, Rows, check_gap_policy, checked
 
 __all__ = [
     "ENDINGS",

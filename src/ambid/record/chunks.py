@@ -17,9 +17,8 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record._hdf5_file import new_hdf5
 from ambid.record.csv_format import head_lines
-from ambid.record.hdf5_format import add_channel, write_head
+from ambid.record.hdf5_format import add_channel, new_hdf5, write_head
 from ambid.record.record import Record
 
 _PIECE = 1 << 17  # bytes, or values, that are read back at once

@@ -19,11 +19,11 @@ from ambid.arrays import Array
 from ambid.errors import RecordError
 from ambid.record.csv_dialect import Dialect, decoded, recognised
 from ambid.record.record import Record, file_bytes, gunzipped, sha256_of
-from ambid.record.rows import Rows
 from ambid.record.sampling import (
     MIN_SAMPLES,
     TIME_NAMES,
     GapPolicy,
+    Rows,
     Table,
     check_gap_policy,
     record_of_rows,
@@ -54,7 +54,7 @@ def read_csv(
 def read_csv_rows(
     path: str | Path, *, rate_hz: float | None = None, layout: Mapping[str, str] = MappingProxyType({})
 ) -> Rows:
-    """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.rows`).
+    """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.sampling.Rows`).
 
     `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
     """

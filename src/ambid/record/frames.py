@@ -18,8 +18,16 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import RecordError, nearest
 from ambid.record.record import Channel, Record
-from ambid.record.rows import Rows
-from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, record_of_rows, refuse_gaps, seconds, uniform_record
+from ambid.record.sampling import (
+    TIME_NAMES,
+    GapPolicy,
+    Rows,
+    Table,
+    record_of_rows,
+    refuse_gaps,
+    seconds,
+    uniform_record,
+)
 from ambid.units import UNKNOWN
 
 _LABEL = re.compile(r"(?P<name>.*?)\s*\[(?P<unit>[^\[\]]*)\]")
@@ -70,7 +78,7 @@ def read_table(
 
 
 def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
-    """Take the rows of a table as they stand, whatever is missing and however time runs (`ambid.record.rows`)."""
+    """Take the rows of a table as they stand, whatever is missing and however time runs (`Rows`)."""
     return record_of_rows(_table(_parts(table), units), rate_hz)
 
 

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError, counted
 from ambid.record.record import Channel, Record, Step, check_rate
-from ambid.record.rows import Rows
 from ambid.units import UNKNOWN, nearest_unit, parse_unit
 
 GapPolicy = Literal["error", "interpolate", "cut"]
@@ -39,6 +38,23 @@ class Table:
     unit_texts: tuple[str | None, ...] = ()  # units as the columns give them
     provenance: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
     settings: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))  # of the reading, for history
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Rows:
+    """A record of rows as they stand in the file: missing values, gaps and jumps of time are kept, not refused.
+
+    Attributes
+    ----------
+    record : Record
+        The rows in the order of the file; NaN where a value is missing. Its rate is that of the usual interval; its
+        own time, which is uniform, is not that of the rows unless `time_s` is None.
+    time_s : ndarray, shape (n_rows,), or None
+        The time column, s; NaN where a stamp is missing. None if the file has none.
+    """
+
+    record: Record
+    time_s: Array | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -40,7 +40,7 @@ from ambid.report.numbers import prefixed, sized
 from ambid.report.response_panels import Pole, bode_panel, correlations_panel, frequency_grid, poles_panel, roots
 from ambid.report.signal_panels import Traces, records_panel, residuals_panel, signals_panel, whiteness_panel
 from ambid.report.text import pole_table
-from ambid.signals.local_response import frf_local
+from ambid.signals.frf import frf_local
 from ambid.signals.response import FrequencyResponse
 from ambid.signals.spectra import power_spectrum
 from ambid.validation import nonlinear_bearing

@@ -14,7 +14,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel, pole_covariance
-from ambid.nonlinear.structures import nonlinear_structure
+from ambid.nonlinear.fit import nonlinear_structure
 from ambid.report.estimate_text import names_words, physics_text, second_lines
 from ambid.report.modes_text import modal_body
 from ambid.report.numbers import prefixed, quantity, response_unit, sized

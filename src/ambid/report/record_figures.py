@@ -26,8 +26,7 @@ from ambid.report.drawing import (
 )
 from ambid.report.numbers import prefixed, sized
 from ambid.signals.faults import find_dropouts, find_outliers, find_saturation, resolution
-from ambid.signals.noise_ratio import snr
-from ambid.signals.spectra import power_spectrum
+from ambid.signals.spectra import power_spectrum, snr
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:

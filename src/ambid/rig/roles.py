@@ -18,8 +18,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import AmbidError
 from ambid.record.record import Channel, Record
-from ambid.signals.noise_ratio import snr
-from ambid.signals.spectra import cross_spectra
+from ambid.signals.spectra import cross_spectra, snr
 from ambid.units import UNKNOWN
 
 ROLES = {"voltage": "V", "current": "A", "position": "m"}

@@ -39,17 +39,17 @@ if TYPE_CHECKING:
     from ambid.signals.faults import find_saturation as find_saturation
     from ambid.signals.faults import resolution as resolution
     from ambid.signals.frf import frequency_response as frequency_response
-    from ambid.signals.local_response import frf_local as frf_local
-    from ambid.signals.noise_ratio import Snr as Snr
-    from ambid.signals.noise_ratio import snr as snr
+    from ambid.signals.frf import frf_local as frf_local
+    from ambid.signals.frf import frf_random as frf_random
     from ambid.signals.periodic_response import Distortions as Distortions
     from ambid.signals.periodic_response import find_period as find_period
     from ambid.signals.periodic_response import frf_periodic as frf_periodic
-    from ambid.signals.random_response import frf_random as frf_random
     from ambid.signals.response import FrequencyResponse as FrequencyResponse
     from ambid.signals.spectra import CrossSpectra as CrossSpectra
     from ambid.signals.spectra import PowerSpectrum as PowerSpectrum
+    from ambid.signals.spectra import Snr as Snr
     from ambid.signals.spectra import cross_spectra as cross_spectra
     from ambid.signals.spectra import power_spectrum as power_spectrum
+    from ambid.signals.spectra import snr as snr
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -1,18 +1,543 @@
-"""Frequency responses from records: the choice of the method, `frf_periodic`, `frf_random` or `frf_local`."""
+"""Frequency responses from records: the choice of the method, and the methods for arbitrary excitation.
+
+Local polynomials: in a window of lines around each line, Z = G(q) X + T(q) + V with polynomials G and T of the distance
+q, where T is the leakage: a smooth spectrum too (Pintelon and Schoukens 2012, sec. 7.2; Schoukens et al. 2009). Least
+squares by QR; what it leaves gives the noise and the covariance of G. X are the inputs, or with feedback the
+references.
+
+Averaged spectra: G = S_yu S_uu⁻¹ (H1: noise at the output), S_yy S_uy⁻¹ (H2: at the input), total least squares (Hv: at
+both), or S_yr S_ur⁻¹ with a reference, which feedback does not bias. Leakage of short segments is not in the variance:
+it is looked for by halving them.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
-from ambid.signals.local_response import frf_local
 from ambid.signals.periodic_response import find_period, frf_periodic
-from ambid.signals.random_response import frf_random
-from ambid.signals.response import FrequencyResponse
+from ambid.signals.response import (
+    FEEDBACK,
+    FrequencyResponse,
+    Hold,
+    checked,
+    labels,
+    product_covariance,
+    ratio,
+    weak_inputs,
+)
+from ambid.signals.spectra import CrossSpectra, cross_spectra
+
+_DEGREE = 2  # of the polynomials
+_LOUD = 1e-6  # power of a line over the largest, from which it is excited
+_CHUNK = 2048  # lines fitted at a time: memory does not grow with the record
+_WORST = 1e8  # condition (Frobenius) of a window's columns, each scaled to length 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Plan:
+    """Half width h of the windows of 2h + 1 lines, and unknowns of each."""
+
+    half: int
+    unknowns: int
+
+    @property
+    def free(self) -> int:
+        return 2 * self.half + 1 - self.unknowns
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Fitted:
+    """Responses `Z` (n_f, n_z, n_x), covariance of vec(Z), per-line weight (n_f, n_x, n_x) and correlation."""
+
+    Z: Complex
+    covariance: Complex
+    weight: Complex
+    condition: Array
+    lines_per_independent: float
+
+    def at(self, lines: np.ndarray) -> _Fitted:
+        """Return the fits at some of the lines."""
+        return replace(
+            self,
+            Z=self.Z[lines],
+            covariance=self.covariance[lines],
+            weight=self.weight[lines],
+            condition=self.condition[lines],
+        )
+
+
+def frf_local(
+    u: Array,
+    y: Array,
+    rate_hz: float,
+    *,
+    r: Array | None = None,
+    free: int | None = None,
+    band: tuple[float, float] | None = None,
+    open_loop: bool = False,
+    hold: Hold = "zoh",
+    leave_out: bool = False,
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> FrequencyResponse:
+    """Estimate the frequency response by local polynomials of response and leakage in sliding windows.
+
+    The resolution is that of the record, rate/n_samples; a resonance should be wider than the window. Errors of
+    neighbouring lines are correlated over the window (`lines_per_independent`).
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_samples, n_u), any units
+        Inputs, with a rough spectrum (noise, PRBS, multisine): a smooth one is not separated from leakage.
+    y : ndarray, shape (n_samples, n_y), any units
+        Outputs.
+    rate_hz : float
+        Sampling rate in Hz.
+    r : ndarray, shape (n_samples, n_r), optional
+        References: outer excitation of the loop, independent of the noise, at least as many as inputs.
+    free : int, optional
+        Least lines of a window beyond its unknowns: more gives a better variance and a wider window. By default 8, or
+        4 more than there are signals.
+    band : (float, float), optional
+        Band in Hz in which the estimate is wanted.
+    open_loop : bool
+        Whether the record is known to be open loop.
+    hold : {"zoh", "band-limited"}
+        What the input does between samples; kept with the result.
+    leave_out : bool
+        Whether lines at which the excitation does not tell G from leakage are left out, and told, instead of refused.
+    inputs, outputs : sequence of str, optional
+        Names.
+    units : Mapping[str, str], optional
+        SI unit by name.
+
+    Returns
+    -------
+    FrequencyResponse
+        At every line of the record in the band, 0 and half the rate left out, and with `leave_out` those not told.
+
+    Raises
+    ------
+    EstimationError
+        If the record is shorter than a window, or the excitation does not tell G from leakage.
+    """
+    u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
+    n, n_y, n_u = u.shape[0], y.shape[1], u.shape[1]
+    x, z = (u, y) if r is None else (r, np.concatenate([y, u], axis=1))
+    X, Z = (np.fft.rfft(s, axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for s in (x, z))
+    plan = _plan(X, Z, free)
+    frequency = np.arange(1, X.shape[0] + 1) * (rate_hz / n)
+    wanted = _in_band(frequency, band)
+    fitted = _fitted(X, Z, wanted, plan)
+    told = _refuse_smooth(fitted.condition, frequency[wanted], leave_out=leave_out)
+    left = () if told.all() else (_smooth(~told, frequency[wanted]) + "; they are left out",)
+    wanted, fitted = wanted[told], fitted.at(told)
+    warnings: tuple[str, ...]
+    if r is None:
+        G, covariance = fitted.Z, fitted.covariance
+        warnings = () if open_loop else (f"local method: {FEEDBACK}",)
+    else:
+        G, covariance = ratio(fitted.Z, fitted.covariance, n_y, weight=fitted.weight)
+        warnings = weak_inputs(fitted.Z, fitted.covariance, n_y)
+    return FrequencyResponse(
+        frequency_hz=frequency[wanted],
+        G=G,
+        covariance=covariance,
+        method=f"local polynomial, degree {_DEGREE}" + ("" if r is None else ", joint input-output with the reference"),
+        inputs=labels(inputs, "u", n_u),
+        outputs=labels(outputs, "y", n_y),
+        units=MappingProxyType(dict(units or {})),
+        rate_hz=rate_hz,
+        hold=hold,
+        degrees_of_freedom=2.0 * plan.free,
+        lines_per_independent=fitted.lines_per_independent,
+        warnings=(*left, *warnings),
+        details=MappingProxyType(
+            {
+                "degree": _DEGREE,
+                "window_lines": 2 * plan.half + 1,
+                "window_hz": (2 * plan.half + 1) * rate_hz / n,
+                "condition": float(np.max(fitted.condition)),
+            }
+        ),
+    )
+
+
+def _plan(X: Complex, Z: Complex, free: int | None) -> _Plan:
+    free = max(8, Z.shape[1] + 4) if free is None else free
+    if free < Z.shape[1]:
+        raise EstimationError(
+            f"local polynomials with {free} lines beyond the unknowns and {Z.shape[1]} signals; there must be at least "
+            "as many lines as signals. Give more"
+        )
+    unknowns = (_DEGREE + 1) * (X.shape[1] + 1)
+    half = max(unknowns + free, (_DEGREE + 2) * _apart(X)) // 2
+    if X.shape[0] < 2 * half + 1:
+        raise EstimationError(f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record")
+    return _Plan(half=half, unknowns=unknowns)
+
+
+def _apart(X: Complex) -> int:
+    """Return how many lines lie between those that excite the sparsest input: a zippered multisine leaves most out."""
+    power = np.abs(X) ** 2
+    loud = power > _LOUD * power.max(axis=0)
+    gaps = [np.diff(np.flatnonzero(column)) for column in loud.T]
+    return max((int(np.percentile(g, 90)) for g in gaps if g.size), default=1)
+
+
+def _in_band(frequency: Array, band: tuple[float, float] | None) -> np.ndarray:
+    if band is None:
+        return np.arange(frequency.size)
+    wanted = np.flatnonzero((frequency >= band[0]) & (frequency <= band[1]))
+    if not wanted.size:
+        raise EstimationError(
+            f"no line between {band[0]:g} and {band[1]:g} Hz; the record has {frequency[0]:g} to {frequency[-1]:g} Hz. "
+            "Give another band"
+        )
+    return wanted
+
+
+def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
+    n_x, n_z, width = X.shape[1], Z.shape[1], 2 * plan.half + 1
+    found = np.empty((wanted.size, n_z, n_x), dtype=complex)
+    covariance = np.empty((wanted.size, n_z * n_x, n_z * n_x), dtype=complex)
+    spread = np.empty((wanted.size, n_x, n_x), dtype=complex)
+    condition = np.empty(wanted.size)
+    shared = np.zeros((X.shape[0], n_x), dtype=complex)
+    for first in range(0, wanted.size, _CHUNK):
+        part = slice(first, first + _CHUNK)
+        lines = wanted[part]
+        # At the ends of the band the window is not centred on its line.
+        window = np.clip(lines - plan.half, 0, X.shape[0] - width)[:, None] + np.arange(width)
+        found[part], L, noise, condition[part] = _windows(X[window], Z[window], (window - lines[:, None]), plan)
+        product = np.einsum("faw,fbw->fab", L, L.conj())
+        C = noise[:, :, None, :, None] * product[:, None, :, None, :]
+        covariance[part] = C.reshape(lines.size, n_z * n_x, n_z * n_x)
+        spread[part] = product
+        for a in range(n_x):
+            weighted = L[:, a] / np.real(spread[part][:, a, a])[:, None]
+            np.add.at(shared[:, a], window.ravel(), weighted.ravel())
+    own = np.sum(1.0 / np.real(np.diagonal(spread, axis1=1, axis2=2)), axis=0)
+    try:
+        weight = np.linalg.inv(np.swapaxes(spread, 1, 2))
+    except np.linalg.LinAlgError:
+        raise EstimationError(
+            "at some lines the excitation does not move all inputs; a response needs each of them. Excite all inputs "
+            "over the whole band, or give a narrower band"
+        ) from None
+    return _Fitted(
+        Z=found,
+        covariance=np.asarray(0.5 * (covariance + np.conj(np.swapaxes(covariance, 1, 2))), dtype=complex),
+        weight=np.asarray(weight, dtype=complex),
+        condition=condition,
+        # variance of the weighted mean over all lines, beside that of as many independent ones
+        lines_per_independent=float(np.mean(np.sum(np.abs(shared) ** 2, axis=0) / own)),
+    )
+
+
+def _windows(X: Complex, Z: Complex, q: np.ndarray, plan: _Plan) -> tuple[Complex, Complex, Complex, Array]:
+    """Fit all windows of a chunk: X (c, w, n_x), Z (c, w, n_z), q (c, w) distances in lines.
+
+    Returns the responses (c, n_z, n_x), the rows L (c, n_x, w) that make them from Z, the noise (c, n_z, n_z)
+    and the condition of the columns (c,).
+    """
+    powers = (q / plan.half)[:, :, None] ** np.arange(_DEGREE + 1)
+    of_x = (X[:, :, None, :] * powers[:, :, :, None]).reshape(*X.shape[:2], -1)
+    columns = np.concatenate([of_x, powers], axis=2)
+    L, left, condition = _solved(columns, Z, X.shape[2])
+    found = np.einsum("faw,fwi->fia", L, Z)
+    noise = np.einsum("fwi,fwj->fij", left, left.conj()) / plan.free
+    return found, L, noise, condition
+
+
+def _solved(columns: Complex, Z: Complex, n_x: int) -> tuple[Complex, Complex, Array]:
+    """Return the rows of the pseudo-inverse for the first `n_x` unknowns, what the fit leaves, and the condition."""
+    scale = np.linalg.norm(columns, axis=1)
+    scale[scale == 0.0] = 1.0
+    Q, R = np.linalg.qr(columns / scale[:, None, :])
+    diagonal = np.abs(np.diagonal(R, axis1=1, axis2=2))
+    singular = diagonal.min(axis=1) < 1e-14 * diagonal.max(axis=1)
+    R[singular] = np.eye(R.shape[1])  # refused afterwards, all such lines in one message
+    inverse = np.linalg.inv(R)
+    condition = np.linalg.norm(R, axis=(1, 2)) * np.linalg.norm(inverse, axis=(1, 2))
+    Qh = np.conj(np.swapaxes(Q, 1, 2))
+    L = inverse[:, :n_x] @ Qh / scale[:, :n_x, None]
+    return L, Z - Q @ (Qh @ Z), np.where(singular, np.inf, condition)
+
+
+def _refuse_smooth(condition: Array, frequency: Array, *, leave_out: bool) -> np.ndarray:
+    """Return which lines the excitation tells from leakage; refuse others, where they are not to be left out."""
+    told = condition < _WORST
+    if not (told.all() or (leave_out and told.any())):
+        raise EstimationError(
+            f"{_smooth(~told, frequency)}. Give a band without them, or excite with noise or a multisine"
+        )
+    return told
+
+
+def _smooth(bad: np.ndarray, frequency: Array) -> str:
+    return (
+        f"at {int(bad.sum())} of {bad.size} lines, {frequency[bad][0]:g} to {frequency[bad][-1]:g} Hz, the "
+        "excitation is absent or too smooth to separate its response from leakage"
+    )
+
+
+Kind = Literal["h1", "h2", "hv"]
+_Found = tuple[Complex, Complex, Array, str]  # G, covariance, coherence, method
+_LEAKAGE_FROM = 32  # shortest segment that is compared with its half
+_EDGE = 2  # lines at 0 and at half the rate whose window reaches over the end, where errors are not circular
+
+
+def frf_random(
+    u: Array,
+    y: Array,
+    rate_hz: float,
+    *,
+    r: Array | None = None,
+    kind: Kind = "h1",
+    segment: int | None = None,
+    noise_ratio: float | None = None,
+    open_loop: bool = False,
+    hold: Hold = "zoh",
+    inputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | None = None,
+    units: Mapping[str, str] | None = None,
+) -> FrequencyResponse:
+    """Estimate the frequency response from arbitrary excitation by Welch's averages.
+
+    Its variance is (1 - γ²)/γ² |G|²/n with one input and n independent averages (Bendat and Piersol 2010, sec. 9.2),
+    with n reduced for overlap (Welch 1967), and its several-input form S_vv ⊗ S_uu⁻ᵀ/n.
+
+    Parameters
+    ----------
+    u : ndarray, shape (n_samples, n_u), any units
+        Inputs.
+    y : ndarray, shape (n_samples, n_y), any units
+        Outputs.
+    rate_hz : float
+        Sampling rate in Hz.
+    r : ndarray, shape (n_samples, n_r), optional
+        References: outer excitation of the loop, independent of the noise, at least as many as inputs.
+    kind : {"h1", "h2", "hv"}
+        Where the noise is, without a reference: outputs, inputs (as many outputs as inputs), or both.
+    segment : int, optional
+        Samples of a segment; by default an eighth of the record. It should hold several time constants.
+    noise_ratio : float, optional
+        For "hv": variance of the input noise over that of the output noise. By default the noise is taken to be the
+        same share of both signals at every line.
+    open_loop : bool
+        Whether the record is known to be open loop.
+    hold : {"zoh", "band-limited"}
+        What the input does between samples; kept with the result.
+    inputs, outputs : sequence of str, optional
+        Names.
+    units : Mapping[str, str], optional
+        SI unit by name.
+
+    Returns
+    -------
+    FrequencyResponse
+        At the lines of a segment, the two next to 0 and to half the rate left out.
+
+    Raises
+    ------
+    EstimationError
+        If there are too few segments, options contradict each other, or inputs cannot be distinguished.
+    RecordError
+        If the segment does not fit the record.
+    """
+    u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
+    _options_agree(kind, noise_ratio, r is not None)
+    z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
+    spectra = cross_spectra(z, rate_hz, segment=segment)
+    n_y, n_u, n_x = y.shape[1], u.shape[1], (u if r is None else r).shape[1]
+    if spectra.n_effective <= n_x + 1 or spectra.frequency_hz.size < 2 * _EDGE + 2:
+        raise EstimationError(
+            f"{spectra.n_segments} segments, worth {spectra.n_effective:.1f} averages, with {n_x} inputs or "
+            f"references; more than {n_x + 1} averages are needed. Use a longer record, or shorter segments"
+        )
+    found, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
+    if r is None:
+        warnings += () if open_loop else (f"{kind.upper()}: {FEEDBACK}",)
+        if kind == "hv" and noise_ratio is None:
+            warnings += ("Hv assumes the same noise share of input and output at every line. Give noise_ratio",)
+    length = round(rate_hz / spectra.frequency_hz[1])
+    if length % 2 == 0 and length >= _LEAKAGE_FROM:
+        half = cross_spectra(z, rate_hz, segment=length // 2)
+        warnings += _leakage(found, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
+    G, covariance, coherence, method = found
+    return FrequencyResponse(
+        frequency_hz=spectra.frequency_hz[_EDGE:-_EDGE],
+        G=G,
+        covariance=covariance,
+        coherence=coherence,
+        method=f"{method}, {spectra.n_segments} segments",
+        inputs=labels(inputs, "u", n_u),
+        outputs=labels(outputs, "y", n_y),
+        units=MappingProxyType(dict(units or {})),
+        rate_hz=rate_hz,
+        hold=hold,
+        degrees_of_freedom=2.0 * (spectra.n_effective - n_x),
+        lines_per_independent=spectra.lines_per_independent,
+        warnings=warnings,
+        details=MappingProxyType(_details(spectra, rate_hz)),
+    )
+
+
+def _options_agree(kind: str, noise_ratio: float | None, reference: bool) -> None:
+    if kind not in ("h1", "h2", "hv"):
+        raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
+    if reference and kind != "h1":
+        raise EstimationError(f"kind {kind!r} with a reference, which replaces it. Omit one of the two")
+    if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
+        raise EstimationError(
+            f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
+        )
+
+
+def _found(
+    spectra: CrossSpectra, n_y: int, n_u: int, kind: str, noise_ratio: float | None
+) -> tuple[_Found, tuple[str, ...]]:
+    S, n = spectra.density[_EDGE:-_EDGE], spectra.n_effective
+    if S.shape[1] > n_y + n_u:
+        return _with_reference(S, n_y, n_u, n)
+    return _by_kind(S, n_y, n_u, kind, n, noise_ratio), ()
+
+
+def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
+    """Return a warning where segments half as long, whose leakage is twice or more, give another response.
+
+    Both share their data, so that without leakage the difference is well under what the sum of variances allows
+    (a quarter of it on average for a Hann window).
+    """
+    k = 2 * np.arange(half[0].shape[0]) + _EDGE  # line i + 2 of half the length is line 2(i + 2) of the full one
+    apart = np.abs(full[0][k] - half[0]) ** 2
+    variance = [np.real(np.diagonal(c, axis1=1, axis2=2)).reshape(apart.shape) for c in (full[1][k], half[1])]
+    share = apart / np.maximum(variance[0] + variance[1], np.finfo(float).tiny)
+    # quantile of the F distribution with 2 and ν degrees of freedom, one false alarm in 1000 over all entries
+    limit = 0.5 * nu * np.expm1(np.log(1e3 * share.size) * 2.0 / nu)
+    if np.max(share) <= limit and np.mean(share) <= 0.6:
+        return ()
+    worst = float(np.sqrt(np.max(share)))
+    return (
+        f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which "
+        "the variance does not include. Give longer segments, or use the local method (--method local)",
+    )
+
+
+def _with_reference(S: Complex, n_y: int, n_u: int, n: float) -> tuple[_Found, tuple[str, ...]]:
+    n_z = n_y + n_u
+    S_rr = S[:, n_z:, n_z:]
+    _told_apart(S_rr)
+    Z, covariance, noise = _regressed(S[:, :n_z, :n_z], S[:, :n_z, n_z:], S_rr, n)
+    G, C = ratio(Z, covariance, n_y, weight=S_rr)
+    coherence = _explained(noise, S, n_y, n, S_rr.shape[1])
+    found = (G, C, coherence, "joint input-output with the reference (Welch)")
+    return found, weak_inputs(Z, covariance, n_y)
+
+
+def _by_kind(S: Complex, n_y: int, n_u: int, kind: str, n: float, noise_ratio: float | None) -> _Found:
+    n_z = n_y + n_u
+    S_yy, S_yu, S_uu = S[:, :n_y, :n_y], S[:, :n_y, n_y:], S[:, n_y:, n_y:]
+    _told_apart(S_uu)
+    G, covariance, noise = _regressed(S_yy, S_yu, S_uu, n)
+    coherence = _explained(noise, S, n_y, n, n_u)
+    if kind == "h1":
+        return G, covariance, coherence, "H1 (Welch)"
+    if kind == "h2":
+        if n_y != n_u:
+            raise EstimationError(f"H2 with {n_y} outputs and {n_u} inputs; it needs as many. Use kind='h1' or 'hv'")
+        _told_apart(S_yy)
+        # H2 is the inverse of H1 with inputs and outputs exchanged: G = F⁻¹, dG = -G dF G.
+        F, C, _ = _regressed(S_uu, np.conj(np.swapaxes(S_yu, 1, 2)), S_yy, n)
+        _told_apart(F)
+        Z = np.concatenate([np.broadcast_to(np.eye(n_y, dtype=complex), F.shape), F], axis=1)
+        joint = np.zeros((S.shape[0], n_z * n_y, n_z * n_y), dtype=complex)
+        joint[:, n_y * n_y :, n_y * n_y :] = C
+        return (*ratio(Z, joint, n_y), coherence, "H2 (Welch)")
+    return (*_total_least_squares(S_yy, S_yu, S_uu, n, noise_ratio), coherence, "Hv (Welch)")
+
+
+def _regressed(S_zz: Complex, S_zx: Complex, S_xx: Complex, n: float) -> tuple[Complex, Complex, Complex]:
+    """Return S_zx S_xx⁻¹, its covariance, and the noise S_vv with the degrees of freedom of the fit taken off."""
+    n_x = S_xx.shape[1]
+    scale = np.sqrt(np.real(np.diagonal(S_xx, axis1=1, axis2=2)))  # units must not decide the condition of S_xx
+    inverse = np.linalg.inv(S_xx / scale[:, :, None] / scale[:, None, :]) / scale[:, :, None] / scale[:, None, :]
+    Z = S_zx @ inverse
+    noise = (S_zz - Z @ np.conj(np.swapaxes(S_zx, 1, 2))) * (n / (n - n_x))
+    noise = 0.5 * (noise + np.conj(np.swapaxes(noise, 1, 2)))
+    return Z, product_covariance(noise, inverse) / n, noise
+
+
+def _explained(noise: Complex, S: Complex, n_y: int, n: float, n_x: int) -> Array:
+    """Return the multiple coherence 1 - S_vv/S_yy of each output, of the biased S_vv as is usual."""
+    residual, power = (np.real(np.diagonal(m, axis1=1, axis2=2))[:, :n_y] for m in (noise, S))
+    share = np.divide(residual * (n - n_x) / n, power, out=np.ones_like(power), where=power > 0)
+    return np.asarray(np.clip(1.0 - share, 0.0, 1.0))  # round-off only: S is positive semidefinite
+
+
+def _total_least_squares(
+    S_yy: Complex, S_yu: Complex, S_uu: Complex, n: float, noise_ratio: float | None
+) -> tuple[Complex, Complex]:
+    """Return G and its covariance from the smallest eigenvector of each output's joint spectrum with the inputs.
+
+    With noise covariance D on [y, u] and w = [1, -G], the smallest eigenvalue is the noise level, and to first order
+    dG = Σ_segments (w·z)(x̂ᴴ)/n S₀⁻¹, where S₀ = S_uu - λ D_u is the spectrum without noise (Van Huffel and Vandewalle
+    1991, sec. 8.5). Outputs are fitted one by one; between them the covariance is left at 0.
+    """
+    n_f, n_y, n_u = S_yu.shape
+    G = np.empty((n_f, n_y, n_u), dtype=complex)
+    C = np.zeros((n_f, n_y * n_u, n_y * n_u), dtype=complex)
+    for i in range(n_y):
+        joint = np.empty((n_f, 1 + n_u, 1 + n_u), dtype=complex)
+        joint[:, 0, 0], joint[:, 0, 1:], joint[:, 1:, 0] = S_yy[:, i, i], S_yu[:, i], S_yu[:, i].conj()
+        joint[:, 1:, 1:] = S_uu
+        power = np.real(np.diagonal(joint, axis1=1, axis2=2))
+        D = power if noise_ratio is None else np.broadcast_to(np.r_[1.0, np.full(n_u, noise_ratio)], power.shape)
+        root = np.sqrt(D)
+        level, vector = np.linalg.eigh(joint / root[:, :, None] / root[:, None, :])
+        w = vector[:, :, 0].conj() / root  # w·z is what the fit leaves
+        G[:, i] = -w[:, 1:] / w[:, :1]
+        S_0 = S_uu - level[:, 0, None, None] * D[:, 1:, None] * np.eye(n_u)
+        noise = level[:, 0] * (D[:, 0] + np.sum(np.abs(G[:, i]) ** 2 * D[:, 1:], axis=1)) * n / (n - n_u)
+        inverse = np.linalg.inv(S_0)
+        # E|v|² S_0⁻¹ (S_0 + what is left of the input noise) S_0⁻¹; the second part is what H1 has not.
+        a = G[:, i].conj() * D[:, 1:] * level[:, :1]
+        left = level[:, 0, None, None] * D[:, 1:, None] * np.eye(n_u)
+        left = left - a[:, :, None] * a[:, None, :].conj() / (noise * (n - n_u) / n)[:, None, None]
+        B = inverse + inverse @ left @ inverse
+        block = slice(i * n_u, (i + 1) * n_u)
+        C[:, block, block] = noise[:, None, None] * np.swapaxes(B, 1, 2) / n
+    return G, C
+
+
+def _told_apart(S: Complex) -> None:
+    scale = np.sqrt(np.abs(np.diagonal(S, axis1=1, axis2=2)))
+    if not np.all(scale > 0):
+        raise EstimationError("a signal has no power at some line. Excite the whole band")
+    worst = float(np.max(np.linalg.cond(S / scale[:, :, None] / scale[:, None, :])))
+    if worst > 1e10:
+        raise EstimationError(
+            f"the spectra of the inputs (or outputs, for H2) are dependent, condition {worst:.1e}; below 1e10 is "
+            "needed. Excite each input independently, or omit one"
+        )
+
+
+def _details(spectra: CrossSpectra, rate_hz: float) -> dict[str, object]:
+    return {
+        "segments": spectra.n_segments,
+        "effective_averages": spectra.n_effective,
+        "segment_samples": round(rate_hz / spectra.frequency_hz[1]),
+    }
+
 
 Method = Literal["auto", "periodic", "random", "local"]
 

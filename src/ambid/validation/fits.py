@@ -24,8 +24,7 @@ from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import criteria, p_text, skipped
-from ambid.nonlinear.fit import NonlinearFit, NonlinearModel
-from ambid.nonlinear.structures import nonlinear_structure
+from ambid.nonlinear.fit import NonlinearFit, NonlinearModel, nonlinear_structure
 from ambid.validation.residuals import (
     LEAST,
     MOST,

@@ -7,8 +7,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.estimation.uncertainty import CRITERIA, information, penalty
-from ambid.nonlinear.polynomial import lagged, products, term_name
-from ambid.nonlinear.selection import MatrixCandidates, candidates, select_terms
+from ambid.nonlinear.polynomial import MatrixCandidates, candidates, lagged, products, select_terms, term_name
 from tests.nonlinear.narmax.systems import polynomial
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from ambid.nonlinear.polynomial import MatrixCandidates, select_terms
 from ambid.nonlinear.rbf import k_means, neighbour_widths, ols_order, typical_size
-from ambid.nonlinear.selection import MatrixCandidates, select_terms
 
 
 def left(columns: np.ndarray, y: np.ndarray) -> float:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.nonlinear.fit import NonlinearFit
-from ambid.nonlinear.lagged_kernels import descent_pass
+from ambid.nonlinear.kernels import descent_pass
 from ambid.nonlinear.rbf import rbf, train_by_sample
 from tests.nonlinear.rbf.systems import bumpy, data, network
 
