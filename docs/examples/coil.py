@@ -1,10 +1,10 @@
-"""The thesis's coil by three methods
-==================================
+"""The thesis's coil by two methods
+=================================
 
-The thesis's coil, I/V = 550/(s + 860) (eq. 4.2), rotor at rest, from voltage and noisy current by three methods.
+The thesis's coil, I/V = 550/(s + 860) (eq. 4.2), rotor at rest, from voltage and noisy current by two methods.
 
 The thesis gets 519.8/(s + 812.5) (eq. 4.3) by least squares. Noise on the current makes least squares biased, because
-the current is its regressor; the instrumental variable and the likelihood are not.
+the current is its regressor; the likelihood is not.
 
 Run: ``python docs/examples/coil.py``
 """
@@ -14,7 +14,7 @@ from __future__ import annotations
 from matplotlib.figure import Figure
 
 from ambid import identify
-from ambid.bearing.coil import coil_instrumental, coil_least_squares
+from ambid.bearing.coil import coil_least_squares
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise
 from ambid.rig import default_rig
@@ -34,9 +34,8 @@ def main(seed: int = 1) -> dict[str, dict[str, float]]:
     record = simulate(coil, voltage, rate_hz=RATE_HZ, seed=seed, noise=noise_at_snr(clean, SNR_DB)).record
 
     found = {"truth (4.2)": {"gain": GAIN, "pole": POLE}, "thesis (4.3)": PRINTED}
-    for estimator in (coil_least_squares, coil_instrumental):
-        result = estimator(record["voltage"].values, record["current"].values, RATE_HZ)
-        found[result.method] = {"gain": result.b, "pole": result.a}
+    result = coil_least_squares(record["voltage"].values, record["current"].values, RATE_HZ)
+    found["least squares"] = {"gain": result.b, "pole": result.a}
     estimate = identify(record, default_rig("coil"))
     resistance, inductance = estimate.parameter("R"), estimate.parameter("L")
     found["likelihood"] = {"gain": 1.0 / inductance.value, "pole": resistance.value / inductance.value}

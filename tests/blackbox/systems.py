@@ -17,6 +17,7 @@ ORDERS = {"na": 2, "nb": 2, "nc": 1, "nd": 1, "nf": 2, "nk": 1, "n": 2}
 _OWN = {
     "fir": {"nb": 40},
     "rfir": {"nb": 60},
+    "correlation": {"nb": 40},
     "arx": {"na": 6, "nb": 6},  # long enough for the moving average of the noise
     "oe": {},
     "bj": {"nd": 2},

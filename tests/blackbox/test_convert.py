@@ -1,12 +1,11 @@
-"""Conversion to scipy.signal and python-control keeps the frequency response, delays included."""
+"""Conversion to python-control keeps the frequency response, delays included."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
-import scipy.signal
 
-from ambid.blackbox.convert import to_control, to_scipy
+from ambid.blackbox.convert import to_control
 from ambid.blackbox.model import PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import ModelError
 
@@ -42,21 +41,6 @@ MODELS = {
 
 
 @pytest.mark.parametrize("name", MODELS)
-def test_scipy_has_the_same_response(name: str) -> None:
-    model = MODELS[name]
-    system = to_scipy(model)
-    assert (system.dt or None) == model.dt
-    s, G = system.to_ss(), model.frequency_response(OMEGA)
-    for k, point in enumerate(1j * OMEGA if model.dt is None else np.exp(1j * OMEGA * DT)):
-        there = s.D + s.C @ np.linalg.solve(point * np.eye(s.A.shape[0]) - s.A, s.B)
-        np.testing.assert_allclose(there, G[k], rtol=1e-8, atol=1e-12)
-    if model.n_inputs * model.n_outputs == 1:
-        response = scipy.signal.freqresp if model.dt is None else scipy.signal.dfreqresp
-        w = OMEGA if model.dt is None else OMEGA * DT
-        np.testing.assert_allclose(response(system, w)[1], G[:, 0, 0], rtol=1e-8)
-
-
-@pytest.mark.parametrize("name", MODELS)
 def test_control_has_the_same_response(name: str) -> None:
     model = MODELS[name]
     system = to_control(model)
@@ -66,11 +50,10 @@ def test_control_has_the_same_response(name: str) -> None:
     np.testing.assert_allclose(there, w, rtol=1e-8, atol=1e-12)
 
 
-@pytest.mark.parametrize("convert", [to_scipy, to_control])
-def test_what_has_no_place_is_refused(convert) -> None:
+def test_what_has_no_place_is_refused() -> None:
     late = TransferModel(num=(([1.0],),), den=(([1.0, 2.0],),), dt=None, delay=(0.1,))
     series = PolynomialModel(outputs=(Polynomials(A=[1, 0.5], B=(), C=[1.0], D=[1.0], F=()),), dt=DT)
     with pytest.raises(ModelError, match="delay"):
-        convert(late)
+        to_control(late)
     with pytest.raises(ModelError, match="time series"):
-        convert(series)
+        to_control(series)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.bearing.coil import coil_instrumental, coil_least_squares
+from ambid.bearing.coil import coil_least_squares
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
@@ -55,15 +55,6 @@ def test_least_squares_is_biased_as_errors_in_variables_say():
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_instrumental_variable_has_no_bias(seed):
-    u, i = record(seed)
-    plain, refined = coil_least_squares(u, i, RATE), coil_instrumental(u, i, RATE)
-    found = [refined.a, refined.b, refined.R, refined.L]
-    np.testing.assert_allclose(found, [POLE, GAIN, TRUTH["R"], TRUTH["L"]], rtol=0.005)
-    assert abs(refined.b - GAIN) < 0.3 * abs(plain.b - GAIN)
-
-
-@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_the_grey_box_has_no_bias_and_knows_how_well(seed):
     u, i = record(seed)
     of = model("coil")
@@ -79,28 +70,11 @@ def test_the_grey_box_has_no_bias_and_knows_how_well(seed):
         assert abs(theta[name] - truth) < 3.3 * sd[name]
 
 
-def test_the_instrumental_variable_is_as_good_as_the_bound():
-    # white noise on the current and nothing else: the refined instrument is the output error estimate
-    found = np.array(
-        [[c.R, c.L] for c in (coil_instrumental(*record(s, n=8000, hold_s=0.005), RATE) for s in range(60))]
-    )
-    of = model("coil")
-    u, i = record(0, n=8000, hold_s=0.005)
-    ps = [Parameter(name=p.name, unit=p.unit) for p in of.parameters]
-    fit = greybox(of, Signals(u=u[:, None], y=i[:, None], rate_hz=RATE), ps, delay=0)
-    bound = uncertainty(fit).standard_deviations(robust=False)
-    ratio = found.std(axis=0, ddof=1) / bound
-    # 60 runs know a spread to 9 %, and the excitation differs from run to run
-    assert np.all((ratio > 0.6) & (ratio < 1.5))
-    assert np.all(np.abs(found.mean(axis=0) - [TRUTH["R"], TRUTH["L"]]) < 4 * bound / np.sqrt(60))
-
-
-@pytest.mark.parametrize("method", [coil_least_squares, coil_instrumental])
-def test_what_is_no_coil_is_refused(method):
+def test_what_is_no_coil_is_refused():
     u, i = record(0, n=2000)
     with pytest.raises(EstimationError, match="constant"):
-        method(np.full_like(u, 3.0), i, RATE)
+        coil_least_squares(np.full_like(u, 3.0), i, RATE)
     with pytest.raises(EstimationError, match="one length"):
-        method(u[:-1], i, RATE)
+        coil_least_squares(u[:-1], i, RATE)
     with pytest.raises(EstimationError):
-        method(u, i * (-1.0) ** np.arange(i.size), RATE)  # rings at half the sampling rate: no coil does
+        coil_least_squares(u, i * (-1.0) ** np.arange(i.size), RATE)  # rings at half the sampling rate: no coil does

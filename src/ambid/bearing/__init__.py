@@ -10,7 +10,6 @@ if TYPE_CHECKING:
     from ambid.bearing.blocks import ThreeBlocks as ThreeBlocks
     from ambid.bearing.blocks import block_parameters as block_parameters
     from ambid.bearing.blocks import three_blocks as three_blocks
-    from ambid.bearing.coil import coil_instrumental as coil_instrumental
     from ambid.bearing.coil import coil_least_squares as coil_least_squares
     from ambid.bearing.linear import greybox as greybox
     from ambid.bearing.magnet_result import NonlinearBearingEstimate as NonlinearBearingEstimate

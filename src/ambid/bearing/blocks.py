@@ -233,10 +233,9 @@ def _clean(data: IOData) -> Array:
 
     u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
     if data.references:
-        part = reference_part("three blocks", replace(data, u=u, y=y))
-        return np.hstack([part.u, part.y])
+        return np.hstack(reference_part("three blocks", replace(data, u=u, y=y)))
     alone = replace(data, u=np.empty((data.n_samples, 0)), inputs=(), y=y, reference=u, references=("voltage",))
-    return np.hstack([u, reference_part("three blocks", alone).y])
+    return np.hstack([u, reference_part("three blocks", alone)[1]])
 
 
 def _warnings(

@@ -8,19 +8,14 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.blackbox.convert import to_control as to_control
-    from ambid.blackbox.convert import to_scipy as to_scipy
     from ambid.blackbox.data import IOData as IOData
     from ambid.blackbox.fit import BlackBoxFit as BlackBoxFit
     from ambid.blackbox.frequency import frf_ml as frf_ml
     from ambid.blackbox.frequency_subspace import best_conditioned as best_conditioned
     from ambid.blackbox.frequency_subspace import block_rows_condition as block_rows_condition
     from ambid.blackbox.frequency_subspace import frf_subspace as frf_subspace
-    from ambid.blackbox.impulse import correlation_analysis as correlation_analysis
-    from ambid.blackbox.impulse import impulse_response as impulse_response
-    from ambid.blackbox.impulse import step_response as step_response
     from ambid.blackbox.instrumental import cliv as cliv
     from ambid.blackbox.instrumental import iv4 as iv4
-    from ambid.blackbox.instrumental import two_stage as two_stage
     from ambid.blackbox.instrumental_continuous import clsrivc as clsrivc
     from ambid.blackbox.instrumental_continuous import srivc as srivc
     from ambid.blackbox.model import PolynomialModel as PolynomialModel

@@ -1,7 +1,7 @@
-"""Models as the objects of ``scipy.signal`` and python-control.
+"""Models as the objects of python-control.
 
-What has no place in the other object is refused or named, never dropped silently: objects of both libraries know
-neither noise models nor operating points, and control's transfer functions no delay in continuous time.
+What has no place in the other object is refused or named, never dropped silently: its objects know neither noise
+models nor operating points, and its transfer functions no delay in continuous time.
 """
 
 from __future__ import annotations
@@ -17,35 +17,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Array = NDArray[np.float64]
-
-
-def to_scipy(model: BlackBoxModel) -> Any:
-    """Return the input-output part of a model as an object of ``scipy.signal``.
-
-    Parameters
-    ----------
-    model : BlackBoxModel
-
-    Returns
-    -------
-    scipy.signal.StateSpace or scipy.signal.TransferFunction
-        A transfer function (in z or s) for one input and one output, else a state space; `dt` is set where the model is
-        discrete. The noise model (K, or C and D) has no place there.
-
-    Raises
-    ------
-    ModelError
-        If the model has no inputs, or a delay in continuous time.
-    """
-    from scipy.signal import StateSpace, TransferFunction
-
-    _with_inputs(model)
-    timing = {} if model.dt is None else {"dt": model.dt}
-    if isinstance(model, StateSpaceModel) or model.n_inputs * model.n_outputs > 1:
-        s = model.state_space()
-        return StateSpace(s.A, s.B, s.C, s.D, **timing)
-    num, den = _num_den(model)
-    return TransferFunction(num, den, **timing)
 
 
 def to_control(model: BlackBoxModel) -> Any:
@@ -105,13 +76,6 @@ def _reduced(num: Array) -> Array:
     """Take leading zeros off."""
     used = np.nonzero(num)[0]
     return np.asarray(num[used[0] :] if used.size else num[-1:])
-
-
-def _num_den(model: BlackBoxModel) -> tuple[Array, Array]:
-    if isinstance(model, PolynomialModel):
-        return _entry(model.outputs[0], 0)
-    assert isinstance(model, TransferModel)
-    return _delayed(model, 0, 0)
 
 
 def _entry(p: Polynomials, i: int) -> tuple[Array, Array]:

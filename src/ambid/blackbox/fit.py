@@ -91,11 +91,6 @@ STRUCTURES: Mapping[str, Structure] = {
         ("clsrivc", "nb nf nk", "consistent", "y = B(s)/F(s) u + noise, in closed loop with its reference"),
     ),
     **_register(
-        "polynomial",
-        "instrumental",
-        ("two-stage", "nb nf nk", "consistent", "y = B/F u in closed loop: reference to input, then oe"),
-    ),
-    **_register(
         "state space",
         "subspace",
         ("n4sid", "n", "biased", "x+ = A x + B u + K e, subspace by oblique projection"),
@@ -113,7 +108,12 @@ STRUCTURES: Mapping[str, Structure] = {
         "state_space_search",
         ("sspem", "n", "with noise model", "x+ = A x + B u + K e by prediction error: statistically efficient"),
     ),
-    **_register("polynomial", "impulse", ("rfir", "nb nk", "biased", "y = B u + e, many taps with a decaying prior")),
+    **_register(
+        "polynomial",
+        "impulse",
+        ("rfir", "nb nk", "biased", "y = B u + e, many taps with a decaying prior"),
+        ("correlation", "nb nk", "biased", "y = B u + e, taps by correlation with the whitened input"),
+    ),
     **_register(
         "transfer function",
         "weak_form",

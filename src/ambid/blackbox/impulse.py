@@ -1,25 +1,18 @@
-"""Impulse responses by regularised least squares, their running sum, and by correlation.
+"""Impulse responses: many taps by regularised least squares (`rfir`), and by correlation.
 
 A prior of fading, smooth responses (the stable spline of order one, "TC") takes the place of an order; its sizes come
-from the marginal likelihood (Pillonetto and De Nicolao 2010; Chen, Ohlsson and Ljung 2012). In open loop the taps are
-estimated directly (`rfir`); where a controller may be at work, past outputs of all channels stand beside past inputs (a
-long regularised autoregression, consistent under feedback; Pillonetto, Chiuso and De Nicolao 2011), and the impulse
-response follows from both.
-
-All that the data say stands in the triangle of [1 Phi y], taken once, by pieces; every evaluation is then a QR of that
-size (Chen and Ljung 2013). The noise variance is profiled out; the gradient is exact. Correlation analysis is that of
-Ljung 1999, sec. 6.1.
+from the marginal likelihood (Pillonetto and De Nicolao 2010; Chen, Ohlsson and Ljung 2012). All that the data say
+stands in the triangle of [1 Phi y], taken once, by pieces; every evaluation is then a QR of that size (Chen and Ljung
+2013). The noise variance is profiled out; the gradient is exact. Correlation analysis is that of Ljung 1999, sec. 6.1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from ambid.arrays import Array
@@ -27,10 +20,8 @@ from ambid.blackbox.data import IOData, Orders, check_length, check_order_names,
 from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.instruments import autoregression
 from ambid.blackbox.model import Offsets, PolynomialModel
-from ambid.blackbox.polynomial_predictor import Layout, arx_layout
-from ambid.errors import EstimationError, counted
+from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.estimation.linear import one_thread
-from ambid.estimation.uncertainty import p_text
 from ambid.signals.delay import lagged_triangle
 
 
@@ -165,137 +156,10 @@ class _Evidence:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class PredictorTaps:
-    """Taps of the one-step predictor, for signals over their standard deviations."""
-
-    mean: Array  # for each output: past of every output, then of every input, lag 1 first
-    covariance: Array  # (n_outputs, n_outputs, p, p), between the taps of two outputs
-    noise: Array  # (n_outputs, n_outputs), covariance of e
-    y_sd: Array  # (n_outputs,)
-    u_sd: Array  # (n_inputs,)
-    # probability of the correlation that is left between outputs and inputs of one sample, if there is no path between
-    # them that is faster than a sample; 1 where the record is too short to see one
-    within_sample: float
-
-
-def predictor_taps(data: IOData, lags: int) -> PredictorTaps:
-    """Estimate the taps of the predictor."""
-    y_sd, u_sd = data.y.std(axis=0), data.u.std(axis=0)
-    z = np.hstack([(data.y - data.y.mean(axis=0)) / y_sd, (data.u - data.u.mean(axis=0)) / u_sd])
-    n_y = data.n_outputs
-    whole = triangle([(x, k) for x in z.T for k in range(1, lags + 1)], z, lags)
-    t = replace(whole, r=whole.r[:, :n_y], left=whole.left[:n_y, :n_y])
-    found = [posterior(t, o, (lags,) * z.shape[1]) for o in range(n_y)]
-    mean = np.stack([f.mean for f in found])
-    error = t.r - t.R @ mean.T
-    noise = (t.left + error.T @ error) / max(t.rows - 1 - float(np.mean([f.freedom for f in found])), 1.0)
-    # between outputs: what noise of both leaves in both; within one: the posterior, prior's share included
-    p = mean.shape[1]
-    covariance = np.empty((n_y, n_y, p, p))
-    weight = [(f.covariance / f.noise_variance) @ t.R.T for f in found]
-    for a in range(n_y):
-        for b in range(n_y):
-            covariance[a, b] = found[a].covariance if a == b else noise[a, b] * weight[a] @ weight[b].T
-    return PredictorTaps(
-        mean=mean,
-        covariance=covariance,
-        noise=noise,
-        y_sd=y_sd,
-        u_sd=u_sd,
-        within_sample=_within_sample(whole, n_y),
-    )
-
-
-def _within_sample(t: Triangle, n_y: int) -> float:
-    """Wilks' test that what the past leaves of outputs and of inputs is independent (Bartlett's factor)."""
-    from scipy.stats import chi2
-
-    n_z, freedom = t.left.shape[0], t.rows - 1 - t.R.shape[0]
-    rows = freedom - 0.5 * (n_z + 1)
-    sizes = np.sqrt(np.diag(t.left))
-    if rows < n_z or not np.all(sizes > 0):
-        return 1.0
-    r = t.left / np.outer(sizes, sizes)
-    parts = [np.linalg.slogdet(x)[1] for x in (r, r[:n_y, :n_y], r[n_y:, n_y:])]
-    return float(chi2.sf(max(rows * (parts[1] + parts[2] - parts[0]), 0.0), n_y * (n_z - n_y)))
-
-
-def responses(taps: PredictorTaps, n_y: int, n_u: int, lags: int) -> tuple[Array, Array]:
-    """Return the plant's impulse responses at lags 1 to `lags`, and the covariance of each.
-
-    Returns `values`: (lags, n_y, n_u); `covariance`: (n_y, n_u, lags, lags).
-    """
-    parts = taps.mean.reshape(n_y, n_y + n_u, lags)
-    A, B = np.moveaxis(parts[:, :n_y], 2, 0), np.moveaxis(parts[:, n_y:], 2, 0)
-    inverse = np.zeros((lags, n_y, n_y))  # (1 - A)^-1, from lag 0
-    inverse[0] = np.eye(n_y)
-    for k in range(1, lags):
-        inverse[k] = np.einsum("jab,jbc->ac", A[:k], inverse[k - 1 :: -1][:k])
-    G = np.zeros((lags, n_y, n_u))
-    for k in range(lags):
-        G[k] = np.einsum("jab,jbc->ac", inverse[: k + 1], B[k::-1])
-    covariance = np.empty((n_y, n_u, lags, lags))
-    for o in range(n_y):
-        for i in range(n_u):
-            slopes = [_slope(inverse[:, o, p], G, i, n_y, n_u, lags) for p in range(n_y)]
-            covariance[o, i] = sum(
-                slopes[a] @ taps.covariance[a, b] @ slopes[b].T for a in range(n_y) for b in range(n_y)
-            )
-    return G, covariance
-
-
-def _slope(through: Array, G: Array, i: int, n_y: int, n_u: int, lags: int) -> Array:
-    """Derivative of one response, (lags, p), by the predictor taps of an output that acts by `through`."""
-    from scipy.linalg import toeplitz
-
-    out = np.zeros((lags, (n_y + n_u) * lags))
-    zero = np.zeros(lags)
-    own = slice((n_y + i) * lags, (n_y + i + 1) * lags)
-    out[:, own] = toeplitz(through, zero)  # dB_j acts from lag j on
-    for q in range(n_y):  # dA_j acts on G, which begins at lag 1: from lag j + 1 on
-        echo = np.concatenate([[0.0], np.convolve(through, G[:, q, i])[: lags - 1]])
-        out[:, q * lags : (q + 1) * lags] = toeplitz(echo, zero)
-    return out
-
-
 _WHITENING = 10  # order of the autoregression that whitens an input before it is correlated
 _NOISE_ORDER = 20  # highest of the noise's autoregression
 _OLDER = 10  # lags beyond the taps that are looked at
-_SEEN = 1e-3  # chance that a tap of a dead time is taken for the response
-_WITHIN = (
-    "inputs and outputs depend on each other within the same sample ({p}). This is normal if the controller acts "
-    "without delay; if the plant does, its first tap is not zero, as is assumed here, and the later ones are "
-    "biased. Without feedback give open_loop (--open-loop): then the first tap is estimated"
-)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Response:
-    time_s: Array  # (n_times,), s, beginning at zero delay
-    values: Array  # (n_times, n_outputs, n_inputs), output unit per input unit
-    inputs: tuple[str, ...]
-    outputs: tuple[str, ...]
-    units: Mapping[str, str]
-    warnings: tuple[str, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ImpulseResponse(_Response):
-    """Sampled impulse responses: y = sum of values[k] u[t - k], plus noise."""
-
-    covariance: Array  # (n_outputs, n_inputs, n_taps, n_taps), within each response
-    noise_sd: Array  # (n_outputs,), of the innovations
-    method: Literal["rfir", "rarx"]
-
-    @property
-    def sd(self) -> Array:
-        """Standard deviations, shape (n_taps, n_outputs, n_inputs)."""
-        return _deviations(self.covariance)
-
-
-def _deviations(covariance: Array) -> Array:
-    return np.moveaxis(np.sqrt(np.maximum(np.diagonal(covariance, axis1=2, axis2=3), 0.0)), 2, 0)
+_SEEN = 1e-3  # chance of a false alarm
 
 
 def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -309,10 +173,16 @@ def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
     nk = order_per_input("rfir", {"nk": 0, **orders}, "nk", 0, data.n_inputs)
     layout = arx_layout(0, nb, nk)
     check_length("rfir", data, 4 * (data.n_samples - layout.first_row), sum(nb) + 1)
+    means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
+    y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
+    u, y = (data.u - means) / u_sd, (data.y - y_mean) / y_sd
+    lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
     with one_thread():
-        found, (means, u_sd), (y_mean, y_sd) = _regress(data, layout)
+        t = triangle([(u[:, i], k) for i, k in lags], y, layout.first_row)
+        rough = [posterior(t, o, nb) for o in range(data.n_outputs)]
+        taps = [_whiten(f, u, y[:, o], nb, lags, layout.first_row) for o, f in enumerate(rough)]
     theta, covariance = list[Array](), list[Array]()
-    for f, sd in zip(found, y_sd, strict=True):
+    for f, sd in zip(taps, y_sd, strict=True):
         scale = np.concatenate([np.full(b, sd / s) for b, s in zip(nb, u_sd, strict=True)])
         theta.append(layout.start())
         theta[-1][layout.free] = f.mean * scale
@@ -324,93 +194,14 @@ def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
         orders={"nb": compact_order(nb), "nk": compact_order(nk)},
         model=PolynomialModel(outputs=tuple(map(layout.polynomials, theta)), dt=data.dt),
         covariance=block_diag(*covariance),
-        n_estimated=int(np.ceil(sum(f.freedom for f in found))),
-        offsets=Offsets(u=means, y=y_mean + y_sd * np.array([f.constant for f in found])),
-        noise_covariance=np.diag([f.noise_variance * sd**2 for f, sd in zip(found, y_sd, strict=True)]),
+        n_estimated=int(np.ceil(sum(f.freedom for f in taps))),
+        offsets=Offsets(u=means, y=y_mean + y_sd * np.array([f.constant for f in taps])),
+        noise_covariance=np.diag([f.noise_variance * sd**2 for f, sd in zip(taps, y_sd, strict=True)]),
         details={
-            "hyperparameters": [f.hyper.tolist() for f in found],
-            "effective_coefficients": [f.freedom for f in found],
+            "hyperparameters": [f.hyper.tolist() for f in taps],
+            "effective_coefficients": [f.freedom for f in taps],
         },
     )
-
-
-def impulse_response(data: IOData, n_taps: int) -> ImpulseResponse:
-    """Estimate impulse responses with their spread.
-
-    In open loop (``data.open_loop``) the taps are estimated directly, ``rfir``. Where feedback may act they follow from
-    a long autoregression, ``rarx``, and the first tap is zero: without a delay in the loop input and output cannot be
-    separated.
-
-    Parameters
-    ----------
-    data : IOData
-    n_taps : int
-        Taps from zero delay on.
-
-    Returns
-    -------
-    ImpulseResponse
-
-    Raises
-    ------
-    EstimationError
-        If the record is too short, or fewer than two taps are asked for.
-    """
-    if n_taps < 2:
-        raise EstimationError(f"impulse response: {counted(n_taps, 'tap')}; at least 2 make a response. Ask for more")
-    values = np.zeros((n_taps, data.n_outputs, data.n_inputs))
-    covariance = np.zeros((data.n_outputs, data.n_inputs, n_taps, n_taps))
-    noise_sd, warnings = (_direct if data.open_loop else _through_autoregression)(data, values, covariance)
-    return ImpulseResponse(
-        time_s=np.arange(n_taps, dtype=np.float64) * data.dt,
-        values=values,
-        covariance=covariance,
-        noise_sd=noise_sd,
-        inputs=data.inputs,
-        outputs=data.outputs,
-        units=data.units,
-        method="rfir" if data.open_loop else "rarx",
-        warnings=warnings,
-    )
-
-
-def _direct(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...]]:
-    """Fill in values and covariance; noise and warnings."""
-    fit = rfir(data, {"nb": values.shape[0], "nk": 0})
-    assert isinstance(fit.model, PolynomialModel)
-    assert fit.covariance is not None
-    for o, letter, i, place in fit.model.blocks():
-        if letter == "B" and i is not None:
-            values[:, o, i] = fit.model.theta[place]
-            covariance[o, i] = fit.covariance[place, place]
-    return np.sqrt(np.diag(fit.noise_covariance)), fit.warnings
-
-
-def _through_autoregression(data: IOData, values: Array, covariance: Array) -> tuple[Array, tuple[str, ...]]:
-    """Fill in values and covariance; noise and warnings."""
-    lags, n_y, n_u = values.shape[0] - 1, data.n_outputs, data.n_inputs
-    check_length("impulse response", data, 2 * (data.n_samples - lags), lags * (n_y + n_u) + 1)
-    with one_thread():
-        taps = predictor_taps(data, lags)
-        found, spread = responses(taps, n_y, n_u, lags)
-    scale = taps.y_sd[:, None] / taps.u_sd
-    values[1:] = found * scale
-    covariance[:, :, 1:, 1:] = spread * scale[:, :, None, None] ** 2
-    warnings = () if taps.within_sample > _SEEN else (_WITHIN.format(p=p_text(taps.within_sample)),)
-    return np.sqrt(np.diag(taps.noise)) * taps.y_sd, warnings
-
-
-def _regress(data: IOData, layout: Layout) -> tuple[list[Posterior], tuple[Array, Array], tuple[Array, Array]]:
-    """Scale, reduce to a triangle, and fit each output."""
-    means, u_sd = data.u.mean(axis=0), data.u.std(axis=0)
-    y_mean, y_sd = data.y.mean(axis=0), data.y.std(axis=0)
-    u, y = (data.u - means) / u_sd, (data.y - y_mean) / y_sd
-    lags = [(i, k) for i in range(layout.n_inputs) for k in layout.free_lags(("B", i))]
-    nb, first = layout.nb, layout.first_row
-    t = triangle([(u[:, i], k) for i, k in lags], y, first)
-    rough = [posterior(t, o, nb) for o in range(data.n_outputs)]
-    found = [_whiten(f, u, y[:, o], nb, lags, first) for o, f in enumerate(rough)]
-    return found, (means, u_sd), (y_mean, y_sd)
 
 
 def _whiten(
@@ -466,132 +257,57 @@ def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple
     return np.asarray(out[first:])
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class StepResponse(_Response):
-    """Response to a unit step, with its spread."""
+def correlation(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Estimate a FIR model by correlation (Ljung 1999, sec. 6.1): g(k) = R_yu(k) / R_uu(0), both channels filtered so
+    that the input is white. One input at a time, so inputs must not be correlated.
 
-    sd: Array  # (n_times, n_outputs, n_inputs)
-
-
-def step_response(impulse: ImpulseResponse) -> StepResponse:
-    """Sum an impulse response.
-
-    Parameters
-    ----------
-    impulse : ImpulseResponse
-
-    Returns
-    -------
-    StepResponse
-        Its band takes the correlation between taps into account.
+    `data`: without feedback. Returns a PolynomialModel whose standard deviations are those of taps where there is no
+    response. Warns where inputs are correlated, or taps of negative lag are significant (feedback).
     """
-    summed = np.cumsum(np.cumsum(impulse.covariance, axis=2), axis=3)
-    return StepResponse(
-        time_s=impulse.time_s,
-        values=np.cumsum(impulse.values, axis=0),
-        sd=_deviations(summed),
-        inputs=impulse.inputs,
-        outputs=impulse.outputs,
-        units=impulse.units,
-        warnings=impulse.warnings,
-    )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Correlation(_Response):
-    """Impulse responses by correlation, one input at a time; times of negative lags come first."""
-
-    lags: NDArray[np.int64]  # (n_times,), samples
-    band: Array  # (n_outputs, n_inputs), 99 % of the values lie within it where there is no response
-
-
-def correlation_analysis(data: IOData, n_lags: int) -> Correlation:
-    """Estimate impulse responses by correlation.
-
-    Parameters
-    ----------
-    data : IOData
-        Inputs that do not go together.
-    n_lags : int
-        Lags on either side.
-
-    Returns
-    -------
-    Correlation
-        Warns where inputs are correlated, or negative lags stand out (feedback).
-
-    Raises
-    ------
-    EstimationError
-        If the record is too short, or has no input.
-    """
-    from scipy.signal import lfilter
-    from scipy.stats import norm
-
-    if not data.n_inputs:
-        raise EstimationError("correlation analysis: no input was named. Give --input")
-    n, order = data.n_samples - _WHITENING, _WHITENING
-    if n_lags < 1 or n < 4 * n_lags + 4 * order + 20:
-        raise EstimationError(
-            f"correlation analysis: {data.n_samples} samples for {n_lags} lags; at least {4 * n_lags + 5 * order + 20} "
-            "are needed. Record longer, or ask for fewer lags"
-        )
-    values = np.empty((2 * n_lags + 1, data.n_outputs, data.n_inputs))
-    band, warnings = np.empty((data.n_outputs, data.n_inputs)), list[str]()
-    for i, name in enumerate(data.inputs):
-        u = data.u[:, i] - data.u[:, i].mean()
-        if not np.any(u):
-            raise EstimationError(f"input {name!r} is constant; it carries no information. Excite it")
-        whitening = _whitening_filter(u, order)
-        white = lfilter(whitening, 1.0, u)[order:]
-        for o in range(data.n_outputs):
-            y = lfilter(whitening, 1.0, data.y[:, o] - data.y[:, o].mean())[order:]
-            values[:, o, i] = _cross(y, white, n_lags) / float(white @ white)
-            band[o, i] = norm.isf(0.005) * y.std() / (white.std() * np.sqrt(n))
-            outside = int(np.sum(np.abs(values[:n_lags, o, i]) > band[o, i]))
-            if outside > _allowed(n_lags):
-                warnings.append(
-                    f"{outside} of {n_lags} negative lags from {name!r} to {data.outputs[o]!r} are significant: "
-                    "there is feedback, and these responses are biased. Use impulse_response"
-                )
-    if data.n_inputs > 1:
-        together = np.abs(np.corrcoef(data.u.T) - np.eye(data.n_inputs)).max()
-        if together > 4 / np.sqrt(n):
-            warnings.append(
-                f"inputs are correlated (up to {together:.2f}), which biases one-at-a-time estimates. Use "
-                "impulse_response"
-            )
-    lags = np.arange(-n_lags, n_lags + 1)
-    return Correlation(
-        lags=lags,
-        time_s=np.asarray(lags * data.dt, dtype=np.float64),
-        values=values,
-        band=band,
-        inputs=data.inputs,
-        outputs=data.outputs,
-        units=data.units,
-        warnings=tuple(warnings),
-    )
-
-
-def _whitening_filter(u: Array, order: int) -> Array:
-    """Coefficients of the autoregression of u, 1 first, by QR."""
-    rows = np.column_stack([u[order - k : u.size - k] for k in range(order + 1)])
-    found = np.linalg.lstsq(rows[:, 1:], rows[:, 0], rcond=1e-10)[0]  # a periodic input leaves directions open
-    return np.concatenate([[1.0], -found])
-
-
-def _cross(y: Array, u: Array, n_lags: int) -> Array:
-    """Sums of y[t] u[t - k] for k = -n_lags to n_lags."""
     from scipy.fft import irfft, next_fast_len, rfft
+    from scipy.signal import lfilter
+    from scipy.stats import binom, norm
 
-    size = next_fast_len(y.size + n_lags)
-    whole = irfft(rfft(y, size) * np.conj(rfft(u, size)), size)
-    return np.concatenate([whole[-n_lags:], whole[: n_lags + 1]])
-
-
-def _allowed(n: int) -> int:
-    """How many of n values may lie outside a 99 % band by chance (one in a thousand records has more)."""
-    from scipy.stats import binom
-
-    return int(binom.isf(1e-3, n, 0.01))
+    check_order_names("correlation", orders, ("nb", "nk"), ("nb",))
+    nb = order_per_input("correlation", orders, "nb", 1, data.n_inputs)
+    nk = order_per_input("correlation", {"nk": 0, **orders}, "nk", 0, data.n_inputs)
+    layout, warnings = arx_layout(0, nb, nk), list[str]()
+    n = data.n_samples - _WHITENING
+    check_length("correlation", data, n - layout.first_row, sum(nb) + 1)
+    u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
+    taps, sd = np.empty((data.n_outputs, sum(nb))), np.empty((data.n_outputs, sum(nb)))
+    for i, place in enumerate(np.split(np.arange(sum(nb)), np.cumsum(nb)[:-1])):
+        last = nk[i] + nb[i]
+        rows = np.column_stack([u[_WHITENING - k : data.n_samples - k, i] for k in range(_WHITENING + 1)])
+        # a periodic input leaves directions open
+        whitening = np.append(1.0, -np.linalg.lstsq(rows[:, 1:], rows[:, 0], rcond=1e-10)[0])
+        white = lfilter(whitening, 1.0, u[:, i])[_WHITENING:]
+        size = next_fast_len(n + last)
+        for o, name in enumerate(data.outputs):
+            out = lfilter(whitening, 1.0, y[:, o])[_WHITENING:]
+            g = irfft(rfft(out, size) * np.conj(rfft(white, size)), size) / float(white @ white)  # lag -k at its end
+            taps[o, place], sd[o, place] = g[nk[i] : last], out.std() / (white.std() * np.sqrt(n))
+            outside = int(np.sum(np.abs(g[-last:]) > norm.isf(0.005) * sd[o, place[0]]))
+            if outside > binom.isf(_SEEN, last, 0.01):
+                warnings.append(
+                    f"{outside} of {last} negative lags from {data.inputs[i]!r} to {name!r} are significant: there is "
+                    "feedback, and these responses are biased. Use pbsid, or cliv with a reference"
+                )
+    together = np.abs(np.corrcoef(u.T) - np.eye(data.n_inputs)).max() if data.n_inputs > 1 else 0.0
+    if together > 4 / np.sqrt(n):
+        warnings.append(f"inputs are correlated (up to {together:.2f}), which biases one-at-a-time estimates. Use rfir")
+    theta, variance = np.tile(layout.start(), (data.n_outputs, 1)), np.zeros((data.n_outputs, layout.n_theta))
+    theta[:, layout.free], variance[:, layout.free] = taps, sd**2
+    model = PolynomialModel(outputs=tuple(map(layout.polynomials, theta)), dt=data.dt)
+    error = y - sum(np.stack([lfilter(p.B[i], 1.0, x) for p in model.outputs], axis=1) for i, x in enumerate(u.T))
+    return build_fit(
+        "correlation",
+        data,
+        orders={"nb": compact_order(nb), "nk": compact_order(nk)},
+        model=model,
+        covariance=np.diag(variance.ravel()),
+        n_estimated=taps.size,
+        offsets=Offsets(u=data.u.mean(axis=0), y=data.y.mean(axis=0)),
+        noise_covariance=error[layout.first_row :].T @ error[layout.first_row :] / (data.n_samples - layout.first_row),
+        warnings=warnings,
+    )

@@ -1,10 +1,9 @@
-"""Instrumental variables in discrete time: iv4 without feedback; cliv and two-stage with the reference of a loop.
+"""Instrumental variables in discrete time: iv4 without feedback; cliv with the reference of a loop.
 
 A y = B u + noise of any colour: least squares is biased where the equation's noise is not white. Instruments that the
 noise did not make (what the inputs, or in a loop the reference, explain) take the bias off, and filtering with a model
 of the noise makes the estimate as sharp as a method without a noise model of G can be (Ljung 1999, sec. 15.3; Gilson
-and Van den Hof 2005). Noise model and estimate are repeated in turn until they settle. two-stage estimates B/F of a
-stable plant from the part of the input that the reference makes (Van den Hof and Schrama 1993).
+and Van den Hof 2005). Noise model and estimate are repeated in turn until they settle.
 """
 
 from __future__ import annotations
@@ -28,13 +27,11 @@ from ambid.blackbox.instruments import (
     reference_part,
     require_reference,
     solve,
-    span,
     weak_instruments,
 )
-from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, pole_covariance, reflect, stable
+from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, reflect
 from ambid.blackbox.polynomial_predictor import Layout, arx_layout
 from ambid.errors import EstimationError
-from ambid.estimation.linear import one_thread
 
 _NO_NOISE_MODEL = Autoregression(D=np.ones(1), variance=0.0)
 _NO_AVERAGE = np.ones(1)
@@ -343,7 +340,7 @@ def _explained(deviations: IOData) -> Array | None:
     u, names = deviations.u, deviations.inputs
     alone = replace(deviations, u=np.empty((u.shape[0], 0)), inputs=(), reference=u, references=names)
     try:
-        return reference_part("iv4", alone).y
+        return reference_part("iv4", alone)[1]
     except EstimationError:
         return None
 
@@ -371,204 +368,9 @@ def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
     require_reference("cliv", data)
     used = arx_orders("cliv", data, orders)
     deviations, means, sds = centre(data)
-    clean = reference_part("cliv", deviations)
+    clean_u, clean_y = reference_part("cliv", deviations)
     found = [
-        estimate_output(
-            "cliv", Signals(y=deviations.y[:, o], u=deviations.u), Signals(y=clean.y[:, o], u=clean.u), used
-        )
-        for o in range(data.n_outputs)
+        estimate_output("cliv", Signals(y=y, u=deviations.u), Signals(y=clean, u=clean_u), used)
+        for y, clean in zip(deviations.y.T, clean_y.T, strict=True)
     ]
     return arx_fit("cliv", data, found, means, sds)
-
-
-_COLUMNS = 400  # of the finite impulse response, all references together
-_CERTAIN = 2.0  # standard deviations by which a pole is outside before the plant is called unstable
-_STAGE_ROUNDS = 30
-_STAGE_SETTLED = 1e-6  # change of the output by a step, relative to the noise
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Refined:
-    """One output after the refined steps."""
-
-    polynomials: Polynomials
-    noise: Array  # (n_samples,), y - G u, free responses and constant taken off
-    constant: float
-    step: Solution  # the last one
-    settled: bool
-
-
-def two_stage(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate G = B/F of a stable plant in a loop from its reference; every output by itself.
-
-    Errors of the first stage reach the second and make it several times less sharp than it has to be. So its G is only
-    the start of refined instrumental variable steps (Gilson and Van den Hof 2005): Z' (y - G u) = 0 with the measured
-    input, Z from the clean one. They leave the noise of the plant alone, and their covariance is known.
-
-    Parameters
-    ----------
-    data : IOData
-        With a reference that the noise does not reach.
-    orders : Mapping[str, int or tuple of int]
-        ``nb``, ``nf`` and ``nk`` (default 1), one or one for each input.
-
-    Returns
-    -------
-    BlackBoxFit
-        PolynomialModel with B and F.
-
-    Raises
-    ------
-    EstimationError
-        If there is no reference, the plant is unstable, an order breaks a rule, or the record is too short.
-    """
-    from ambid.blackbox.polynomial import oe
-
-    who = "two-stage"
-    require_reference(who, data)
-    check_order_names(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
-    n_u = data.n_inputs
-    nb, nf = order_per_input(who, orders, "nb", 1, n_u), order_per_input(who, orders, "nf", 0, n_u)
-    nk = order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u)
-    layout = Layout(na=0, nb=nb, nc=0, nd=0, nf=nf, nk=nk)
-    unknowns = layout.free.size
-    check_length(who, data, data.n_samples - max(nf), unknowns + 1)
-    with one_thread():
-        _refuse_unstable(data, nb, nf, nk)
-        clean, lags, warnings = _first_stage(who, data)
-        rest = data.part(lags, data.n_samples)
-        second = oe(replace(rest, u=clean), {"nb": nb, "nf": nf, "nk": nk})
-        assert isinstance(second.model, PolynomialModel)
-        if not all(stable(f) for p in second.model.outputs for f in p.F):
-            raise EstimationError(_UNSTABLE.format(poles="the second stage found poles outside the unit circle"))
-        mean = rest.u.mean(axis=0)
-        found = [
-            _refine(layout, p, clean - mean, rest.u - mean, rest.y[:, o] - second.offsets.y[o])
-            for o, p in enumerate(second.model.outputs)
-        ]
-        blocks = [_stage_covariance(f, layout) for f in found]
-    noise = np.stack([f.noise for f in found], axis=1)
-    return build_fit(
-        who,
-        data,
-        orders={"nb": nb, "nf": nf, "nk": nk},
-        model=PolynomialModel(outputs=tuple(f.polynomials for f in found), dt=data.dt),
-        covariance=block_diag(*blocks),
-        n_estimated=data.n_outputs * unknowns,
-        offsets=Offsets(u=mean, y=second.offsets.y + np.array([f.constant for f in found])),
-        noise_covariance=noise.T @ noise / max(noise.shape[0] - unknowns - 1, 1),
-        status="converged" if all(f.settled for f in found) else "stalled",
-        warnings=(*warnings, *weak_instruments([f.step for f in found], data.outputs)),
-        details={
-            "first_stage_lags": lags,
-            "condition": [f.step.condition for f in found],
-            "instrument_strength": [f.step.strength() for f in found],
-        },
-    )
-
-
-_UNSTABLE = (
-    "two-stage: {poles}; the second stage simulates the plant from its input, which is bounded only for a stable one. "
-    "Use cliv or clsrivc, which need no simulation, or bj and armax on the loop's own signals"
-)
-
-
-def _refuse_unstable(data: IOData, nb: tuple[int, ...], nf: tuple[int, ...], nk: tuple[int, ...]) -> None:
-    """Ask cliv, which stands unstable plants, where the poles are."""
-    if not max(nf):
-        return
-    try:
-        plain = cliv(data, {"na": max(nf), "nb": nb, "nk": nk})
-    except EstimationError:
-        return
-    poles = plain.model.poles()
-    size = np.abs(poles)
-    if plain.covariance is None or not size.size:
-        return
-    direction = np.stack([poles.real, poles.imag], axis=1) / np.maximum(size, 1e-12)[:, None]
-    spread = np.einsum("pi,pij,pj->p", direction, pole_covariance(plain.model, plain.covariance), direction)
-    outside = size - _CERTAIN * np.sqrt(np.maximum(spread, 0)) > 1
-    if np.any(outside):
-        worst = float(size[outside].max())
-        raise EstimationError(_UNSTABLE.format(poles=f"the plant is unstable (a pole at |z| = {worst:.6g})"))
-
-
-def _first_stage(who: str, data: IOData) -> tuple[Array, int, tuple[str, ...]]:
-    """Part of the input that the reference makes, from sample `lags` on; `lags`; warnings."""
-    memory = reference_part(who, centre(data)[0]).memory
-    n, n_r = data.reference.shape
-    lags = int(min(memory, _COLUMNS // n_r, n // (6 * n_r)))
-    r = data.reference - data.reference.mean(axis=0)
-    rows = np.hstack([np.ones((n - lags, 1)), *[r[lags - k : n - k] for k in range(lags + 1)]])
-    mean = data.u.mean(axis=0)
-    basis = span(rows)
-    u = data.u[lags:] - mean
-    warnings = (
-        ()
-        if lags >= memory
-        else (
-            f"the response of the loop to its reference lasts {memory} samples, and the record allows a first stage of "
-            f"{lags}: the rest counts as noise. Use a longer record, or cliv",
-        )
-    )
-    return basis @ (basis.T @ u) + mean, lags, warnings
-
-
-def _refine(layout: Layout, p: Polynomials, clean: Array, u: Array, y: Array) -> _Refined:
-    """Solve Z' (y - G u) = 0 with the measured input, Z the gradient by the clean one, from G of the second stage."""
-    settled = False
-    for _ in range(_STAGE_ROUNDS):
-        pulses = _pulses(p, y.size)
-        basis = span(pulses)
-        raw = y - sum(lfilter(b, f, u[:, i]) for i, (b, f) in enumerate(zip(p.B, p.F, strict=True)))
-        noise = raw - basis @ (basis.T @ raw)
-        instruments, rows = _gradient(p, clean, 0.0, layout.nk), _gradient(p, u, noise, layout.nk)
-        instruments -= basis @ (basis.T @ instruments)
-        rows -= basis @ (basis.T @ rows)
-        step = solve(instruments, rows, noise, who="two-stage")
-        size = np.linalg.norm(pulses, axis=0)
-        constant = float(np.linalg.lstsq(pulses / size, raw, rcond=1e-8)[0][0] / size[0])
-        here = _Refined(polynomials=p, noise=noise, constant=constant, step=step, settled=settled)
-        if settled:
-            return here
-        theta = p.theta
-        theta[layout.free] += step.theta
-        moved = layout.polynomials(theta)
-        if not all(stable(f) for f in moved.F):
-            return here
-        settled = bool(np.linalg.norm(instruments @ step.theta) <= _STAGE_SETTLED * np.linalg.norm(noise))
-        p = moved
-    return here
-
-
-def _gradient(p: Polynomials, u: Array, error: Array | float, nk: tuple[int, ...]) -> Array:
-    """Derivatives of B/F u by the free b of each input, then the free f of each; `error` is added to B/F u."""
-    by_b, by_f = [], []
-    for i, (b, f) in enumerate(zip(p.B, p.F, strict=True)):
-        smooth = lfilter([1.0], f, u[:, i])
-        out = -lfilter([1.0], f, lfilter(b, f, u[:, i]) + error)
-        by_b += [_delay(smooth, k) for k in range(nk[i], b.size)]
-        by_f += [_delay(out, k) for k in range(1, f.size)]
-    return np.stack(by_b + by_f, axis=1)
-
-
-def _pulses(p: Polynomials, n: int) -> Array:
-    """A constant, and what initial states make of the output."""
-    pulse = np.zeros(n)
-    pulse[0] = 1.0
-    return np.stack(
-        [np.ones(n), *(_delay(lfilter([1.0], f, pulse), k) for f in p.F for k in range(f.size - 1))], axis=1
-    )
-
-
-def _stage_covariance(found: _Refined, layout: Layout) -> Array:
-    """Covariance of all coefficients of one output, for noise of any colour."""
-    n, size = found.noise.size, layout.free.size
-    out = np.zeros((layout.n_theta,) * 2)
-    inner = found.step.covariance(autoregression(found.noise, NOISE_ORDER))
-    out[np.ix_(layout.free, layout.free)] = inner * (n / max(n - size - 1, 1))
-    return out
-
-
-def _delay(x: Array, k: int) -> Array:
-    return np.concatenate([np.zeros(k), x[: x.size - k]]) if k else x

@@ -426,11 +426,11 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
     check_length(who, data, data.n_samples - sampled.first_row, sampled.free.size + 1)
     deviations, means, sds = centre(data)
     with one_thread():
-        clean = reference_part(who, deviations)
+        clean_u, clean_y = reference_part(who, deviations)
         found = list[ArxEstimate]()
         for o in range(data.n_outputs):
             own = Signals(y=deviations.y[:, o] / sds[1][o], u=deviations.u / sds[0])
-            pure = Signals(y=clean.y[:, o] / sds[1][o], u=clean.u / sds[0])
+            pure = Signals(y=clean_y[:, o] / sds[1][o], u=clean_u / sds[0])
             found.append(estimate_output("cliv", own, pure, sampled))
         w0 = [_time_scale(f.polynomials.A, data.dt) for f in found]
         nearest = [_nearest(f, used, w * data.dt) for f, w in zip(found, w0, strict=True)]

@@ -207,16 +207,6 @@ _SMALL = 1e-3  # weight of that, relative to signals of unit spread
 _ROUNDING = 1e-12  # variance, relative to the signal's, that counts as none: a controller without noise is exact
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ReferencePart:
-    """Inputs and outputs without noise."""
-
-    u: Array  # (n_samples, n_inputs)
-    y: Array  # (n_samples, n_outputs)
-    order: int  # lags of the autoregression
-    memory: int  # samples after which the loop has forgotten an impulse of the reference
-
-
 def require_reference(who: str, data: IOData) -> None:
     """Refuse data without a reference."""
     if not data.references:
@@ -226,8 +216,8 @@ def require_reference(who: str, data: IOData) -> None:
         )
 
 
-def reference_part(who: str, data: IOData) -> ReferencePart:
-    """Simulate inputs and outputs of the loop from its reference.
+def reference_part(who: str, data: IOData) -> tuple[Array, Array]:
+    """Return inputs and outputs of the loop without noise, simulated from its reference.
 
     `who`: method, for errors; `data`: means taken off.
     """
@@ -253,7 +243,7 @@ def reference_part(who: str, data: IOData) -> ReferencePart:
 
             out = sum(oaconvolve(found[:, :, j], r[:, j : j + 1], axes=0)[:n] for j in range(n_r)) * scale[0]
             n_y = data.n_outputs
-            return ReferencePart(u=out[:, n_y:], y=out[:, :n_y], order=p, memory=found.shape[0])
+            return out[:, n_y:], out[:, :n_y]
     raise EstimationError(
         f"{who}: no stable loop from {', '.join(data.references)} to inputs and outputs fits this record. Check "
         "the reference column, or cut out the part where the loop is unstable"

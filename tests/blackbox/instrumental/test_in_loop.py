@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import ss2tf
 
-from ambid.blackbox.instrumental import cliv, iv4, two_stage
+from ambid.blackbox.instrumental import cliv, iv4
 from ambid.blackbox.instrumental_continuous import clsrivc, sampled_coefficients
 from ambid.blackbox.model import pole_covariance
 from ambid.errors import EstimationError
@@ -108,23 +108,9 @@ def test_the_sampled_equivalent_and_its_derivative():
             np.testing.assert_allclose(exact, near, rtol=1e-7, atol=1e-9)
 
 
-def test_two_stage_on_a_stable_plant():
-    a1, a2, b1, b2 = _sampled(SPRUNG)
-    errors, scores = monte_carlo(
-        _sprung, lambda d: two_stage(d, {"nb": 2, "nf": 2}), np.array([b1, b2, a1, a2]), [2, 3, 7, 8], 40
-    )
-    assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(40))
-    assert np.all((scores.std(axis=0) > 0.7) & (scores.std(axis=0) < 1.35))
-
-
-def test_two_stage_says_that_an_unstable_plant_is_not_for_it():
-    with pytest.raises(EstimationError, match=r"unstable.*cliv"):
-        two_stage(_rising(np.random.default_rng(1)), {"nb": 2, "nf": 2})
-
-
 @pytest.mark.parametrize(
     ("estimator", "orders"),
-    [(cliv, {"na": 2, "nb": 2}), (clsrivc, {"nb": 1, "nf": 2}), (two_stage, {"nb": 2, "nf": 2})],
+    [(cliv, {"na": 2, "nb": 2}), (clsrivc, {"nb": 1, "nf": 2})],
 )
 def test_without_a_reference(estimator, orders):
     d = _sprung(np.random.default_rng(1))

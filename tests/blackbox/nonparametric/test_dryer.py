@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.impulse import correlation_analysis, impulse_response, step_response
+from ambid.blackbox.impulse import correlation, rfir
+from tests.blackbox.nonparametric.test_impulse import step_sd, taps
 from tests.measured import ABSENT, BENCHMARKS
 
 DRYER = BENCHMARKS / "dryer.csv"
@@ -17,14 +18,14 @@ def test_delay_and_gain_of_the_dryer():
     data = IOData(
         u=table[:, :1], y=table[:, 1:], dt=0.08, inputs=("power",), outputs=("temperature",), units={}, open_loop=True
     )
-    first, second = (impulse_response(data.part(a, a + 500), 60) for a in (0, 500))
-    for half in (first, second):
-        assert np.argmax(np.abs(half.values[:, 0, 0]) > 4.3 * half.sd[:, 0, 0]) == 3
+    halves = [taps(rfir(data.part(a, a + 500), {"nb": 60})) for a in (0, 500)]
+    for g, covariance in halves:
+        assert np.argmax(np.abs(g) > 4.3 * np.sqrt(np.diag(covariance))) == 3
     # both halves of the record give one gain, within the spread that they claim
-    gains = [step_response(r) for r in (first, second)]
-    difference = gains[0].values[-1, 0, 0] - gains[1].values[-1, 0, 0]
-    assert abs(difference) < 4 * np.hypot(gains[0].sd[-1, 0, 0], gains[1].sd[-1, 0, 0])
-    assert gains[0].values[-1, 0, 0] == pytest.approx(0.93, abs=0.05)
-    simple = correlation_analysis(data, 30)
-    assert np.all(np.abs(simple.values[31:33, 0, 0]) < 2 * simple.band[0, 0])
-    assert simple.values[34, 0, 0] > 3 * simple.band[0, 0]
+    gains, sds = [g.sum() for g, _ in halves], [step_sd(covariance)[-1] for _, covariance in halves]
+    assert abs(gains[0] - gains[1]) < 4 * np.hypot(*sds)
+    assert gains[0] == pytest.approx(0.93, abs=0.05)
+    simple, covariance = taps(correlation(data, {"nb": 31}))
+    band = 2.576 * np.sqrt(covariance[0, 0])
+    assert np.all(np.abs(simple[1:3]) < 2 * band)
+    assert simple[4] > 3 * band

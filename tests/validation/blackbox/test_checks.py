@@ -9,7 +9,7 @@ import pytest
 from scipy.signal import cont2discrete, lfilter
 
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instrumental import two_stage
+from ambid.blackbox.instrumental_continuous import clsrivc
 from ambid.blackbox.model import Offsets, StateSpaceModel, TransferModel
 from ambid.blackbox.polynomial import arma, armax, bj, oe
 from ambid.blackbox.prediction import errors, gradient, innovations_form, polynomial_gradient
@@ -95,7 +95,7 @@ def test_in_a_loop_an_output_error_model_is_judged_by_the_reference():
     plain = loop(seed=6, n=3000)
     reference = plain.u[:, 0] + 0.5 * plain.y[:, 0]
     data = io(plain.u, plain.y, reference=reference[:, None], references=("r0",))
-    fit = judge(two_stage(data, {"nb": 2, "nf": 2, "nk": 1}), data)
+    fit = judge(clsrivc(data, {"nb": 2, "nf": 2}), data)
     assert fit.checks["residuals_uncorrelated"].passed
     assert fit.checks["feedback"].passed
     assert fit.checks["feedback"].values["seen"] == 1.0
