@@ -11,7 +11,7 @@ from ambid.estimation.predictor import PredictorProblem, Scales
 from ambid.estimation.sensitivity import Workspace, innovations, residual_blocks
 from ambid.physics.linear_model import LinearModel, model
 from ambid.physics.loop import Noise
-from ambid.physics.sensor_gain import SensorGains
+from ambid.physics.sensor_errors import SensorGains
 from ambid.signals import multisine
 from ambid.simulation import LinearPlant, simulate
 from ambid.simulation.variation import Schedule, Variation

@@ -23,7 +23,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.predictor import NoiseForm, PredictorProblem, Scales, assemble, predictor_gain, scales_for
 from ambid.physics.linear_model import LinearModel, discretise, model
-from ambid.physics.sensor_gain import SensorGains
+from ambid.physics.sensor_errors import SensorGains
 from ambid.record import Record
 
 MEMORY_S = 0.02  # longest memory of the predictor: it is deaf for ten of them after a gap, and slow to show a change

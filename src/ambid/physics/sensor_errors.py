@@ -1,0 +1,206 @@
+"""Errors of sensors: what each adds to the signals, how far it moves the parameters, which residuals it leaves.
+
+The plant is y = G(jw; theta) u. A channel that should log s(t) logs, to first order in the error e,
+
+    gain s + e s,   offset s + e,   lag (or a pole at 1/e) s - e s',   cross-talk s + e s_2,   time (1 + e) t,
+
+and a number of the model that is fixed, such as the plane of a sensor, is too large by e. Each adds a column c to the
+outputs beside G u. Least squares with the Jacobian J of the free parameters then moves them by J⁺c and leaves the
+residuals c - J J⁺c: along these, and no others, a score test sees the error (Rao 1948).
+
+A gain is a change of the channel's unit. Where every parameter that it scales is free nothing of c is left: no record
+shows it, and J⁺c are whole numbers, the powers of the parameters. A gain of the position sensor moves m and k_x by -2
+and k_i by -1, for in m x'' = k_i i - k_x x and u = R i + L i' + k_i x' (thesis eq. 4.4) k_i stands twice. Where one of
+them is held, such as a mass that was weighed, what happens depends on the record. An offset is a constant of the model
+and moves no parameter.
+
+`SensorGains` has the gains as parameters. With states in logged units, x_g = T x and T = diag(g of the state's sensor),
+the outputs stay what they were, A becomes T A T^-1, B and E become T B and T E.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.physics.linear_model import LinearModel, ParameterSpec, StateSpace
+from ambid.physics.rotor_model import RotorModel
+
+Kind = Literal["gain", "offset", "lag", "cross-talk", "fixed"]
+CHANNELS = ("voltage", "current", "position", "time")
+_LINES, _BEYOND = 60, 10.0  # of the default frequencies, and the factor by which they reach beyond the poles
+_RANK = 1e-9  # relative singular value of directions that no parameter is moved along
+_GENERIC = {"m": 1.3, "k_x": -2.1, "k_i": 1.7, "R": 0.9, "L": 0.6, "c": 0.4}  # of which whole powers are the same
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SensorError:
+    """An error of one channel, or of a number that the model takes for known."""
+
+    kind: Kind
+    channel: str  # role of an input or output, "time", or the name of a fixed number
+    other: str = ""  # channel that a cross-talk is of
+
+
+def logged_error(kind: Kind, signal: Complex, omega: Array, other: Complex | None = None) -> Complex:
+    """Return what an error of one unit adds to the spectrum of its channel at `omega`; `other`: of cross-talk."""
+    match kind:
+        case "gain":
+            return signal
+        case "lag":
+            return np.asarray(-1j * omega * signal)
+        case "cross-talk" if other is not None:
+            return other
+    return np.zeros_like(signal)
+
+
+def other_plane(model: RotorModel, k: int) -> int | None:
+    """Return the sensor of the other plane beside sensor `k` of a rotor: the one it may have a cross-talk of."""
+    j, number = model.sensors[k]
+    bearing = model.placed[j][0]
+    beside = (i for i, (axis, n) in enumerate(model.sensors) if n == number and model.placed[axis][0] is bearing)
+    return next((i for i in beside if i != k), None)
+
+
+def position_errors(model: RotorModel) -> tuple[SensorError, ...]:
+    """Return the errors that a rotor's position sensors may have and that are no parameters of the model."""
+    outputs, free = model.outputs, set(model.extras)
+    roles = [(outputs[k], model.axes[j], other_plane(model, k)) for k, (j, _) in enumerate(model.sensors)]
+    return (
+        *(SensorError(kind="gain", channel=role) for role, axis, _ in roles if f"{axis}.gain" not in free),
+        *(SensorError(kind="lag", channel=role) for role, axis, _ in roles if f"{axis}.sensor_pole" not in free),
+        *(
+            SensorError(kind="cross-talk", channel=role, other=outputs[other])
+            for role, _, other in roles
+            if other is not None
+        ),
+    )
+
+
+class _Response:
+    """Outputs of a plant over lines, (n_lines, n_outputs, n_experiments), and what they are changed by."""
+
+    def __init__(self, plant: LinearModel | RotorModel, theta: Mapping[str, float], omega: Array, u: Complex) -> None:
+        self.plant, self.theta, self.omega, self.u = plant, theta, omega[:, None], u
+        self.space = plant.matrices(theta)
+        self.states = np.linalg.inv(1j * self.omega[:, None] * np.eye(len(self.space.A)) - self.space.A)
+        self.x = self.states @ self.space.B @ u
+        self.y = self.space.C @ self.x
+
+    def slope(self, name: str) -> Complex:
+        """Derivative by a parameter."""
+        d = self.plant.derivative(self.theta, name)
+        return np.asarray(self.space.C @ self.states @ (d.A @ self.x + d.B @ self.u) + d.C @ self.x)
+
+    def column(self, error: SensorError) -> Complex:
+        """Derivative by an error of what is logged, for the inputs that are logged."""
+        if error.kind == "fixed":
+            return -self.slope(error.channel)
+        if error.channel == "time":  # G(jw) is taken for G(jw (1 + e))
+            return np.asarray(-1j * self.omega[:, None] * (self.space.C @ self.states @ self.x))
+        roles, signals = self.plant.outputs, self.y
+        if error.channel in self.plant.inputs:
+            roles, signals = self.plant.inputs, self.u
+        k, moved = roles.index(error.channel), np.zeros_like(signals)
+        other = signals[:, roles.index(error.other)] if error.other else None
+        moved[:, k] = logged_error(error.kind, signals[:, k], self.omega, other)
+        # an input acts as it is: what is logged, less the error
+        return moved if roles is self.plant.outputs else np.asarray(-self.space.C @ self.states @ self.space.B @ moved)
+
+
+def error_moves(
+    plant: LinearModel | RotorModel,
+    theta: Mapping[str, float],
+    errors: Sequence[SensorError],
+    *,
+    free: Sequence[str] | None = None,
+    omega: Array | None = None,
+    excitation: Complex | None = None,
+    whiten: Complex | None = None,
+) -> Array:
+    """Return d ln(parameter) / d(error), (n_free, n_errors); of a parameter that is zero over its natural scale.
+
+    `theta`: parameters, SI; `free`: default all without a default value; `omega`: rad/s, default around the poles;
+    `excitation`: (n_lines, n_inputs, n_experiments), default each input alone; `whiten`: (n_lines, n_outputs,
+    n_outputs), default each output over its root mean square. Units: of a lag s, of an offset and a fixed number SI.
+    Directions that the outputs do not show are not moved along.
+    """
+    free = [p.name for p in plant.parameters if p.default is None] if free is None else list(free)
+    if omega is None:
+        poles = np.abs(np.linalg.eigvals(plant.matrices(theta).A))
+        omega = np.geomspace(poles[poles > 0.0].min() / _BEYOND, _BEYOND * poles.max(), _LINES)
+    alone = np.broadcast_to(np.eye(len(plant.inputs), dtype=complex), (omega.size, *(len(plant.inputs),) * 2))
+    response = _Response(plant, theta, omega, alone if excitation is None else excitation)
+    if whiten is None:
+        whiten = np.diag(1.0 / np.sqrt(np.mean(np.abs(response.y) ** 2, axis=(0, 2)))).astype(complex)
+
+    def rows(c: Complex) -> Array:
+        c = (whiten @ c).ravel()
+        return np.concatenate([c.real, c.imag])
+
+    natural = {name: theta[name] or plant.references(theta).get(name, 1.0) for name in free}
+    J = np.column_stack([natural[name] * rows(response.slope(name)) for name in free])
+    size = np.linalg.norm(J, axis=0)
+    size[size == 0.0] = 1.0
+    columns = np.column_stack([rows(response.column(e)) for e in errors])
+    moves = np.linalg.lstsq(J / size, columns, rcond=_RANK)[0]
+    return np.asarray(moves / size[:, None], dtype=float)
+
+
+def unit_powers(plant: LinearModel) -> Mapping[str, tuple[int, ...]]:
+    """Return by parameter the powers of gains on `CHANNELS` that it scales with; 0 for a channel that is not there.
+
+    All parameters are free, but for a mass that nothing shows: without a voltage only ratios to it are seen.
+    """
+    theta = {p.name: _GENERIC[p.name] for p in plant.parameters}
+    free = [name for name in theta if name != "m" or "voltage" in plant.inputs]
+    there = [c for c in CHANNELS if c in (*plant.inputs, *plant.outputs, "time")]
+    moves = error_moves(plant, theta, [SensorError(kind="gain", channel=c) for c in there], free=free)
+    powers = {name: dict(zip(there, np.rint(row), strict=True)) for name, row in zip(free, moves, strict=True)}
+    return {name: tuple(int(powers.get(name, {}).get(c, 0)) for c in CHANNELS) for name in theta}
+
+
+class SensorGains:
+    """A linear model with one more parameter for each output: ``gain_<output>``, 1 for a sensor as calibrated."""
+
+    def __init__(self, base: LinearModel) -> None:
+        """`base`: its outputs are states of it."""
+        self.base, self.name, self.summary = base, base.name, f"{base.summary}, with sensor gains"
+        self.inputs, self.outputs, self.states = base.inputs, base.outputs, base.states
+        self.disturbances, self.units = base.disturbances, base.units
+        self.gains = tuple(f"gain_{output}" for output in base.outputs)
+        self.parameters: tuple[ParameterSpec, ...] = (
+            *base.parameters,
+            *(
+                ParameterSpec(name=f"gain_{x}", unit="1", meaning=f"gain of the {x} sensor", positive=True, default=1.0)
+                for x in base.outputs
+            ),
+        )
+        # of each state; the velocity goes with the position
+        self._gains = [f"gain_{'position' if state == 'velocity' else state}" for state in base.states]
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return the matrices in logged units; a gain that `theta` lacks is 1."""
+        return self._logged(self.base.matrices(theta), theta)
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return the derivative of the matrices by a parameter of the base model, or a gain."""
+        if parameter not in self.gains:
+            return self._logged(self.base.derivative(theta, parameter), theta)
+        at = self.matrices(theta)
+        own = np.array([float(gain == parameter) for gain in self._gains]) / theta.get(parameter, 1.0)
+        return StateSpace(
+            A=own[:, None] * at.A - at.A * own, B=own[:, None] * at.B, E=own[:, None] * at.E, C=np.zeros_like(at.C)
+        )
+
+    def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
+        """Return the natural scales of the base model."""
+        return self.base.references(theta)
+
+    def _logged(self, at: StateSpace, theta: Mapping[str, float]) -> StateSpace:
+        t = np.array([theta.get(gain, 1.0) for gain in self._gains])
+        return StateSpace(A=t[:, None] * at.A / t, B=t[:, None] * at.B, E=t[:, None] * at.E, C=at.C)
