@@ -1,8 +1,7 @@
 """Slips of commissioning that leave a sound fit: a channel in another unit than its column says.
 
-A factor on one channel is an exact symmetry of the model, and so is one on time. With voltage, current, position and
-time read too large by s_v, s_i, s_x and s_t, the same residuals belong to R s_v/s_i, L s_v s_t/s_i, k_i s_v s_t/s_x,
-k_x s_v s_i s_t/s_x^2 and m s_v s_i s_t^3/s_x^2: only sizes can tell. Each size below has a usual range over the
+A factor on one channel is an exact symmetry of the model, and so is one on time: the same residuals belong to other
+parameters (`ambid.physics.sensor_errors`), and only sizes can tell. Each size below has a usual range over the
 machines that are built, wide because it holds micro-bearings and turbines alike; together they leave a factor of 1000
 hardly any room. What a rig says of a parameter is one more size, of a narrow range.
 """
@@ -18,25 +17,14 @@ from ambid.arrays import Array
 from ambid.bearing.multistart import Signals
 from ambid.estimation.estimate import Check
 from ambid.physics.linear_model import LinearModel, Parameter, model
+from ambid.physics.sensor_errors import CHANNELS, unit_powers
 
-CHANNELS = {"voltage": "V", "current": "A", "position": "m", "time": "s"}
-_SYMMETRY = {  # exponents of s_v, s_i, s_x, s_t
-    "R": (1, -1, 0, 0),
-    "L": (1, -1, 0, 1),
-    "k_i": (1, 0, -1, 1),
-    "k_x": (1, 1, -2, 1),
-    "m": (1, 1, -2, 3),
-    "c": (1, 1, -2, 2),
+_UNITS = dict(zip(CHANNELS, ("V", "A", "m", "s"), strict=True))
+_SIGNALS = {  # powers of gains of `CHANNELS`
     "voltage": (1, 0, 0, 0),
     "current": (0, 1, 0, 0),
     "position": (0, 0, 1, 0),
     "rate": (0, 0, 0, -1),
-}
-_OF_MASS = {  # of a magnet driven by a current, whose mass is known
-    "k_i": (0, -1, 1, -2),
-    "k_x": (0, 0, 0, -2),
-    "m": (0, 0, 0, 0),
-    "c": (0, 0, 0, -1),
 }
 _HIGH = 0.999
 _EXACT = 0.1  # power of ten within which a rig's value is a thousand times another
@@ -74,10 +62,6 @@ class Size:
     usual: tuple[float, float]
     possible: tuple[float, float]
     source: str
-
-    def symmetry(self, of: Mapping[str, Sequence[int]]) -> Array:
-        """Exponents of s_v, s_i, s_x, s_t; `of`: those of each parameter and signal."""
-        return np.asarray(np.sum([e * np.array(of[k], dtype=float) for k, e in self.of.items()], axis=0))
 
 
 # Usual: of micro-bearings of a few grams to turbines of several tons. The presets, the benches that the thesis names
@@ -134,7 +118,6 @@ def check_units(
     says; `signals`: of the record; `plant`: default one-axis.
     """
     plant = model("one-axis") if plant is None else plant
-    of = _SYMMETRY | ({} if "voltage" in plant.inputs else _OF_MASS)
     sizes, largest = [*SIZES, *_said(parameters)], _seen(signals, plant)
     logs = np.array([_log(size, {**values, **largest}) for size in sizes])
     low, high = (np.log10([size.usual[j] for size in sizes]) for j in (0, 1))
@@ -142,8 +125,9 @@ def check_units(
     odd = [j for j in np.flatnonzero(~(np.abs(far) <= 1.0)) if np.isfinite(far[j])]
     if not odd:
         return Check(passed=True, values={"unusual": 0.0}, detail="all sizes are typical of magnetic bearings")
-    symmetry = np.array([size.symmetry(of) for size in sizes])
-    slips = _slips(far, symmetry / ((high - low) / 2)[:, None], [c for c in CHANNELS if c in largest or c == "time"])
+    powers, none = {**unit_powers(plant), **_SIGNALS}, (0,) * len(CHANNELS)  # none: of what the plant does not have
+    moves = np.array([sum(e * np.array(powers.get(k, none)) for k, e in size.of.items()) for size in sizes])
+    slips = _slips(far, moves / ((high - low) / 2)[:, None], [c for c in CHANNELS if c in largest or c == "time"])
     factors: dict[str, float] = {}
     for slip in slips:
         factors.setdefault(f"{slip.channel}_factor", slip.factor)
@@ -244,7 +228,7 @@ def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
     """
     applies, found = np.isfinite(far), []
     most = float(np.sum(far[applies] ** 2)) - _GAIN
-    for j, (channel, unit) in enumerate(CHANNELS.items()):
+    for j, (channel, unit) in enumerate(_UNITS.items()):
         if channel not in channels:
             continue
         own = _TIMES if channel == "time" else {**_FACTORS, **(_LENGTHS if channel == "position" else {})}

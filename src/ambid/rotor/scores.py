@@ -19,6 +19,7 @@ from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import directions, triangle_of
 from ambid.physics.rotor_model import RotorModel
+from ambid.physics.sensor_errors import SensorError, logged_error, position_errors
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, sampled
 
 _FAR = 4.5
@@ -40,9 +41,11 @@ def scores(problem: Likelihood, v: Array) -> list[Score]:
     """Return the causes that the residuals may have, the surest first."""
     rows = problem.rows(v, corrected=True)
     at, model = problem.point(v), problem.unknowns.model
-    named = _causes(problem, model)
+    fixed = [SensorError(kind="fixed", channel=p.name) for p in problem.unknowns.known if p.role == "fixed"]
+    causes = [*fixed, *position_errors(model)]
+    named = [(e.kind, e.channel) for e in causes] + ([] if "a" in model.extras else [("eddy", "a")])
     columns = [
-        np.concatenate([_real(w.whiten, c) for c in _columns(e, model, at, named)], axis=1)
+        np.concatenate([_real(w.whiten, c) for c in _columns(e, model, at, causes)], axis=1)
         for e, w in zip(problem.experiments, problem.weights, strict=True)
     ]
     J, r = np.concatenate([block[:, :-1] for block in rows]), np.concatenate([block[:, -1] for block in rows])
@@ -65,52 +68,26 @@ def sensor_gain(problem: Likelihood, v: Array) -> float:
     return max((s.gain for s in scores(problem, v) if s.kind != "fixed"), default=0.0)
 
 
-def _causes(problem: Likelihood, model: RotorModel) -> list[tuple[str, str]]:
-    """Return kind and name of all causes that are tried."""
-    fixed = [("fixed", p.name) for p in problem.unknowns.known if p.role == "fixed"]
-    positions = model.outputs[: len(model.sensors)]
-    extra = set(model.extras)
-    axes = [model.axes[j] for j, _ in model.sensors]
-    gains = [("gain", role) for role, axis in zip(positions, axes, strict=True) if f"{axis}.gain" not in extra]
-    lags = [("lag", role) for role, axis in zip(positions, axes, strict=True) if f"{axis}.sensor_pole" not in extra]
-    cross = [("cross-talk", role) for k, role in enumerate(positions) if _other(model, k) is not None]
-    return [*fixed, *gains, *lags, *cross, *([] if "a" in extra else [("eddy", "a")])]
-
-
-def _other(model: RotorModel, k: int) -> int | None:
-    """Return the sensor of the other plane beside a sensor."""
-    j, number = model.sensors[k]
-    bearing = model.placed[j][0]
-    same = [
-        i for i, (axis, n) in enumerate(model.sensors) if n == number and model.placed[axis][0] is bearing and i != k
-    ]
-    return same[0] if same else None
-
-
-def _columns(e: Experiment, model: RotorModel, at: Point, named: Sequence[tuple[str, str]]) -> Iterator[Complex]:
-    """Yield what each cause adds to the outputs, (n_lines, n_y)."""
+def _columns(e: Experiment, model: RotorModel, at: Point, causes: Sequence[SensorError]) -> Iterator[Complex]:
+    """Yield what each cause adds to the outputs, (n_lines, n_y); an eddy pole last, where it is not in the model."""
     of, mean, turned = sampled(e, model, at), e.spectra.mean_u, model.at_speed(e.speed)
-    x = of.states(mean)
-    y = x @ of.space.C.T
-    jw, outputs = 1j * e.spectra.omega, list(model.outputs)
-    for kind, name in named:
-        found = np.zeros_like(y)
-        if kind == "fixed":
-            yield of.slopes(mean, [turned.derivative(at.theta, name)])[:, :, 0]
+    y = of.states(mean) @ of.space.C.T
+    omega, outputs = e.spectra.omega, list(model.outputs)
+    for cause in causes:
+        if cause.kind == "fixed":
+            yield of.slopes(mean, [turned.derivative(at.theta, cause.channel)])[:, :, 0]
             continue
-        if kind == "eddy":
-            rate = np.zeros((y.shape[0], len(model.axes)), dtype=complex)
-            for j, axis in enumerate(model.axes):
-                role = f"{axis}_current"
-                current = y[:, outputs.index(role)] if role in outputs else mean[:, j]
-                rate[:, j] = -jw * at.theta[f"{axis}.k_i"] * current
-            yield (of.disturbed()[:, :, : len(model.axes)] @ rate[:, :, None])[:, :, 0]
-            continue
-        k = outputs.index(name)
-        other = _other(model, k)
-        source = {"gain": y[:, k], "lag": -jw * y[:, k]}
-        found[:, k] = source[kind] if kind in source else y[:, 0 if other is None else other]
-        yield found
+        added, k = np.zeros_like(y), outputs.index(cause.channel)
+        other = y[:, outputs.index(cause.other)] if cause.other else None
+        added[:, k] = logged_error(cause.kind, y[:, k], omega, other)
+        yield added
+    if "a" not in model.extras:
+        rate = np.zeros((y.shape[0], len(model.axes)), dtype=complex)
+        for j, axis in enumerate(model.axes):
+            role = f"{axis}_current"
+            current = y[:, outputs.index(role)] if role in outputs else mean[:, j]
+            rate[:, j] = logged_error("lag", at.theta[f"{axis}.k_i"] * current, omega)
+        yield (of.disturbed()[:, :, : len(model.axes)] @ rate[:, :, None])[:, :, 0]
 
 
 def _real(whiten: Complex, c: Complex) -> Array:
