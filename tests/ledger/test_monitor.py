@@ -60,6 +60,28 @@ def test_an_alarm_is_cleared_where_the_level_comes_back():
     assert watch([h]).passed
 
 
+def test_with_a_held_mass_a_sensor_moves_what_the_record_shows():
+    """Where the motion fixes k_i, a position that reads too large moves k_i alone, a current k_i, R and L."""
+    h = bearing("B", "", np.random.default_rng(2)).history
+    held = {**h.series, "m": replace(h.series["m"], role="fixed")}
+    late = h.series["k_i"].taken_at > h.estimates[120].taken_at
+
+    def cause(**powers):
+        names = {n: replace(held[n], value=np.where(late, 1.12**p * held[n].value, held[n].value))
+                 for n, p in powers.items()}  # fmt: skip
+        return {a.cause for a in watch([replace(h, series={**held, **names})], [rule]).alarms}
+
+    rule = Rule(parameter="k_i", change=0.05)
+    assert cause(k_i=1) == {"the position sensor's gain stepped: exchanged or damaged"}
+    rule = Rule(parameter="k_i", change=-0.05)
+    assert cause(k_i=-1, R=-1, L=-1) == {"the current sensor's gain stepped: exchanged or damaged"}
+    flux, position = "the magnet's bias flux stepped: cracked or demagnetised", "the position sensor's gain stepped"
+    (alike,) = cause(k_i=-1, k_x=-2)  # where the induced voltage fixes k_i
+    assert flux in alike
+    assert position in alike
+    assert "not clear" in alike
+
+
 def test_what_is_near_zero_has_no_relative_change():
     h = bearing("B", "", np.random.default_rng(5)).history
     s = h.series["L"]

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
@@ -23,6 +23,8 @@ from ambid.errors import AmbidError, counted, nearest
 from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.ledger.entry import moment
 from ambid.ledger.history import History, Series
+from ambid.physics.linear_model import model
+from ambid.physics.sensor_errors import CHANNELS, unit_powers
 
 SCHEMA = "ambid.alarms/1"
 MONTH_S = 365.25 / 12 * 86400.0
@@ -36,20 +38,23 @@ _BAI = 11.0  # 95 % of the date's error in samples, times (step / spread)^2
 _PLAIN = 25.0  # chi-squared above chance from which a trend is told: slow wander looks like small ones
 _STEEP = 8.0  # standard deviations of a slope that fixes the date of a drift
 
-# what changes of one thing do to m, k_x, k_i, R and L, as powers of its factor (docs/monitoring.md)
 _NAMES = ("m", "k_x", "k_i", "R", "L")
-_SIGNATURES: Mapping[str, tuple[tuple[int, ...], str, str]] = {
-    "coil": ((0, 0, 0, 1, 0), "the coil's resistance stepped: look at contacts", "the coil warms or corrodes"),
-    "flux": ((0, 2, 1, 0, 0), "the magnet's bias flux stepped: cracked or demagnetised", "the magnet ages: bias flux"),
-    "gap": ((0, -3, -2, 0, -1), "the air gap stepped: rotor or stator moved", "the air gap changes: wear or growth"),
-    "position": ((-2, -2, -1, 0, 0), "the position sensor's gain stepped: exchanged or damaged",
-                 "the position sensor's gain drifts"),
-    "current": ((1, 1, 0, -1, -1), "the current sensor's gain stepped: exchanged or damaged",
-                "the current sensor's gain drifts"),
-    "voltage": ((1, 1, 1, 1, 1), "the voltage's scale stepped: supply or amplifier", "the voltage's scale drifts"),
-    "mass": ((1, 0, 0, 0, 0), "the rotor's mass stepped: a part was exchanged or lost", "the rotor's mass changes"),
-}  # fmt: skip
-_LIKE = 0.15  # of a change, to which a signature holds
+_CAUSES: Mapping[str, tuple[str, str]] = {  # what is said of a step and of a drift
+    "coil": ("the coil's resistance stepped: look at contacts", "the coil warms or corrodes"),
+    "flux": ("the magnet's bias flux stepped: cracked or demagnetised", "the magnet ages: bias flux"),
+    "gap": ("the air gap stepped: rotor or stator moved", "the air gap changes: wear or growth"),
+    "position": ("the position sensor's gain stepped: exchanged or damaged", "the position sensor's gain drifts"),
+    "current": ("the current sensor's gain stepped: exchanged or damaged", "the current sensor's gain drifts"),
+    "voltage": ("the voltage's scale stepped: supply or amplifier", "the voltage's scale drifts"),
+    "mass": ("the rotor's mass stepped: a part was exchanged or lost", "the rotor's mass changes"),
+}
+_BENCH = {  # powers of `_NAMES` with which parameters follow what changes on the bench (docs/monitoring.md)
+    "coil": (0, 0, 0, 1, 0),
+    "flux": (0, 2, 1, 0, 0),
+    "gap": (0, -3, -2, 0, -1),
+    "mass": (1, 0, 0, 0, 0),
+}
+_LIKE = 0.15  # of a change, to which a pattern holds
 _CALM = (0.01, 0.01, 0.01, 0.03, 0.01)  # relative changes that tell nothing; R follows the weather
 
 
@@ -600,26 +605,45 @@ def _cause(h: History, name: str, rule: Rule, kind: str, at: float, end: float) 
         seen.append(j)
         change.append(math.log(b / a))
         spread.append(math.hypot(a_sd / a, b_sd / b))
-    return _said(np.array(seen, dtype=int), np.array(change), np.array(spread), kind)
+    coil = f"{axis}.L" in h.series if axis else "L" in h.series
+    return _likeliest(np.array(seen, dtype=int), np.array(change), np.array(spread), kind, coil)
 
 
-def _said(seen: Any, change: Array, spread: Array, kind: str) -> str:
+def _patterns(*, mass: bool, coil: bool) -> Iterator[tuple[str, Array]]:
+    """Yield causes and the powers of `_NAMES` that they have.
+
+    Where the mass is held (not `mass`), a cause that would move it moves the others, between two limits: as before
+    where a coil's induced voltage fixes k_i, and as ratios to the mass where the motion does.
+    """
+    powers = unit_powers(model("one-axis"))
+    sensors = {c: [powers[name][CHANNELS.index(c)] for name in _NAMES] for c in ("position", "current", "voltage")}
+    for cause in _CAUSES:
+        own = np.array({**_BENCH, **sensors}[cause], dtype=float)
+        if mass or coil or not own[0]:
+            yield cause, own
+        if not mass and own[0]:
+            yield cause, own - own[0] * np.array([1.0, 1.0, 1.0, 0.0, 0.0])
+
+
+def _likeliest(places: Any, change: Array, spread: Array, kind: str, coil: bool) -> str:
+    """Say which cause the logarithmic changes of the parameters at `places` of `_NAMES` speak for."""
     from scipy.stats import chi2
 
-    if seen.size < 2:
+    if places.size < 2:
         return "the cause is not clear: too few other parameters were measured"
-    fits: list[tuple[float, str]] = []
-    for of, step, drift in _SIGNATURES.values():
-        v = np.array(of, dtype=float)[seen]
+    misfit: dict[str, float] = {}
+    for cause, powers in _patterns(mass=0 in places, coil=coil):
+        v = powers[places]
         if not v.any():
             continue
-        var = spread**2 + np.array(_CALM)[seen] ** 2
+        var = spread**2 + np.array(_CALM)[places] ** 2
         for _ in range(3):  # the tolerance is a share of the change
             size = (v @ (change / var)) / (v @ (v / var))
-            var = spread**2 + np.array(_CALM)[seen] ** 2 + (_LIKE * size * v) ** 2
-        fits.append((float(np.sum((change - size * v) ** 2 / var)), step if kind == "step" else drift))
-    fits.sort()
-    if chi2.sf(fits[0][0], seen.size - 1) < 0.01:
+            var = spread**2 + np.array(_CALM)[places] ** 2 + (_LIKE * size * v) ** 2
+        chi = float(np.sum((change - size * v) ** 2 / var))
+        misfit[cause] = min(chi, misfit.get(cause, chi))
+    order = sorted(misfit, key=lambda cause: misfit[cause])
+    if chi2.sf(misfit[order[0]], places.size - 1) < 0.01:
         return "the cause is not clear: no single one fits the changes of all parameters"
-    near = [text for chi, text in fits if chi < fits[0][0] + _CLEAR]
+    near = [_CAUSES[c][kind != "step"] for c in order if misfit[c] < misfit[order[0]] + _CLEAR]
     return near[0] if len(near) == 1 else f"the cause is not clear: {' or '.join(near[:3])}"

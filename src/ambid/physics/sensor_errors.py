@@ -10,9 +10,9 @@ residuals c - J J⁺c: along these, and no others, a score test sees the error (
 
 A gain is a change of the channel's unit. Where every parameter that it scales is free nothing of c is left: no record
 shows it, and J⁺c are whole numbers, the powers of the parameters. A gain of the position sensor moves m and k_x by -2
-and k_i by -1, for in m x'' = k_i i - k_x x and u = R i + L i' + k_i x' (thesis eq. 4.4) k_i stands twice. Where one of
-them is held, such as a mass that was weighed, what happens depends on the record. An offset is a constant of the model
-and moves no parameter.
+and k_i by -1: one k_i fixes both m x'' = k_i i - k_x x and u = R i + L i' + k_i x' (thesis eq. 4.4). Where one of them
+is held, such as a mass that was weighed, what happens depends on the record. An offset is a constant of the model and
+moves no parameter.
 
 `SensorGains` has the gains as parameters. With states in logged units, x_g = T x and T = diag(g of the state's sensor),
 the outputs stay what they were, A becomes T A T^-1, B and E become T B and T E.
