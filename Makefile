@@ -18,10 +18,10 @@ unexport PIP_TARGET
 unexport PIP_USER
 
 .DEFAULT_GOAL := help
-.PHONY: help setup demo test tests lint types firmware peers bench docs format changelog lock clean distclean
+.PHONY: help setup demo test test-all tests lint types firmware peers bench docs format changelog lock clean distclean
 
 help:  ## list the targets
-	@grep -E '^[a-z]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
+	@grep -E '^[a-z-]+:.*##' Makefile | sed -E 's/:[^#]*## */|/' | awk -F'|' '{ printf "  make %-10s %s\n", $$1, $$2 }'
 
 setup: $(VENV)/.setup  ## make .venv with ambid and its tools, from hash-pinned versions (PYTHON=... chooses the Python)
 
@@ -41,10 +41,13 @@ $(VENV)/.setup: pyproject.toml requirements/build.txt requirements/dev.txt tools
 demo: setup  ## identify the embedded record and print the estimate beside the truth
 	@$(BIN)/ambid demo
 
-test: setup  ## everything that must hold: lint, types, firmware, all tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
+test: setup  ## what must hold at each change: lint, types, firmware, short tests; ends with pytest's verdict (PYTEST_ARGS="-k words" chooses)
 	@$(MAKE) --no-print-directory lint
 	@sh tools/firmware_tools.sh && $(MAKE) --no-print-directory -C firmware all || [ $$? -eq 3 ]
 	@$(MAKE) --no-print-directory -j2 types tests
+
+test-all: export AMBID_TESTS := all
+test-all: test  ## the same with the long half of the tests: full Monte Carlo, every page of the docs, whole commissionings
 
 tests: setup
 	$(BIN)/python -m pytest -n 2 --dist loadfile $(PYTEST_ARGS)

@@ -9,8 +9,12 @@ from __future__ import annotations
 import gc
 import signal
 from itertools import groupby
+from pathlib import Path
+from typing import Any
 
 import pytest
+
+from tests.tiers import ALL
 
 LONGEST = (
     "examples/test_pages.py",
@@ -49,6 +53,9 @@ LONGEST = (
 )
 
 
+LONG = Path(__file__).with_name("long_tests.txt")
+
+
 def pytest_configure(config: pytest.Config) -> None:
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:  # in the background of a shell (``nohup make test &``) or CI:
         signal.signal(signal.SIGINT, signal.default_int_handler)  # tests of Ctrl-C, and what they start, need it
@@ -57,11 +64,41 @@ def pytest_configure(config: pytest.Config) -> None:
         config.option.loadscopereorder = False
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    if not ALL:
+        _leave_out_long_ones(config, items)
     files = [list(of_file) for _, of_file in groupby(items, key=lambda item: item.path)]
     files.sort(key=lambda of_file: next((k for k, n in enumerate(LONGEST) if str(of_file[0].path).endswith(n)), 99))
     items[:] = [item for of_file in files for item in of_file]
 
 
+def _leave_out_long_ones(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect the tests of long_tests.txt and those marked ``long``; refuse a line that names no test."""
+    lines = LONG.read_text(encoding="utf-8").splitlines()
+    long = {line.split(maxsplit=1)[1] for line in lines if not line.startswith("#")}
+    names = {item: item.nodeid.removeprefix("tests/") for item in items}
+    here = Path(__file__).parent
+    if {Path(x).resolve() for x in config.args} <= {here, here.parent} and (unknown := long - set(names.values())):
+        raise pytest.UsageError(f"tests/long_tests.txt names no test: {', '.join(sorted(unknown))}. Correct the lines")
+    if any("::" in str(x) for x in config.args):  # named alone, a long test runs
+        return
+    left = {item for item in items if names[item] in long or item.get_closest_marker("long")}
+    config.hook.pytest_deselected(items=list(left))
+    items[:] = [item for item in items if item not in left]
+
+
 def pytest_collection_finish() -> None:
     gc.freeze()  # thousands of tests stay to the end: each collection would go through all of them, a third of a second
+
+
+@pytest.fixture(autouse=True)
+def figures_are_empty(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Lay out and render no figure where a test asks only whether it is written; tests/report/ looks at figures."""
+    if not ALL and request.path.parent.name != "report" and not request.node.get_closest_marker("drawn"):
+        monkeypatch.setattr("matplotlib.figure.Figure.draw", _empty)
+
+
+def _empty(figure: Any, renderer: Any) -> None:
+    renderer.open_group("figure", gid="figure_1")
+    renderer.close_group("figure")
+    figure.stale = False

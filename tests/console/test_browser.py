@@ -177,7 +177,7 @@ def test_a_bearing_of_a_ledger_is_drawn_over_time_in_chosen_colours(page, folder
 
 
 EMULATED = [
-    pytest.mark.slow, pytest.mark.skipif(shutil.which("avr-gcc") is None, reason="no avr-gcc: apt-get install gcc-avr")
+    pytest.mark.long, pytest.mark.skipif(shutil.which("avr-gcc") is None, reason="no avr-gcc: apt-get install gcc-avr")
 ]  # fmt: skip
 
 

@@ -270,6 +270,7 @@ def test_a_measured_peak_is_that_of_many_lines():
         assert np.mean(np.abs(scaled) > 1.96) < 0.12
 
 
+@pytest.mark.drawn
 def test_the_command_writes_text_json_figure_and_page(axis, tmp_path, monkeypatch, capsys):
     from ambid.cli import main
     from ambid.rig import write_rig

@@ -8,8 +8,9 @@ import pytest
 from ambid.recursive.joint import JointEkf, JointUkf
 from tests.bearing.benches import run
 from tests.recursive.joint_starts import start_of, truth_of
+from tests.tiers import runs
 
-RUNS = 80
+RUNS = runs(80, short=24)
 
 
 @pytest.fixture(scope="module")
@@ -31,8 +32,8 @@ def test_intervals_hold_the_truth_as_often_as_they_say(benches, kind):
     # the record has told something of each number: the start alone would pass, too
     assert np.all(s.mean(axis=0) < [0.25 * 0.04 * abs(v) for v in truth_of(benches[0], filter_.names)[:5]])
     inside = np.mean(np.abs(e) < 1.96 * s, axis=0)
-    assert np.all(inside > 0.87)  # 80 runs: one number's share scatters by 0.024
-    assert 0.90 < inside.mean() < 0.98
+    assert np.all(inside > RUNS.limit(0.87))  # 80 runs: one number's share scatters by 0.024
+    assert RUNS.limit(0.90) < inside.mean() < RUNS.limit(0.98)
     # normalised squared errors: their mean is 5, with a standard deviation of sqrt(10 / 80)
     assert abs(np.mean(squares) - 5.0) < 3.0 * np.sqrt(10.0 / RUNS)
-    assert np.all(np.abs(e.mean(axis=0)) < 0.4 * e.std(axis=0))
+    assert np.all(np.abs(e.mean(axis=0)) < RUNS.limit(0.4, centre=0) * e.std(axis=0))

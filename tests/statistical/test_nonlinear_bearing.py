@@ -18,8 +18,9 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of
+from tests.tiers import runs
 
-RUNS, SAMPLES = 40, 3000
+RUNS, SAMPLES = runs(40, short=20), 3000
 FAR = Motion(swing=0.45, swing_hz=4.0, volts=8.0, hold=3)
 LAW = MagnetLaw(pair=True)
 ESTIMATED = {"k", "s", "L_leak", "m", "R", "x_offset", "v_offset"}
@@ -62,21 +63,21 @@ def test_the_runs_go_as_far_as_they_claim() -> None:
 
 def test_intervals_of_numbers_hold_the_truth() -> None:
     numbers = outcomes()[0]
-    assert 0.90 < np.mean(np.abs(numbers) < 1.96) < 0.985
-    assert np.all(np.mean(np.abs(numbers) < 1.96, axis=0) > 0.80)
+    assert RUNS.limit(0.90) < np.mean(np.abs(numbers) < 1.96) < RUNS.limit(0.985)
+    assert np.all(np.mean(np.abs(numbers) < 1.96, axis=0) > RUNS.limit(0.80))
     assert np.all(np.abs(numbers.mean(axis=0)) < 4 / np.sqrt(RUNS))
     spread = numbers.std(axis=0)
-    assert np.all((spread > 0.65) & (spread < 1.4))
+    assert np.all((spread > RUNS.limit(0.65, centre=1)) & (spread < RUNS.limit(1.4, centre=1)))
 
 
 def test_bands_of_curves_hold_the_truth() -> None:
     curves = outcomes()[1]
     held = np.mean(np.abs(curves) < 1.96, axis=(0, 2))  # of force, k_x, k_i, L over all points
-    assert np.all((held > 0.86) & (held < 0.995))
-    assert 0.89 < np.mean(np.abs(curves) < 1.96) < 0.985
+    assert np.all((held > RUNS.limit(0.86)) & (held < RUNS.limit(0.995)))
+    assert RUNS.limit(0.89) < np.mean(np.abs(curves) < 1.96) < RUNS.limit(0.985)
 
 
 def test_the_residual_test_is_as_often_wrong_as_it_says() -> None:
     white = outcomes()[2]
-    assert np.mean(white < 0.05) < 0.16  # 0.05 of 40, and four deviations
-    assert np.mean(white < 0.5) > 0.15
+    assert np.mean(white < 0.05) < RUNS.limit(0.16, centre=0.05)  # 0.05 of 40, and four deviations
+    assert np.mean(white < 0.5) > RUNS.limit(0.15, centre=0.5)

@@ -12,8 +12,9 @@ import pytest
 
 from ambid.recursive.estimator import RecursiveEstimator
 from ambid.recursive.regression import Lms, Nlms, RecursiveInstrumentalVariables, RecursiveLeastSquares
+from tests.tiers import runs
 
-RUNS = 400
+RUNS = runs(400, short=100)
 TRUTH = np.array([1.5, -0.7, 1.0, 0.5])
 IN_LOOP = np.array([1.5, -0.6, 0.5, 0.2])
 
@@ -56,26 +57,25 @@ RECURSIONS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", RECURSIONS)
 def test_least_squares_knows_its_error(name: str, open_loop: tuple[np.ndarray, np.ndarray]) -> None:
     z = scores(RECURSIONS[name], *open_loop, TRUTH)
     covered = (np.abs(z) < 1.96).mean(axis=0)
-    assert ((covered > 0.915) & (covered < 0.98)).all(), covered
-    assert (np.abs(z.mean(axis=0)) < 0.25).all()  # a small bias of order 1/n is known of autoregressions
+    assert ((covered > RUNS.limit(0.915)) & (covered < RUNS.limit(0.98))).all(), covered
+    assert (
+        np.abs(z.mean(axis=0)) < RUNS.limit(0.25, centre=0)
+    ).all()  # a small bias of order 1/n is known of autoregressions
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("make", [lambda: Lms(4, step=0.02), lambda: Nlms(4, step=0.1, small=1e-6)])
 def test_gradient_recursions_know_their_error(make: Callable[[], RecursiveEstimator]) -> None:
     rng = np.random.default_rng(12)
     phi = rng.normal(size=(1500, RUNS, 4))
     z = scores(make, phi, phi @ TRUTH + 0.5 * rng.normal(size=(1500, RUNS)), TRUTH)
     covered = (np.abs(z) < 1.96).mean(axis=0)
-    assert ((covered > 0.917) & (covered < 0.983)).all(), covered
+    assert ((covered > RUNS.limit(0.917)) & (covered < RUNS.limit(0.983))).all(), covered
 
 
-@pytest.mark.slow
 def test_in_a_loop_with_coloured_noise_only_instruments_are_consistent_and_honest() -> None:
     phi, y, past = autoregression(4000, 0.9, 0.8, IN_LOOP)
     biased = scores(lambda: RecursiveLeastSquares(4), phi, y, IN_LOOP)
@@ -84,5 +84,5 @@ def test_in_a_loop_with_coloured_noise_only_instruments_are_consistent_and_hones
     for settings in ({}, {"memory": 1000.0}):
         z = scores(lambda s=settings: RecursiveInstrumentalVariables(4, n_instruments=6, **s), rows, y, IN_LOOP)
         covered = (np.abs(z) < 1.96).mean(axis=0)
-        assert (np.abs(z.mean(axis=0)) < 0.2).all()
-        assert ((covered > 0.90) & (covered < 0.98)).all(), covered
+        assert (np.abs(z.mean(axis=0)) < RUNS.limit(0.2, centre=0)).all()
+        assert ((covered > RUNS.limit(0.90)) & (covered < RUNS.limit(0.98))).all(), covered

@@ -7,22 +7,21 @@ import pytest
 
 from ambid.recursive.polynomial import RecursivePolynomial
 from tests.blackbox.polynomial.systems import SYSTEMS, unstable_loop
+from tests.tiers import runs as number
 
-pytestmark = pytest.mark.slow
-
-N_RUNS = 200
+N_RUNS = number(200, short=50)
 N_SAMPLES, N_FIRST = 3000, 600
 
 
 def checked(error: np.ndarray, sd: np.ndarray) -> None:
     """Coverage, and bias and spread as far as 200 runs tell them."""
     inside = np.mean(np.abs(error) < 1.959964 * sd, axis=0)
-    assert np.all((inside >= 0.895) & (inside <= 0.985)), inside
-    assert 0.92 <= np.mean(inside) <= 0.98
+    assert np.all((inside >= N_RUNS.limit(0.895)) & (inside <= N_RUNS.limit(0.985))), inside
+    assert N_RUNS.limit(0.92) <= np.mean(inside) <= N_RUNS.limit(0.98)
     bias = np.mean(error, axis=0) / np.std(error, axis=0, ddof=1)
-    assert np.all(np.abs(bias) < 0.25), bias  # 3.5 / sqrt(200)
+    assert np.all(np.abs(bias) < N_RUNS.limit(0.25, centre=0)), bias  # 3.5 / sqrt(200)
     ratio = np.std(error, axis=0, ddof=1) / np.sqrt(np.mean(sd**2, axis=0))
-    assert np.all((ratio > 0.85) & (ratio < 1.2)), ratio
+    assert np.all((ratio > N_RUNS.limit(0.85, centre=1)) & (ratio < N_RUNS.limit(1.2, centre=1))), ratio
 
 
 @pytest.fixture(scope="module", params=["armax", "oe", "bj"])

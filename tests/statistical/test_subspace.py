@@ -8,6 +8,7 @@ import pytest
 from ambid.blackbox.model import StateSpaceModel, pole_covariance, response_covariance
 from ambid.blackbox.subspace import n4sid, pbsid
 from tests.blackbox.subspace.systems import COLOURED, UNSTABLE, record
+from tests.tiers import runs as number
 
 OMEGA = np.array([1.0, 20.0, 50.0, 150.0, 280.0])
 
@@ -32,7 +33,11 @@ def real_numbers(fit, truth: StateSpaceModel) -> tuple[np.ndarray, np.ndarray]:
 
 @pytest.mark.parametrize(
     ("estimator", "plant", "hold", "bias", "runs"),
-    [(n4sid, COLOURED, None, 0.8, 100), (pbsid, COLOURED, None, 0.6, 50), (pbsid, UNSTABLE, 1.2, 0.6, 50)],
+    [
+        (n4sid, COLOURED, None, 0.8, number(100, short=25)),
+        (pbsid, COLOURED, None, 0.6, number(50, short=25)),
+        (pbsid, UNSTABLE, 1.2, 0.6, number(50, short=50)),
+    ],
     ids=["n4sid", "pbsid", "pbsid in a loop"],
 )
 def test_intervals_hold_the_truth_as_often_as_they_say(estimator, plant, hold, bias, runs):
@@ -46,10 +51,10 @@ def test_intervals_hold_the_truth_as_often_as_they_say(estimator, plant, hold, b
     inside = np.mean(np.abs(e) < 1.96 * s, axis=0)
     # one number's share scatters by 0.02 in 100 runs, the mean over all by less
     assert np.all(inside > 0.95 - 0.95 / np.sqrt(runs))
-    assert 0.90 < np.mean(inside) < 0.985
-    assert np.all(np.abs(np.mean(e, axis=0)) < bias * np.std(e, axis=0))
+    assert runs.limit(0.90) < np.mean(inside) < runs.limit(0.985)
+    assert np.all(np.abs(np.mean(e, axis=0)) < runs.limit(bias, centre=0) * np.std(e, axis=0))
     ratio = np.median(s, axis=0) / np.std(e, axis=0)  # the median: single short records have long tails
-    assert 0.85 < np.median(ratio) < 1.25
+    assert runs.limit(0.85, centre=1) < np.median(ratio) < runs.limit(1.25, centre=1)
 
 
 def test_order_is_found_in_most_records():

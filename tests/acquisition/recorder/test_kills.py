@@ -1,8 +1,9 @@
 """A recorder under full load is killed at random moments: what it had acknowledged is there, and the file opens."""
 
 from tests.acquisition.recorder.kills import killed
+from tests.tiers import ALL
 
-CASES = 100
+CASES = 100 if ALL else 12
 
 
 def test_nothing_acknowledged_is_lost_by_a_kill(tmp_path):

@@ -10,8 +10,9 @@ from ambid.acquisition.recorder.disk import JournalFile
 from ambid.record.hdf5_format import read_hdf5
 from ambid.tracking.blocks import Block
 from tests.acquisition.recorder.signals import ROWS, block, contents, header, same_bits, values_at
+from tests.tiers import ALL
 
-CASES = 200
+CASES = 200 if ALL else 40
 BLOCKS = 60
 
 

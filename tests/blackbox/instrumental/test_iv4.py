@@ -9,6 +9,7 @@ from ambid.blackbox.model import response_covariance
 from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, second_order
+from tests.tiers import runs
 
 A, B = np.array([1, -1.5, 0.7]), np.array([0, 1.0, 0.5])
 ORDERS = {"na": 2, "nb": 2, "nk": 1}
@@ -23,10 +24,11 @@ def _record(rng, n=1000, scale=1.0, noise=0.5):
 
 
 def test_consistent_under_coloured_noise_where_least_squares_is_not():
-    errors, scores = monte_carlo(_record, lambda d: iv4(d, ORDERS), TRUTH, PLACES, 100)
-    assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / 10)
-    assert np.all(np.mean(np.abs(scores) < 1.96, axis=0) > 0.87)
-    assert np.all((scores.std(axis=0) > 0.8) & (scores.std(axis=0) < 1.25))
+    n = runs(100, short=30)
+    errors, scores = monte_carlo(_record, lambda d: iv4(d, ORDERS), TRUTH, PLACES, n)
+    assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(n))
+    assert np.all(np.mean(np.abs(scores) < 1.96, axis=0) > n.limit(0.87))
+    assert np.all((scores.std(axis=0) > n.limit(0.8, centre=1)) & (scores.std(axis=0) < n.limit(1.25, centre=1)))
 
     def plain(seed):
         d = _record(np.random.default_rng(seed))

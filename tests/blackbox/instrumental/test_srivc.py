@@ -7,6 +7,7 @@ from scipy.signal import lfilter, lsim, max_len_seq
 from ambid.blackbox.instrumental_continuous import responses, srivc
 from ambid.errors import EstimationError
 from tests.blackbox.instrumental.records import io_data, monte_carlo, zoh
+from tests.tiers import runs
 
 # Rao and Garnier 2002: stiff (2 and 20 rad/s, damping 0.1 and 0.25), non-minimum phase
 NUM, DEN = np.array([-6400.0, 1600.0]), np.array([1, 5, 408, 416, 1600.0])
@@ -43,13 +44,14 @@ def test_simulation_agrees_with_an_independent_one():
 
 
 def test_rao_garnier_at_10_db():
-    errors, scores = monte_carlo(_rao_garnier, lambda d: srivc(d, ORDERS), TRUTH, PLACES, 25)
+    n = runs(25, short=8)
+    errors, scores = monte_carlo(_rao_garnier, lambda d: srivc(d, ORDERS), TRUTH, PLACES, n)
     # no bias, and 95 % intervals that hold
-    assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(25))
-    assert np.mean(np.abs(scores) < 1.96) > 0.91
+    assert np.all(np.abs(errors.mean(axis=0)) < 4 * errors.std(axis=0) / np.sqrt(n))
+    assert np.mean(np.abs(scores) < 1.96) > n.limit(0.91)
     # the Cramer-Rao bound for white noise: no unbiased method is sharper than 40, 71, 0.059, 1.04, 3.5, 7.5
     bound = np.array([40.2, 70.6, 0.0595, 1.042, 3.467, 7.486])
-    assert np.all(errors.std(axis=0) < 1.4 * bound)
+    assert np.all(errors.std(axis=0) < n.limit(1.4, centre=1) * bound)
 
 
 def test_rao_garnier_without_noise():
@@ -66,8 +68,9 @@ def test_intervals_hold_under_coloured_noise():
         return io_data(u, _output([5.0, 100.0], [1, 4, 100.0], 0.02, u) + v, dt=0.02, open_loop=True)
 
     orders, truth, places = {"nb": 2, "nf": 2, "nk": 0}, np.array([5, 100, 4, 100.0]), [0, 1, 3, 4]
-    _, scores = monte_carlo(make, lambda d: srivc(d, orders), truth, places, 25)
-    assert np.mean(np.abs(scores) < 1.96) > 0.9
+    n = runs(25, short=8)
+    _, scores = monte_carlo(make, lambda d: srivc(d, orders), truth, places, n)
+    assert np.mean(np.abs(scores) < 1.96) > n.limit(0.9)
 
 
 @pytest.mark.parametrize("rate", [50.0, 1e3, 5e3])

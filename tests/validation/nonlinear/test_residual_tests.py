@@ -8,11 +8,12 @@ import pytest
 from ambid.nonlinear.narmax import narmax
 from ambid.validation.fits import judge, nonlinear_residuals, run
 from ambid.validation.residuals import correlations
+from tests.tiers import runs
 from tests.validation.nonlinear.plants import io, levitated, output_error, squared
 
 TRUE = {"ny": 1, "nu": 1, "ne": 0, "constant": 0, "selection": "frols"}
 TESTS = ("residuals_white", "residuals_uncorrelated", "residuals_nonlinear", "residual_variance", "feedback")
-RUNS = 80
+RUNS = runs(80, short=30)
 
 
 @pytest.fixture(scope="module")
@@ -108,9 +109,10 @@ def test_a_level_error_at_one_operating_point_is_left_in_the_residuals() -> None
 
 def test_instruments_refuse_right_free_run_models_as_often_as_p_says() -> None:
     p = []
-    for seed in range(40):
+    n = runs(40, short=12)
+    for seed in range(n):
         data = output_error(400, seed)
         fit = narmax([data], {"focus": "simulation", "ne": 0, "ny": 1, "nu": 1, "constant": 0})
         p.append([judge(fit, [data]).checks[name].p for name in ("residuals_uncorrelated", "residuals_nonlinear")])
     hits = np.mean(np.array(p, dtype=float) < 0.1, axis=0)
-    assert np.all(hits < 0.1 + 3.5 * np.sqrt(0.09 / 40))
+    assert np.all(hits < 0.1 + 3.5 * np.sqrt(0.09 / n))
