@@ -13,8 +13,7 @@ import numpy as np
 
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.program import program
-from ambid.acquisition.recording import acquire
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.estimation.estimate import Estimate
 from ambid.job import identify
 from ambid.job.track_live import track_live

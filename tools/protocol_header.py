@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from ambid.acquisition.protocol import CRC_BYTES, FORMATS, Entry, FieldType, MessageType, Table, table
 from ambid.acquisition.protocol.codec import frame, message, pack
-from ambid.acquisition.protocol.table import CRC_BYTES, FORMATS, Entry, FieldType, MessageType, Table, table
 
 ROOT = Path(__file__).resolve().parents[1]
 

@@ -7,8 +7,8 @@ import time
 import tty
 from contextlib import suppress
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import FrameDecoder, encode, frame, message, unpack
-from ambid.acquisition.protocol.table import table
 
 STATE = {e.name: e.value for e in table().enums["state"]}
 CAUSE = {e.name: e.value for e in table().enums["cause"]}

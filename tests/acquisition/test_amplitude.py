@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from ambid.acquisition.amplitude import Room, Trial, find_amplitude, fitting_amplitude
 from ambid.acquisition.session import RunReport
+from ambid.acquisition.trials import Room, Trial, find_amplitude, fitting_amplitude
 from ambid.errors import DeviceError
 from ambid.rig import rig_from_text
 from tests.job.benches import COIL, THESIS, Spoiled, prototype

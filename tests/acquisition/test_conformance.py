@@ -12,7 +12,7 @@ import pytest
 from ambid.acquisition.device import Program
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.devices.line_device import SerialDevice
-from ambid.acquisition.devices.replay import ReplayDevice
+from ambid.acquisition.devices.played import ReplayDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import DeviceError
 from ambid.record import Channel, Record, write_record

@@ -4,9 +4,8 @@ from dataclasses import replace
 
 import pytest
 
-from ambid.acquisition.default_daq import default_daq_notes, with_default_daq
 from ambid.acquisition.scales import scale_of
-from ambid.acquisition.settings import controller_settings
+from ambid.acquisition.settings import controller_settings, default_daq_notes, with_default_daq
 from ambid.errors import RigError
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset

@@ -6,9 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquisition.amplitude import Room, make_look, why_incomplete
 from ambid.acquisition.device import DeviceEvent
 from ambid.acquisition.session import Course, RunReport
+from ambid.acquisition.trials import Room, make_look, why_incomplete
 from ambid.rig import rig_from_text
 from tests.job.benches import COIL, PLAIN, Spoiled, prototype
 

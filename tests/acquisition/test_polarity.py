@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquisition.amplitude import Room, make_look
 from ambid.acquisition.devices.simulated import SimulatedDevice
-from ambid.acquisition.polarity import find_polarity
+from ambid.acquisition.trials import Room, find_polarity, make_look
 from ambid.job import commissioning_steps as judge
 from ambid.physics.presets import preset
 from tests.job.benches import CURRENT, POSITION, Spoiled, prototype

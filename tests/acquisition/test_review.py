@@ -2,9 +2,8 @@
 
 import pytest
 
-from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.review import review
-from ambid.acquisition.settings import controller_settings
+from ambid.acquisition.settings import controller_settings, with_default_daq
 from tests.acquisition.rigs import bench
 from tests.acquisition.test_default_daq import of_preset
 

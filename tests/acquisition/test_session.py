@@ -2,10 +2,10 @@
 
 import pytest
 
-from ambid.acquisition.default_daq import fault_words
 from ambid.acquisition.device import DeviceEvent, Program
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.session import Course, run
+from ambid.acquisition.settings import fault_words
 from ambid.errors import DeviceError
 from tests.acquisition.scripted import Listener, ScriptedDevice
 

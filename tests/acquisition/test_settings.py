@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import scale_of
 from ambid.acquisition.settings import columns, controller_settings, in_si, realised, rest_of
 from ambid.errors import DeviceError, RigError

@@ -7,7 +7,7 @@ import pytest
 
 from ambid.acquisition.device import Column
 from ambid.acquisition.devices.simulated import SimulatedDevice
-from ambid.acquisition.view import BenchView, as_record
+from ambid.acquisition.settings import BenchView, as_record
 from ambid.errors import AmbidError
 from ambid.record.calibration import Calibration
 from ambid.rig import rig_from_text

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import FrameDecoder, encode, message
-from ambid.acquisition.protocol.table import table
 from tests.bars.host import Host, trajectory
 
 CHUNK = 200  # bytes at once: 2 ms of the line

@@ -14,10 +14,10 @@ import numpy as np
 
 import ambid
 from ambid.acquisition.devices.benches import plant_text
+from ambid.acquisition.devices.controller import open_port
 from ambid.acquisition.devices.emulated import Emulator
-from ambid.acquisition.devices.port import open_port
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import FrameDecoder, encode, message, unpack
-from ambid.acquisition.protocol.table import table
 from ambid.acquisition.settings import controller_settings
 from ambid.rig import load_rig
 

@@ -7,8 +7,7 @@ from pathlib import Path
 from ambid.acquisition.devices.benches import bench_of
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.program import program
-from ambid.acquisition.recording import acquire
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.job import identify
 from ambid.physics.nonlinear import NonlinearPlant
 from ambid.rig import load_rig

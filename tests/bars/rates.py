@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import PWM_HZ
 from tests.bars.host import Host, Refused
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ambid.acquisition.law_words import WATCH_MS
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from tests.bars.host import Host, tick_times, trajectory
 
 LASTS_S = 0.5  # how long an accident lasts: the host, which is at most some 0.15 s behind, sees it before its end

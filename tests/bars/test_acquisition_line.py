@@ -7,9 +7,8 @@ import pytest
 
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.program import program
-from ambid.acquisition.recording import acquire
 from ambid.acquisition.scales import SHORTEST_PERIOD
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.record import read_record
 from tests.bars.rates import COUNTED, run, stream_of
 

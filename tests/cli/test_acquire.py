@@ -219,7 +219,7 @@ def test_what_is_not_there_is_refused_in_one_line(acquire, options, said):
 def test_a_record_that_exists_is_kept_unless_forced(acquire, place, monkeypatch):
     (place / "o.h5").write_text("precious")
     opened = []
-    monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: opened.append(1))
+    monkeypatch.setattr("ambid.acquisition.devices.open_device", lambda *_, **__: opened.append(1))
     done = acquire("--seconds", "1")
     assert (done.code, opened) == (2, [])
     assert "o.h5 exists" in done.err
@@ -240,7 +240,7 @@ def test_an_excitation_that_a_record_cannot_play(acquire):
 
 # Ended early.
 def bench(monkeypatch, device):
-    monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: device)
+    monkeypatch.setattr("ambid.acquisition.devices.open_device", lambda *_, **__: device)
 
 
 def test_a_fault_keeps_what_came_and_is_said_with_a_remedy(acquire, monkeypatch):
@@ -295,7 +295,7 @@ def test_a_full_disk_is_told_at_once_and_ends_with_2(acquire, monkeypatch):
                 self._writer._fail(DeviceError("the disk is full. Make room"))
             return super().append(block)
 
-    monkeypatch.setattr("ambid.acquisition.recording.Recorder", Full)
+    monkeypatch.setattr("ambid.acquisition.session.Recorder", Full)
     done = acquire("--seconds", "30")
     assert done.code == 2
     told = [line for line in done.err.splitlines() if "the disk is full" in line]
@@ -337,7 +337,7 @@ def test_a_second_signal_says_where_what_came_is(acquire, monkeypatch, place):
 
 
 def test_a_signal_while_an_amplitude_is_looked_for_records_nothing(acquire, monkeypatch, place):
-    from ambid.acquisition.amplitude import Kept
+    from ambid.acquisition.trials import Kept
 
     take = Kept.take
 
@@ -356,8 +356,7 @@ def test_a_signal_while_an_amplitude_is_looked_for_records_nothing(acquire, monk
 @pytest.fixture(scope="module")
 def estimate(tmp_path_factory):
     from ambid.acquisition.program import program
-    from ambid.acquisition.recording import acquire
-    from ambid.acquisition.session import Course
+    from ambid.acquisition.session import Course, acquire
     from ambid.job import identify
 
     folder, rig = tmp_path_factory.mktemp("start"), prototype()

@@ -12,8 +12,8 @@ from io import FileIO
 
 import pytest
 
-from ambid.acquisition.default_daq import fault_words
 from ambid.acquisition.device import DeviceEvent
+from ambid.acquisition.settings import fault_words
 from ambid.cli import _BestEffort
 from ambid.cli.interrupts import Stop, signals
 

@@ -37,7 +37,7 @@ def commission(ambid, place):
 
 
 def bench(monkeypatch, device):
-    monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: device)
+    monkeypatch.setattr("ambid.acquisition.devices.open_device", lambda *_, **__: device)
 
 
 def files(folder="out"):
@@ -111,7 +111,7 @@ def test_one_that_is_not_good_enough_ends_with_3_where_why_and_what_next(commiss
 def test_the_folder_of_an_earlier_one_is_refused_before_the_bench_is_opened(commission, place, monkeypatch):
     (place / "out").mkdir()
     (place / "out" / "record.h5").write_text("precious")
-    monkeypatch.setattr("ambid.acquisition.devices.choose.open_device", lambda *_, **__: pytest.fail("opened"))
+    monkeypatch.setattr("ambid.acquisition.devices.open_device", lambda *_, **__: pytest.fail("opened"))
     done = commission()
     assert done.code == 2
     assert "out holds record.h5 of an earlier commissioning" in done.err

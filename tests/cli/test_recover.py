@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ambid.acquisition.recorder import Recorded, Recorder, journal_path
-from ambid.acquisition.recorder.reader import Damage, Survey
+from ambid.acquisition.recorder.convert import Damage, Survey
 from ambid.job import load
 from ambid.record import read_record
 from tests.acquisition.recorder.signals import ROWS, block, header, same_bits, values_at

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquisition.law_kernel import law_tick
+from ambid.acquisition.devices._kernels import law_tick
 from ambid.acquisition.law_words import BEGIN, LawWords
 from ambid.control.fixed_point import Counts, fixed_point
 from ambid.control.knobs import Family

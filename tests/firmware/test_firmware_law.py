@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.acquisition.law_kernel import law_tick
+from ambid.acquisition.devices._kernels import law_tick
 from ambid.acquisition.law_words import BEGIN, LAW_ROW, LawWords, law_words
 from ambid.errors import RigError
 from ambid.physics.law import StateLaw

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.acquisition.law_kernel import law_tick, watch
+from ambid.acquisition.devices._kernels import law_tick, watch
 from ambid.acquisition.law_words import BEGIN, WATCH_MS, law_words
 from ambid.control.lqg import lqg
 from ambid.errors import AmbidError

@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from ambid.acquisition import scales as board
-from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.device import Program
 from ambid.acquisition.program import expected, program
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import scale_of
-from ambid.acquisition.settings import controller_settings, in_si, realised
+from ambid.acquisition.settings import controller_settings, in_si, realised, with_default_daq
 from tests.acquisition.rigs import bench
 from tests.acquisition.test_default_daq import of_preset
 from tests.firmware.native.console import FIRMWARE, Console, build, code, command

@@ -9,8 +9,7 @@ import pytest
 from ambid.acquisition.devices import _kernels as k
 from ambid.acquisition.program import program
 from ambid.acquisition.recorder import Recorder
-from ambid.acquisition.recording import acquire
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.errors import DeviceError
 from ambid.record import read_record
 from tests.acquisition.scripted import Listener
@@ -148,7 +147,7 @@ def test_a_disk_that_fails_ends_the_run_and_is_told_at_once(tmp_path, monkeypatc
                 self._writer._fail(DeviceError("the disk is full"))
             return super().append(block)
 
-    monkeypatch.setattr("ambid.acquisition.recording.Recorder", Failing)
+    monkeypatch.setattr("ambid.acquisition.session.Recorder", Failing)
     with Spoiled(RIG) as device:
         done = acquire(device, RIG, tmp_path / "o.h5", course(seconds=60.0), on_trouble=told.append)
         runs.append(device.state)

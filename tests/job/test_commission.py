@@ -534,7 +534,7 @@ def test_an_interruption_while_numbers_are_worked_out(tmp_path):
 
 def test_a_disk_that_failed_is_the_reason(finished):
     from ambid.acquisition.quality import Quality
-    from ambid.acquisition.recording import Acquired
+    from ambid.acquisition.session import Acquired
     from ambid.errors import DeviceError
 
     info = SimulatedDevice(prototype()).info

@@ -10,8 +10,7 @@ import pytest
 
 import ambid
 from ambid.acquisition.devices.simulated import SimulatedDevice
-from ambid.acquisition.recording import acquire
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Check
 from ambid.estimation.result import Reason, Result, Verdict

@@ -7,8 +7,7 @@ from functools import cache
 import pytest
 
 from ambid.acquisition.program import program
-from ambid.acquisition.recording import acquire
-from ambid.acquisition.session import Course
+from ambid.acquisition.session import Course, acquire
 from ambid.errors import AmbidError, DeviceError
 from ambid.job import identify
 from ambid.job.track_live import track_live
@@ -245,7 +244,7 @@ def test_a_line_that_is_lost_is_raised(start, tmp_path):
 
 
 def test_a_record_made_meanwhile_is_whole(start, tmp_path):
-    from ambid.acquisition.recording import recording
+    from ambid.acquisition.session import recording
 
     with Spoiled(RIG) as device, recording(device, RIG, tmp_path / "o.h5", course(2.0)) as tap:
         track_live(device, RIG, course(2.0), start=start, taps=[tap], on_event=tap.tell)

@@ -7,10 +7,8 @@ import pytest
 
 from ambid.acquisition.device import Counters, DeviceInfo
 from ambid.acquisition.quality import ColumnQuality, QualityReport
-from ambid.acquisition.recorder.convert import Recorded
-from ambid.acquisition.recorder.reader import Survey
-from ambid.acquisition.recording import Acquired
-from ambid.acquisition.session import RunReport
+from ambid.acquisition.recorder.convert import Recorded, Survey
+from ambid.acquisition.session import Acquired, RunReport
 from ambid.estimation.result import Reason
 from ambid.job.commissioning_steps import STEPS
 from ambid.job.presentation import text as show

@@ -11,7 +11,7 @@ import math
 import numpy as np
 
 from ambid.acquisition.device import Program
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import TABLE_LENGTH, scale_of, who
 from ambid.acquisition.settings import ControllerSettings
 from ambid.arrays import Array

@@ -8,10 +8,16 @@ from types import MappingProxyType
 
 import numpy as np
 
-from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.device import DeviceInfo
 from ambid.acquisition.scales import LAG_S, output_rates, scale_of, who
-from ambid.acquisition.settings import ControllerSettings, controller_settings, exact_gains, has_position, realised
+from ambid.acquisition.settings import (
+    ControllerSettings,
+    controller_settings,
+    exact_gains,
+    has_position,
+    realised,
+    with_default_daq,
+)
 from ambid.errors import ModelError, RigError
 from ambid.physics.linear_model import model
 from ambid.rig.rig import Rig

@@ -8,15 +8,16 @@ at rest. What a controller cannot hold, or could not protect, is refused; what i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from ambid.acquisition.device import Column, LawTrial
+from ambid.acquisition.device import Column, DeviceEvent, DeviceInfo, LawTrial
 from ambid.acquisition.law_words import LawWords, law_words
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import (
     ADC_TOP,
     BYTE_BITS,
@@ -29,6 +30,8 @@ from ambid.acquisition.scales import (
     drives,
     duty_off,
     duty_range,
+    nearest_rate,
+    output_rates,
     period_of,
     scale_of,
     trip_counts,
@@ -37,8 +40,12 @@ from ambid.acquisition.scales import (
 from ambid.arrays import Array
 from ambid.errors import DeviceError, ModelError, RigError
 from ambid.physics.linear_model import model
-from ambid.physics.loop import Loop
-from ambid.rig.rig import Daq, Rig
+from ambid.physics.loop import UNLIMITED, Interval, Loop
+from ambid.record import Channel, Record
+from ambid.record.calibration import Calibration
+from ambid.rig import bench_record
+from ambid.rig.rig import DAQ_RATE_HZ, Daq, Rig, RigChannel
+from ambid.tracking.blocks import Block
 
 GAIN_BITS, INTEGRAL_BITS, POLE_BITS = 12, 16, 16
 """Binary places of kp, kd and kc, of ki, and of the pole, as the message ``gains`` has them."""
@@ -98,7 +105,7 @@ class ControllerSettings:
 def controller_settings(rig: Rig) -> ControllerSettings:
     """Turn a rig into what its controller is told.
 
-    `rig`: with ``[daq]`` and calibrations from counts; `ambid.acquisition.default_daq.with_default_daq` makes them up.
+    `rig`: with ``[daq]`` and calibrations from counts; `ambid.acquisition.settings.with_default_daq` makes them up.
     Returns each within what the controller takes. Trips are rounded inwards, all else to the nearest.
     """
     daq = _daq(rig)
@@ -189,7 +196,7 @@ def held_by(rig: Rig, loop: Loop) -> Loop:
     """
     if rig.daq is None or rig.rotor is not None:
         return loop
-    from ambid.acquisition.default_daq import with_default_daq
+    from ambid.acquisition.settings import with_default_daq
 
     full = replace(with_default_daq(rig), loop=loop)
     return replace(realised(controller_settings(full), full), delay=loop.delay)
@@ -418,3 +425,177 @@ def _unit(rig: Rig, role: str) -> str:
 
     third = _third_role(rig) if role == "extra" else None
     return role_units(model(rig.model)).get(third or role, "1")
+
+
+SPAN = 1.25
+"""Full scale of a sensor that is made up, over the limits of the loop."""
+
+_UNITS = {"position": "m", "current": "A", "voltage": "V"}
+
+
+def with_default_daq(rig: Rig) -> Rig:
+    """Return a rig with ``[daq]`` and calibrations from counts; what it has already stays.
+
+    `rig`: with limits of voltage, current and position where it has no calibrations. Returns for `controller_settings`,
+    as an emulated or simulated bench uses it; `default_daq_notes` says what was made up.
+    """
+    return _filled(rig)[0]
+
+
+def is_made_up(rig: Rig, full: Rig) -> bool:
+    """Return whether `with_default_daq` made a calibration up: its counts mean nothing to anybody else."""
+    return any(rig.channel(c.role).calibration is None and c.calibration is not None for c in full.channels)
+
+
+def default_daq_notes(rig: Rig) -> tuple[str, ...]:
+    """Return what `with_default_daq` makes up for a rig, one line each.
+
+    `rig`: as for `with_default_daq`. Returns empty where the rig is complete.
+    """
+    return _filled(rig)[1]
+
+
+def _filled(rig: Rig) -> tuple[Rig, tuple[str, ...]]:
+    notes: list[str] = []
+    plant = model(rig.model)
+    channels = []
+    for c in rig.channels:
+        wanted = c.role in _UNITS and c.role in (*plant.inputs, *plant.outputs)
+        channels.append(_calibrated(rig, c, notes) if wanted and c.calibration is None else c)
+    daq = rig.daq
+    if daq is None:
+        wanted_hz = rig.record.rate_hz or DAQ_RATE_HZ
+        rate = nearest_rate(wanted_hz, output=True)
+        possible = math.isclose(rate, wanted_hz, rel_tol=1e-9)
+        daq = Daq(rate_hz=wanted_hz if possible else rate)
+        if not possible:
+            notes.append(
+                f"rate: {rate:.6g} Hz, the nearest to {wanted_hz:g} Hz at which the controller drives"
+                f" ({output_rates()})"
+            )
+    return replace(rig, channels=tuple(channels), daq=daq), tuple(notes)
+
+
+def _calibrated(rig: Rig, c: RigChannel, notes: list[str]) -> RigChannel:
+    """Give a channel a straight line from counts; its column is then in counts, whatever unit it was read in."""
+    low, high = _full_scale(rig, c.role)
+    top = PWM_TOP if c.role == "voltage" else ADC_TOP
+    of = Calibration(unit_in="1", unit_out=_UNITS[c.role], gain=(high - low) / top, offset=low)
+    notes.append(f"{c.role}: 0 to {top} counts assumed to be {low:.4g} to {high:.4g} {_UNITS[c.role]}")
+    return replace(c, calibration=of, unit=None)
+
+
+def _full_scale(rig: Rig, role: str) -> Interval:
+    low, high = UNLIMITED if rig.limits is None else getattr(rig.limits, role)
+    if not (math.isfinite(low) and math.isfinite(high)):
+        raise RigError(
+            f"{who(rig)}: channels.{role} has no calibration, and there is no loop.limits.{role} to derive one "
+            "from. Give one of them"
+        )
+    if role == "voltage":
+        return low, high
+    middle, half = (low + high) / 2.0, SPAN * (high - low) / 2.0
+    return middle - half, middle + half
+
+
+_REMEDY: Mapping[str, str] = MappingProxyType(
+    {
+        "overrun": "Lower daq.rate_hz",
+        "host_silent": "Free the machine, or raise daq.host_ms",
+        "over_current": "Excite less, check the coil, or widen daq.trip.current if the coil can bear it",
+        "out_of_gap": "Change the gains of [loop], excite less, or check sensor and daq.trip.position",
+        "interlock": "Close the loop: cable, emergency stop",
+        "line_break": "Check the cable",
+        "self_test": "Correct what the self-test names",
+        "watchdog": "Check the supply and the firmware build",
+    }
+)
+"""What to do about each cause of `messages.toml`."""
+
+
+_AT_ONCE_MS = 10  # after the time to lift
+
+
+def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int = 0) -> str:
+    """Write a fault for people: cause, what it means, where, and what to do.
+
+    `fault`: of kind ``fault``. Returns one sentence with its remedy, without a full stop.
+    """
+    about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
+    at = "" if fault.sample is None else f" at sample {fault.sample}"
+    meaning = "" if about is None else f", {about}"
+    remedy = _REMEDY.get(fault.what, "Remove the cause")
+    lifted = (lift_ms + _AT_ONCE_MS) * rate_hz / 1e3  # a rate that is not known compares false
+    if fault.what == "out_of_gap" and fault.sample is not None and fault.sample <= lifted:
+        remedy = f"The rotor was not levitated within daq.lift_ms = {lift_ms}: raise it, or change the gains of [loop]"
+    return f"{fault.what}{meaning}{at}. {remedy}"
+
+
+def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start_s: float = 0.0) -> Record:
+    """Return samples of a device as a record.
+
+    `values`: (n_samples, n_columns), in the columns' units, as blocks hold them; `columns`: of the device; `rate_hz`:
+    sampling rate in Hz; `start_s`: time of the first sample, s. Returns one channel per column, named like it.
+    """
+    channels = tuple(Channel(name=c.name, unit=c.unit, values=values[:, k]) for k, c in enumerate(columns))
+    return Record(channels=channels, rate_hz=rate_hz, start_s=start_s, provenance=MappingProxyType({}), history=())
+
+
+class BenchView:
+    """Turns raw blocks of a device into blocks of roles, SI.
+
+    `info`: of the opened device; `rig`: its columns and calibrations; `roles`: which, in which order.
+
+    `units`: SI unit of each role, in the order given; `rate_hz`: sampling rate in Hz.
+    """
+
+    def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
+        self.rate_hz = info.rate_hz
+        self._columns, self._rig = info.columns, rig
+        late = [c.role for c in rig.channels if c.delay not in ("auto", 0) and c.role not in model(rig.model).inputs]
+        if late:
+            raise RigError(
+                f"channels.{late[0]}.delay is taken back in a whole record only; samples of a device come in blocks. "
+                "Remove it for live work"
+            )
+        spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
+        seen = self.record(np.array([spare]))  # so that what does not fit is told at once
+        self.units = {role: seen.channel(role).unit for role in roles}
+        self._lines = self._linear()
+
+    def block(self, raw: Block) -> Block:
+        """Return a block in the order of the roles.
+
+        `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
+        """
+        if self._lines is None:
+            seen = self.record(raw.values)
+            values = np.column_stack([seen[role].values for role in self.units])
+        else:
+            columns, gain, offset = self._lines
+            values = np.ascontiguousarray(gain * raw.values[:, columns] + offset)
+        return Block(first=raw.first, time_s=raw.time_s, values=values)
+
+    def _linear(self) -> tuple[NDArray[np.int64], Array, Array] | None:
+        """Return columns, gains and offsets of the roles; applying them takes a tenth of the time of making a record.
+
+        None where a table or a declared unit asks for more.
+        """
+        columns = {c.name: k for k, c in enumerate(self._columns)}
+        channels = {c.role: c for c in self._rig.channels}
+        found = []
+        for c in (channels[role] for role in self.units):
+            k, of = columns[c.column], c.calibration
+            if c.unit not in (None, self._columns[k].unit) or (of is not None and of.raw is not None):
+                return None
+            found.append((k, 1.0, 0.0) if of is None else (k, of.gain, of.offset))
+        k, gain, offset = np.array(found).T
+        return k.astype(int), gain, offset
+
+    def record(self, values: Array, *, start_s: float = 0.0) -> Record:
+        """Return samples as a record whose channels are named by role.
+
+        `values`: (n_samples, n_columns), in the device's units, as blocks hold them; `start_s`: time of the first
+        sample, s. Returns all of the rig's channels, SI.
+        """
+        return bench_record(as_record(values, self._columns, self.rate_hz, start_s=start_s), self._rig)

@@ -22,8 +22,7 @@ from ambid.errors import AmbidError, counted
 
 if TYPE_CHECKING:
     from ambid.acquisition.device import Device
-    from ambid.acquisition.recording import Acquired, Progress
-    from ambid.acquisition.session import Course, RunReport
+    from ambid.acquisition.session import Acquired, Course, Progress, RunReport
     from ambid.estimation.estimate import Estimate
     from ambid.recursive.lines import Track
     from ambid.rig import Rig
@@ -159,7 +158,7 @@ class Recording:
 
         The second result prints the track, and raises what it ends with.
         """
-        from ambid.acquisition.recording import recording
+        from ambid.acquisition.session import recording
         from ambid.cli.live import Follower
         from ambid.job.track_live import track_live
 
@@ -234,7 +233,7 @@ class Recording:
         """Tell what ended the run early, and end with the exit code."""
         kept = f"{self.path} holds the {done.stored} samples before it" if done.recorded else "nothing was recorded"
         if done.run.fault is not None:
-            from ambid.acquisition.default_daq import fault_words
+            from ambid.acquisition.settings import fault_words
             from ambid.rig.rig import Daq
 
             rate_hz = done.info.rate_hz
@@ -274,7 +273,7 @@ def _changed(record: Path) -> int | None:
 
 
 def _journal(record: Path) -> Path:
-    from ambid.acquisition.recorder.layout import journal_path
+    from ambid.acquisition.recorder.journal import journal_path
 
     return journal_path(record)
 

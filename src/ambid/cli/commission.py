@@ -21,7 +21,7 @@ from ambid.cli.terminal import painter, say_note, watching
 from ambid.errors import AmbidError
 
 if TYPE_CHECKING:
-    from ambid.acquisition.recording import Progress
+    from ambid.acquisition.session import Progress
     from ambid.job.commissioning_steps import StepName
     from ambid.report.commission_page import Step
 

@@ -58,7 +58,7 @@ def _recover(journal: Path, output: Path | None, outputs: Outputs, *, delete: bo
     `quiet`: standard output is for the result alone.
     """
     from ambid.acquisition.recorder import JournalReader, record_path, recorded_already, recorded_from
-    from ambid.acquisition.recorder.disk import sync_folder
+    from ambid.acquisition.recorder.journal import sync_folder
     from ambid.errors import DeviceError
 
     if not journal.name:

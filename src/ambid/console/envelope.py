@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from ambid.acquisition.view import BenchView
+from ambid.acquisition.settings import BenchView
 from ambid.arrays import Array
 from ambid.console.feed import FeedWriter
 from ambid.errors import AmbidError

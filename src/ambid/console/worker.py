@@ -265,8 +265,8 @@ def _export(worker: Worker) -> None:
 
 def _live(worker: Worker) -> None:
     """Record and track what a device samples."""
-    from ambid.acquisition.recording import recording
-    from ambid.acquisition.view import BenchView
+    from ambid.acquisition.session import recording
+    from ambid.acquisition.settings import BenchView
     from ambid.job.acquiring import Request, ready
     from ambid.job.results import read_linear_estimate
     from ambid.job.track_live import track_live
@@ -403,7 +403,7 @@ def _summary(made: Any) -> Mapping[str, Any]:
 
 def _commission(worker: Worker) -> None:
     """Commission a bench; the operator agrees before the output is switched on."""
-    from ambid.acquisition.recording import Progress
+    from ambid.acquisition.session import Progress
     from ambid.job import commission
     from ambid.job.acquiring import opened
     from ambid.job.commissioning_steps import Plan

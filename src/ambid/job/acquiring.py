@@ -9,14 +9,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
-from ambid.acquisition.amplitude import Trial, band_for, fitting_amplitude
-from ambid.acquisition.default_daq import default_daq_notes, with_default_daq
 from ambid.acquisition.device import Device, Mode
-from ambid.acquisition.recording import Acquired, Progress
-from ambid.acquisition.recording import acquire as record_course
 from ambid.acquisition.review import refuse_unstable, review
-from ambid.acquisition.session import Course
-from ambid.acquisition.settings import controller_settings, law_trial
+from ambid.acquisition.session import Acquired, Course, Progress
+from ambid.acquisition.session import acquire as record_course
+from ambid.acquisition.settings import controller_settings, default_daq_notes, law_trial, with_default_daq
+from ambid.acquisition.trials import Trial, band_for, fitting_amplitude
 from ambid.control.experiment import Experiment
 from ambid.errors import (
     LARGEST,
@@ -269,7 +267,7 @@ def opened(
     `bench`: plant behind a controller that is no hardware; `pace`: of such a device; `seed`: of simulated noise;
     `closes`: whether a loop is to be closed that has to be stable. Returns idle.
     """
-    from ambid.acquisition.devices.choose import open_device
+    from ambid.acquisition.devices import open_device
 
     behind, invented = None if bench is None else bench_of_source(bench), port in ("emulated", "simulated")
     complete = with_default_daq(rig) if invented else rig

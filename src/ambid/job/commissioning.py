@@ -14,14 +14,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Unpack
 
-from ambid.acquisition.amplitude import VOLTAGE, Kept, Look, Room, Size, make_look
-from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.device import Device, DeviceInfo, Program
-from ambid.acquisition.recording import Listeners, acquire
 from ambid.acquisition.review import loop_on, refuse_unstable
-from ambid.acquisition.session import Course
-from ambid.acquisition.settings import law_trial
-from ambid.acquisition.view import BenchView
+from ambid.acquisition.session import Course, Listeners, acquire
+from ambid.acquisition.settings import BenchView, law_trial, with_default_daq
+from ambid.acquisition.trials import VOLTAGE, Kept, Look, Room, Size, make_look
 from ambid.control.design import Design
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
@@ -158,7 +155,7 @@ def commission(
     force : bool
         Go on with a loop that is predicted unstable.
     **listeners
-        See `ambid.acquisition.recording.Listeners`.
+        See `ambid.acquisition.session.Listeners`.
 
     Returns
     -------

@@ -13,23 +13,24 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ambid.acquisition.amplitude import (
+from ambid.acquisition.device import Device, Program
+from ambid.acquisition.session import Acquired, Course
+from ambid.acquisition.trials import (
     AIM,
     TOO_MUCH,
     USE,
     Look,
+    Polarity,
+    Pulse,
     Room,
     Size,
     Trial,
     find_amplitude,
+    find_polarity,
     moving_band,
     room_used,
     why_incomplete,
 )
-from ambid.acquisition.device import Device, Program
-from ambid.acquisition.polarity import Polarity, Pulse, find_polarity
-from ambid.acquisition.recording import Acquired
-from ambid.acquisition.session import Course
 from ambid.arrays import Array
 from ambid.control.design import FIGURES, Design
 from ambid.control.experiment import Experiment

@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ambid.acquisition.amplitude import USE, VOLTAGE, Room
-from ambid.acquisition.default_daq import with_default_daq
 from ambid.acquisition.scales import TABLE_LENGTH, scale_of
-from ambid.acquisition.settings import controller_settings
+from ambid.acquisition.settings import controller_settings, with_default_daq
+from ambid.acquisition.trials import USE, VOLTAGE, Room
 from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.control.curvature import advised, expected_shift, judge_shift

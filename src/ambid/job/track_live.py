@@ -19,10 +19,9 @@ from typing import Unpack
 
 import numpy as np
 
-from ambid.acquisition.default_daq import fault_words
 from ambid.acquisition.device import Device, DeviceEvent
 from ambid.acquisition.session import Course, RunReport, Tap, run
-from ambid.acquisition.view import BenchView
+from ambid.acquisition.settings import BenchView, fault_words
 from ambid.arrays import Array
 from ambid.errors import AmbidError, DeviceError
 from ambid.estimation.estimate import Estimate

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ambid.acquisition.polarity import Pulse
+from ambid.acquisition.trials import Pulse
 from ambid.arrays import Array
 from ambid.control.design import Design
 from ambid.control.margins import Margins

@@ -13,8 +13,7 @@ if TYPE_CHECKING:
     from ambid.acquisition.device import Counters
     from ambid.acquisition.quality import ColumnQuality, QualityReport
     from ambid.acquisition.recorder import Recorded
-    from ambid.acquisition.recording import Acquired
-    from ambid.acquisition.session import RunReport
+    from ambid.acquisition.session import Acquired, RunReport
     from ambid.report.commission_page import Step
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.acquisition.devices.choose import open_device
+from ambid.acquisition.devices import open_device
 from ambid.acquisition.devices.emulated import EmulatedDevice
 from ambid.acquisition.devices.line_device import SerialDevice
-from ambid.acquisition.devices.replay import ReplayDevice
+from ambid.acquisition.devices.played import ReplayDevice
 from ambid.acquisition.devices.simulated import SimulatedDevice
 from ambid.errors import AmbidError, DeviceError
 from ambid.job.acquiring import opened

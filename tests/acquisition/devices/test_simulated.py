@@ -9,7 +9,7 @@ import pytest
 from ambid.acquisition.device import Program
 from ambid.acquisition.devices import _kernels, played
 from ambid.acquisition.devices.simulated import SimulatedDevice
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.errors import AmbidError, DeviceError
 from ambid.rig import load_rig
 from tests.acquisition.devices.bare import bare_rig

@@ -6,8 +6,8 @@ import os
 import pytest
 import serial
 
-from ambid.acquisition.devices import port as ports
-from ambid.acquisition.devices.port import candidate_ports, open_port
+from ambid.acquisition.devices import controller as ports
+from ambid.acquisition.devices.controller import candidate_ports, open_port
 from ambid.errors import DeviceError
 from tests.acquisition.fake import FakeController, PtyBoard
 

@@ -5,6 +5,7 @@ import struct
 
 import pytest
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import (
     FrameCounters,
     FrameDecoder,
@@ -16,7 +17,6 @@ from ambid.acquisition.protocol.codec import (
     refuse_other_version,
     unpack,
 )
-from ambid.acquisition.protocol.table import table
 from ambid.errors import DeviceError
 from tests.acquisition.protocol.vectors import random_message
 

@@ -9,9 +9,9 @@ from dataclasses import replace
 
 import pytest
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import FrameDecoder, encode, frame, pack, unpack
 from ambid.acquisition.protocol.samples import SampleDecoder
-from ambid.acquisition.protocol.table import table
 from tests.acquisition.protocol.vectors import random_message, sample
 
 MASK = 0b1011

@@ -11,8 +11,8 @@ import subprocess
 
 import pytest
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import pack
-from ambid.acquisition.protocol.table import table
 from tests.acquisition.protocol.vectors import random_message
 from tests.conventions.sources import ROOT
 

@@ -6,9 +6,9 @@ import struct
 import numpy as np
 import pytest
 
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import pack
 from ambid.acquisition.protocol.samples import SampleCounters, SampleDecoder, columns_of
-from ambid.acquisition.protocol.table import table
 from ambid.errors import DeviceError
 from tests.acquisition.protocol.vectors import sample
 

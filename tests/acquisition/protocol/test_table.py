@@ -7,7 +7,7 @@ from importlib import resources
 
 import pytest
 
-from ambid.acquisition.protocol.table import read_table, table
+from ambid.acquisition.protocol import read_table, table
 from tests.conventions.sources import ROOT
 from tools.protocol_header import c_header, complaints, protocol_page
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import random
 
+from ambid.acquisition.protocol import CRC_BYTES, FieldType, MessageType, table
 from ambid.acquisition.protocol.codec import Message, message
-from ambid.acquisition.protocol.table import CRC_BYTES, FieldType, MessageType, table
 
 
 def number(field: FieldType, source: random.Random) -> int:

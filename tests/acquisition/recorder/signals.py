@@ -8,7 +8,7 @@ import numpy as np
 
 from ambid.acquisition.device import Column, DeviceEvent
 from ambid.acquisition.recorder import JournalHeader, JournalReader
-from ambid.acquisition.recorder.disk import JournalFile
+from ambid.acquisition.recorder.journal import JournalFile
 from ambid.tracking.blocks import Block
 
 RATE = 2000.0

@@ -10,9 +10,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ambid.acquisition.recorder import JournalHeader, Recorder, disk, journal_path
+from ambid.acquisition.recorder import JournalHeader, Recorder, journal_path
+from ambid.acquisition.recorder import journal as disk
 from ambid.acquisition.recorder import recorder as recorder_module
-from ambid.acquisition.recorder.layout import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE, json_bytes
+from ambid.acquisition.recorder.journal import HEAD_SIZE, OVERHEAD, PREAMBLE_SIZE, json_bytes
 from ambid.errors import DeviceError
 from ambid.record import read_record
 from ambid.tracking.blocks import Block

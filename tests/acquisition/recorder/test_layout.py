@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from ambid.acquisition.recorder import layout
-from ambid.acquisition.recorder.layout import (
+from ambid.acquisition.recorder import journal as layout
+from ambid.acquisition.recorder.journal import (
     BLOCK,
     Head,
     frame_bytes,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.acquisition.recorder import JournalReader, Recorder, journal_path, recorded_from
-from ambid.acquisition.recorder.disk import JournalFile
+from ambid.acquisition.recorder.journal import JournalFile
 from ambid.record.hdf5_format import read_hdf5
 from ambid.tracking.blocks import Block
 from tests.acquisition.recorder.signals import ROWS, block, contents, header, same_bits, values_at

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from ambid.acquisition.device import DeviceEvent
-from ambid.acquisition.recorder import JournalReader, Recorder, layout
+from ambid.acquisition.recorder import JournalReader, Recorder
+from ambid.acquisition.recorder import journal as layout
 from ambid.acquisition.recorder import recorder as recorder_module
-from ambid.acquisition.recorder.layout import HEADER, Head, frame_bytes, json_bytes, preamble
+from ambid.acquisition.recorder.journal import HEADER, Head, frame_bytes, json_bytes, preamble
 from ambid.errors import DeviceError
 from ambid.tracking.blocks import Block
 from tests.acquisition.recorder.signals import ROWS, block, contents, header, same_bits, values_at

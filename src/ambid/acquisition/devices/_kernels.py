@@ -1,7 +1,4 @@
-"""The simulated controller's tick, compiled: converter, checks, law in whole numbers, excitation, plant.
-
-It follows ``protocol/messages.toml`` and the firmware's ``control.h``; what a call leaves off, the next one continues.
-"""
+"""Controller and bench, tick by tick, bit by bit as ``firmware/amb_daq`` has it: laws, excitations, trips; compiled."""
 
 from __future__ import annotations
 
@@ -10,12 +7,64 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.law_kernel import law_tick, watch
+from ambid.acquisition.law_words import BEGIN, D0, D1, E_BITS, HEAD, OF_A_STATE, SHARE_BITS, SUM_BITS, Y_BITS
+from ambid.acquisition.program import MASKS
 from ambid.arrays import Array
 from ambid.compiled import compiled
 from ambid.simulation.kernels import Linear, Nonlinear, advance_plant
 
 Integers = NDArray[np.int64]
+
+_STATES, _E = 1 << 29, 4095
+_ONE = 1 << 12  # a count in the law's fixed point
+_TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
+_MASKS = np.array([MASKS.get(bits, 0) for bits in range(max(MASKS) + 1)], dtype=np.int64)
+
+
+@compiled
+def shifted(value: int, shift: int) -> int:
+    """Return value / 2^shift to the nearest, ties up."""
+    return value if shift == 0 else (value + (1 << (shift - 1))) >> shift
+
+
+@compiled
+def limited(value: int, largest: int) -> int:
+    """Return `value` limited to both sides."""
+    return min(max(value, -largest), largest)
+
+
+@compiled
+def law_tick(words: Integers, z: Integers, position: int, current: int, offset: int, low: int, high: int) -> int:
+    """Return the pulse width of a tick, and move the states `z` (n,) on.
+
+    `position`, `current`: from set point and rest, counts; `offset`: bias and excitation.
+    """
+    n, y0, y1 = words[HEAD] & 0xFF, position << Y_BITS, current << Y_BITS
+    total = words[D0] * y0 + words[D1] * y1
+    for i in range(n):
+        total += words[OF_A_STATE + 7 * i + 6] * (z[i] >> SHARE_BITS)
+    wanted = shifted(limited(shifted(total, words[HEAD] >> 8), _SUM), SUM_BITS) + offset
+    duty = min(max(wanted, low), high)
+    e = limited(duty - wanted, _E) << E_BITS
+    for i in range(0, n, 2):
+        last = i + 1 == n
+        first, second = z[i] >> SHARE_BITS, 0 if last else z[i + 1] >> SHARE_BITS
+        for j in range(1 if last else 2):
+            own, other, at = (second, first, OF_A_STATE + 7 * (i + 1)) if j else (first, second, OF_A_STATE + 7 * i)
+            total = words[at + 1] * own + words[at + 2] * other + words[at + 3] * y0 + words[at + 4] * y1
+            moved = z[i + j] + shifted(total + words[at + 5] * e, words[at])
+            z[i + j] = min(max(moved, -_STATES), _STATES - 1)
+    return int(duty)
+
+
+@compiled
+def watch(words: Integers, z: Integers, position: int, current: int, bias: int, off: int, last: bool) -> None:
+    """Move the states on while the pulse width is still `off`; with the last such tick integrators begin at zero."""
+    law_tick(words, z, position, current, bias, off, off)
+    for i in range(z.size if last else 0):
+        if words[OF_A_STATE + 7 * i + 1] == 0 and words[OF_A_STATE + 7 * i + 2] == 0:
+            z[i] = BEGIN
+
 
 # States and causes: as in messages.toml; a test compares them.
 IDLE, SAMPLING, DRIVING, LEVITATING, FAULT = 0, 1, 2, 3, 4
@@ -33,10 +82,6 @@ N_SETTINGS = 24
 STATE, CAUSE, INTEGRAL, DERIVATIVE, LAST, FRESH, TICK, FAULT_TICK, LIFTED = 0, 1, 2, 3, 4, 5, 6, 7, 8
 PLAYING, ELEMENT, HELD, PLAYED, SHIFT, DUTY, INSIDE, WATCHING = 9, 10, 11, 12, 13, 14, 15, 16
 N_MEMORY = 17
-
-_ONE = 1 << 12  # a count in the law's fixed point
-_TERM, _INTEGRAL, _SUM = 1 << 28, 1 << 27, (1 << 26) - 1  # where the firmware limits its terms
-_MASKS = np.array([0, 0, 0, 0x3, 0x3, 0x5, 0x3, 0x3, 0x1D, 0x11, 0x9, 0x5, 0x53, 0x1B, 0x443, 0x3], dtype=np.int64)
 
 
 @compiled
@@ -91,12 +136,6 @@ def played(settings: Integers, memory: Integers, table: Integers) -> int:
 
 
 @compiled
-def within(value: int, largest: int) -> int:
-    """Return `value` limited to both sides."""
-    return min(max(value, -largest), largest)
-
-
-@compiled
 def ordered(
     position: int, current: int, excitation: int, settings: Integers, memory: Integers, words: Integers, z: Integers
 ) -> int:
@@ -111,9 +150,9 @@ def ordered(
     derivative = (memory[DERIVATIVE] * settings[POLE] + 0x8000) >> 16
     if memory[FRESH] == 0:
         derivative -= settings[KD] * (position - memory[LAST])
-    memory[DERIVATIVE], memory[LAST], memory[FRESH] = within(derivative, _TERM), position, 0
+    memory[DERIVATIVE], memory[LAST], memory[FRESH] = limited(derivative, _TERM), position, 0
     wanted = settings[KP] * error + (memory[INTEGRAL] >> 4) + memory[DERIVATIVE]
-    wanted = within(wanted - settings[KC] * (current - settings[REST]), _SUM) + (settings[BIAS] + excitation) * _ONE
+    wanted = limited(wanted - settings[KC] * (current - settings[REST]), _SUM) + (settings[BIAS] + excitation) * _ONE
     duty, beyond = (wanted + _ONE // 2) >> 12, 0
     if wanted > high * _ONE:
         duty, beyond = high, 1
@@ -121,7 +160,7 @@ def ordered(
         duty, beyond = low, -1
     # Anti-windup: while the pulse width is limited the integral may only move back.
     if beyond * growth <= 0:
-        memory[INTEGRAL] = within(memory[INTEGRAL] + growth, _INTEGRAL)
+        memory[INTEGRAL] = limited(memory[INTEGRAL] + growth, _INTEGRAL)
     return int(duty)
 
 

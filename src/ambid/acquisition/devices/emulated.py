@@ -21,11 +21,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
-from ambid.acquisition.default_daq import is_made_up, with_default_daq
 from ambid.acquisition.devices.benches import bench_of, plant_text
+from ambid.acquisition.devices.controller import Port, PortEnded, open_port
 from ambid.acquisition.devices.line_device import LineDevice
 from ambid.acquisition.devices.played import Pace, check_pace
-from ambid.acquisition.devices.port import Port, PortEnded, open_port
+from ambid.acquisition.settings import is_made_up, with_default_daq
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig

@@ -25,14 +25,13 @@ from ambid.acquisition.device import (
     State,
     check_mode,
 )
-from ambid.acquisition.devices.controller import Controller
-from ambid.acquisition.devices.frames import FrameQueue
-from ambid.acquisition.devices.port import Port, open_port
+from ambid.acquisition.devices.controller import Controller, Port, open_port
+from ambid.acquisition.devices.played import FrameQueue
 from ambid.acquisition.law_words import LawWords
 from ambid.acquisition.program import counts_of
+from ambid.acquisition.protocol import table
 from ambid.acquisition.protocol.codec import Message
 from ambid.acquisition.protocol.samples import SampleCounters, SampleDecoder, Samples
-from ambid.acquisition.protocol.table import table
 from ambid.acquisition.settings import columns, controller_settings, in_si
 from ambid.arrays import Array
 from ambid.errors import DeviceError

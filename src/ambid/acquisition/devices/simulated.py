@@ -12,15 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.default_daq import is_made_up, with_default_daq
 from ambid.acquisition.device import DeviceEvent, DeviceInfo, Mode, Program, SelfTest
 from ambid.acquisition.devices.benches import bench_of, instruments
 from ambid.acquisition.devices.played import Pace, PlayedDevice
 from ambid.acquisition.law_words import BEGIN, WATCH_MS
 from ambid.acquisition.program import counts_of
-from ambid.acquisition.protocol.table import table
+from ambid.acquisition.protocol import table
 from ambid.acquisition.scales import ADC_TOP, LAG_S, LIFTED_MS, PWM_TOP, TABLE_LENGTH, Scale, output_rates
-from ambid.acquisition.settings import ControllerSettings, carried, columns, controller_settings, in_si
+from ambid.acquisition.settings import (
+    ControllerSettings,
+    carried,
+    columns,
+    controller_settings,
+    in_si,
+    is_made_up,
+    with_default_daq,
+)
 from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset

@@ -15,7 +15,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
 
-from ambid.acquisition.protocol.table import CRC_BYTES, MessageType, table
+from ambid.acquisition.protocol import CRC_BYTES, MessageType, table
 from ambid.errors import DeviceError, nearest
 
 _NO_FIELDS: Mapping[str, int] = MappingProxyType({})

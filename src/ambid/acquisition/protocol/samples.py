@@ -14,7 +14,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.acquisition.protocol.table import StreamColumn, table
+from ambid.acquisition.protocol import StreamColumn, table
 from ambid.errors import DeviceError
 
 _WRAP = 1 << 16  # ticks in a sample

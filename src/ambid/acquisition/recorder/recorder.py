@@ -20,24 +20,26 @@ from typing import Any, Self
 import numpy as np
 
 from ambid.acquisition.device import DeviceEvent
-from ambid.acquisition.recorder.convert import Recorded, check_target, recorded_from
-from ambid.acquisition.recorder.disk import REMOVED, JournalFile, disk_error, free_bytes
-from ambid.acquisition.recorder.layout import (
+from ambid.acquisition.recorder.convert import JournalReader, Recorded, check_target, recorded_from
+from ambid.acquisition.recorder.journal import (
     BLOCK,
     CLOSE,
     EVENT,
     HEADER,
     LARGEST,
+    REMOVED,
     Head,
+    JournalFile,
     JournalHeader,
+    disk_error,
     event_frame,
     frame_bytes,
+    free_bytes,
     journal_path,
     json_bytes,
     packed_values,
     preamble,
 )
-from ambid.acquisition.recorder.reader import JournalReader
 from ambid.errors import DeviceError
 from ambid.tracking.blocks import Block
 
