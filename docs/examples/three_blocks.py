@@ -15,7 +15,9 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.linalg import expm
 
-from ambid.bearing.blocks import ThreeBlocks, block_parameters, three_blocks
+from ambid import fit
+from ambid.blackbox import BlackBoxFit
+from ambid.blackbox.blocks import block_parameters
 
 PRINTED = np.array([653.5, 1204.0, 0.003496, 1.752, 1.049, 0.07209])  # thesis eq. 5.4-5.6: K_a, a, K_b, b, K_c, c
 NAMES = ("R", "L", "C", "K", "k_i", "k_x")
@@ -39,7 +41,7 @@ def bench(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return voltage, states[:, 0] + states[:, 1] + noise[:, 0], states[:, 2] + noise[:, 1]
 
 
-def main(seed: int = 1) -> tuple[dict[str, float], ThreeBlocks]:
+def main(seed: int = 1) -> tuple[dict[str, float], BlackBoxFit]:
     """Print table 5.1 corrected and the blocks of the simulated bench; return both."""
     corrected = dict(zip(NAMES, block_parameters(PRINTED)[0].tolist(), strict=True))
     print("table 5.1   corrected   printed")
@@ -47,20 +49,25 @@ def main(seed: int = 1) -> tuple[dict[str, float], ThreeBlocks]:
         print(f"{name:10} {value:10.5g}   {TABLE_5_1.get(name, '')}")
 
     voltage, current, position = bench(seed)
-    found = three_blocks(voltage, current, position, RATE_HZ, open_loop=True)
+    found = fit(
+        {"voltage": voltage, "current": current, "position": position},
+        structure="blocks", input="voltage", output=("current", "position"), orders="nk=0", open_loop=True,
+        rate_hz=RATE_HZ, units={"voltage": "V", "current": "A", "position": "m"},
+    )  # fmt: skip
     truth = dict(zip(NAMES, block_parameters(BENCH)[0].tolist(), strict=True))
     print("\nsimulated bench, truth", ", ".join(f"{k} {v:.4g}" for k, v in truth.items()))
-    print(found)
+    print(found.summary())
+    print(found.details["limit"])
     return corrected, found
 
 
-def draw(done: tuple[dict[str, float], ThreeBlocks]) -> Figure:
+def draw(done: tuple[dict[str, float], BlackBoxFit]) -> Figure:
     """Draw how far each parameter of the simulated bench is from the truth, with its 95 % interval."""
     figure = Figure(figsize=(7.0, 2.8), layout="constrained")
     axes = figure.subplots()
-    found, truth = done[1].parameters, block_parameters(BENCH)[0].tolist()
-    off = [100.0 * (p.value / true - 1.0) for p, true in zip(found.values(), truth, strict=True)]
-    bars = [196.0 * p.sd / abs(true) for p, true in zip(found.values(), truth, strict=True)]
+    found, truth = done[1].details["parameters"], block_parameters(BENCH)[0].tolist()
+    off = [100.0 * (p["value"] / true - 1.0) for p, true in zip(found.values(), truth, strict=True)]
+    bars = [196.0 * p["sd"] / abs(true) for p, true in zip(found.values(), truth, strict=True)]
     axes.errorbar(list(found), off, yerr=bars, fmt="o", capsize=4)
     axes.axhline(0.0, color="0.3", linewidth=0.8)
     axes.set_ylabel("error in %, with 95 % interval")

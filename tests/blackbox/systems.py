@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import scipy.signal
 
+from ambid.blackbox.blocks import transfer_functions
 from ambid.blackbox.data import IOData
+from ambid.blackbox.model import TransferModel
+from ambid.blackbox.prediction import held_transfer
+from tests.blackbox.instrumental import block_benches
 
 DT = 0.01
 A = np.array([1.0, -1.5, 0.7])
@@ -26,6 +32,7 @@ _OWN = {
     "srivc": {"nk": 0},  # what is sampled with a hold comes a sample later
     "clsrivc": {"nk": 0},
     "weakform": {"na": 2, "nb": 2, "nk": 0},
+    "blocks": {"nk": 0},
 }
 
 
@@ -59,6 +66,26 @@ def open_loop(n: int = 3000, seed: int = 0, *, told: bool = True, inputs: bool =
         references=("wish",) if inputs else (),
         record={"samples": n, "rate_hz": 1 / DT, "sha256": None, "file": None, "history": []},
     )
+
+
+BLOCKS = np.array([653.5, 1204.0, -30.0, 40.0, 2.0, 15.0])  # K_a, a, K_b, b, K_c, c
+
+
+def three_blocks(n: int = 10_000, seed: int = 0, *, told: bool = True) -> IOData:
+    """i = K_a/(s + a) u + K_b/(s + b) x, x = K_c/(s + c) i about an operating point."""
+    v, i, x, r = block_benches.record(seed, n, truth=BLOCKS)
+    data = block_benches.io(v, i, x, r, open_loop=told)
+    return replace(
+        data, inputs=("drive",), outputs=("place", "other"), units=dict.fromkeys(("drive", "place", "other"), "m")
+    )
+
+
+def truth_of_blocks(omega: np.ndarray) -> np.ndarray:
+    """Frequency response from voltage to current, held over a sample."""
+    model = TransferModel(
+        num=((transfer_functions(BLOCKS)[0][0],),), den=((transfer_functions(BLOCKS)[0][1],),), dt=None
+    )
+    return held_transfer(model, 1 / block_benches.RATE).frequency_response(omega)[:, 0, 0]
 
 
 UNSTABLE_A = np.array([1.0, -2.1, 1.08])  # poles 0.9 and 1.2

@@ -54,10 +54,10 @@ def test_three_blocks_are_recovered_and_print_their_limit(capsys):
     assert corrected["L"] == pytest.approx(1.530e-3, abs=5e-7)
     assert corrected["k_x"] == pytest.approx(0.00886, abs=5e-6)
     truth = three.block_parameters(three.BENCH)[0]
-    for p, true in zip(found.parameters.values(), truth, strict=True):
-        assert abs(p.value - true) < IN_99_9 * p.sd
-        assert p.sd < 0.1 * abs(true)
-    assert found.limit in " ".join(capsys.readouterr().out.split())
+    for p, true in zip(found.details["parameters"].values(), truth, strict=True):
+        assert abs(p["value"] - true) < IN_99_9 * p["sd"]
+        assert p["sd"] < 0.1 * abs(true)
+    assert found.details["limit"] in " ".join(capsys.readouterr().out.split())
 
 
 def test_unstable_bearing_is_recovered_in_closed_loop():

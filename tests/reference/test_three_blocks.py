@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.bearing.blocks import block_parameters
+from ambid.blackbox.blocks import block_parameters
 
 PRINTED = np.array([653.5, 1204.0, 0.003496, 1.752, 1.049, 0.07209])  # K_a, a, K_b, b, K_c, c
 

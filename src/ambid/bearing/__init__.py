@@ -7,9 +7,6 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.bearing.blocks import ThreeBlocks as ThreeBlocks
-    from ambid.bearing.blocks import block_parameters as block_parameters
-    from ambid.bearing.blocks import three_blocks as three_blocks
     from ambid.bearing.coil import coil_least_squares as coil_least_squares
     from ambid.bearing.linear import greybox as greybox
     from ambid.bearing.magnet_result import NonlinearBearingEstimate as NonlinearBearingEstimate

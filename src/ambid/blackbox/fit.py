@@ -36,7 +36,7 @@ class Structure:
     @property
     def inputs(self) -> bool:
         """Whether it takes inputs."""
-        return bool({"nb", "nf", "n"} & set(self.orders))
+        return bool({"nb", "nf", "n", "nk"} & set(self.orders))
 
     @property
     def prediction_error(self) -> bool:
@@ -113,6 +113,16 @@ STRUCTURES: Mapping[str, Structure] = {
         "impulse",
         ("rfir", "nb nk", "biased", "y = B u + e, many taps with a decaying prior"),
         ("correlation", "nb nk", "biased", "y = B u + e, taps by correlation with the whitened input"),
+    ),
+    **_register(
+        "transfer function",
+        "blocks",
+        (
+            "blocks",
+            "nk",
+            "consistent",
+            "i = K_a/(s+a) u + K_b/(s+b) x, x = K_c/(s+c) i, continuous time (mass 1, no inertia)",
+        ),
     ),
     **_register(
         "transfer function",

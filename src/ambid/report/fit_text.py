@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 
 _COEFFICIENTS = 24  # that a terminal shows; the file has all
+_NAMED = ("coefficients", "parameters")  # of a structure whose coefficients are those of a physical form
 _TERMS = 20  # rows of terms and named parameters
 _TRAININGS = 6  # learning curves
 _SINGULAR_VALUES = 8
@@ -124,10 +125,12 @@ def coefficient_lines(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[
     """Write the coefficients that are not fixed by the structure, each with its standard deviation, `without` some."""
     theta, sd = fit.model.theta, fit.sd
     free = np.setdiff1d(np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0], without)
+    named: Mapping[str, Any] = {k: x for part in _NAMED for k, x in fit.details.get(part, {}).items()}  # type: ignore[attr-defined]
     rows = [
         (fit.model.names[k], coefficient_text(float(theta[k]), 0.0 if sd is None else float(sd[k])))
-        for k in free[:_COEFFICIENTS]
+        for k in free[: 0 if named else _COEFFICIENTS]
     ]
+    rows += [(f"{k} [{x['unit']}]", coefficient_text(x["value"], x["sd"])) for k, x in named.items()]
     if not rows:
         return []
     head = ("", "value" if sd is None else "value ± sd")
@@ -136,7 +139,7 @@ def coefficient_lines(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[
         half = -(-len(rows) // 2)
         right = [*rows[half:], ("", "")][:half]
         table = [(*a, *b) for a, b in zip([head, *rows[:half]], [head, *right], strict=True)]
-    rest = free.size - len(rows)
+    rest = 0 if named else free.size - len(rows)
     return [*columns(table), *([f"… and {rest} more; --json has them all"] if rest else [])]
 
 

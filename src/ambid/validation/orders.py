@@ -308,7 +308,7 @@ def _orders(keys: tuple[Coordinate, ...], point: Point) -> UsedOrders:
 def _line(keys: tuple[Coordinate, ...], start: Start, at: Callable[[Point], float]) -> Point:
     """All orders grow together, noise orders up to 2; the best size, and no further than it helps."""
     best, least, since = tuple[int, ...](), float("inf"), 0
-    top = max(start.bounds[k][1] for k, _ in keys if k != "nk")
+    top = max((start.bounds[k][1] for k, _ in keys if k != "nk"), default=1)
     for size in range(1, top + 1):
         point = tuple(
             start.nk[i or 0]

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
-from ambid.bearing.blocks import score_covariance_of
+from ambid.blackbox.blocks import score_covariance_of
 from ambid.blackbox.instruments import Autoregression, autoregression, noise_covariance, score_covariance
 
 D = np.array([1.0, -1.2, 0.5])

@@ -4,7 +4,8 @@ import numpy as np
 from scipy.linalg import expm
 from scipy.signal import lfilter
 
-from ambid.bearing.blocks import ThreeBlocks
+from ambid.blackbox.data import IOData
+from ambid.blackbox.fit import BlackBoxFit
 
 RATE = 1e4
 TRUTH = np.array([653.5, 1204.0, -30.0, 40.0, 2.0, 15.0])  # K_a, a, K_b, b, K_c, c; the coil of eq. 5.4
@@ -38,9 +39,18 @@ def record(seed, n, *, truth=TRUTH, noise=NOISE, gain=0.0, rate=RATE, hold=40, s
     return v + 2.0, y[:, 0] + y[:, 1] + e[:, 0] + 0.2, y[:, 2] + e[:, 1] + 0.01, r
 
 
-def coefficients(found: ThreeBlocks):
-    blocks = found.blocks.values()
-    return (
-        np.array([x for b in blocks for x in (b.gain, b.pole)]),
-        np.array([x for b in blocks for x in (b.gain_sd, b.pole_sd)]),
-    )
+def io(v, i, x, reference=None, *, rate=RATE, open_loop=False):
+    """Columns of a record as the estimator takes them."""
+    r = np.empty((v.size, 0)) if reference is None else np.reshape(reference, (v.size, -1))
+    return IOData(
+        u=v[:, None], y=np.stack([i, x], axis=1), dt=1 / rate, inputs=("voltage",), outputs=("current", "position"),
+        units={"voltage": "V", "current": "A", "position": "m"}, open_loop=open_loop, reference=r,
+        references=tuple(f"r{k}" for k in range(r.shape[1])),
+        record={"samples": v.size, "rate_hz": rate, "sha256": None, "file": None, "history": []},
+    )  # fmt: skip
+
+
+def table(found: BlackBoxFit, which="coefficients"):
+    """Values and standard deviations of a table in the details of a fit."""
+    rows = found.details[which].values()
+    return np.array([r["value"] for r in rows]), np.array([r["sd"] for r in rows])

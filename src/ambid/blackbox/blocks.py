@@ -1,29 +1,26 @@
 """Three first-order blocks from voltage, current and position (thesis eq. 2.8-2.15, 5.4-5.6), the fast on-line form.
 
 TFa = K_a/(s + a) from voltage to its part of the current, TFb = K_b/(s + b) from position to the other part,
-TFc = K_c/(s + c) from current to position: i = TFa V + TFb x, x = TFc i. Each is estimated by instrumental variables
-whose instruments come from the voltage of an open-loop record, or from the reference of a loop.
-
-First-order blocks by instrumental variables: the two equations of the three-block model.
-
-Solves i = K_a/(s + a) V + K_b/(s + b) x + constant and x = K_c/(s + c) i + constant with instruments that the noise did
-not make. Columns are voltage, current and position, means off and scaled. The covariance of the instrumental sums comes
-from the residuals' own periodogram, averaged over a width that grows with frequency: an autoregression of moderate
-order misses a slow part that is hidden under white noise, and the instruments of a slow plant see just that part.
+TFc = K_c/(s + c) from current to position: i = TFa V + TFb x, x = TFc i. Both equations are solved by instrumental
+variables: what the voltage of an open-loop record, or the reference of a loop, makes of the channels. Columns are
+voltage, current and position, means off and scaled. The covariance of the instrumental sums comes from the residuals'
+own periodogram, averaged over a width that grows with frequency: an autoregression of moderate order misses a slow part
+that is hidden under white noise, and the instruments of a slow plant see just that part.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData
-from ambid.blackbox.instruments import solve, span
+from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, single_order
+from ambid.blackbox.fit import BlackBoxFit, build_fit
+from ambid.blackbox.instruments import reference_part, solve, span
+from ambid.blackbox.model import Offsets, TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.uncertainty import p_text
@@ -33,94 +30,74 @@ LIMIT = (
     "kilogram), and the term m s^2 is dropped from X/I, so that they hold where inertia is small beside damping and "
     "stiffness. The grey-box model has neither limit"
 )
-_UNITS = {
-    "R": "ohm",
-    "L": "H",
-    "C": "N s/(m kg)",
-    "K": "N/(m kg)",
-    "k_i": "N/(A kg)",
-    "k_x": "N/(m kg)",
-}
+COEFFICIENTS = {"K_a": "A/(V s)", "a": "rad/s", "K_b": "A/(m s)", "b": "rad/s", "K_c": "m/(A s)", "c": "rad/s"}
+PARAMETERS = {"R": "ohm", "L": "H", "C": "N s/(m kg)", "K": "N/(m kg)", "k_i": "N/(A kg)", "k_x": "N/(m kg)"}
 _DOUBT = 1e-3  # probability under which a block is not of first order
+_LEAST_ROWS = 100
+_TINY = 1e-20  # complex step
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FirstOrder:
-    """One block gain/(s + pole)."""
+def blocks(data: IOData, orders: Orders) -> BlackBoxFit:
+    """Identify the three blocks from one record.
 
-    gain: float  # ``gain`` in its unit per second; ``pole`` in rad/s, positive for a stable block
-    pole: float
-    gain_sd: float
-    pole_sd: float
-    gain_unit: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class BlockParameter:
-    """A physical parameter by the thesis's mapping."""
-
-    value: float
-    sd: float
-    unit: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class ThreeBlocks:
-    """The three blocks and what the thesis reads from them.
-
-    Attributes
-    ----------
-    blocks : Mapping[str, FirstOrder]
-        ``a``, ``b``, ``c``.
-    parameters : Mapping[str, BlockParameter]
-        R, L, C, K, k_i, k_x, the last four per kilogram.
-    covariance : ndarray, shape (6, 6)
-        Of the parameters, in this order.
-    fit : Mapping[str, float]
-        ``current``, ``position``: 1 - |error|/|signal|, 1 is perfect.
-    first_order : Mapping[str, float]
-        ``current``, ``position``: probability of what the data show against first-order blocks, if they were true.
-    status : {"converged", "stalled"}
-    warnings : tuple of str
-    limit : str
-        What the form cannot tell; belongs to every print of the result.
+    `data`: voltage as the input, current and position as the outputs, in this order; without feedback, or with the
+    loop's reference; `orders`: ``nk`` (default 0), samples by which the voltage reaches the coil late. Returns a
+    TransferModel from voltage to both; ``coefficients`` of the blocks and physical ``parameters`` in its details.
     """
-
-    blocks: Mapping[str, FirstOrder]
-    parameters: Mapping[str, BlockParameter]
-    covariance: Array
-    fit: Mapping[str, float]
-    first_order: Mapping[str, float]
-    status: Literal["converged", "stalled"]
-    warnings: tuple[str, ...]
-    limit: str = LIMIT
-
-    def __str__(self) -> str:
-        lines = [
-            f"TF{name} = ({b.gain:.6g} ± {b.gain_sd:.2g}) / (s + {b.pole:.6g} ± {b.pole_sd:.2g})   [{b.gain_unit}]"
-            for name, b in self.blocks.items()
-        ]
-        lines += [f"{name:4s} {p.value: .6g} ± {p.sd:.2g} {p.unit}" for name, p in self.parameters.items()]
-        lines += [f"warning: {w}" for w in self.warnings]
-        return "\n".join([*lines, self.limit])
+    check_order_names("blocks", orders, ("nk",))
+    nk, n = single_order("blocks", {"nk": 0, **orders}, "nk", 0), data.n_samples
+    if (data.n_inputs, data.n_outputs) != (1, 2):
+        raise EstimationError(
+            f"blocks: {data.n_inputs} inputs and {data.n_outputs} outputs; it takes one input, the voltage, and two "
+            "outputs, current and position in this order. Name these columns"
+        )
+    if n - nk < _LEAST_ROWS:
+        raise EstimationError(f"blocks: {n} samples are too few for six coefficients; give at least {_LEAST_ROWS}")
+    check_length("blocks", data, n - nk, len(COEFFICIENTS))
+    u, y = data.u[: n - nk], data.y[nk:]
+    means, scale = (u.mean(axis=0), y.mean(axis=0)), np.concatenate([u.std(axis=0), y.std(axis=0)])
+    late = replace(data, u=u - means[0], y=y - means[1], reference=data.reference[nk:])
+    with one_thread():
+        measured, clean = np.hstack([late.u, late.y]) / scale, _clean(late) / scale
+        coil, coil_settled = electric(measured, clean, data.dt)
+        rotor, rotor_settled = mechanic(measured, clean, data.dt)
+        covariance, doubt = spread(coil, rotor, clean)
+    v, i, x = scale
+    unit = np.array([i / v, 1.0, i / x, 1.0, x / i, 1.0])
+    theta = np.concatenate([coil.theta, rotor.theta]) * unit
+    covariance *= np.outer(unit, unit)
+    if not np.all(np.isfinite(theta)) or theta[0] == 0:
+        raise EstimationError("blocks: no finite coefficients fit this record. Check the columns and their units")
+    (num_i, den, num_x), slope = transfer_functions(theta)
+    error = np.stack([coil.error, rotor.error], axis=1) * scale[1:]
+    values, mapping = block_parameters(theta)
+    return build_fit(
+        "blocks",
+        data,
+        orders={"nk": nk},
+        model=TransferModel(num=((num_i,), (num_x,)), den=((den,), (den,)), dt=None, delay=(nk * data.dt,)),
+        covariance=slope @ covariance @ slope.T,
+        n_estimated=theta.size,
+        offsets=Offsets(u=means[0], y=means[1]),
+        noise_covariance=error.T @ error / (error.shape[0] - theta.size - 2),
+        status="converged" if coil_settled and rotor_settled else "stalled",
+        warnings=_warnings(data, theta, covariance, doubt),
+        details={
+            "coefficients": _table(COEFFICIENTS, theta, covariance),
+            "parameters": _table(PARAMETERS, values, mapping @ covariance @ mapping.T),
+            "equation_fit": {"current": coil.fit, "position": rotor.fit},
+            "first_order": doubt,  # probability of what the data show against first-order blocks, if they were true
+            "limit": LIMIT,
+        },
+    )
 
 
 def block_parameters(coefficients: Array) -> tuple[Array, Array]:
     """Map the three blocks to physical parameters (thesis eq. 2.8-2.15, m = 1; derivation of table 5.1).
 
     s^2 + (b + c) s + b c - K_b K_c is read as s^2 + C s + K, and K_c/(s + c) as -k_i/(C s + k_x + K).
-
-    Parameters
-    ----------
-    coefficients : ndarray, shape (6,)
-        K_a, a, K_b, b, K_c, c.
-
-    Returns
-    -------
-    ndarray, shape (6,)
-        R in ohm, L in H, C, K, k_i, k_x per kilogram.
-    ndarray, shape (6, 6)
-        Their derivative by the coefficients.
+    `coefficients`: (6,), K_a, a, K_b, b, K_c, c. Returns (6,), R in ohm, L in H, C, K, k_i, k_x per kilogram; (6, 6),
+    their derivative by the coefficients.
     """
     ka, a, kb, b, kc, c = (float(x) for x in coefficients)
     big_c = b + c
@@ -135,119 +112,48 @@ def block_parameters(coefficients: Array) -> tuple[Array, Array]:
     return values, slope
 
 
-def three_blocks(
-    voltage: Array,
-    current: Array,
-    position: Array,
-    rate_hz: float,
-    *,
-    reference: Array | None = None,
-    open_loop: bool = False,
-    delay: int = 0,
-) -> ThreeBlocks:
-    """Identify the three blocks from one record.
+def transfer_functions(coefficients: Array) -> tuple[tuple[Array, Array, Array], Array]:
+    """Eliminate the loop: i/V = K_a (s + b)(s + c)/F, x/V = K_a K_c (s + b)/F, F = (s + a)((s + b)(s + c) - K_b K_c).
 
-    Parameters
-    ----------
-    voltage, current, position : ndarray, shape (n_samples,), V, A, m
-        The voltage is held over a sample; current and position run straight between samples.
-    rate_hz : float
-    reference : ndarray, shape (n_samples,) or (n_samples, n_references), optional
-        Outer excitation of the loop, independent of the noise. Without it the voltage itself is the instrument.
-    open_loop : bool, optional
-        Declare the record open loop.
-    delay : int, optional
-        Whole samples by which the voltage reaches the coil late.
-
-    Returns
-    -------
-    ThreeBlocks
-
-    Raises
-    ------
-    EstimationError
-        If the record is too short, does not move, or no blocks with a stable coil fit.
+    `coefficients`: (6,). Returns numerator of i, F and numerator of x; the derivative of the model's theta by the
+    coefficients, (13, 6), by complex steps.
     """
-    data = _data(voltage, current, position, rate_hz, reference, delay)
-    with one_thread():
-        scale = np.concatenate([data.u.std(axis=0), data.y.std(axis=0)])
-        measured = np.hstack([data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)]) / scale
-        clean = _clean(data) / scale
-        coil, coil_settled = electric(measured, clean, data.dt)
-        rotor, rotor_settled = mechanic(measured, clean, data.dt)
-        covariance, doubt = spread(coil, rotor, clean)
-    v, i, x = scale
-    unit = np.array([i / v, 1.0, i / x, 1.0, x / i, 1.0])
-    coefficients = np.concatenate([coil.theta, rotor.theta]) * unit
-    covariance *= np.outer(unit, unit)
-    return blocks_of(
-        coefficients,
-        covariance,
-        data.dt,
-        fit={"current": coil.fit, "position": rotor.fit},
-        doubt=doubt,
-        settled=coil_settled and rotor_settled,
-        safe=open_loop or reference is not None,
-    )
+
+    def parts(theta: NDArray[np.inexact]) -> tuple[NDArray[np.inexact], NDArray[np.inexact], NDArray[np.inexact]]:
+        ka, a, kb, b, kc, c = theta
+        inner = np.convolve([1.0, b], [1.0, c])
+        return ka * inner, np.convolve([1.0, a], inner - [0.0, 0.0, kb * kc]), ka * kc * np.array([1.0, b])
+
+    columns = []
+    for step in _TINY * np.eye(coefficients.size):
+        num_i, den, num_x = parts(coefficients + 1j * step)
+        columns.append(np.concatenate([num_i, den, num_x, den]).imag / _TINY)
+    num_i, den, num_x = (np.asarray(p, dtype=np.float64) for p in parts(coefficients))
+    return (num_i, den, num_x), np.stack(columns, axis=1)
 
 
-def _data(
-    voltage: Array, current: Array, position: Array, rate_hz: float, reference: Array | None, delay: int
-) -> IOData:
-    columns = [np.asarray(c, dtype=np.float64) for c in (voltage, current, position)]
-    if any(c.ndim != 1 or c.size != columns[0].size for c in columns):
-        raise EstimationError(
-            f"three blocks: voltage, current and position have shapes {[c.shape for c in columns]}; they must be three "
-            "columns of one length. Check the record"
-        )
-    n = columns[0].size
-    if isinstance(delay, bool) or not isinstance(delay, int) or not 0 <= delay < n // 2:
-        raise EstimationError(f"three blocks: delay {delay!r}; it must be a whole number of samples, 0 or more")
-    if n - delay < 100:
-        raise EstimationError(f"three blocks: {n} samples are too few for six coefficients; give at least 100")
-    for name, c in zip(("voltage", "current", "position"), columns, strict=True):
-        if np.ptp(c) == 0:
-            raise EstimationError(f"three blocks: the {name} is constant; it carries no information. Excite it")
-    r = (
-        np.empty((n - delay, 0))
-        if reference is None
-        else np.asarray(reference, dtype=np.float64).reshape(n, -1)[delay:]
-    )
-    return IOData(
-        u=columns[0][: n - delay, None],
-        y=np.stack([c[delay:] for c in columns[1:]], axis=1),
-        dt=1.0 / rate_hz,
-        inputs=("voltage",),
-        outputs=("current", "position"),
-        units={"voltage": "V", "current": "A", "position": "m"},
-        reference=r,
-        references=tuple(f"reference {k}" for k in range(r.shape[1])),
-    )
+def _table(units: Mapping[str, str], values: Array, covariance: Array) -> dict[str, dict[str, object]]:
+    sd = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    return {
+        name: {"value": float(values[k]), "sd": float(sd[k]), "unit": unit}
+        for k, (name, unit) in enumerate(units.items())
+    }
 
 
 def _clean(data: IOData) -> Array:
     """Voltage, current and position without noise, shape (n_samples, 3): what voltage or reference make of them."""
-    from dataclasses import replace
-
-    from ambid.blackbox.instruments import reference_part
-
-    u, y = data.u - data.u.mean(axis=0), data.y - data.y.mean(axis=0)
     if data.references:
-        return np.hstack(reference_part("three blocks", replace(data, u=u, y=y)))
-    alone = replace(data, u=np.empty((data.n_samples, 0)), inputs=(), y=y, reference=u, references=("voltage",))
-    return np.hstack([u, reference_part("three blocks", alone)[1]])
+        return np.hstack(reference_part("blocks", data))
+    alone = replace(data, u=np.empty((data.n_samples, 0)), inputs=(), reference=data.u, references=data.inputs)
+    return np.hstack([data.u, reference_part("blocks", alone)[1]])
 
 
-def _warnings(
-    doubt: Mapping[str, float], coefficients: Array, covariance: Array, dt: float, settled: bool, safe: bool
-) -> tuple[str, ...]:
+def _warnings(data: IOData, theta: Array, covariance: Array, doubt: Mapping[str, float]) -> list[str]:
     out = []
-    if not settled:
-        out.append("the search did not converge: treat the values as a first guess")
-    if not safe:
+    if not (data.open_loop or data.references):
         out.append(
-            "three blocks: biased by feedback. Name the loop's reference (--reference), or give --open-loop if the "
-            "record is open loop"
+            "blocks is biased by feedback. Name the loop's reference (--reference), or give --open-loop if the record "
+            "is open loop"
         )
     what = {"current": "TFa and TFb do not explain the current", "position": "TFc does not explain the position"}
     for name, p in doubt.items():
@@ -256,63 +162,13 @@ def _warnings(
                 f"{what[name]} ({p_text(p)}): the blocks are of first order, the bench is not. Use the values as a "
                 "rough guide only, and the grey-box model for the parameters"
             )
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0))
-    for k, name in enumerate(("K_a", "a", "K_b", "b", "K_c", "c")):
-        if sd[k] > abs(coefficients[k]):
-            out.append(f"{name} = {coefficients[k]:.3g} ± {sd[k]:.2g} does not differ significantly from zero")
+    for name, value, sd in zip(COEFFICIENTS, theta, np.sqrt(np.maximum(np.diag(covariance), 0)), strict=True):
+        if sd > abs(value):
+            out.append(f"{name} = {value:.3g} ± {sd:.2g} does not differ significantly from zero")
     for k, name in ((1, "a"), (3, "b")):
-        if coefficients[k] * dt > np.pi:
+        if theta[k] * data.dt > np.pi:
             out.append(f"the pole {name} lies beyond the Nyquist frequency and is not identifiable")
-    return tuple(out)
-
-
-def blocks_of(
-    coefficients: Array,
-    covariance: Array,
-    dt: float,
-    *,
-    fit: Mapping[str, float],
-    doubt: Mapping[str, float],
-    settled: bool,
-    safe: bool,
-    remarks: tuple[str, ...] = (),
-) -> ThreeBlocks:
-    """Say what estimated coefficients mean: parameters with their spread, and what there is to warn of.
-
-    `coefficients`: (6,), K_a, a, K_b, b, K_c, c; `covariance`: (6, 6), of them; `dt`: sampling period, s; `fit`,
-    `doubt`: `ThreeBlocks.fit` and `ThreeBlocks.first_order`; `settled`: whether the search converged; `safe`: whether
-    feedback cannot have biased them; `remarks`: further warnings.
-    """
-    if not np.all(np.isfinite(coefficients)) or coefficients[0] == 0:
-        raise EstimationError("three blocks: no finite coefficients fit this record. Check the columns and their units")
-    sd = np.sqrt(np.maximum(np.diag(covariance), 0))
-    units = ("A/(V s)", "A/(m s)", "m/(A s)")
-    blocks = {
-        name: FirstOrder(
-            gain=float(coefficients[2 * k]),
-            pole=float(coefficients[2 * k + 1]),
-            gain_sd=float(sd[2 * k]),
-            pole_sd=float(sd[2 * k + 1]),
-            gain_unit=units[k],
-        )
-        for k, name in enumerate("abc")
-    }
-    warnings = _warnings(doubt, coefficients, covariance, dt, settled, safe) + remarks
-    values, slope = block_parameters(coefficients)
-    spread = slope @ covariance @ slope.T
-    parameters = {
-        name: BlockParameter(value=float(values[k]), sd=float(np.sqrt(max(spread[k, k], 0.0))), unit=unit)
-        for k, (name, unit) in enumerate(_UNITS.items())
-    }
-    return ThreeBlocks(
-        blocks=blocks,
-        parameters=parameters,
-        covariance=spread,
-        fit=dict(fit),
-        first_order=dict(doubt),
-        status="converged" if settled else "stalled",
-        warnings=warnings,
-    )
+    return out
 
 
 Complex = NDArray[np.complex128]
@@ -396,7 +252,7 @@ def electric(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
             break
     if best is None:
         raise EstimationError(
-            "three blocks: no stable coil fits voltage and current. Check channels.voltage, channels.current and delay"
+            "blocks: no stable coil fits voltage and current. Check channels.voltage, channels.current and delay"
         )
     return best
 
@@ -414,7 +270,7 @@ def _gains(measured: Array, clean: Array, a: float, b: float, dt: float) -> Arra
         np.stack([_lag(a, dt, s[:, 0], hold=True), _lag(b, dt, s[:, 2], hold=False)], axis=1) for s in (clean, measured)
     ]
     Z, Phi, target = (_off(basis, m) for m in (rows[0], rows[1], measured[:, 1:2]))
-    ka, kb = solve(Z, Phi, target[:, 0], who="three blocks").theta
+    ka, kb = solve(Z, Phi, target[:, 0], who="blocks").theta
     return np.array([ka, a, kb, b])
 
 
@@ -423,7 +279,7 @@ def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equ
     for _ in range(_STEPS):
         now = _electric_at(measured, clean, theta, dt)
         try:
-            change = solve(now.Z, now.Phi, now.error, who="three blocks").theta
+            change = solve(now.Z, now.Phi, now.error, who="blocks").theta
         except EstimationError:
             return found, False
         found = now
@@ -467,7 +323,7 @@ def mechanic(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
         ]
         target = measured[:, 2] + filter_pole * rows[1][:, 1]
         Z, Phi, top = (_off(basis, m) for m in (rows[0], rows[1], target[:, None]))
-        step = solve(Z, Phi, top[:, 0], who="three blocks")
+        step = solve(Z, Phi, top[:, 0], who="blocks")
         fit = 1 - float(np.linalg.norm(step.residual) / np.linalg.norm(measured[:, 2]))
         found = Equation(theta=step.theta, error=step.residual, Z=Z, Phi=Phi, basis=basis, fit=fit)
         if settled:
