@@ -17,6 +17,7 @@ from ambid.bearing.rescue import Rescue, global_candidates, likelihood_cost
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, estimate_from_json
+from ambid.estimation.global_search import describe_search
 from ambid.estimation.likelihood import Fit
 from ambid.job import identify
 from ambid.record import Channel, Record
@@ -185,4 +186,4 @@ def test_an_interruption_keeps_the_best_so_far(weak: Bench, before: Fit, monkeyp
     assert fit.global_search["interrupted"]
     assert fit.global_search["evaluations"] == 300
     assert fit.criterion <= before.criterion
-    assert "interrupted" in rescue.describe_search(fit.global_search)
+    assert "interrupted" in describe_search(fit.global_search)

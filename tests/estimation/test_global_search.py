@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from ambid.estimation.global_search import global_search
+from ambid.estimation.global_search import BestByDelay, global_search
 
 LOW, HIGH = np.full(5, -5.0), np.full(5, 6.0)
 
@@ -55,8 +55,13 @@ def test_where_half_of_the_space_has_no_model_and_where_none_has() -> None:
 
 
 def test_an_interruption_loses_nothing_and_progress_never_falls() -> None:
-    kept: list[tuple[np.ndarray, float]] = []
+    best = BestByDelay()
     shares: list[float] = []
+
+    def cost(x: np.ndarray) -> float:
+        value = float(rastrigin(x))
+        best.note(0, value, x)
+        return value
 
     def tick(stage: str, done: float | None = None, /) -> None:
         assert stage == "global search"
@@ -66,14 +71,10 @@ def test_an_interruption_loses_nothing_and_progress_never_falls() -> None:
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        global_search(
-            rastrigin, LOW, HIGH, seed=2, evaluations=2000, tick=tick, keep=lambda x, value: kept.append((x, value))
-        )
+        global_search(cost, LOW, HIGH, seed=2, evaluations=2000, tick=tick)
     assert np.all(np.diff(shares) >= 0)
     assert shares[-1] == pytest.approx(0.25)
-    values = [v for _, v in kept]
-    assert values == sorted(values, reverse=True)
-    assert values[-1] == rastrigin(kept[-1][0]) < 40.0
+    assert rastrigin(best.vectors()[0]) < 40.0
 
 
 def test_bounds_that_make_no_sense_are_refused() -> None:

@@ -1,4 +1,4 @@
-"""Maximum likelihood of the extended Kalman predictor over all records, by Levenberg-Marquardt on Fisher information.
+"""Maximum likelihood of the extended Kalman predictor over all records.
 
 Minimised is the sum of log s + e^2/s over all innovations e with their predicted variances s (Ljung 1999, sec. 7.4;
 Astrom 1980), exact in state and covariance. Its gradient and Fisher information are inner products of rows
@@ -8,7 +8,7 @@ Astrom 1980), exact in state and covariance. Its gradient and Fisher information
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
@@ -19,7 +19,8 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_problem import EDDY_STEPS, NOISE_PRIOR_SD, BearingProblem, BearingRecord
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.progress import Tick
-from ambid.estimation.search import Status
+from ambid.estimation.search import PhysicalFit
+from ambid.estimation.search import search as descend
 
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
@@ -44,17 +45,11 @@ class Linear:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class BearingFit:
+class BearingFit(PhysicalFit):
     """Where a search ended."""
 
     problem: BearingProblem
-    vector: Array  # (size,)
-    at: Linear | None  # the criterion about it; None where the search failed
-    criterion: float  # twice the negative log-likelihood but for constants, with the squared residuals of the priors
-    status: Status
-    evaluations: int
-    # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue.look_elsewhere`
-    global_search: Mapping[str, object] | None = None
+    at: Linear | None  # the criterion about `vector`; None where the search failed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -290,17 +285,13 @@ def _of_record(
     return found, own[:, : problem.size], [triangle]
 
 
-def promise(at: Linear, loose: NDArray[np.bool_] | None = None, delay: int | None = None) -> float:
+def promise(at: Linear, delay: int | None = None) -> float:
     """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
 
-    `loose`: (size,), bool, which numbers may move; None: all; `delay`: column of `J_delay` that may, too.
+    `delay`: column of `J_delay` that may move, too.
     """
-    J = at.J if loose is None else at.J[:, loose]
-    if delay is not None:
-        J = np.column_stack([J, at.J_delay[:, delay]])
-    found = directions(J)
-    # as strict as ever: with the common tolerance a search in loud noise counted as ended, its deviations too small
-    return float(np.sum((found.U.T @ at.r)[found.s > 1e-10 * found.s[0]] ** 2))
+    J = at.J if delay is None else np.column_stack([at.J, at.J_delay[:, delay]])
+    return directions(J).explain(at.r)
 
 
 def search(
@@ -317,57 +308,45 @@ def search(
     Returns with status ``"failed"`` where there is no
     predictor at `start`.
     """
-    upper = problem.upper()
-    vector, count, status = np.minimum(start, upper), 1, "stalled"
-    at = linearise(problem, vector)
-    if at is None:
-        return BearingFit(problem=problem, vector=vector, at=None, criterion=np.inf, status="failed", evaluations=1)
-    try:
-        begun, share = promise(at), 0.0
-        for n in range(iterations):
-            loose = ~((vector >= upper) & (at.J.T @ at.r < 0.0))  # what stands at its bound, and would go beyond, rests
-            left = promise(at, loose)
-            if left < _SETTLED:
-                status = "converged"
-                break
-            share = max(share, n / iterations, _approach(begun, left))
-            moved, first = None, True
-            while damping < 1e8:
-                trial = np.minimum(vector + _step(at, damping, loose), upper)
-                # the first step is mostly right, and wants its slopes anyway; after a refusal the criterion alone asks
-                if first or criterion(problem, trial) < at.criterion:
-                    moved = linearise(problem, trial)
-                count, first = count + 1, False
-                if tick is not None:
-                    tick(_SEARCHING, share)
-                if moved is not None and moved.criterion < at.criterion:
-                    break
-                moved, damping = None, max(10.0 * damping, 1e-6)
-            if moved is None:
-                # no way down from here: converged where what a step promises is below what rounding leaves
-                status = "converged" if promise(at, loose) < 1.0 else "stalled"
-                break
-            vector, at, damping = trial, moved, damping / 10.0
-    except KeyboardInterrupt:
-        status = "stalled"
-    final: Status = "converged" if status == "converged" else "stalled"
-    return BearingFit(problem=problem, vector=vector, at=at, criterion=at.criterion, status=final, evaluations=count)
+    objective = _Objective(problem)
+    end = descend(
+        objective, start, stage=_SEARCHING, most=iterations, tolerance=0.0, settled=_SETTLED, damping=damping,
+        upper=problem.upper(), longest=_LONGEST, tick=tick, keep_best=True,
+    )  # fmt: skip
+    return BearingFit(
+        problem=problem, vector=end.theta, at=objective.linear(end.theta), criterion=end.cost, status=end.status,
+        evaluations=objective.evaluations,
+    )  # fmt: skip
 
 
-def _approach(begun: float, left: float) -> float:
-    """Guess how much of a search is over from how far its promise has fallen, in powers of ten."""
-    if not begun > _SETTLED:
-        return 0.0
-    return float(np.clip(np.log(begun / max(left, _SETTLED)) / np.log(begun / _SETTLED), 0.0, 1.0))
+class _Objective:
+    """The criterion as `search.Problem`; its slopes come with it where the last step went well."""
 
+    def __init__(self, problem: BearingProblem) -> None:
+        self.problem, self.evaluations, self.hopeful = problem, 0, True
+        self.vector = np.zeros(0)
+        self.at: Linear | None = None
 
-def _step(at: Linear, damping: float, loose: NDArray[np.bool_]) -> Array:
-    norm = np.linalg.norm(at.J, axis=0)
-    norm[norm == 0] = 1.0
-    u, s, vt = np.linalg.svd(at.J / norm * loose, full_matrices=False)
-    step = np.asarray(-(vt.T @ (s / (s**2 + damping) * (u.T @ at.r))) / norm)
-    longest = float(np.max(np.abs(step)))
-    return step if longest <= _LONGEST else step * (_LONGEST / longest)
+    def cost(self, theta: Array) -> float:
+        """Return the criterion."""
+        self.evaluations += 1
+        # the first step is mostly right, and wants its slopes anyway; after a refusal the criterion alone asks
+        if not self.hopeful:
+            return criterion(self.problem, theta)
+        self.hopeful = False
+        at = self.linear(theta)
+        return np.inf if at is None else at.criterion
+
+    def triangle(self, theta: Array) -> Array:
+        """Return [J | r]."""
+        at, self.hopeful = self.linear(theta), True
+        return np.full((1, theta.size + 1), np.nan) if at is None else np.column_stack([at.J, -at.r])
+
+    def linear(self, theta: Array) -> Linear | None:
+        """Return the criterion about a vector."""
+        if not np.array_equal(theta, self.vector):
+            self.vector, self.at = theta, linearise(self.problem, theta)
+        return self.at
 
 
 def _sum(found: Innovations) -> float:

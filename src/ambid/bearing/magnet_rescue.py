@@ -10,8 +10,8 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
-from ambid.bearing.rescue import NOT_CONVERGED, PAST, look_elsewhere, predictable
-from ambid.estimation.global_search import STAGE, global_search
+from ambid.bearing.rescue import PAST
+from ambid.estimation.global_search import NOT_CONVERGED, STAGE, BestByDelay, global_search, predictable, rescued
 from ambid.estimation.predictor import noise_floor
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.uncertainty import explained_by_past
@@ -72,7 +72,7 @@ def rescue(
         whole = _whole(places[0], records, before.problem.skip)
         return search(whole, whole.start(), iterations=0)
 
-    return look_elsewhere(before, why, look, so_far, _better, tick) or before
+    return rescued(before, why, look, so_far, _better, tick) or before
 
 
 def _whole(problem: BearingProblem, records: Sequence[BearingRecord], skip: int) -> BearingProblem:
@@ -121,8 +121,7 @@ class BearingCost:
     # carries a weight: over what the weight says)
     bounds: tuple[tuple[float, float], ...]
     weight: float  # that one magnet carries, N; 0 for a pair
-    # by delay in samples: least cost so far, and where it is; so that an interruption loses nothing
-    best: dict[int, tuple[float, tuple[float, ...]]] = field(default_factory=dict)
+    best: BestByDelay = field(default_factory=BestByDelay)  # so that an interruption loses nothing
 
     def __call__(self, z: Array) -> float:
         """Return the criterion per measured value.
@@ -134,14 +133,12 @@ class BearingCost:
             return np.inf
         with np.errstate(all="ignore"):
             value = criterion(problem, problem.start()) / problem.n_used
-        delay = int(next(iter(problem.delays.values())))
-        if np.isfinite(value):
-            self.best[delay] = min(self.best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
+        self.best.note(int(next(iter(problem.delays.values()))), value, z)
         return value
 
     def found(self) -> list[BearingProblem]:
         """Return the problems at the best vectors that were evaluated, of a few delays, best first."""
-        places = [self.at(np.array(z)) for _, z in sorted(self.best.values())[:_TRIED]]
+        places = [self.at(z) for z in self.best.vectors()[:_TRIED]]
         return [p for p in places if p is not None]
 
     def at(self, z: Array) -> BearingProblem | None:
@@ -232,5 +229,5 @@ def global_problems(cost: BearingCost, *, seed: int, evaluations: int, tick: Tic
     `evaluations`: at most. Returns of the short records, the best of each of a few delays, best first.
     """
     n = len(cost.names)
-    global_search(cost, np.zeros(n), np.ones(n), seed=[seed, 7], evaluations=evaluations, tick=tick, stage=STAGE)
+    global_search(cost, np.zeros(n), np.ones(n), seed=[seed, 7], evaluations=evaluations, tick=tick)
     return cost.found()

@@ -14,13 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from time import perf_counter
-from typing import Any, TypeVar
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet_likelihood import BearingFit
 from ambid.bearing.multistart import (
     FARTHEST,
     MAX_DELAY,
@@ -33,8 +30,7 @@ from ambid.bearing.multistart import (
     fixed_values,
     race,
 )
-from ambid.estimation.estimate import Check
-from ambid.estimation.global_search import STAGE, global_search
+from ambid.estimation.global_search import NOT_CONVERGED, BestByDelay, global_search, predictable, rescued
 from ambid.estimation.likelihood import Fit, evaluate, search
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -43,7 +39,6 @@ from ambid.estimation.uncertainty import explained_by_past
 from ambid.physics.linear_model import LinearModel, Parameter
 
 EVALUATIONS = 1200  # of the likelihood, unless the caller says otherwise: 1 to 2 s, and as much for local searches
-FAR = 0.5  # part of the innovations' variance that a linear regression may explain before a fit counts as failed
 PAST = 10  # samples of innovations that it looks at
 _INPUTS = FARTHEST + 4  # and of inputs: a delay that was missed shows there
 _LOOKED = 2048  # samples that it looks at
@@ -64,16 +59,6 @@ def reason(fit: Fit) -> str:
     return predictable(unexplained(fit))
 
 
-NOT_CONVERGED = "no search converged"
-
-
-def predictable(part: float) -> str:
-    """Return why a fit counts as failed whose residuals a linear regression on the past predicts; empty if not."""
-    return (
-        f"a linear regression on past data predicts {100 * part:.0f} % of the residual variance" if part > FAR else ""
-    )
-
-
 def unexplained(fit: Fit) -> float:
     """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains.
 
@@ -90,54 +75,6 @@ def unexplained(fit: Fit) -> float:
     return explained_by_past([(e[at], ((e[at], PAST), (u[at], _INPUTS)))])[0]
 
 
-F = TypeVar("F", Fit, BearingFit)
-
-
-def look_elsewhere(
-    before: F | None,
-    why: str,
-    look: Callable[[Tick], F | None],
-    so_far: Callable[[], F | None],
-    better: Callable[[F, F], bool],
-    tick: Tick,
-) -> F | None:
-    """Return the better of a fit and of one from a global search, with what was done in its `global_search`.
-
-    `before`: what the ordinary starts led to; `why`: why that is not enough; `look`: searches; `so_far`: the best that
-    it has, where a KeyboardInterrupt ends it; `better`: whether the first of two fits is. The report: ``why``,
-    ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per value, None where there is none),
-    ``taken``, ``interrupted``. None where nothing was found at all.
-    """
-    began, count, interrupted = perf_counter(), 0, False
-
-    def note(stage: str, done: float | None = None, /) -> None:
-        nonlocal count
-        count += stage == STAGE and done is not None
-        tick(stage, None)
-
-    try:
-        after = look(note)
-    except KeyboardInterrupt:
-        interrupted, after = True, so_far()
-        if before is None and (after is None or after.status == "failed"):
-            raise
-    taken = after is not None and after.status != "failed"
-    if taken and after is not None and before is not None and before.status != "failed":
-        taken = better(after, before)
-    fit = after if taken else before
-    if fit is None:
-        return None
-    report = {
-        "why": why, "evaluations": count, "seconds": perf_counter() - began, "criterion_before": _per_value(before),
-        "criterion_after": _per_value(after), "taken": taken, "interrupted": interrupted,
-    }  # fmt: skip
-    return replace(fit, global_search=report)
-
-
-def _per_value(fit: Fit | BearingFit | None) -> float | None:
-    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
-
-
 def rescue(
     before: Fit | None,
     why: str,
@@ -151,59 +88,23 @@ def rescue(
 ) -> Fit | None:
     """Search globally, and locally from what was found.
 
-    `before`, `why`: see `look_elsewhere`; `follow`: the local search from several candidates; `tick`: a
+    `before`, `why`: see `rescued`; `follow`: the local search from several candidates; `tick`: a
     KeyboardInterrupt ends in the best so far, where there is any.
     """
     cost = likelihood_cost(model, signals, parameters, delay) if how.evaluations else None
     if cost is None:
         return before
-    seen: list[tuple[float, Array]] = []
 
     def look(note: Tick) -> Fit | None:
-        candidates = global_candidates(cost, signals, how, tick=note, keep=lambda z, value: seen.append((value, z)))
+        candidates = global_candidates(cost, signals, how, tick=note)
         candidates = sorted((race(c, tick) for c in candidates), key=lambda c: c.criterion)
         return follow(candidates[:1]) if candidates else None
 
     def so_far() -> Fit | None:  # not a step further: what was found, with its information
-        candidates = candidates_at(cost, signals, [seen[-1][1]]) if seen else []
+        candidates = candidates_at(cost, signals, cost.best.vectors()[:1])
         return search(candidates[0].problem, candidates[0].vector, steps=0) if candidates else None
 
-    return look_elsewhere(before, why, look, so_far, _better, lambda *_: tick() if tick is not None else None)
-
-
-def describe_search(report: Mapping[str, object]) -> str:
-    """Return what a global search did, in one sentence.
-
-    `report`: `global_search` of a fit.
-    """
-    before, after = report["criterion_before"], report["criterion_after"]
-    out = f"the ordinary start values failed ({report['why']}): "
-    if report["interrupted"]:
-        out += "a global search was interrupted and "
-    else:
-        out += f"a global search (differential evolution, {report['evaluations']} evaluations) "
-    if not report["taken"]:
-        return out + "found nothing better. Check columns, signs, units, delay and excitation"
-    if before is None:
-        return out + "found this fit"
-    fall = float(str(before)) - float(str(after))
-    return out + f"found this fit, whose likelihood criterion is {fall:.2g} per sample lower"
-
-
-def warnings_of(fit: Any, checks: Mapping[str, Check], inflated_by: str) -> tuple[str, ...]:
-    """Return what a reader has to know before using the values, most important first.
-
-    `fit`: of either estimator; `inflated_by`: where its robust standard deviations come from; empty if not used.
-    """
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
-    found += [] if fit.global_search is None else [describe_search(fit.global_search)]
-    found += [c.detail for c in checks.values() if not c.passed]
-    if inflated_by:
-        found.append(
-            f"the model does not fully fit; standard errors are inflated ({inflated_by}) but cannot cover a systematic "
-            "bias"
-        )
-    return tuple(found)
+    return rescued(before, why, look, so_far, _better, lambda *_: tick() if tick is not None else None)
 
 
 def _better(after: Fit, before: Fit) -> bool:
@@ -251,7 +152,7 @@ class LikelihoodCost:
     delay: float  # samples, where it is not searched
     scales: Scales  # of order one where the parameters' are; disturbances of 1
     _work: dict[int, Workspace] = field(default_factory=dict)  # by delay
-    _best: dict[int, tuple[float, tuple[float, ...]]] = field(default_factory=dict)  # by delay: cost and coordinates
+    best: BestByDelay = field(default_factory=BestByDelay)
 
     def __call__(self, z: Array) -> float:
         """Return the criterion per sample.
@@ -261,16 +162,9 @@ class LikelihoodCost:
         candidate = self.candidate(z, shared=True)
         if candidate is None:
             return np.inf
-        value, delay = candidate.criterion / candidate.problem.n_used, candidate.problem.delay
-        self._best[delay] = min(self._best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
+        value = candidate.criterion / candidate.problem.n_used
+        self.best.note(candidate.problem.delay, value, z)
         return value
-
-    def best_of_each_delay(self) -> list[Array]:
-        """Return the best vectors that were evaluated, one for each delay, best first.
-
-        Returns (n_coordinates,).
-        """
-        return [np.array(z) for _, z in sorted(self._best.values())]
 
     def candidate(self, z: Array, *, shared: bool = False) -> Candidate | None:
         """Return the place to search from at a vector.
@@ -396,19 +290,14 @@ def global_candidates(
     how: Rescue,
     *,
     tick: Tick = silent,
-    keep: Callable[[Array, float], None] | None = None,
 ) -> list[Candidate]:
-    """Search globally for places to search from.
+    """Search globally for places to search from: the best, then the best of each delay.
 
-    `signals`: the whole record; `keep`: given each better vector, shape (n_coordinates,), and its cost. Returns on the
-    whole record, the best first, then the best of each delay.
+    `signals`: the whole record, which they are places of.
     """
     low = np.array([-1.0 if c.signed else 0.0 for c in cost.coordinates])
-    found = global_search(
-        cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick, stage=STAGE,
-        keep=keep,
-    )  # fmt: skip
-    return candidates_at(cost, signals, (found.vector, *cost.best_of_each_delay(), *found.best[: _TRIED // 5]))[:_TRIED]
+    found = global_search(cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick)
+    return candidates_at(cost, signals, (found.vector, *cost.best.vectors(), *found.best[: _TRIED // 5]))[:_TRIED]
 
 
 def candidates_at(cost: LikelihoodCost, signals: Signals, vectors: Sequence[Array]) -> list[Candidate]:

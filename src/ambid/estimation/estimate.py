@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, nearest
+from ambid.estimation.global_search import describe_search
 from ambid.estimation.result import NORMAL_95, Linear, Predicting, Reason, Result, Simulating
 from ambid.physics.linear_model import LinearModel, Parameter, model
 
@@ -681,3 +682,19 @@ def _check_consistent(estimate: Estimate) -> None:
     for delay in (estimate.delay[role] for role in plant.inputs):
         if not 0 <= delay.samples < 10**6 or not 0 <= delay.fraction < 1:
             raise ValueError("the delay is not whole samples and a fraction")
+
+
+def warnings_of(fit: Any, checks: Mapping[str, Check], inflated_by: str) -> tuple[str, ...]:
+    """Return what a reader has to know before using the values, most important first.
+
+    `fit`: of either estimator; `inflated_by`: where its robust standard deviations come from; empty if not used.
+    """
+    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
+    found += [] if fit.global_search is None else [describe_search(fit.global_search)]
+    found += [c.detail for c in checks.values() if not c.passed]
+    if inflated_by:
+        found.append(
+            f"the model does not fully fit; standard errors are inflated ({inflated_by}) but cannot cover a systematic "
+            "bias"
+        )
+    return tuple(found)

@@ -1,4 +1,4 @@
-"""Global search by differential evolution (Storn and Price 1997), a start for fits whose ordinary starts fail.
+"""Global search by differential evolution (Storn and Price 1997), and the rescue of fits whose ordinary starts fail.
 
 Numbers are searched for between bounds, scaled to 0 .. 1; SciPy's `differential_evolution` does it, strategy best1bin
 with dithered mutation, from a Sobol sequence; the result depends on the seed alone. Local refinement is the caller's.
@@ -6,21 +6,27 @@ with dithered mutation, from a Sobol sequence; the result depends on the seed al
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import TypeVar
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.progress import Tick, silent
+from ambid.estimation.search import PhysicalFit
 
 STAGE = "global search"
+NOT_CONVERGED = "no search converged"
+_PREDICTABLE = 0.5  # part of the residuals' variance that a regression may explain before a fit counts as failed
 _MUTATION = (0.5, 1.0)  # factor of the difference vectors, drawn anew for each generation
 _RECOMBINATION = 0.9  # numbers of a physical model hang together: most of them change at once
 _MEMBERS = 8  # of the population, for each number
 _TOLERANCE = 1e-3  # spread of the costs, relative to their mean, at which a search has ended
 _FEWEST = 16
+
+F = TypeVar("F", bound=PhysicalFit)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -45,70 +51,129 @@ def global_search(
     evaluations: int,
     tick: Tick = silent,
     stage: str = STAGE,
-    keep: Callable[[Array, float], None] | None = None,
 ) -> GlobalFound:
     """Search for the least cost between bounds.
 
     `low`, `high`: (n,), finite, low below high. Scale what spans decades before (logarithm, inverse hyperbolic sine);
     `seed`: equal seeds give equal results; `evaluations`: of `cost`, at most.
     """
+    from scipy.optimize import differential_evolution
+    from scipy.stats import qmc
+
     low, high = np.asarray(low, dtype=np.float64), np.asarray(high, dtype=np.float64)
     if low.shape != high.shape or not np.all(np.isfinite(low) & np.isfinite(high)) or not np.all(low < high):
         raise ValueError("bounds of a global search must be finite, and each lower one below its upper one")
-    began = perf_counter()
-    run = _Run(cost=cost, low=low, span=high - low, budget=evaluations, tick=tick, stage=stage, keep=keep)
-    last = _evolved(run, _first_generation(low.size, evaluations, seed), seed)
-    return GlobalFound(
-        vector=run.vector,
-        cost=run.least,
-        evaluations=run.done,
-        seconds=perf_counter() - began,
-        best=tuple(low + z * (high - low) for z in last),
+    began, span, n, count = perf_counter(), high - low, low.size, 0
+    least, vector = np.inf, low + 0.5 * span
+
+    def value(z: Array) -> float:
+        nonlocal count, least, vector
+        if count >= evaluations:
+            return np.inf
+        member = low + z * span
+        own = float(cost(member))
+        count += 1
+        if own < least:
+            least, vector = own, member
+        tick(stage, min(count / evaluations, 1.0))
+        return own if np.isfinite(own) else np.inf
+
+    size = max(_FEWEST, min(_MEMBERS * n, evaluations // 10))
+    sobol = qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(int(np.ceil(np.log2(size))))
+    last = differential_evolution(
+        value, [(0.0, 1.0)] * n, strategy="best1bin", init=sobol[:size], mutation=_MUTATION,
+        recombination=_RECOMBINATION, maxiter=max(evaluations // size - 1, 1), tol=_TOLERANCE, polish=False,
+        updating="deferred", seed=np.random.default_rng(seed),
+    )  # fmt: skip
+    order = np.argsort(last.population_energies, kind="stable")
+    best = tuple(low + z * span for z in np.asarray(last.population, dtype=np.float64)[order])
+    return GlobalFound(vector=vector, cost=least, evaluations=count, seconds=perf_counter() - began, best=best)
+
+
+class BestByDelay:
+    """The best vectors that a cost was evaluated at, one for each delay: each has minima of its own."""
+
+    def __init__(self) -> None:
+        self._best: dict[int, tuple[float, tuple[float, ...]]] = {}
+
+    def note(self, delay: int, value: float, z: Array) -> None:
+        """Take note of an evaluation."""
+        if np.isfinite(value):
+            self._best[delay] = min(self._best.get(delay, (np.inf, ())), (value, tuple(z.tolist())))
+
+    def vectors(self) -> list[Array]:
+        """Return them, best first."""
+        return [np.array(z) for _, z in sorted(self._best.values())]
+
+
+def predictable(part: float) -> str:
+    """Return why a fit counts as failed of whose residuals a regression on the past predicts a part; empty if not."""
+    return (
+        f"a linear regression on past data predicts {100 * part:.0f} % of the residual variance"
+        if part > _PREDICTABLE
+        else ""
     )
 
 
-class _Run:
-    """What a search has seen so far, in the order of the members."""
+def rescued(
+    before: F | None,
+    why: str,
+    look: Callable[[Tick], F | None],
+    so_far: Callable[[], F | None],
+    better: Callable[[F, F], bool],
+    tick: Tick,
+) -> F | None:
+    """Return the better of a fit and of one from a global search, with what was done in its `global_search`.
 
-    def __init__(
-        self, *, cost: Callable[[Array], float], low: Array, span: Array, budget: int, tick: Tick, stage: str,
-        keep: Callable[[Array, float], None] | None,
-    ) -> None:  # fmt: skip
-        self.cost, self.low, self.span, self.budget = cost, low, span, budget
-        self.tick, self.stage, self.keep = tick, stage, keep
-        self.done, self.least, self.vector = 0, np.inf, low + 0.5 * span
+    `before`: what the ordinary starts led to; `why`: why that is not enough; `look`: searches; `so_far`: the best that
+    it has, where a KeyboardInterrupt ends it; `better`: whether the first of two fits is. The report: ``why``,
+    ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per value, None where there is none),
+    ``taken``, ``interrupted``. None where nothing was found at all.
+    """
+    began, count, interrupted = perf_counter(), 0, False
 
-    def value(self, z: Array) -> float:
-        """Return the cost of a member; infinite beyond the budget."""
-        if self.done >= self.budget:
-            return np.inf
-        found = float(self.cost(self.low + z * self.span))
-        self.done += 1
-        if found < self.least:
-            self.least, self.vector = found, self.low + z * self.span
-            if self.keep is not None:
-                self.keep(self.vector, found)
-        self.tick(self.stage, min(self.done / self.budget, 1.0))
-        return found if np.isfinite(found) else np.inf
+    def note(stage: str, done: float | None = None, /) -> None:
+        nonlocal count
+        count += stage == STAGE and done is not None
+        tick(stage, None)
+
+    try:
+        after = look(note)
+    except KeyboardInterrupt:
+        interrupted, after = True, so_far()
+        if before is None and (after is None or after.status == "failed"):
+            raise
+    taken = after is not None and after.status != "failed"
+    if taken and after is not None and before is not None and before.status != "failed":
+        taken = better(after, before)
+    fit = after if taken else before
+    if fit is None:
+        return None
+    report = {
+        "why": why, "evaluations": count, "seconds": perf_counter() - began, "criterion_before": _per_value(before),
+        "criterion_after": _per_value(after), "taken": taken, "interrupted": interrupted,
+    }  # fmt: skip
+    return replace(fit, global_search=report)
 
 
-def _first_generation(n: int, budget: int, seed: int | Sequence[int]) -> Array:
-    """A Sobol sequence."""
-    from scipy.stats import qmc
-
-    size = max(_FEWEST, min(_MEMBERS * n, budget // 10))
-    power = int(np.ceil(np.log2(size)))
-    return np.asarray(qmc.Sobol(n, seed=np.random.default_rng(seed)).random_base2(power), dtype=np.float64)[:size]
+def _per_value(fit: PhysicalFit | None) -> float | None:
+    return None if fit is None or fit.status == "failed" else fit.criterion / fit.problem.n_used
 
 
-def _evolved(run: _Run, first: Array, seed: int | Sequence[int]) -> Array:
-    """Members of the last generation, best first."""
-    from scipy.optimize import differential_evolution
+def describe_search(report: Mapping[str, object]) -> str:
+    """Return what a global search did, in one sentence.
 
-    found = differential_evolution(
-        run.value, [(0.0, 1.0)] * first.shape[1], strategy="best1bin", init=first, mutation=_MUTATION,
-        recombination=_RECOMBINATION, maxiter=max(run.budget // first.shape[0] - 1, 1), tol=_TOLERANCE, polish=False,
-        updating="deferred", seed=np.random.default_rng(seed),
-    )  # fmt: skip
-    order = np.argsort(found.population_energies, kind="stable")
-    return np.asarray(found.population, dtype=np.float64)[order]
+    `report`: `global_search` of a fit.
+    """
+    before, after = report["criterion_before"], report["criterion_after"]
+    out = f"the ordinary start values failed ({report['why']}): "
+    if report["interrupted"]:
+        out += "a global search was interrupted and "
+    else:
+        out += f"a global search (differential evolution, {report['evaluations']} evaluations) "
+    if not report["taken"]:
+        return out + "found nothing better. Check columns, signs, units, delay and excitation"
+    if before is None:
+        return out + "found this fit"
+    fall = float(str(before)) - float(str(after))
+    return out + f"found this fit, whose likelihood criterion is {fall:.2g} per sample lower"

@@ -10,47 +10,38 @@ known, is the sum of the innovations since, e(t) + C K e(t-1) + ... + C A^(k-2) 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import BLIND, directions, triangle_of
+from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, predictor_gain
-from ambid.estimation.search import Status
+from ambid.estimation.search import PhysicalFit
+from ambid.estimation.search import search as descend
 from ambid.estimation.sensitivity import Workspace, innovations, linearise, run
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
 _STEPS = 200
-_NOTHING = 1e-12  # radius of the trust region below which no step is left
-_ROUNDING = 1e-15  # singular value, over the largest, below which there is nothing but rounding
-_SECULAR = 30  # Newton steps towards the damping that gives a step its length
 _SETTLED = 0.01  # Newton step of every physical parameter, in standard deviations, below which a search has converged
-_POOR = 0.1  # share of the squares that offsets and initial state would take off, above which they are set first
 _FLAT = 0.001  # fall of the criterion in one step below which a search has converged; a needless number earns one
+_POOR = 0.1  # share of the squares that offsets and initial state would take off, above which they are set first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Fit:
+class Fit(PhysicalFit):
     """Outcome of one likelihood search."""
 
     problem: PredictorProblem
-    vector: Array  # (size,)
     covariance: Array  # (n_outputs, n_outputs), innovation covariance, scaled output units
     # (size + 1, size), compressed Jacobian of the weighted innovations: J^T J is the information matrix of the data
     J: Array
     J_prior: Array  # (n_priors, size)
     r_prior: Array  # (n_priors,), rows and residuals of the priors
-    # twice the negative log-likelihood but for constants: n log det(covariance) plus squared prior residuals
-    criterion: float
-    status: Status
-    evaluations: int
     start_s: float = 0.0  # time that finding start values took before this search, s
     work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
     freed: Array | None = None  # Jacobian with the delay freed as well, where that was asked and is not needed
-    # what a global search did where the ordinary starts failed, see `ambid.bearing.rescue`
-    global_search: Mapping[str, object] | None = None
 
 
 def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
@@ -192,16 +183,11 @@ def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) 
 
     `vector`: (size,). Returns (size,), unchanged where there is no predictor at `vector`.
     """
-    at = _point(problem, vector, work)
-    return vector.copy() if at is None else at.with_linear_part()
-
-
-def _step_left(J: Array, r: Array, n_physical: int) -> float:
-    """Largest Newton step of a physical parameter (of any number, where there are none), in standard deviations."""
-    found = directions(J)
-    half = found.root(BLIND)
-    ratio = np.abs(half @ (found.U.T @ r)) / np.linalg.norm(half, axis=1)
-    return float(np.max(ratio[: n_physical or None]))
+    rows, out = _Objective(problem, work, None).triangle(vector), vector.copy()
+    if np.all(np.isfinite(rows)):
+        linear = problem.slices["offset"].start
+        out[linear:] += directions(rows[:, linear:-1]).solve(rows[:, -1])
+    return out
 
 
 def search(
@@ -214,151 +200,78 @@ def search(
 ) -> Fit:
     """Minimise the likelihood criterion from `start`.
 
-    `start`: (size,); `steps`: steps tried at most; `tick`: called after each (progress, interruption); `work`: of this
-    problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor at `start`.
+    `start`: (size,); `steps`: iterations at most; `tick`: called after each evaluation (progress, interruption);
+    `work`: of this problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor
+    at `start`.
     """
-    work = Workspace(problem) if work is None else work.of(problem)
-    at = _point(problem, start, work)
-    if at is not None and at.linear_fall() > _POOR * float(at.r @ at.r):
-        at = _point(problem, at.with_linear_part(), work)
-    if at is None:
+    objective = _Objective(problem, Workspace(problem) if work is None else work.of(problem), tick)
+    linear = problem.slices["offset"].start
+    rows = objective.triangle(start)
+    if np.all(np.isfinite(rows)):
+        offsets, r = directions(rows[:, linear:-1]), rows[:, -1]
+        if offsets.explain(r) > _POOR * float(r @ r):
+            start = start.copy()
+            start[linear:] += offsets.solve(r)
+    end = descend(objective, start, most=steps, enough=_FLAT, settled=_SETTLED**2, bounded=linear,
+                  judged=problem.n_physical or problem.size)  # fmt: skip
+    rows = objective.triangle(end.theta)
+    if not np.all(np.isfinite(rows)):
         return _failed(problem, start)
-    status: Status = "stalled"
-    region, fall = _Region(), np.inf
-    count = 1
-    for _ in range(steps):
-        step, promise = region.step(at)
-        value, covariance = evaluate(problem, at.vector + step, work)
-        count += 1
-        if tick is not None:
-            tick()
-        # the weighted sum of squares falls by less than the criterion, which is concave in the covariance
-        gain = at.fall(problem, at.vector + step, covariance)
-        better = _point(problem, at.vector + step, work, value, covariance) if gain > 0.0 else None
-        region.judge(gain / promise if better is not None else -1.0)
-        if better is not None:
-            at, fall = better, at.criterion - value
-        if (fall < _FLAT or promise < _FLAT) and _step_left(at.J, at.r, problem.n_physical) < _SETTLED:
-            status = "converged"
-            break
-        if region.radius < _NOTHING:
-            break
-    n = at.J.shape[0] - at.n_priors
+    n = rows.shape[0] - objective.n_priors
     return Fit(
         problem=problem,
-        vector=at.vector,
-        covariance=at.covariance,
-        J=at.J[:n],
-        J_prior=at.J[n:],
-        r_prior=at.r[n:],
-        criterion=at.criterion,
-        status=status,
-        evaluations=count,
-        work=work,
+        vector=end.theta,
+        covariance=objective.covariance,
+        J=rows[:n, :-1],
+        J_prior=rows[n:, :-1],
+        r_prior=-rows[n:, -1],
+        criterion=end.cost,
+        status=end.status,
+        evaluations=objective.evaluations,
+        work=objective.work,
     )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Point:
-    """Criterion and its slope at one vector, rows of the priors last."""
+class _Objective:
+    """The likelihood as `search.Problem`: rows are weighted by the innovation covariance at the same vector."""
 
-    vector: Array  # (size,)
-    covariance: Array  # (n_outputs, n_outputs), innovation covariance, scaled
-    criterion: float
-    r: Array  # (n_rows,), weighted by the covariance here: the gradient of the criterion is 2 J^T r
-    J: Array  # (n_rows, size)
-    n_priors: int
-    linear: int  # from here on numbers enter linearly: offsets and initial state
+    def __init__(self, problem: PredictorProblem, work: Workspace, tick: Callable[[], None] | None) -> None:
+        self.problem, self.work, self.tick = problem, work, tick
+        self.evaluations, self.n_priors = 0, 0
+        self.at, self.covariance = np.full(problem.size, np.nan), np.eye(problem.y.shape[1])
+        self.rows = np.zeros((0, 0))  # [J | r] at `at`, those of the priors last; empty until they are wanted
+        self.value = np.inf
 
-    def linear_fall(self) -> float:
-        """Return by how much the sum of squares falls where the numbers that enter linearly are set to their best."""
-        return directions(self.J[:, self.linear :]).explain(self.r)
-
-    def with_linear_part(self) -> Array:
-        """Return the vector with those set to their best; one solve finds them."""
-        out = self.vector.copy()
-        out[self.linear :] -= directions(self.J[:, self.linear :]).solve(self.r)
-        return out
-
-    def fall(self, problem: PredictorProblem, vector: Array, covariance: Array | None) -> float:
-        """Return by how much the sum of squares, weighted as here, falls to a vector with that covariance."""
+    def cost(self, theta: Array) -> float:
+        """Return n log det(covariance) plus the squared prior residuals."""
+        if np.array_equal(theta, self.at):
+            return self.value
+        value, covariance = evaluate(self.problem, theta, self.work)
+        self.evaluations += 1
+        if self.tick is not None:
+            self.tick()
         if covariance is None:
-            return -np.inf
-        r, _ = prior_rows(problem, vector)
-        return float(self.r @ self.r - problem.n_used * np.trace(np.linalg.solve(self.covariance, covariance)) - r @ r)
+            return np.inf
+        self.at, self.value, self.covariance, self.rows = theta, value, covariance, np.zeros((0, 0))
+        return value
 
-
-def _point(
-    problem: PredictorProblem,
-    vector: Array,
-    work: Workspace,
-    value: float = np.nan,
-    covariance: Array | None = None,
-) -> _Point | None:
-    """The point at a vector, None without a predictor or its slope; `value`, `covariance`: where they are known."""
-    if covariance is None:
-        value, covariance = evaluate(problem, vector, work)
-    if covariance is None:
-        return None
-    try:
-        weight = weight_of(covariance)
-    except np.linalg.LinAlgError:  # a record without noise: what is left is rounding
-        return None
-    at = linearise(problem, vector, weight, work)
-    if at is None:
-        return None
-    r, J = prior_rows(problem, vector)
-    return _Point(
-        vector=vector,
-        covariance=covariance,
-        criterion=value,
-        r=np.concatenate([at.r, r]),
-        J=np.vstack([at.J, J]),
-        n_priors=r.size,
-        linear=problem.slices["offset"].start,
-    )
-
-
-class _Region:
-    """Trust region of Gauss-Newton steps (Nocedal and Wright 2006, sec. 10.3).
-
-    Lengths are those of what acts nonlinearly, in its own unit: parts of a parameter, and logarithms of levels bend at
-    about the same length, whatever the data say of them. Offsets and initial state, which enter linearly, follow.
-    """
-
-    def __init__(self) -> None:
-        self.radius = 1.0
-        self.length, self.bound = 0.0, False  # of the last step, and whether it was cut
-
-    def step(self, at: _Point) -> tuple[Array, float]:
-        """Return the best step inside the region, and the fall of the sum of squares that it promises."""
-        n = at.linear
-        easy = directions(at.J[:, n:])
-        rows = np.column_stack([at.J[:, :n], at.r])
-        rows = rows - easy.U @ (easy.U.T @ rows)
-        U, s, Vt = np.linalg.svd(rows[:, :n], full_matrices=False)
-        seen = s > _ROUNDING * np.max(s, initial=0.0)
-        s, pull = s[seen], -(U.T @ rows[:, n])[seen]
-        damping, along = 0.0, pull / s
-        for _ in range(_SECULAR):  # Newton's method on 1 / length, which is nearly linear in the damping
-            self.length = float(np.linalg.norm(along))
-            if self.length <= 1.1 * self.radius:
-                break
-            slope = float(along**2 @ (1.0 / (s**2 + damping)))
-            damping += self.length**2 / slope * (self.length / self.radius - 1.0)
-            along = s * pull / (s**2 + damping)
-        self.bound = damping > 0.0
-        step = Vt[seen].T @ along
-        rest = easy.solve(-at.r - at.J[:, :n] @ step)
-        promise = float(2.0 * pull @ (s * along) - np.sum((s * along) ** 2)) + easy.explain(at.r)
-        return np.concatenate([step, rest]), promise
-
-    def judge(self, ratio: float) -> None:
-        """Move the bound by the ratio of the fall that came to the one that was promised."""
-        if ratio < 0.25:
-            self.radius = 0.25 * self.length
-        elif ratio > 0.75 and self.bound:
-            self.radius = 2.0 * self.length
+    def triangle(self, theta: Array) -> Array:
+        """Return [J | r], compressed, NaN where there is no predictor or its innovations are rounding."""
+        if self.rows.size and np.array_equal(theta, self.at):
+            return self.rows
+        nothing = np.full((1, self.problem.size + 1), np.nan)
+        if not np.isfinite(self.cost(theta)):
+            return nothing
+        try:
+            at = linearise(self.problem, theta, weight_of(self.covariance), self.work)
+        except np.linalg.LinAlgError:  # a record without noise: what is left is rounding
+            return nothing
+        if at is None:
+            return nothing
+        r, J = prior_rows(self.problem, theta)
+        self.n_priors = r.size
+        self.rows = np.vstack([np.column_stack([at.J, -at.r]), np.column_stack([J, -r])])
+        return self.rows
 
 
 def _failed(problem: PredictorProblem, start: Array) -> Fit:

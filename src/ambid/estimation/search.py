@@ -1,5 +1,6 @@
-"""One damped Gauss-Newton (Levenberg-Marquardt) search for all estimators, on triangles (More 1978; Nocedal and Wright
-2006, sec. 10.3).
+"""One Gauss-Newton search for all estimators, on triangles: steps are damped in the lengths of the columns
+(Levenberg-Marquardt; More 1978), or bounded in the numbers' own units (trust region; Nocedal and Wright 2006, sec.
+10.3), which logarithms of levels need that the data hardly show.
 
 A problem gives its criterion at a vector, and there the triangle of [J | r]: a step d lowers the criterion by about
 |r|² - |r - J d|². For least squares J is the slope of the prediction and r = target - prediction, both weighted to
@@ -9,21 +10,24 @@ rows like others.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.linear import BLIND, Directions, directions, triangle_of
 from ambid.estimation.progress import Tick, guessed
 
 Status = Literal["converged", "stalled", "failed"]
 
 _USUAL = 10.0  # iterations, roughly, of a search
 _MOST_DAMPED = 1e9
+_NOTHING = 1e-12  # radius of the trust region below which no step is left
+_ROUNDING = 1e-15  # singular value, over the largest, below which there is nothing but rounding
+_SECULAR = 30  # Newton steps towards the damping that gives a step its length
 _PATIENCE = 6  # iterations in a row in which held-out errors may grow
 
 
@@ -82,6 +86,19 @@ class Found:
         return "converged" if self.converged else "stalled" if np.isfinite(self.cost) else "failed"
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class PhysicalFit:
+    """Outcome of a likelihood search for physical numbers."""
+
+    problem: Any  # what was estimated from what; has `n_used`, the values that enter the fit
+    vector: Array  # (size,)
+    criterion: float  # twice the negative log-likelihood but for constants, with the squared residuals of the priors
+    status: Status
+    evaluations: int
+    # what a global search did where the ordinary starts failed, see `ambid.estimation.global_search.rescued`
+    global_search: Mapping[str, object] | None = None
+
+
 def search(
     problem: Problem,
     theta: Array,
@@ -101,18 +118,23 @@ def search(
     keep: Callable[[Array], None] | None = None,
     solved: Callable[[Array], Array] | None = None,
     n_linear: int = 0,
+    bounded: int = 0,
+    judged: int = 0,
     keep_best: bool = False,
 ) -> Found:
     """Search for the least criterion.
 
     `theta`: (n_theta,), start; `stage`: for `tick`; `most`: iterations; `tolerance`, `enough`: relative and absolute
     gain of a step below which the search is over; `settled`: what a full step promises below which it is over, in the
-    criterion's unit (squared Newton decrement: the step's squared length in standard deviations);
-    `damping`: at the beginning, for columns of unit length; small where the start is
-    good; `upper`: (n_theta,), bounds; what stands at its bound and would go beyond rests; `longest`: change of any
-    number in one step; `move`: takes a step along J's columns from a vector, by its own rules (shortened, projected, in
-    a tangent space), None where it cannot; `held_out`: error on other data; training ends where it grows; `tick`:
-    called before each iteration, with the share of this search that is over; `keep`: given each better vector;
+    criterion's unit (squared Newton decrement: the step's squared length in standard deviations); `judged`: with it the
+    search is over where a step gains or promises no more than `enough` and a full one moves none of the first `judged`
+    numbers by more than the root of `settled` in its standard deviations, whatever the others still do; `damping`: at
+    the beginning, for columns of unit length; small where the start is good; `bounded`: instead of damping, so many
+    numbers, the first, stay in a trust region, of radius 1 at first in their own units, and the others, which enter
+    linearly, follow; `upper`: (n_theta,), bounds; what stands at its bound and would go beyond rests; `longest`: change
+    of any number in one step; `move`: takes a step along J's columns from a vector, by its own rules (shortened,
+    projected, in a tangent space), None where it cannot; `held_out`: error on other data; training ends where it grows;
+    `tick`: called before each iteration, with the share of this search that is over; `keep`: given each better vector;
     `solved`: sets the first `n_linear` numbers, which enter linearly, to their best; `keep_best`: a KeyboardInterrupt
     ends in the best so far.
     """
@@ -124,24 +146,19 @@ def search(
     seconds, costs = [0.0], [cost]
     held = [held_out(theta)] if held_out is not None else []
     best_held, best_theta, worse = (held[0] if held else np.inf), theta, 0
-    how = _How(
-        problem=problem,
-        upper=upper,
-        longest=longest,
-        move=move,
-        solved=solved,
-        n_linear=n_linear,
-        settled=settled,
-    )
+    steps = _Steps(
+        problem=problem, control=_Region(bounded) if bounded else _Damping(damping), upper=upper, longest=longest,
+        move=move, solved=solved, n_linear=n_linear, settled=settled, enough=enough, judged=judged,
+    )  # fmt: skip
+    gained = np.inf
     try:
         for k in range(most):
             if tick is not None:
                 tick(stage, max(k / most, guessed(k, _USUAL)))
             if not np.isfinite(cost):
                 break
-            trial, trial_cost, damping, over = how.step(theta, cost, damping)
+            trial, trial_cost, converged = steps.step(theta, cost, gained)
             if trial is None:
-                converged = over
                 break
             gained = cost - trial_cost
             theta, cost = trial, trial_cost
@@ -154,7 +171,7 @@ def search(
                 worse = 0 if held[-1] < best_held else worse + 1
                 if held[-1] < best_held:
                     best_held, best_theta = held[-1], theta
-            converged = gained <= max(tolerance * abs(cost), enough)
+            converged = not judged and gained <= max(tolerance * abs(cost), enough)
             if converged or worse >= _PATIENCE:
                 break
     except KeyboardInterrupt:
@@ -176,42 +193,119 @@ def search(
     )
 
 
+class _Damping:
+    """Levenberg-Marquardt steps, damped in the lengths of the columns."""
+
+    def __init__(self, value: float) -> None:
+        self.value = value
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no step is left."""
+        return self.value >= _MOST_DAMPED
+
+    def step(self, full: Directions, J: Array, r: Array) -> tuple[Array, float]:
+        """Return a step, and about the fall of the sum of squares that it promises."""
+        del J
+        return full.solve(r, self.value), full.explain(r)
+
+    def judge(self, ratio: float) -> None:
+        """Move the damping by whether the step was better."""
+        self.value = max(self.value / 10.0, 1e-14) if ratio > 0.0 else self.value * 8.0
+
+
+class _Region:
+    """Trust region of the first numbers in their own units; the others follow."""
+
+    def __init__(self, n: int) -> None:
+        self.n, self.radius = n, 1.0
+        self.length, self.bound = 0.0, False  # of the last step, and whether it was cut
+
+    @property
+    def exhausted(self) -> bool:
+        """Whether no step is left."""
+        return self.radius < _NOTHING
+
+    def step(self, full: Directions, J: Array, r: Array) -> tuple[Array, float]:
+        """Return the best step inside the region, and the fall of the sum of squares that it promises."""
+        del full
+        easy = directions(J[:, self.n :])
+        rows = np.column_stack([J[:, : self.n], r])
+        rows = rows - easy.U @ (easy.U.T @ rows)
+        U, s, Vt = np.linalg.svd(rows[:, :-1], full_matrices=False)
+        seen = s > _ROUNDING * np.max(s, initial=0.0)
+        s, pull = s[seen], (U.T @ rows[:, -1])[seen]
+        damping, along = 0.0, pull / s
+        for _ in range(_SECULAR):  # Newton's method on 1 / length, which is nearly linear in the damping
+            self.length = float(np.linalg.norm(along))
+            if self.length <= 1.1 * self.radius:
+                break
+            slope = float(along**2 @ (1.0 / (s**2 + damping)))
+            damping += self.length**2 / slope * (self.length / self.radius - 1.0)
+            along = s * pull / (s**2 + damping)
+        self.bound = damping > 0.0
+        step = Vt[seen].T @ along
+        promise = float(2.0 * pull @ (s * along) - np.sum((s * along) ** 2)) + easy.explain(r)
+        return np.concatenate([step, easy.solve(r - J[:, : self.n] @ step)]), promise
+
+    def judge(self, ratio: float) -> None:
+        """Move the bound by the ratio of the fall that came to the one that was promised."""
+        if ratio < 0.25:
+            self.radius = 0.25 * self.length
+        elif ratio > 0.75 and self.bound:
+            self.radius = 2.0 * self.length
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _How:
-    """How one step is made."""
+class _Steps:
+    """How steps are taken."""
 
     problem: Problem
+    control: _Damping | _Region
     upper: Array | None
     longest: float
     move: Callable[[Array, Array], Array | None] | None
     solved: Callable[[Array], Array] | None
     n_linear: int
     settled: float
+    enough: float
+    judged: int
 
-    def step(self, theta: Array, cost: float, damping: float) -> tuple[Array | None, float, float, bool]:
-        """Return a better vector (None without one), its cost, the next damping, and whether there is nothing to
-        gain.
+    def step(self, theta: Array, cost: float, gained: float) -> tuple[Array | None, float, bool]:
+        """Return a better vector, None without one, its cost, and whether there is nothing to gain.
+
+        `gained`: by the last step.
         """
         R = self.problem.triangle(theta)
         if not np.all(np.isfinite(R)):
-            return None, cost, damping, False
+            return None, cost, False
         R = R[self.n_linear :, self.n_linear :]  # slopes less what the linear numbers take over
         J, r = R[:, :-1], R[:, -1]
         if self.upper is not None:
             J = J * ~((theta >= self.upper)[self.n_linear :] & (J.T @ r > 0.0))
         if not J.shape[1]:
-            return None, cost, damping, True
-        found = directions(J)
-        to_gain = found.explain(r)
-        if to_gain <= max(self.settled, 1e-13 * abs(cost)):
-            return None, cost, damping, True
-        while damping < _MOST_DAMPED:
-            trial = self._moved(theta, found.solve(r, damping))
+            return None, cost, True
+        full = directions(J)
+        to_gain = full.explain(r)
+        near = self._settled(full, r) if self.judged else to_gain <= max(self.settled, 1e-13 * abs(cost))
+        if near and (not self.judged or gained <= self.enough):
+            return None, cost, True
+        while not self.control.exhausted:
+            step, promise = self.control.step(full, J, r)
+            if self.judged and near and promise <= self.enough:
+                return None, cost, True
+            trial = self._moved(theta, step)
             trial_cost = np.inf if trial is None else self.problem.cost(trial)
+            self.control.judge((cost - trial_cost) / promise if trial_cost < cost else -1.0)
             if trial_cost < cost:
-                return trial, trial_cost, max(damping / 10.0, 1e-14), False
-            damping *= 8.0
-        return None, cost, damping, to_gain <= 1e-6 * abs(cost)
+                return trial, trial_cost, False
+        return None, cost, not self.judged and to_gain <= 1e-6 * abs(cost)
+
+    def _settled(self, full: Directions, r: Array) -> bool:
+        """Whether a full step hardly moves what is judged."""
+        half = full.root(BLIND)
+        step = np.abs(half @ (full.U.T @ r)) / np.linalg.norm(half, axis=1)
+        return bool(np.max(step[: self.judged]) < np.sqrt(self.settled))
 
     def _moved(self, theta: Array, step: Array) -> Array | None:
         """The vector after a step, None where there is none."""

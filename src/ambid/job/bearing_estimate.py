@@ -15,8 +15,7 @@ from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty
 from ambid.bearing.magnet_problem import LEVELS, UNITS, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
-from ambid.bearing.rescue import warnings_of
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
+from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit, warnings_of
 from ambid.estimation.uncertainty import WEAK
 from ambid.job.bearing_records import TakenRecord
 from ambid.validation.nonlinear_bearing import WhitenessTest, whiteness, whiteness_checks

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Literal, Unpack
 import numpy as np
 
 from ambid.errors import EstimationError
-from ambid.estimation.estimate import Estimate, plain_json
+from ambid.estimation.estimate import Estimate, plain_json, warnings_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
@@ -190,7 +190,6 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     `bench`: the record it came from, channels named by role.
     """
     from ambid.bearing.lag import check_lag
-    from ambid.bearing.rescue import warnings_of
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.control.curvature import curvature_check
     from ambid.estimation.likelihood import simulation_error

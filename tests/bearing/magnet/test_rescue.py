@@ -78,7 +78,7 @@ def test_a_better_minimum_is_found_where_no_search_converges(noisy, before):
 
 def test_what_is_hardly_better_is_not_taken():
     # the delay is 1; in such noise other delays do as well, with other numbers
-    record = ball(1500, 7, swing=0.0, louder=30.0)
+    record = ball(1500, 3, swing=0.0, louder=30.0)
     fit = estimate_bearing([record], KNOWN, laws=[LAW], extend=False)
     assert fit.global_search is not None
     assert not fit.global_search["taken"]
