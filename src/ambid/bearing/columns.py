@@ -56,7 +56,9 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
     held = np.clip(columns - centre, -reach, reach)  # a glitch is no reason
     _refuse_twins(roles, held)
     _refuse_set_points(model, replace(signals, u=signals.u[at], y=signals.y[at]))
-    chance = [min(pair) for pair in zip(_by_chance(held), _by_chance(np.diff(held, axis=0)), strict=True)]
+    chance = _by_chance(held)
+    if max(chance) > _CHANCE:
+        chance = [min(pair) for pair in zip(chance, _by_chance(np.diff(held, axis=0)), strict=True)]
     most = int(np.argmax(chance))
     if chance[most] > _CHANCE:
         role, others = roles[most], " and ".join(r for j, r in enumerate(roles) if j != most)
@@ -106,18 +108,20 @@ def _by_chance(columns: Array) -> list[float]:
     moves = sorted({*_LAGS, *(-k for k in _LAGS)}, key=abs)  # a column as it is comes first
     if n - 2 * most < 4 * len(moves) * width:
         return [0.0] * width
-    Z = np.hstack([columns[most + k : n - most + k] for k in moves])
-    Z = Z - Z.mean(axis=0)
-    Z = Z / np.maximum(np.linalg.norm(Z, axis=0), 1e-300)
-    inner = Z.T @ Z + _RIDGE * np.eye(Z.shape[1])
-    found: list[float] = []
+    rows = np.ascontiguousarray(columns.T)
+    Z = np.vstack([rows[:, most + k : n - most + k] for k in moves])
+    Z -= Z.mean(axis=1, keepdims=True)
+    inner = Z @ Z.T
+    size = np.maximum(np.sqrt(np.diag(inner)), 1e-300)
+    inner = inner / np.outer(size, size) + _RIDGE * np.eye(len(Z))
+    chances: list[float] = []
     for j in range(width):
-        others = np.arange(Z.shape[1]) % width != j
+        others = np.arange(len(Z)) % width != j
         along = inner[others, j]
         part = float(along @ np.linalg.solve(inner[np.ix_(others, others)], along))
         degrees = int(np.count_nonzero(others))
-        found.append(chi_squared_tail(degrees, (len(Z) - degrees) * part / max(1.0 - part, 1e-12)))
-    return found
+        chances.append(chi_squared_tail(degrees, (Z.shape[1] - degrees) * part / max(1.0 - part, 1e-12)))
+    return chances
 
 
 def refuse_mistaken(

@@ -127,18 +127,17 @@ def _coarse(target: Spectrum, stiffness: Spectrum, current: Spectrum, turn: Arra
     Where one resonance has most of the motion, half of its period later the current explains as much with the other
     sign.
     """
-    aside, goal = _real(stiffness), _real(target)
-    if not (np.any(goal) and np.any(aside) and np.any(current)):
+    if not (np.any(target) and np.any(stiffness) and np.any(current)):
         return 0.0, 0
-    aside = aside / float(np.linalg.norm(aside))
-    power, goal = float(goal @ goal), goal - aside * float(aside @ goal)
+    power, size = (float(np.vdot(x, x).real) for x in (target, current))
+    aside = stiffness / float(np.linalg.norm(stiffness))
+    goal = target - aside * float(np.vdot(aside, target).real)
+    unexplained = float(np.vdot(goal, goal).real)
     shares = np.empty(2 * _FARTHEST + 1)
     moved, step = current * np.exp(1j * turn * _FARTHEST), np.exp(-1j * turn)
     for k in range(shares.size):
-        row = _real(moved)
-        row = row - aside * float(aside @ row)
-        gain = float(row @ goal) ** 2 / float(row @ row)
-        shares[k] = 1.0 - (float(goal @ goal) - gain) / power
+        own = size - float(np.vdot(aside, moved).real) ** 2  # of what position does not explain of the current
+        shares[k] = 1.0 - (unexplained - float(np.vdot(moved, goal).real) ** 2 / own) / power
         moved = moved * step
     alike = (1.0 - shares.max()) * (1.0 + _ALIKE / turn.size)
     near = np.flatnonzero(1.0 - shares <= alike) - _FARTHEST

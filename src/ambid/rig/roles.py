@@ -147,34 +147,37 @@ def coil_of(v: Array, i: Array, x: Array | None, rate_hz: float) -> Coil:
 
     The window and the delay are those at which the inductance explains most of what the other terms leave.
     """
-    best, found = -1.0, Coil(share=0.0, R=0.0, L=0.0)
-    for late, length in itertools.product(_DELAYS, _WINDOWS):
+    best, coil = -1.0, Coil(share=0.0, R=0.0, L=0.0)
+    for late in _DELAYS:
         n = v.size - late - 1
-        starts = np.arange(0, n - length + 1, max(1, length // 2))
-        ends, after = starts + length, i[late : late + n + 1]
+        after = i[late : late + n + 1]
         total = [np.concatenate([[0.0], np.cumsum(s)]) for s in (v[:n], (after[1:] + after[:-1]) / 2.0)]
-        target, area = (s[ends] - s[starts] for s in total)
-        moved = [s[ends] - s[starts] for s in ([after] if x is None else [after, x[late : late + n + 1]])]
-        terms = np.column_stack([area, *moved])
-        terms, target = terms - terms.mean(axis=0), target - target.mean()
-        size, power = np.linalg.norm(terms, axis=0), float(target @ target)
-        if not (np.all(size > 0) and power > 0):
-            continue
-        values = np.linalg.lstsq(terms / size, target, rcond=None)[0]
-        left = target - terms / size @ values
-        share = 1.0 - float(left @ left) / power
-        # what R and L explain that the other terms do not, from the inverse of their scalar products
-        alone = values**2 / np.diag(np.linalg.pinv(terms.T @ terms / np.outer(size, size))) / power
-        alone /= alone + max(1.0 - share, 1e-12)
-        if alone[1] > best:
-            best = float(alone[1])
-            signs = {bool(value > 0) for value, part in zip(values[:2], alone[:2], strict=True) if part > _SHOWN}
-            R = abs(float(values[0] / size[0])) if alone[0] > _SHOWN else 0.0
-            found = replace(
-                found, share=share if len(signs) == 1 else 0.0, reversed=signs == {False},
-                R=R, L=abs(float(values[1] / size[1])) / rate_hz,
-            )  # fmt: skip
-    return found
+        sums = np.array([total[1], after, *([] if x is None else [x[late : late + n + 1]]), total[0]])
+        for length in _WINDOWS:
+            starts = np.arange(0, n - length + 1, max(1, length // 2))
+            terms = sums[:, starts + length] - sums[:, starts]
+            terms -= terms.mean(axis=1, keepdims=True)
+            terms, target = terms[:-1], terms[-1]
+            size, power = np.linalg.norm(terms, axis=1), float(target @ target)
+            if not (np.all(size > 0) and power > 0):
+                continue
+            terms /= size[:, None]
+            inverse = np.linalg.pinv(terms @ terms.T)
+            values = inverse @ (terms @ target)
+            left = target - values @ terms
+            share = 1.0 - float(left @ left) / power
+            # what R and L explain that the other terms do not
+            alone = values**2 / np.diag(inverse) / power
+            alone /= alone + max(1.0 - share, 1e-12)
+            if alone[1] > best:
+                best = float(alone[1])
+                signs = {bool(value > 0) for value, part in zip(values[:2], alone[:2], strict=True) if part > _SHOWN}
+                coil = Coil(
+                    share=share if len(signs) == 1 else 0.0, reversed=signs == {False},
+                    R=abs(float(values[0] / size[0])) if alone[0] > _SHOWN else 0.0,
+                    L=abs(float(values[1] / size[1])) / rate_hz,
+                )  # fmt: skip
+    return coil
 
 
 def _coherences(record: Record, names: set[str]) -> dict[tuple[str, str], float]:
