@@ -9,7 +9,8 @@ import pytest
 from ambid.physics.presets import preset
 from ambid.record import read_record
 from ambid.rig import default_rig, write_rig
-from ambid.simulation import scenario_names, simulate_scenario, truth_columns
+from ambid.simulation import simulate_scenario, truth_columns
+from ambid.simulation.scenarios import scenario_names
 
 SHORT = ("--duration", "0.1", "--seed", "3", "--amplitude", "8")
 

@@ -8,7 +8,8 @@ import pytest
 from ambid.errors import RecordError
 from ambid.physics.presets import preset
 from ambid.record import read_record, write_record
-from ambid.simulation import Simulation, damage, losses, simulate_scenario
+from ambid.simulation import Simulation, simulate_scenario
+from ambid.simulation.scenarios import damage, losses
 
 
 @pytest.fixture(scope="module")

@@ -14,16 +14,8 @@ from ambid.job import identify
 from ambid.physics.presets import preset
 from ambid.record import read_record, write_record
 from ambid.rig import Rig, default_rig, rig_from_text
-from ambid.simulation import (
-    Simulation,
-    losses,
-    scenario,
-    scenario_blocks,
-    scenario_names,
-    simulate_preset,
-    simulate_scenario,
-    truth_columns,
-)
+from ambid.simulation import Simulation, scenario_blocks, simulate_preset, simulate_scenario, truth_columns
+from ambid.simulation.scenarios import losses, scenario, scenario_names
 
 BEARING = preset("unstable-bearing")
 RATE = 20_000

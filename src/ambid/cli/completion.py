@@ -25,7 +25,7 @@ def _presets(*, rotors: bool | None = None) -> Iterable[str]:
 
 
 def _scenarios() -> Iterable[str]:
-    from ambid.simulation import scenario_names
+    from ambid.simulation.scenarios import scenario_names
 
     return scenario_names()
 

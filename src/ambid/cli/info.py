@@ -45,7 +45,7 @@ def models() -> None:
     from ambid.physics.rotor_model import Bearing, RotorModel
     from ambid.report.text import columns
     from ambid.signals import AXES_EXCITATIONS, EXCITATIONS
-    from ambid.simulation import scenario, scenario_names
+    from ambid.simulation.scenarios import scenario, scenario_names
 
     paint = painter()
     bearing = Bearing(name="A", axes=("ax",))

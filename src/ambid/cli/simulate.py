@@ -154,7 +154,8 @@ def _run_scenario(
     """
     from ambid.record import write_record
     from ambid.rig import load_rig
-    from ambid.simulation import damage, scenario, simulate_scenario
+    from ambid.simulation import simulate_scenario
+    from ambid.simulation.scenarios import damage, scenario
 
     what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):

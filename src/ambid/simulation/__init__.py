@@ -17,14 +17,7 @@ if TYPE_CHECKING:
     from ambid.simulation.rig_bench import plant_of_rig as plant_of_rig
     from ambid.simulation.rig_bench import simulate_preset as simulate_preset
     from ambid.simulation.rig_bench import simulate_rig as simulate_rig
-    from ambid.simulation.scenarios import Loss as Loss
-    from ambid.simulation.scenarios import Scenario as Scenario
-    from ambid.simulation.scenarios import ScenarioBlock as ScenarioBlock
-    from ambid.simulation.scenarios import damage as damage
-    from ambid.simulation.scenarios import losses as losses
-    from ambid.simulation.scenarios import scenario as scenario
     from ambid.simulation.scenarios import scenario_blocks as scenario_blocks
-    from ambid.simulation.scenarios import scenario_names as scenario_names
     from ambid.simulation.scenarios import simulate_scenario as simulate_scenario
     from ambid.simulation.scenarios import truth_columns as truth_columns
     from ambid.simulation.variation import Schedule as Schedule

@@ -280,7 +280,16 @@ class VaryingLoop:
             self._line, self.counts, standing.centre, standing.centre_input, *self._law, measured, command, states,
         )  # fmt: skip
         if lost >= 0:
-            raise ModelError(self._loss(first + lost))
+            at = f"at sample {first + lost} ({(first + lost) / self.rate_hz:.6g} s); an unstable plant needs a loop"
+            if self._told:
+                raise ModelError(
+                    f"the simulation diverges {at} that holds it while it changes, and stops. Give limits.position, "
+                    "another loop, or a smaller change"
+                )
+            raise ModelError(
+                f"the simulation leaves the air gap or diverges {at}, and stops in the gap. Give limits.position, "
+                "another loop, or more substeps"
+            )
         if "current" in of.states:
             i, (low, high) = states[:, of.states.index("current")], self.limits.current
             self.n_over_current += int(np.count_nonzero((i < low) | (i > high)))
@@ -290,18 +299,6 @@ class VaryingLoop:
             first=first, command=command, measured=measured, states=states[:, : len(of.states)], speed=speed,
             angle=angle, truth=MappingProxyType(truth),
         )  # fmt: skip
-
-    def _loss(self, sample: int) -> str:
-        at = f"at sample {sample} ({sample / self.rate_hz:.6g} s); an unstable plant needs a loop"
-        if self._told:
-            return (
-                f"the simulation diverges {at} that holds it while it changes, and stops. Give limits.position, "
-                "another loop, or a smaller change"
-            )
-        return (
-            f"the simulation leaves the air gap or diverges {at}, and stops in the gap. Give limits.position, "
-            "another loop, or more substeps"
-        )
 
     def _loads(self, first: int, n: int) -> tuple[Array, Array | None, Array | None, dict[str, Array]]:
         """Return the force over each sample (empty for none), speed and angle at its instant, and the true loads."""
@@ -487,14 +484,26 @@ def largest_amplitude(
     point = operating_point or OperatingPoint()
 
     def allowed(factor: float) -> bool:
-        return _within(respond(factor * unit), limits, point, fraction)
+        done = respond(factor * unit)
+        signals = {name: done.states[:, j] for j, name in enumerate(done.state_names)}
+        signals |= {name: done.record[name].values for name in done.record.names if name not in signals}
+        for name, values in signals.items() if done.within_limits else ():
+            kind = name.rsplit("_", 1)[-1]  # of an axis of a rotor: ``ax_position``
+            if kind not in OperatingPoint._fields:
+                continue
+            (low, high), rest = getattr(limits, kind), getattr(point, kind)
+            if values.min() < rest + fraction * (low - rest) or values.max() > rest + fraction * (high - rest):
+                return False
+        return done.within_limits
 
     if not allowed(0.0):
         raise ModelError(
             f"the bench exceeds {fraction:g} of its limits without any excitation. Reduce the noise, or correct "
             "the loop or the limits"
         )
-    low, high = 0.0, _first_guess(unit, limits, point)
+    # Any start works; with a limited voltage this one is near the answer in open loop.
+    room = [abs(end - point.voltage) for end in limits.voltage if math.isfinite(end)]
+    low, high = 0.0, (min(room) if room and min(room) > 0.0 else 1.0) / float(np.abs(unit).max())
     while allowed(high):
         low, high = high, 4.0 * high
         if not math.isfinite(high):
@@ -505,24 +514,3 @@ def largest_amplitude(
         middle = 0.5 * (low + high)
         low, high = (middle, high) if allowed(middle) else (low, middle)
     return low
-
-
-def _first_guess(unit: Array, limits: Limits, point: OperatingPoint) -> float:
-    # Any start works; with a limited voltage this one is near the answer in open loop.
-    room = [abs(end - point.voltage) for end in limits.voltage if math.isfinite(end)]
-    return (min(room) if room and min(room) > 0.0 else 1.0) / float(np.abs(unit).max())
-
-
-def _within(done: Simulation, limits: Limits, point: OperatingPoint, fraction: float) -> bool:
-    if not done.within_limits:
-        return False
-    signals = {name: done.states[:, j] for j, name in enumerate(done.state_names)}
-    signals |= {name: done.record[name].values for name in done.record.names if name not in signals}
-    for name, values in signals.items():
-        kind = name.rsplit("_", 1)[-1]  # of an axis of a rotor: ``ax_position``
-        if kind not in OperatingPoint._fields:
-            continue
-        (low, high), rest = getattr(limits, kind), getattr(point, kind)
-        if values.min() < rest + fraction * (low - rest) or values.max() > rest + fraction * (high - rest):
-            return False
-    return True

@@ -285,7 +285,10 @@ class RotorBench:
         truth = np.empty((n, len(of.axes) + len(self._currents)))
         counts = np.array([-1, -1, 0], dtype=np.int64)
         angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
-        disturbed = self._noise(np.random.default_rng(seed), n)
+        force, voltage = self.noise.held_rms(self.rate_hz)
+        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
+        size = np.array([sizes[kind_of(name)] for name in (*of.outputs, *of.disturbances)])
+        disturbed = np.random.default_rng(seed).standard_normal((n, size.size)) * size
         if load is not None:
             disturbed[:, len(of.outputs) : len(of.outputs) + len(of.axes)] += load
         lost = self._run(u, disturbed, start, angle, counts, measured, command, truth)
@@ -307,9 +310,14 @@ class RotorBench:
         units = {**of.units, **dict.fromkeys((f"{axis}_reference" for axis in of.axes), of.units[of.inputs[0]])}
         order = sorted(values, key=lambda name: of.axes.index(name.split("_")[0]))  # an axis after the other
         channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
-        channels += [
-            Channel(name=name, unit=unit, values=x[settle:]) for name, (unit, x) in self._turning(angle).items()
-        ]
+        roles = {c.role for c in self.rig.channels}  # of a rotor that turns; speed and tacho where the rig names them
+        if of.speed or "angle" in roles:
+            channels.append(Channel(name="angle", unit="rad", values=angle[settle:]))
+        if "speed" in roles:
+            channels.append(Channel(name="speed", unit="rad/s", values=np.full(n - settle, of.speed)))
+        if "tacho" in roles:  # high in the first tenth of every revolution
+            pulses = np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0)
+            channels.append(Channel(name="tacho", unit="V", values=pulses[settle:]))
         made = {"plant": f"{of.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
         settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
         record = Record(
@@ -336,16 +344,6 @@ class RotorBench:
             n_over_current=int(np.count_nonzero(((currents < low) | (currents > high)).any(axis=1))),
             largest_pole=self.largest_pole,
         )
-
-    def _turning(self, angle: Array) -> dict[str, tuple[str, Array]]:
-        """Return what is logged of a rotor that turns: its angle; speed and tacho pulses where the rig names them."""
-        of, named = self.model, {c.role for c in self.rig.channels}
-        found = {"angle": ("rad", angle)} if of.speed or "angle" in named else {}
-        if "speed" in named:
-            found["speed"] = ("rad/s", np.full(angle.size, of.speed))
-        if "tacho" in named:  # high in the first tenth of every revolution
-            found["tacho"] = ("V", np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0))
-        return found
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
         """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits.
@@ -383,7 +381,13 @@ class RotorBench:
         mass, _, _ = of.rotor_matrices(self.plant.parameters)
         pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
         continuous = self._continuous()
-        equations = self._sampled(continuous, fraction) if self.poles is None else self._nonlinear(self.poles, fraction)
+        equations: RotorLinear | RotorNonlinear
+        if self.poles is None:
+            d, *_ = discretise(continuous, period, fraction=fraction)
+            a, b, late, e = (np.ascontiguousarray(x) for x in (d.A, d.B, d.B_late, d.E))
+            equations = a, b, late, e
+        else:
+            equations = self._nonlinear(self.poles, fraction)
         at, law = start if isinstance(start, Running) else self.begun(start), law_on(c, of, self.rate_hz)
         if law is not None and law is not at.law:
             at.hand_over(law, (continuous.C @ at.x)[signals_fed_back(of)])
@@ -420,11 +424,6 @@ class RotorBench:
         B, E = (np.vstack([x, np.zeros((2, x.shape[1]))]) for x in (space.B, space.E))
         return StateSpace(A=A, B=B, E=E, C=C)
 
-    def _sampled(self, space: StateSpace, fraction: float) -> RotorLinear:
-        d, *_ = discretise(space, 1.0 / self.rate_hz, fraction=fraction)
-        a, b, late, e = (np.ascontiguousarray(x) for x in (d.A, d.B, d.B_late, d.E))
-        return a, b, late, e
-
     def _nonlinear(self, poles: Poles, fraction: float) -> RotorNonlinear:
         """Return what the compiled loop steps the plant with: all that is linear, and the poles."""
         of, theta = self.model, self.plant.parameters
@@ -453,13 +452,6 @@ class RotorBench:
             at = [k for k, q in enumerate(of.coordinates) if q.endswith("xy"[plane])]
             found[[n + k for k in at]] = size * np.outer(self.shapes[u.name] / mass[at], turned[plane])
         return found
-
-    def _noise(self, rng: np.random.Generator, n: int) -> Array:
-        of = self.model
-        force, voltage = self.noise.held_rms(self.rate_hz)
-        sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
-        size = np.array([sizes[kind_of(name)] for name in (*of.outputs, *of.disturbances)])
-        return np.asarray(rng.standard_normal((n, size.size)) * size)
 
     def _runout(self, angle: Array) -> Array:
         """Return what the sensors see beside the rotor's motion: (n_samples, n_outputs), or (0, n_outputs)."""

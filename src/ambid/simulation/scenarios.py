@@ -18,7 +18,6 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, TypedDict, Unpack
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, RecordError, nearest
@@ -26,7 +25,7 @@ from ambid.physics.presets import Preset
 from ambid.record import write_record
 from ambid.record.record import Channel, Record, Step
 from ambid.signals import multisine
-from ambid.simulation.bench import TRUE, Simulation, Stretch, VaryingLoop, join
+from ambid.simulation.bench import TRUE, Simulation, VaryingLoop, join
 from ambid.simulation.rig_bench import Bench, as_columns
 from ambid.simulation.variation import Schedule, Unbalance, Variation
 
@@ -35,22 +34,15 @@ _MEAN_BURST = 8  # samples
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loss:
-    """One burst of lost samples.
+    """One burst of lost samples, `first` to `stop` - 1.
 
-    Attributes
-    ----------
-    first, stop : int
-        Samples ``first`` to ``stop - 1`` are lost.
-    kind : {"cells", "rows", "skipped"}
-        One channel's cells are empty; all cells but the time are; or the rows are missing, so that time jumps.
-    column : int
-        Which channel, for ``"cells"``; any number, to be taken modulo the number of channels.
+    One channel's cells are empty; all cells but the time are; or the rows are missing, so that time jumps.
     """
 
     first: int
     stop: int
-    kind: str
-    column: int
+    kind: str  # ``"cells"``, ``"rows"`` or ``"skipped"``
+    column: int  # which channel, for ``"cells"``; any number, to be taken modulo the number of channels
 
 
 _KINDS = ("cells", "rows", "skipped")
@@ -59,26 +51,7 @@ _KINDS = ("cells", "rows", "skipped")
 def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[Loss, ...]:
     """Return which samples are lost: bursts of some samples each, of all kinds in turn, apart from each other.
 
-    Parameters
-    ----------
-    n_samples : int
-        Length of the record.
-    share : float
-        Of the samples from `first` on that is lost, above 0 and at most 0.5.
-    seed : int
-        Equal seeds give equal losses.
-    first : int
-        No sample before this one is lost; nor are the record's first and last eight.
-
-    Returns
-    -------
-    tuple of Loss
-        In order; at least one of each kind where there is room.
-
-    Raises
-    ------
-    RecordError
-        If the share is out of range, or the record too short.
+    `share` of the samples from `first` on, above 0 and at most 0.5; not of the record's first and last eight.
     """
     begin, end = max(first, 8), n_samples - 8
     if not 0.0 < share <= 0.5:
@@ -102,28 +75,9 @@ def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[
 def damage(
     record: Record, path: str | Path, *, share: float, seed: int, first: int = 0, comments: Sequence[str] = ()
 ) -> tuple[Loss, ...]:
-    """Write a record as a CSV file in which samples are lost.
+    """Write a record as a CSV file in which samples are lost (see `losses`), and return which.
 
-    Parameters
-    ----------
-    record : Record
-        The whole record; it stays as it is. Channels whose names begin with ``true_`` lose no cells.
-    path : str or Path
-        ``.csv`` or ``.csv.gz``.
-    share, seed, first
-        As in `losses`.
-    comments : sequence of str
-        Comment lines on top.
-
-    Returns
-    -------
-    tuple of Loss
-        What is lost.
-
-    Raises
-    ------
-    RecordError
-        If the file is no CSV file, cannot be written, or the record is too short.
+    Channels whose names begin with ``true_`` lose no cells.
     """
     path = Path(path)
     if not path.name.lower().endswith((".csv", ".csv.gz")):
@@ -198,70 +152,26 @@ GRADE = 2.5e-3
 _MAX_LOAD = 0.1  # of the force that the current's limit allows
 
 
-def _nothing(_: Bench, __: float, ___: float, ____: float) -> Variation:
-    return Variation()
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """What happens to a bench.
-
-    Attributes
-    ----------
-    name, summary : str
-        Name for the command line, and one line that describes it.
-    duration_s : float
-        Length in s unless told otherwise.
-    begins : float
-        Part of the duration after which it begins, unless told otherwise.
-    size : float or None
-        How much, unless told otherwise; None where the bench says it.
-    size_is : str
-        What the size is, with its unit; empty where there is none.
-    vary : Callable
-        Takes the bench, the beginning in s, the size and the duration in s; gives the `Variation`.
-    own_size : Callable or None
-        Takes the bench, gives the size where `size` is None.
-    excited : bool
-        Whether the bench is excited persistently.
-    driven : bool
-        Whether a second, larger excitation is added from the beginning on: its peak is `size` times the voltage's room.
-    dropped : bool
-        Whether samples are lost; `size` is their share.
-    """
+    """What happens to a bench."""
 
     name: str
     summary: str
-    duration_s: float
-    begins: float = 0.5
-    size: float | None = None
-    size_is: str = ""
-    vary: Callable[[Bench, float, float, float], Variation] = _nothing
-    own_size: Callable[[Bench], float] | None = None
-    excited: bool = True
+    duration_s: float  # length in s unless told otherwise
+    begins: float = 0.5  # part of the duration after which it begins, unless told otherwise
+    size: float | None = None  # how much, unless told otherwise; None where the bench says it
+    size_is: str = ""  # what the size is, with its unit; empty where there is none
+    # from the bench, the beginning in s, the size and the duration in s
+    vary: Callable[[Bench, float, float, float], Variation] = lambda *_: Variation()
+    own_size: Callable[[Bench], float] | None = None  # the size where `size` is None
+    excited: bool = True  # whether the bench is excited persistently
+    # whether a second, larger excitation is added from the beginning on: its peak is `size` times the voltage's room
     driven: bool = False
-    dropped: bool = False
+    dropped: bool = False  # whether samples are lost; `size` is their share
 
     def size_for(self, bench: Bench, given: float | None) -> float:
-        """Return how much happens.
-
-        Parameters
-        ----------
-        bench : Bench
-            The bench, for the scenarios whose size it says.
-        given : float or None
-            What the user says.
-
-        Returns
-        -------
-        float
-            In the unit of `size_is`; 0 where the scenario has none.
-
-        Raises
-        ------
-        ModelError
-            If a size is given that is not finite, or the scenario has none.
-        """
+        """Return how much happens, in the unit of `size_is`: what was `given`, else its own or the bench's."""
         if given is not None and not self.size_is:
             raise ModelError(f"scenario {self.name!r} has no size. Omit the size")
         if given is not None and not math.isfinite(given):
@@ -275,34 +185,12 @@ class Scenario:
 
 
 def scenario_names() -> tuple[str, ...]:
-    """Return the names of all scenarios.
-
-    Returns
-    -------
-    tuple of str
-        Names for the command line.
-    """
+    """Return the names of all scenarios, for the command line."""
     return tuple(SCENARIOS)
 
 
 def scenario(name: str) -> Scenario:
-    """Return the scenario called `name`.
-
-    Parameters
-    ----------
-    name : str
-        One of `scenario_names`.
-
-    Returns
-    -------
-    Scenario
-        The scenario.
-
-    Raises
-    ------
-    ModelError
-        If there is none of that name; the message names the nearest.
-    """
+    """Return the scenario called `name`."""
     if name not in SCENARIOS:
         known = list(SCENARIOS)
         raise ModelError(
@@ -311,26 +199,16 @@ def scenario(name: str) -> Scenario:
     return SCENARIOS[name]
 
 
-def _ramp(bench: Bench, at: float, size: float, _: float) -> Variation:
-    r = _parameter(bench, "R")
-    return Variation(parameters={"R": Schedule.ramp(r, r * (1.0 + size), at, at + DRIFT_S)})
+def _changing(
+    name: str, course: Callable[[float, float, float], Schedule] = Schedule.step
+) -> Callable[[Bench, float, float, float], Variation]:
+    """Return a parameter's course from its value to (1 + size) times it, from a time on."""
 
-
-def _warm_up(bench: Bench, at: float, size: float, _: float) -> Variation:
-    r = _parameter(bench, "R")
-    return Variation(parameters={"R": Schedule.warm_up(r, r * (1.0 + size), at, WARM_UP_S)})
-
-
-def _jump(name: str) -> Callable[[Bench, float, float, float], Variation]:
     def vary(bench: Bench, at: float, size: float, _: float) -> Variation:
         value = _parameter(bench, name)
-        return Variation(parameters={name: Schedule.step(value, value * (1.0 + size), at)})
+        return Variation(parameters={name: course(value, value * (1.0 + size), at)})
 
     return vary
-
-
-def _sensor(_: Bench, at: float, size: float, __: float) -> Variation:
-    return Variation(gains={"position": Schedule.step(1.0, 1.0 + size, at)})
 
 
 def _spin_up(_: Bench, at: float, size: float, duration: float) -> Variation:
@@ -339,19 +217,11 @@ def _spin_up(_: Bench, at: float, size: float, duration: float) -> Variation:
     return Variation(unbalance=Unbalance(moment=size, phase=HEAVY_SPOT, speed=speed))
 
 
-def _load(_: Bench, at: float, size: float, __: float) -> Variation:
-    return Variation(force=Schedule.step(0.0, size, at))
-
-
-def _unbalance_of(bench: Bench) -> float:
-    return _parameter(bench, "m") * GRADE / TOP_SPEED
-
-
 def _load_of(bench: Bench) -> float:
     room = min(abs(end - bench.point.current) for end in bench.limits.current)
-    return (
-        _MAX_LOAD * abs(_parameter(bench, "k_i")) * room if math.isfinite(room) else 0.5 * 9.81 * _parameter(bench, "m")
-    )
+    if not math.isfinite(room):
+        return 0.5 * 9.81 * _parameter(bench, "m")
+    return _MAX_LOAD * abs(_parameter(bench, "k_i")) * room
 
 
 def _parameter(bench: Bench, name: str) -> float:
@@ -374,33 +244,37 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             Scenario(
                 name="drift",
                 summary="the coil warms evenly: R +20 % over 60 s",
-                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R after 60 s", vary=_ramp,
+                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R after 60 s",
+                vary=_changing("R", lambda before, after, at: Schedule.ramp(before, after, at, at + DRIFT_S)),
             ),
             Scenario(
                 name="warm-up",
                 summary="the coil warms exponentially: R +20 %, time constant 20 s",
-                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R in the end", vary=_warm_up,
+                duration_s=60.0, begins=0.0, size=0.2, size_is=f"{_PART} of R in the end",
+                vary=_changing("R", lambda before, after, at: Schedule.warm_up(before, after, at, WARM_UP_S)),
             ),
             Scenario(
                 name="change",
                 summary="k_i drops by 15 %, in the force and in the back-EMF",
-                duration_s=4.0, size=-0.15, size_is=f"{_PART} of k_i", vary=_jump("k_i"),
+                duration_s=4.0, size=-0.15, size_is=f"{_PART} of k_i", vary=_changing("k_i"),
             ),
             Scenario(
                 name="added-mass",
                 summary="the rotor becomes 10 % heavier at once",
-                duration_s=4.0, size=0.1, size_is=f"{_PART} of m", vary=_jump("m"),
+                duration_s=4.0, size=0.1, size_is=f"{_PART} of m", vary=_changing("m"),
             ),
             Scenario(
                 name="sensor-gain",
                 summary="the position sensor loses 20 % of its gain, unknown to the controller",
-                duration_s=4.0, size=-0.2, size_is=f"{_PART} of the position sensor's gain", vary=_sensor,
+                duration_s=4.0, size=-0.2, size_is=f"{_PART} of the position sensor's gain",
+                vary=lambda _, at, size, __: Variation(gains={"position": Schedule.step(1.0, 1.0 + size, at)}),
             ),
             Scenario(name="quiet", summary="nothing changes, no excitation", duration_s=60.0, excited=False),
             Scenario(
                 name="spin-up",
                 summary="the rotor spins up to 15 000 rpm with unbalance (G 2.5 there)",
-                duration_s=20.0, begins=0.05, size_is="unbalance in kg m", vary=_spin_up, own_size=_unbalance_of,
+                duration_s=20.0, begins=0.05, size_is="unbalance in kg m", vary=_spin_up,
+                own_size=lambda bench: _parameter(bench, "m") * GRADE / TOP_SPEED,
             ),
             Scenario(
                 name="saturation",
@@ -415,7 +289,8 @@ SCENARIOS: Mapping[str, Scenario] = MappingProxyType(
             Scenario(
                 name="offset",
                 summary="a constant load of a tenth of what the current limit can hold",
-                duration_s=4.0, size_is="force in N", vary=_load, own_size=_load_of,
+                duration_s=4.0, size_is="force in N", own_size=_load_of,
+                vary=lambda _, at, size, __: Variation(force=Schedule.step(0.0, size, at)),
             ),
         )
     }
@@ -433,25 +308,14 @@ _LARGEST = 10**8  # samples of one record: it has to fit into memory
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class ScenarioBlock:
-    """Consecutive samples of a scenario.
+    """Consecutive samples of a scenario."""
 
-    Attributes
-    ----------
-    first : int
-        Number of the first sample.
-    time_s : ndarray, shape (n_samples,)
-        Sampling instants in s.
-    signals : Mapping[str, ndarray of shape (n_samples,)]
-        As logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns. Lost
-        samples of the scenario ``dropped`` are NaN.
-    truth : Mapping[str, ndarray of shape (n_samples,)]
-        What varies, SI, by name: parameters, ``gain_<output>``, ``force``, ``unbalance``, ``unbalance_phase``.
-    """
-
-    first: int
-    time_s: Array
+    first: int  # number of the first sample
+    time_s: Array  # sampling instants
+    # as logged, SI, by role: input, outputs, ``excitation``, and ``speed`` and ``angle`` where the rotor turns; lost
+    # samples of the scenario ``dropped`` are NaN
     signals: Mapping[str, Array]
-    truth: Mapping[str, Array]
+    truth: Mapping[str, Array]  # what varies, SI: parameters, ``gain_<output>``, ``force``, ``unbalance``, its phase
 
 
 class Course(TypedDict, total=False):
@@ -550,7 +414,7 @@ def scenario_blocks(
     """
     if block < 1:
         raise ModelError(f"a block of {block} samples; it has at least one. Give another size")
-    return _blocks(_Run(name, bench, **course), block)
+    return _Run(name, bench, **course).blocks(block)
 
 
 def truth_columns(record: Record) -> Mapping[str, Channel]:
@@ -616,14 +480,6 @@ class _Run:
             raise ModelError(f"scenario {self.scenario.name!r} has no excitation. Omit the amplitude")
         self.size = self.scenario.size_for(b, size)
         self.amplitude, self._period, self._extra = 0.0, np.zeros(1), np.zeros(1)
-        self._prepare_excitation(amplitude)
-        self.running = VaryingLoop(
-            b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
-            loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
-        )  # fmt: skip
-
-    def _prepare_excitation(self, amplitude: float | None) -> None:
-        b = self.bench
         if self.scenario.excited:
             shape = one_period(b, self.seed)
             self.amplitude = amplitude_for(b, shape, self.seed) if amplitude is None else amplitude
@@ -636,6 +492,10 @@ class _Run:
                     " loop.limits, or choose another scenario"
                 )
             self._extra = self.size * room * one_period(b, self.seed + 1, fast=True)
+        self.running = VaryingLoop(
+            b.plant, self.scenario.vary(b, self.at_s, self.size, self.duration_s), rate_hz=b.rate_hz, seed=seed,
+            loop=b.loop, limits=b.limits, noise=b.noise, operating_point=b.point,
+        )  # fmt: skip
 
     @property
     def first_sample(self) -> int:
@@ -657,49 +517,31 @@ class _Run:
             found |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
         return found
 
-
-def _blocks(run: _Run, block: int) -> Iterator[ScenarioBlock]:
-    lost = _lost(run)
-    chunk = block * math.ceil(_CHUNK / block)
-    for first in range(0, run.n_samples, chunk):
-        u = run.excitation(first, min(chunk, run.n_samples - first))
-        stretch = run.running.advance(u)
-        signals = _signals(run, stretch, u)
-        if lost.size:
-            _lose(signals, lost, first)
-        time = (first + np.arange(u.size)) / run.bench.rate_hz
-        for k in range(0, u.size, block):
-            part = slice(k, min(k + block, u.size))
-            yield ScenarioBlock(
-                first=first + k,
-                time_s=time[part],
-                signals=MappingProxyType({name: x[part] for name, x in signals.items()}),
-                truth=MappingProxyType({name: x[part] for name, x in stretch.truth.items()}),
-            )
-
-
-def _signals(run: _Run, stretch: Stretch, excitation: Array) -> dict[str, Array]:
-    of = run.bench.linear.model
-    found = {of.inputs[0]: stretch.command}
-    found.update({o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)})
-    found["excitation"] = excitation
-    if stretch.speed is not None and stretch.angle is not None:
-        found |= {"speed": stretch.speed, "angle": stretch.angle}
-    return found
-
-
-def _lost(run: _Run) -> NDArray[np.int64]:
-    """Return first, stop and column (-1: all) of what is lost, shape (n_losses, 3)."""
-    if not run.scenario.dropped:
-        return np.zeros((0, 3), dtype=np.int64)
-    found = losses(run.n_samples, run.size, run.seed, first=run.first_sample)
-    return np.array([(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in found], dtype=np.int64)
-
-
-def _lose(signals: dict[str, Array], lost: NDArray[np.int64], first: int) -> None:
-    columns = list(signals.values())
-    stop = first + columns[0].size
-    for a, b, column in lost[(lost[:, 1] > first) & (lost[:, 0] < stop)].tolist():
-        part = slice(max(a - first, 0), min(b, stop) - first)
-        for values in columns if column < 0 else [columns[column % len(columns)]]:
-            values[part] = np.nan
+    def blocks(self, block: int) -> Iterator[ScenarioBlock]:
+        """Yield the scenario block by block, lost samples NaN."""
+        of, lost = self.bench.linear.model, list[tuple[int, int, int]]()  # first, stop and column, -1: all
+        if self.scenario.dropped:
+            bursts = losses(self.n_samples, self.size, self.seed, first=self.first_sample)
+            lost = [(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in bursts]
+        chunk = block * math.ceil(_CHUNK / block)
+        for first in range(0, self.n_samples, chunk):
+            u = self.excitation(first, min(chunk, self.n_samples - first))
+            stretch = self.running.advance(u)
+            signals = {of.inputs[0]: stretch.command}
+            signals |= {o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)}
+            signals["excitation"] = u
+            if stretch.speed is not None and stretch.angle is not None:
+                signals |= {"speed": stretch.speed, "angle": stretch.angle}
+            columns, stop = list(signals.values()), first + u.size
+            for a, b, column in (x for x in lost if x[1] > first and x[0] < stop):
+                for values in columns if column < 0 else [columns[column % len(columns)]]:
+                    values[max(a - first, 0) : min(b, stop) - first] = np.nan
+            time = (first + np.arange(u.size)) / self.bench.rate_hz
+            for k in range(0, u.size, block):
+                part = slice(k, min(k + block, u.size))
+                yield ScenarioBlock(
+                    first=first + k,
+                    time_s=time[part],
+                    signals=MappingProxyType({name: x[part] for name, x in signals.items()}),
+                    truth=MappingProxyType({name: x[part] for name, x in stretch.truth.items()}),
+                )

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 from types import MappingProxyType
 from typing import Literal, NamedTuple, Self
 
@@ -272,10 +273,7 @@ class Pieces(NamedTuple):
     theta: Mapping[str, Array]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class _Part:
-    middles: Array
-    matrices: tuple[Array, Array, Array, Array]
+Matrices = tuple[Array, Array, Array, Array]
 
 
 class Tables:
@@ -296,59 +294,60 @@ class Tables:
         knots = [s.knots(rate_hz) for s in self._schedules.values()]
         inside = np.unique(np.concatenate([np.zeros(1), *knots]))
         self._corners = inside[inside >= 0.0].astype(np.int64)
-        self._moving = [self._moves(j) for j in range(self._corners.size)]
-        self._halvings = max(0, math.ceil(math.log2(max(self._norm(), 1e-9) / 0.5)))
-        self._known: dict[tuple[float, ...], tuple[Array, Array, Array, Array]] = {}
+        self._moving = []  # by corner, whether anything changes up to the next
+        for begin, end in pairwise(self._corners):
+            near = begin + np.array([0.25, 0.75]) * (end - begin)
+            values = [s.at(near, rate_hz) for s in self._schedules.values()]
+            self._moving.append(any(v[0] != v[1] for v in values))
+        self._moving.append(False)
+        # the largest 1-norm at the corners: in between the parameters, and about so the norm, are smaller
+        at = self._corners.astype(np.float64)
+        thetas = self._parameters(at) + self._parameters(at, before=np.ones(at.size, dtype=np.bool_))
+        norm = float(np.abs(self._stacked(thetas)).sum(axis=1).max())
+        self._halvings = max(0, math.ceil(math.log2(max(norm, 1e-9) / 0.5)))
+        self._known: dict[tuple[float, ...], Matrices] = {}
 
     @property
     def corners(self) -> Integers:
         """Samples at which anything begins or ends to change, shape (n_corners,), the first of them 0."""
         return self._corners
 
-    def _moves(self, j: int) -> bool:
-        if j + 1 == self._corners.size:
-            return False
-        near = self._corners[j] + np.array([0.25, 0.75]) * (self._corners[j + 1] - self._corners[j])
-        values = [s.at(near, self._rate) for s in self._schedules.values()]
-        return any(v[0] != v[1] for v in values)
-
     def pieces(self, first: int, stop: int) -> Pieces:
         """Return the stretches of samples `first` to `stop`, counted from `first`."""
         edges: list[int] = [first]
-        parts: list[_Part] = []
+        places, parts = list[Array](), list[Matrices]()
         j = int(np.searchsorted(self._corners, first, side="right")) - 1
         while edges[-1] < stop:
             begin = int(self._corners[j])
             end = int(self._corners[j + 1]) if j + 1 < self._corners.size else max(stop, begin + 1)
             if self._moving[j]:
-                part, ends = self._drifting(begin, end, edges[-1], min(end, stop))
+                middle, matrices, ends = self._drifting(begin, end, edges[-1], min(end, stop))
                 edges.extend(ends)
             else:
-                part = self._still(begin)
+                middle = np.array([begin + 0.5])
+                matrices = self._still(middle)
                 edges.append(min(end, stop))
-            parts.append(part)
+            places.append(middle)
+            parts.append(matrices)
             j += 1
-        middles = np.concatenate([p.middles for p in parts])
-        a, b, late, e = (
-            np.ascontiguousarray(np.concatenate(m)) for m in zip(*(p.matrices for p in parts), strict=True)
-        )
+        middles = np.concatenate(places)
+        a, b, late, e = (np.ascontiguousarray(np.concatenate(m)) for m in zip(*parts, strict=True))
         theta = {name: s.at(middles, self._rate) for name, s in self._schedules.items()}
         one = np.ones(middles.size)
         gains = np.ascontiguousarray(np.column_stack([theta.get(f"gain_{o}", one) for o in self._of.outputs]))
         return Pieces(np.array(edges, dtype=np.int64) - first, gains, (a, b, late, e), theta)
 
-    def _still(self, begin: int) -> _Part:
-        """Return one stretch, with matrices to the last bit as `Standing.equations` has them."""
-        middle = np.array([begin + 0.5])
+    def _still(self, middle: Array) -> Matrices:
+        """Return the matrices of one stretch, to the last bit as `Standing.equations` has them."""
         (theta,) = self._parameters(middle)
         key = tuple(theta.values())
         if key not in self._known:
             d, _ = discretise(self._of.matrices(theta), 1.0 / self._rate, fraction=self._fraction)
             self._known[key] = (d.A[None], d.B[None, :, 0], d.B_late[None, :, 0], d.E[None])
-        return _Part(middles=middle, matrices=self._known[key])
+        return self._known[key]
 
-    def _drifting(self, begin: int, end: int, first: int, stop: int) -> tuple[_Part, list[int]]:
-        """Return the cells of an interval in which something moves, and where each ends.
+    def _drifting(self, begin: int, end: int, first: int, stop: int) -> tuple[Array, Matrices, list[int]]:
+        """Return the cells of an interval in which something moves: middles, matrices, and where each ends.
 
         Matrices are exact at nodes, every `_NODE` cells, and linear between them: right to second order in the change
         from node to node, where held ones are right to first order in the change over a cell.
@@ -363,9 +362,8 @@ class Tables:
         at = cells // _NODE - numbers[0]
         weight = (middles - nodes[at]) / (nodes[at + 1] - nodes[at])
         exact = self._exact(self._parameters(nodes, before=nodes > begin))
-        matrices = [m[at] + weight.reshape(-1, *[1] * (m.ndim - 1)) * (m[at + 1] - m[at]) for m in exact]
-        part = _Part(middles=middles, matrices=(matrices[0], matrices[1], matrices[2], matrices[3]))
-        return part, np.minimum(ends, stop).tolist()
+        a, b, late, e = (m[at] + weight.reshape(-1, *[1] * (m.ndim - 1)) * (m[at + 1] - m[at]) for m in exact)
+        return middles, (a, b, late, e), np.minimum(ends, stop).tolist()
 
     def _parameters(self, samples: Array, before: NDArray[np.bool_] | None = None) -> list[dict[str, float]]:
         """Return all parameters of the model at sample numbers; where `before`, the value ahead of a jump."""
@@ -376,7 +374,7 @@ class Tables:
         rows = zip(*(v.tolist() for v in values.values()), strict=True) if values else [()] * samples.size
         return [{**self._fixed, **dict(zip(values, row, strict=True))} for row in rows]
 
-    def _exact(self, thetas: list[dict[str, float]]) -> tuple[Array, Array, Array, Array]:
+    def _exact(self, thetas: list[dict[str, float]]) -> Matrices:
         """Discretise many at once: exp([[A, B, E], [0, 0, 0]] T) holds all three (Van Loan 1978)."""
         stack = self._stacked(thetas)
         n, inside = len(self._of.states), slice(0, len(self._of.states))
@@ -392,12 +390,6 @@ class Tables:
         stack[:, :n, n] = [s.B[:, 0] for s in spaces]
         stack[:, :n, n + 1 :] = [s.E for s in spaces]
         return np.asarray(stack / self._rate)
-
-    def _norm(self) -> float:
-        """Return the largest 1-norm at the corners: in between the parameters, and about so the norm, are smaller."""
-        at = self._corners.astype(np.float64)
-        thetas = self._parameters(at) + self._parameters(at, before=np.ones(at.size, dtype=np.bool_))
-        return float(np.abs(self._stacked(thetas)).sum(axis=1).max())
 
 
 def exponentials(stack: Array, halvings: int) -> Array:
