@@ -238,41 +238,14 @@ NO_WEIGHTS = "no finite weights were found: the columns vary too much in size fr
 """Why the weights of a network that looks at measured signals alone come to nothing."""
 
 
-def provenance(records: Sequence[IOData]) -> dict[str, Any]:
-    """Return channels, units, rate and records, by the names that `NonlinearFit` has for them."""
-    first = {k: getattr(records[0], k) for k in ("inputs", "outputs", "dt")}
-    return {**first, "units": dict(records[0].units), "records": tuple(dict(x.record) for x in records)}
-
-
-def failed_fit(
-    structure: str,
-    records: Sequence[IOData],
-    settings: Mapping[str, object],
-    seed: int,
-    reason: str,
-    timing_s: Mapping[str, float],
-) -> NonlinearFit:
-    """Return a fit without a model, for a reason of one line."""
-    p = records[0].n_outputs
-    return NonlinearFit(
-        structure=structure,
-        settings=dict(settings),
-        model=None,
-        covariance=None,
-        n_estimated=0,
-        noise_covariance=np.full((p, p), np.nan),
-        seed=seed,
-        status="failed",
-        reason=reason,
-        timing_s=dict(timing_s),
-        **provenance(records),
-    )
-
-
 @dataclass(slots=True, kw_only=True)
 class Attempt:
     """What a fit has come to, so that an interruption loses nothing."""
 
+    structure: str
+    records: Sequence[IOData]
+    settings: dict[str, Any]  # as used
+    seed: int = 0
     status: Literal["converged", "stalled"] = "converged"
     curves: list[LearningCurve] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -309,14 +282,39 @@ class Attempt:
         self.status = "stalled"
         self.warnings.insert(0, "interrupted: the best model so far")
 
-    def result(
-        self, structure: str, records: Sequence[IOData], settings: Mapping[str, object], seed: int, **found: Any
-    ) -> NonlinearFit:
-        """Return the fit of a model; `found` are the other fields of `NonlinearFit`."""
+    def guarded(self, identify: Callable[[], None]) -> str:
+        """Run the stages of a fit and return why they broke down; an interruption leaves the best model so far."""
+        began = perf_counter()
+        try:
+            identify()
+        except KeyboardInterrupt:
+            self.interrupt()
+        except (np.linalg.LinAlgError, FloatingPointError) as error:
+            self.timing_s["all"] = perf_counter() - began
+            return f"the training failed: {error}"
+        return ""
+
+    def failed(self, reason: str) -> NonlinearFit:
+        """Return a fit without a model, for a reason of one line."""
+        p = self.records[0].n_outputs
+        return self._fit(
+            model=None, covariance=None, n_estimated=0, noise_covariance=np.full((p, p), np.nan), status="failed",
+            reason=reason,
+        )  # fmt: skip
+
+    def result(self, **fields: Any) -> NonlinearFit:
+        """Return the fit of a model; `fields` are the other fields of `NonlinearFit`."""
+        return self._fit(
+            status=self.status, curves=tuple(self.curves), warnings=tuple(self.warnings), details=dict(self.details),
+            **fields,
+        )  # fmt: skip
+
+    def _fit(self, **fields: Any) -> NonlinearFit:
+        first = self.records[0]
         return NonlinearFit(
-            structure=structure, settings=dict(settings), seed=seed, status=self.status, curves=tuple(self.curves),
-            warnings=tuple(self.warnings), timing_s=dict(self.timing_s), details=dict(self.details),
-            **provenance(records), **found,
+            structure=self.structure, settings=dict(self.settings), seed=self.seed, timing_s=dict(self.timing_s),
+            inputs=first.inputs, outputs=first.outputs, units=dict(first.units), dt=first.dt,
+            records=tuple(dict(x.record) for x in self.records), **fields,
         )  # fmt: skip
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from time import perf_counter
 from typing import Any, ClassVar, Self
 
@@ -20,12 +20,11 @@ from ambid.errors import EstimationError
 from ambid.estimation.linear import least_squares
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
-from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, failed_fit, read_settings, whole
+from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, read_settings, whole
 from ambid.nonlinear.lagged import Block, LaggedFunction, Mask, Regressors, Table, Terms, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
     finish,
-    guarded,
     laplace,
     problem_at,
     refine,
@@ -162,7 +161,10 @@ def hammerstein(
     if data.n_outputs > 1 or not data.u_level.size:
         raise EstimationError("hammerstein: a model has one output, and inputs. Choose one output, and an input")
     of = HammersteinFunction(m=data.u_level.size, ny=s.ny, nu=s.nu, nk=s.nk, degree=s.degree)
-    draft = Draft(function=of, theta=of.start(data))
+    draft = Draft(
+        structure="hammerstein", records=records, settings=asdict(s), seed=seed, data=data, function=of,
+        theta=of.start(data),
+    )  # fmt: skip
     ticks = portions(tick, (1.0, 2.0 * (s.focus == "simulation")))
 
     def identify() -> None:
@@ -170,22 +172,14 @@ def hammerstein(
         problem = problem_at(of, data.parts, draft.theta)
         found = search(problem, draft.theta, stage="search", most=s.iterations, tick=ticks[0], keep=draft.keep)
         draft.keep(found.theta)
-        draft.note(found, problem, "Levenberg-Marquardt, prediction errors")
-        draft.status = "converged" if found.converged else "stalled"
+        draft.settle(found, problem, "Levenberg-Marquardt, prediction errors")
         began = draft.timed("search", began)
         if s.focus == "simulation":
-            free = lambda theta: problem_at(of, data.parts, theta, free=True)  # noqa: E731
-            refine(draft, free, s.iterations, ticks[1], "terms")
+            refine(draft, partial(problem_at, of, data.parts, free=True), s.iterations, ticks[1], "terms")
             draft.timed("simulation errors", began)
 
-    def fail(why: str) -> NonlinearFit:
-        return failed_fit("hammerstein", records, asdict(s), seed, why, draft.timing_s)
-
-    failed = guarded(identify, draft, fail)
+    reason = draft.guarded(identify)
     problem = problem_at(of, data.parts, draft.theta, free=draft.free)
-    if failed or not np.isfinite(problem.cost(draft.theta)):
-        return failed or fail(NO_WEIGHTS)
-    return finish(
-        "hammerstein", records, asdict(s), data, draft, problem, laplace(problem, draft.theta), units="lags or powers",
-        seed=seed,
-    )  # fmt: skip
+    if reason or not np.isfinite(problem.cost(draft.theta)):
+        return draft.failed(reason or NO_WEIGHTS)
+    return finish(draft, problem, laplace(problem, draft.theta), units="lags or powers")

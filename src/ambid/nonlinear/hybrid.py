@@ -30,7 +30,7 @@ from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, guessed, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import penalty
-from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit, number, read_settings, whole
+from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, number, read_settings, whole
 from ambid.nonlinear.lagged import (
     Block,
     LaggedFunction,
@@ -49,7 +49,6 @@ from ambid.nonlinear.lagged_problem import (
     choose_smallest,
     draw_start,
     finish,
-    guarded,
     laplace,
     problem_at,
     rms_error,
@@ -71,7 +70,7 @@ from ambid.nonlinear.polynomial import (
     terms_to_json,
     unit_of,
 )
-from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.records import Parts, scaled_records
 
 MOST_NOISE = 4  # largest order of C that is tried where it is left open
 _NEURONS = (0, 1, 2, 4, 8)
@@ -240,16 +239,10 @@ class HybridFunction(LaggedFunction):
 
 
 @dataclass(slots=True, kw_only=True)
-class _Hybrid(Draft):
-    """A draft whose function is a hybrid one."""
+class _Hybrid(Draft[HybridFunction]):
+    """A draft with what is known of its terms."""
 
     err: Mapping[tuple[str, str], float]  # error reduction ratios in the choice of the polynomial, by output and term
-
-    @property
-    def model(self) -> HybridFunction:
-        """Its function."""
-        assert isinstance(self.function, HybridFunction)
-        return self.function
 
     def take(self, function: HybridFunction, theta: Array) -> None:
         """Take over another model."""
@@ -276,23 +269,32 @@ def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     began = perf_counter()
     first = narmax(records, s.polynomial, seed=seed, tick=ticks[0])
     timing = {"polynomial": perf_counter() - began}
+    attempt: dict[str, Any] = {
+        "structure": "hybrid", "records": records, "settings": asdict(s), "seed": seed, "timing_s": timing
+    }  # fmt: skip
     if not isinstance(first.model, LaggedModel):
-        return failed_fit("hybrid", records, asdict(s), seed, first.reason, timing)
-    draft = _polynomial(s, first, first.model)
-    draft.timing_s.update(timing)
+        return Attempt(**attempt).failed(first.reason)
+    function, theta = _polynomial(s, first.model)
+    chosen: Any = first.details["terms"]
+    draft = _Hybrid(
+        **attempt, data=data, function=function, theta=theta,
+        err={(out, x["term"]): x["err"] for out, own in chosen.items() for x in own},
+        curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
+        details={"candidates": first.details["candidates"], "tried": []},
+    )  # fmt: skip
 
     def identify() -> None:
         if any(w.startswith("interrupted") for w in first.warnings):
             raise KeyboardInterrupt
-        _identify(s, data, draft, seed, ticks[1:])
+        _identify(s, draft, ticks[1:])
         if draft.status == "stalled":
             draft.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
-    failed = guarded(identify, draft, lambda why: failed_fit("hybrid", records, asdict(s), seed, why, draft.timing_s))
-    return failed or _finish(s, records, data, draft, seed)
+    reason = draft.guarded(identify)
+    return draft.failed(reason) if reason else _finish(s, draft)
 
 
-def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _Hybrid:
+def _polynomial(s: HybridSettings, model: LaggedModel) -> tuple[HybridFunction, Array]:
     """The polynomial model as a hybrid without neurons, its chosen noise terms in a full C."""
     assert isinstance(model.function, PolynomialFunction)
     terms = tuple(tuple(x for x in one if not is_noisy(x)) for one in model.function.numerators)
@@ -301,23 +303,16 @@ def _polynomial(s: HybridSettings, first: NonlinearFit, model: LaggedModel) -> _
         terms=terms, ne=ne if s.ne is None else s.ne, p=model.n_outputs, m=model.n_inputs, ny=s.ny, nu=s.nu, nk=s.nk,
         neurons=0,
     )  # fmt: skip
-    known = dict(zip(model.names, model.scaled_theta, strict=True))
-    start = np.array([known.get(name, 0.0) for name in function.names], dtype=np.float64)
-    chosen: Any = first.details["terms"]
-    return _Hybrid(
-        function=function,
-        theta=function.make_invertible(start),
-        err={(out, x["term"]): x["err"] for out, own in chosen.items() for x in own},
-        curves=[replace(c, method=f"polynomial: {c.method}") for c in first.curves],
-        details={"candidates": first.details["candidates"], "tried": []},
-    )
+    values = dict(zip(model.names, model.scaled_theta, strict=True))
+    start = np.array([values.get(name, 0.0) for name in function.names], dtype=np.float64)
+    return function, function.make_invertible(start)
 
 
-def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks: list[Tick | None]) -> None:
-    began = perf_counter()
-    lean = _lean(draft.model)
+def _identify(s: HybridSettings, draft: _Hybrid, ticks: list[Tick | None]) -> None:
+    began, parts = perf_counter(), draft.data.parts
+    lean = _lean(draft.function)
     draft.function = lean
-    _search(s, data, draft, "polynomial and noise model", ticks[0])
+    _search(s, draft, "polynomial and noise model", ticks[0])
     # all regressors of the network are in the polynomial too: it shall not do what is linear, nor hide a term
     factors = lagged(lean.p, lean.m, ny=s.ny, nu=s.nu, nk=s.nk)
     few = draft.details["candidates"] <= _FEW
@@ -326,7 +321,7 @@ def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks:
     start = transfer(lean, draft.theta, full)
     neurons = s.neurons
     if neurons is None:
-        neurons = _choose_neurons(s, full, start, data.parts, draft, seed, ticks[1])
+        neurons = _choose_neurons(s, full, start, draft, ticks[1])
         if not neurons:
             few, as_well = "is all that so few samples allow", "predicts held-out data as well as with a network"
             draft.warnings.append(
@@ -335,17 +330,17 @@ def _identify(s: HybridSettings, data: Scaled, draft: _Hybrid, seed: int, ticks:
     began = draft.timed("choice of neurons", began)
     if neurons:
         function = replace(full, neurons=neurons)
-        theta = train(s, function, start, data.parts, seed, s.starts, ticks[2], draft)
+        theta = train(s, function, start, parts, draft.seed, s.starts, ticks[2], draft)
         draft.take(function, theta)
-        problem = _search(s, data, draft, "all together", ticks[3])
+        problem = _search(s, draft, "all together", ticks[3])
         _revise(s, problem.at(draft.theta), draft, ticks[4])
     if s.ne is None:
-        problem = hybrid_problem(draft.model, data.parts, draft.theta, s.prior)
+        problem = hybrid_problem(draft.function, parts, draft.theta, s.prior)
         draft.take(*choose_noise(problem, draft.theta, s.prior, ticks[5]))
         if not neurons:
-            function = _lean(draft.model)
-            draft.take(function, transfer(draft.model, draft.theta, function))
-    _search(s, data, draft, "all together", ticks[6])
+            function = _lean(draft.function)
+            draft.take(function, transfer(draft.function, draft.theta, function))
+    _search(s, draft, "all together", ticks[6])
     draft.timed("all together", began)
 
 
@@ -371,10 +366,10 @@ def transfer(old: HybridFunction, theta: Array, new: HybridFunction) -> Array:
     return new.make_invertible(np.array([known.get(name, 0.0) for name in new.names], dtype=np.float64))
 
 
-def _search(s: HybridSettings, data: Scaled, draft: _Hybrid, stage: str, tick: Tick | None) -> LaggedProblem:
+def _search(s: HybridSettings, draft: _Hybrid, stage: str, tick: Tick | None) -> LaggedProblem:
     """Search for all numbers, errors of unit variance."""
-    function = draft.model
-    problem = hybrid_problem(function, data.parts, draft.theta, s.prior)
+    function = draft.function
+    problem = hybrid_problem(function, draft.data.parts, draft.theta, s.prior)
     if tick is not None:
         tick(stage, 0.0)
     found = search(
@@ -389,8 +384,7 @@ def _search(s: HybridSettings, data: Scaled, draft: _Hybrid, stage: str, tick: T
         keep=partial(draft.take, function),
     )
     draft.take(function, found.theta)
-    draft.note(found, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
-    draft.status = "converged" if found.converged else "stalled"
+    draft.settle(found, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
     return problem
 
 
@@ -429,15 +423,14 @@ def train(
 
 
 def _choose_neurons(
-    s: HybridSettings, function: HybridFunction, linear: Array, parts: Parts, draft: _Hybrid, seed: int,
-    tick: Tick | None,
-) -> int:  # fmt: skip
+    s: HybridSettings, function: HybridFunction, linear: Array, draft: _Hybrid, tick: Tick | None
+) -> int:
     """Choose the number of hidden units by one-step errors behind the parts of the records that are trained on.
 
     A short record has several ends that are held out, one before the other.
     """
-    most = max(_MOST_ROWS // len(parts), 10 * function.lag + 60)
-    parts, share = tuple((y[:most], u[:most]) for y, u in parts), s.held_out
+    most = max(_MOST_ROWS // len(draft.data.parts), 10 * function.lag + 60)
+    parts, share = tuple((y[:most], u[:most]) for y, u in draft.data.parts), s.held_out
     n = sum(y.shape[0] - function.lag for y, _ in parts)
     if n * share < _FEWEST:
         return 0
@@ -448,7 +441,7 @@ def _choose_neurons(
         for end, own in zip(ends, portions(tick, ends), strict=True):
             some = tuple((y[: round(end * y.shape[0])], u[: round(end * y.shape[0])]) for y, u in parts)
             training, held = split(some, share / end, function.lag)
-            theta = train(s, one, linear, training, seed, 2, part_of(own, 0.0, 0.8)) if one.neurons else linear
+            theta = train(s, one, linear, training, draft.seed, 2, part_of(own, 0.0, 0.8)) if one.neurons else linear
             problem = hybrid_problem(one, training, theta, s.prior)
             theta = search(problem, theta, stage="choice of neurons", tick=part_of(own, 0.8, 1.0), **_ROUGH).theta
             squares += rms_error(one, theta, held) ** 2
@@ -489,11 +482,11 @@ def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tic
     Terms were chosen before there was a network, so that some only imitate it. One that the network could take over
     stays: otherwise units that are to spare would swallow it, and what can be read would become what cannot.
     """
-    n = max(problem.n_errors // draft.model.p, 2)
-    for k in range(draft.model.n_terms):
+    n = max(problem.n_errors // draft.function.p, 2)
+    for k in range(draft.function.n_terms):
         if tick is not None:
             tick("terms beside the network", guessed(k, 4.0))
-        of, theta = draft.model, draft.theta
+        of, theta = draft.function, draft.theta
         R = problem.triangle(theta)[:, :-1]
         P, _ = information_inverse(R)
         if P is None:
@@ -528,27 +521,41 @@ def _inflation(R: Array, P: Array, n_linear: int) -> Array:
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-def _finish(s: HybridSettings, records: Sequence[IOData], data: Scaled, draft: _Hybrid, seed: int) -> NonlinearFit:
-    of = draft.model
-    used = {**asdict(s), "ne": of.ne, "neurons": of.neurons}
-    problem = hybrid_problem(of, data.parts, draft.theta, s.prior)
+def _finish(s: HybridSettings, draft: _Hybrid) -> NonlinearFit:
+    of, records = draft.function, draft.records
+    draft.settings |= {"ne": of.ne, "neurons": of.neurons}
+    problem = hybrid_problem(of, draft.data.parts, draft.theta, s.prior)
     if not np.isfinite(problem.cost(draft.theta)):
-        return failed_fit("hybrid", records, used, seed, DIVERGED, draft.timing_s)
+        return draft.failed(DIVERGED)
     found = laplace(problem, draft.theta)
-    draft.warnings += _cautions(draft, found)
+    radius = of.noise_radius(draft.theta)
+    if radius > _NEAR:
+        draft.warnings.append(
+            f"C has a root at {radius:.4g}, close to the unit circle, which the search must not cross: its "
+            "standard deviation is unreliable, and the predictor forgets its start slowly. A differenced or "
+            "detrended output causes this"
+        )
+    if found.covariance is not None:
+        inflated = _inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
+        names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > _SHARED)
+        if names:
+            draft.warnings.append(
+                f"the network can replace these terms, so that their values are not unique: {names}. Use fewer "
+                "neurons or a smaller prior"
+            )
     spare = _spare_units(of, draft.theta, problem, found)
     terms: dict[str, list[dict[str, object]]] = {}
     for o, out in enumerate(records[0].outputs):
-        named = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
-        terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in named]
-    draft.details |= {"terms": terms, "levels": data.levels(records[0])}
+        names_of = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
+        terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in names_of]
+    draft.details |= {"terms": terms, "levels": draft.data.levels(records[0])}
     why_not = (
         f"no standard deviations: {spare} of {of.neurons} units improve the fit by less than their parameters "
         f"cost, and intervals would be too narrow. Give neurons = {of.neurons - spare}"
     )
     return finish(
-        "hybrid", records, used, data, draft, problem, found, units="neurons or terms", how="laplace",
-        why_not=why_not if spare else "", noise=s.ne != 0, instead="Raise ne", seed=seed,
+        draft, problem, found, units="neurons or terms", how="laplace", why_not=why_not if spare else "",
+        noise=s.ne != 0, instead="Raise ne",
     )  # fmt: skip
 
 
@@ -567,23 +574,3 @@ def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found
         wald = theta[own] @ np.linalg.solve(found.covariance[np.ix_(own, own)], theta[own])
         spare += bool(wald < price)
     return spare
-
-
-def _cautions(draft: _Hybrid, found: Laplace) -> list[str]:
-    of, out = draft.model, []
-    radius = of.noise_radius(draft.theta)
-    if radius > _NEAR:
-        out.append(
-            f"C has a root at {radius:.4g}, close to the unit circle, which the search must not cross: its "
-            "standard deviation is unreliable, and the predictor forgets its start slowly. A differenced or "
-            "detrended output causes this"
-        )
-    if found.covariance is not None:
-        inflated = _inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
-        names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > _SHARED)
-        if names:
-            out.append(
-                f"the network can replace these terms, so that their values are not unique: {names}. Use fewer "
-                "neurons or a smaller prior"
-            )
-    return out

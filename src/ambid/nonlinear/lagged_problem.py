@@ -6,16 +6,15 @@ by block, slopes going on from block to block, so that a long record needs no mo
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from time import perf_counter
-from typing import Any, Protocol, Self
+from typing import Any, Generic, Protocol, Self, TypeVar
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData
 from ambid.estimation.linear import information_inverse, least_squares, triangle_of
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
@@ -330,11 +329,6 @@ def laplace(problem: LaggedProblem, theta: Array) -> Laplace:
     return Laplace(covariance=P, noise=noise, effective=effective, condition=condition, triangle=R)
 
 
-def sandwiched(problem: LaggedProblem, theta: Array) -> Array | None:
-    """Return the covariance that does not take errors as white; None where data and prior leave a direction open."""
-    return sandwich_at(problem, problem.whole(theta)[problem.live])
-
-
 class SampledProblem(Protocol):
     """A problem of least squares that tells the rows of each sample."""
 
@@ -344,50 +338,46 @@ class SampledProblem(Protocol):
 
 
 def sandwich_at(problem: SampledProblem, v: Array) -> Array | None:
-    """As `sandwiched`, of what is searched."""
+    """Return the covariance that does not take errors as white; None where data and prior leave a direction open."""
     rows, prior = problem.sample_rows(v), problem.prior_rows(v)[:, :-1]
     scores = [np.einsum("tok,to->tk", r[:, :, :-1], r[:, :, -1]) for r in rows]
     return sandwich(problem.triangle(v)[:, :-1], scores, prior.T @ prior, [r[:, :, :-1] for r in rows])[0]
 
 
+F = TypeVar("F", bound=LaggedFunction)
+
+
 @dataclass(slots=True, kw_only=True)
-class Draft(Attempt):
+class Draft(Attempt, Generic[F]):
     """What the fit of a lagged function has come to."""
 
-    function: LaggedFunction
+    data: Scaled
+    function: F
     theta: Array  # (n_theta,), scaled
     free: bool = False  # whether `theta` is that of simulation errors
     stopped_early: bool = False
     held_out: float = float("nan")  # error on held-out data; NaN without
+    sampled: Array | None = None  # covariance by bootstrap
 
     def keep(self, theta: Array) -> None:
         """Take over other parameters."""
         self.theta = theta
 
     def note(self, found: Found, problem: LaggedProblem, method: str) -> None:
-        """Add the learning curve of a search, and say whether it ended."""
+        """Add the learning curve of a search."""
         noise = np.linalg.inv(problem.weight) if np.isfinite(found.cost) else np.eye(problem.weight.shape[0])
         size = float(np.sqrt(np.sum(noise**2) / noise.shape[0]))
         self.note_curve(found, method, problem.n_errors, size)
 
-
-def guarded(identify: Callable[[], None], draft: Attempt, failed: Callable[[str], NonlinearFit]) -> NonlinearFit | None:
-    """Run the stages of a fit; an interruption leaves the best draft, a breakdown gives a failed fit."""
-    began = perf_counter()
-    try:
-        identify()
-    except KeyboardInterrupt:
-        draft.interrupt()
-    except (np.linalg.LinAlgError, FloatingPointError) as error:
-        draft.timing_s["all"] = perf_counter() - began
-        return failed(f"the training failed: {error}")
-    return None
+    def settle(self, found: Found, problem: LaggedProblem, method: str) -> None:
+        """Add the learning curve of a search, and whether it converged."""
+        self.note(found, problem, method)
+        self.status = "converged" if found.converged else "stalled"
 
 
 def train_watched(
-    draft: Draft,
+    draft: Draft[Any],
     problem_of: Callable[[Parts, Array], LaggedProblem],
-    parts: Parts,
     share: float,
     method: str,
     tick: Tick | None,
@@ -399,7 +389,7 @@ def train_watched(
 
     `problem_of` gives the problem of some records about parameters, `n_linear` see `solve_linear`.
     """
-    training, held = split(parts, share, draft.function.lag)
+    training, held = split(draft.data.parts, share, draft.function.lag)
     first, second = portions(tick, (1.0, 1.0 * bool(held)))
 
     def run(some: Parts, **more: Any) -> tuple[LaggedProblem, Found]:
@@ -418,14 +408,14 @@ def train_watched(
     draft.stopped_early = found.stopped_early
     draft.held_out = watch(found.theta) if held else float("nan")
     if held and not found.stopped_early:
-        _, found = run(parts, stage="all data", tick=second)
+        _, found = run(draft.data.parts, stage="all data", tick=second)
         draft.keep(found.theta)
     draft.status = "converged" if found.converged else "stalled"
     return found
 
 
 def refine(
-    draft: Draft, problem_of: Callable[[Array], LaggedProblem], most: int, tick: Tick | None, units: str
+    draft: Draft[Any], problem_of: Callable[[Array], LaggedProblem], most: int, tick: Tick | None, units: str
 ) -> None:
     """Go on with the errors of the free run; `problem_of` gives its problem around parameters."""
     problem = problem_of(draft.theta)
@@ -445,73 +435,54 @@ def refine(
         start = draft.theta[problem.live]
         found = search(problem, start, stage="simulation errors", most=most, tick=part, keep=keep)
         keep(found.theta)
-        draft.note(found, problem, "Levenberg-Marquardt, simulation errors")
-        draft.status = "converged" if found.converged else "stalled"
+        draft.settle(found, problem, "Levenberg-Marquardt, simulation errors")
         problem = problem_of(draft.theta)
 
 
-def _cautions(draft: Draft, problem: LaggedProblem, found: Laplace, units: str) -> list[str]:
-    """Return what a reader must be told of any lagged model; `units` are what it has too many of."""
-    out, taken = [], found.effective / problem.n_errors
-    if taken > _CROWDED:
-        out.append(
-            f"the data determine {taken:.0%} as many parameters as there are errors: the model overfits, and "
-            f"standard deviations are unreliable. Use fewer {units}, or a longer record"
-        )
-    if draft.stopped_early:
-        out.append(
-            f"training was stopped at the smallest held-out error: more {units.split()[0]} than the data support; "
-            "standard deviations are those of a linearisation there"
-        )
-    if not draft.free and not np.isfinite(rms_error(draft.function, draft.theta, problem.parts, free=True)):
-        out.append(
-            "the simulation diverges on the training records: the model is fit for prediction, not for simulation"
-        )
-    return out
-
-
-def _bias_caution(structure: str, records: Sequence[IOData], draft: Draft, instead: str) -> list[str]:
-    """Return what a reader must be told of a model without a noise model, unless there is no feedback."""
-    if not records[0].n_inputs or all(x.open_loop for x in records):
-        return []
-    what = "simulation" if draft.free else "one-step errors"
-    return [
-        f"{structure} has no noise model: trained on {what}, it is biased by feedback unless its errors are white. "
-        f"{instead}, or give --open-loop if the records are open loop"
-    ]
-
-
 def finish(
-    structure: str,
-    records: Sequence[IOData],
-    used: Mapping[str, object],
-    data: Scaled,
-    draft: Draft,
+    draft: Draft[Any],
     problem: LaggedProblem,
     found: Laplace,
     *,
     units: str,
     how: str = "auto",
     why_not: str = "",
-    sampled: Array | None = None,
     noise: bool = False,
     instead: str = "Use narmax or nn",
-    seed: int,
 ) -> NonlinearFit:
     """Return the fit of a draft in SI with the covariance that was asked for, and what a reader must be told.
 
-    `units` are what a model has too many of, `how` is the setting ``uncertainty``, `sampled` a covariance by bootstrap;
-    `why_not` says why there are no standard deviations. Without a `noise` model feedback does harm; `instead` says what
-    to do then.
+    `units` are what a model has too many of, `how` is the setting ``uncertainty``; `why_not` says why there are no
+    standard deviations. Without a `noise` model feedback does harm; `instead` says what to do then.
     """
-    draft.warnings += _cautions(draft, problem, found, units)
-    if not noise:
-        draft.warnings += _bias_caution(structure, records, draft, instead)
+    records, data, taken = draft.records, draft.data, found.effective / problem.n_errors
+    if taken > _CROWDED:
+        draft.warnings.append(
+            f"the data determine {taken:.0%} as many parameters as there are errors: the model overfits, and "
+            f"standard deviations are unreliable. Use fewer {units}, or a longer record"
+        )
+    if draft.stopped_early:
+        draft.warnings.append(
+            f"training was stopped at the smallest held-out error: more {units.split()[0]} than the data support; "
+            "standard deviations are those of a linearisation there"
+        )
+    if not draft.free and not np.isfinite(rms_error(draft.function, draft.theta, problem.parts, free=True)):
+        draft.warnings.append(
+            "the simulation diverges on the training records: the model is fit for prediction, not for simulation"
+        )
+    if not noise and records[0].n_inputs and not all(x.open_loop for x in records):
+        draft.warnings.append(
+            f"{draft.structure} has no noise model: trained on {'simulation' if draft.free else 'one-step errors'}, it "
+            f"is biased by feedback unless its errors are white. {instead}, or give --open-loop if the records are "
+            "open loop"
+        )
     robust = how == "sandwich" or (draft.free and how == "auto")
     origin = "sandwich" if robust else "laplace" if np.any(problem.precision) else "information"
-    covariance = sandwiched(problem, draft.theta) if robust and not why_not else found.covariance
-    if sampled is not None:
-        covariance, origin = sampled, "bootstrap"
+    covariance = found.covariance
+    if robust and not why_not:
+        covariance = sandwich_at(problem, problem.whole(draft.theta)[problem.live])
+    if draft.sampled is not None:
+        covariance, origin = draft.sampled, "bootstrap"
     if how == "none":
         why_not = "no standard deviations: no covariance was requested"
     elif draft.free and origin == "laplace" and not why_not:
@@ -542,7 +513,7 @@ def finish(
     if np.any(problem.precision):
         draft.details = {"effective_parameters": found.effective, **draft.details}
     return draft.result(
-        structure, records, used, seed, model=model, covariance=whole, covariance_from="" if whole is None else origin,
+        model=model, covariance=whole, covariance_from="" if whole is None else origin,
         n_estimated=int(np.count_nonzero(problem.live)),
         noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
     )  # fmt: skip

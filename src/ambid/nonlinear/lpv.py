@@ -25,8 +25,7 @@ from ambid.estimation.linear import least_squares as solve
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import information
-from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, choice, failed_fit, number, read_settings, text, whole
-from ambid.nonlinear.lagged_problem import guarded
+from ambid.nonlinear.fit import Attempt, NonlinearFit, Settings, choice, number, read_settings, text, whole
 from ambid.nonlinear.lpv_model import (
     LEVEL,
     STEP,
@@ -137,24 +136,29 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     if not records:
         raise EstimationError("lpv: no record was given. Pass at least one")
     s, schedule, columns = lpv_settings(settings, records[0])
-    fitting, began = _begin(s, records, schedule, columns), perf_counter()
-
-    def fail(why: str) -> NonlinearFit:
-        return failed_fit("lpv", records, _used(s, fitting), seed, why, fitting.timing_s)
+    fitting, began = _begin(s, records, schedule, columns, seed), perf_counter()
 
     def identify() -> None:
         _identify(s, fitting, tick)
         if fitting.status == "stalled":
             fitting.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
-    failed = guarded(identify, fitting, fail)
+    reason = fitting.guarded(identify)
     fitting.timed("all", began)
-    if failed or fitting.reason or not np.isfinite(fitting.problem(fitting.shape).cost(fitting.theta)):
-        return failed or fail(fitting.reason or DIVERGED)
-    return _finish(records, _used(s, fitting), fitting, seed=seed)
+    of = fitting.shape
+    form = {(False, False): s.error_form, (True, False): "ar", (False, True): "ma", (True, True): "arma"}
+    fitting.settings |= {
+        "degree": of.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(of.ar, of.ma),
+        "form": of.form, "error_form": form[of.ar > 0, of.ma > 0],
+    }  # fmt: skip
+    if reason or fitting.reason or not np.isfinite(fitting.problem(of).cost(fitting.theta)):
+        return fitting.failed(reason or fitting.reason or DIVERGED)
+    return _finish(fitting)
 
 
-def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, columns: tuple[int, ...]) -> Fitting:
+def _begin(
+    s: LpvSettings, records: Sequence[IOData], schedule: Schedule, columns: tuple[int, ...], seed: int
+) -> Fitting:
     """A model by least squares: something to hand over when the very next thing is an interruption."""
     assert s.nb is not None
     tau = 50.0 * records[0].dt if s.time_constant is None else s.time_constant
@@ -178,22 +182,12 @@ def _begin(s: LpvSettings, records: Sequence[IOData], schedule: Schedule, column
             f"{'order or error_order' if s.degree is None else 'degree, order or error_order'}"
         )
     fitting = Fitting(
-        data=data, records=records, schedule=schedule.over(records, tau), shape=shape, theta=np.zeros(shape.n_theta),
-        first=first, most=s.iterations,
+        structure="lpv", records=records, settings=asdict(s), seed=seed, data=data,
+        schedule=schedule.over(records, tau), shape=shape, theta=np.zeros(shape.n_theta), first=first,
+        most=s.iterations,
     )  # fmt: skip
     fitting.theta = fitting.by_equations(shape)
     return fitting
-
-
-def _used(s: LpvSettings, fitting: Fitting) -> dict[str, object]:
-    """Settings with nothing left open."""
-    of = fitting.shape
-    form = {(False, False): s.error_form, (True, False): "ar", (False, True): "ma", (True, True): "arma"}
-    found = {
-        "degree": of.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(of.ar, of.ma),
-        "form": of.form, "error_form": form[of.ar > 0, of.ma > 0],
-    }  # fmt: skip
-    return {**asdict(s), **found}
 
 
 def _identify(s: LpvSettings, fitting: Fitting, tick: Tick | None) -> None:
@@ -356,7 +350,6 @@ class Fitting(Attempt):
     """What a fit has come to."""
 
     data: Scaled
-    records: Sequence[IOData]
     schedule: Schedule
     shape: LpvShape
     theta: Array  # (n_theta,), scaled
@@ -557,8 +550,9 @@ def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick:
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting, *, seed: int) -> NonlinearFit:
-    """Return the fit of a model that runs; `used` are the settings."""
+def _finish(fitting: Fitting) -> NonlinearFit:
+    """Return the fit of a model that runs."""
+    records = fitting.records
     problem, theta, of, d = fitting.problem(fitting.shape), fitting.theta, fitting.schedule, fitting.data
     noise = problem.cost(theta) / problem.freedom
     R = fitting.problem(fitting.shape, beside=fitting.level_counts).triangle(theta)
@@ -573,10 +567,10 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
         cloud=cloud_of(np.concatenate(near)),
     )  # fmt: skip
     model = model.with_theta(theta * model.unit)
-    warnings = [*fitting.warnings, *_cautions(records, fitting)]
+    fitting.warnings += _cautions(records, fitting)
     covariance = None
     if inverse is None:
-        warnings.append(
+        fitting.warnings.append(
             "no standard deviations: the data do not determine the coefficients (condition number "
             f"{condition:.1e}). Lower degree or error_order, or give records at more set points"
         )
@@ -585,7 +579,6 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
             (noise * inverse[: theta.size, : theta.size] + _disagreement(fitting)) * model.unit[:, None] * model.unit
         )
     column = records[0].outputs[0] if of.column < 0 else of.name
-    fitting.warnings = warnings
     fitting.details = {
         "schedule": {
             "signal": of.name, "low": of.low, "high": of.high, "time_constant_s": of.time_constant,
@@ -595,7 +588,7 @@ def _finish(records: Sequence[IOData], used: dict[str, object], fitting: Fitting
         "tried": [x.summary() for x in fitting.tried],
     }  # fmt: skip
     return fitting.result(
-        "lpv", records, used, seed, model=model, covariance=covariance,
+        model=model, covariance=covariance,
         covariance_from="" if covariance is None else "information", n_estimated=int(theta.size),
         noise_covariance=np.array([[noise * float(d.y_scale[0]) ** 2]]),
     )  # fmt: skip

@@ -17,9 +17,8 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, part_of, portions
-from ambid.nonlinear.fit import NonlinearFit, Settings, failed_fit
-from ambid.nonlinear.lagged import Rows, Terms
-from ambid.nonlinear.lagged_problem import Draft, finish, guarded, laplace
+from ambid.nonlinear.fit import NonlinearFit, Settings
+from ambid.nonlinear.lagged_problem import Draft, finish, laplace
 from ambid.nonlinear.narmax_choice import (
     Choice,
     NarmaxSettings,
@@ -34,8 +33,8 @@ from ambid.nonlinear.narmax_choice import (
     rational_terms,
     samples,
 )
-from ambid.nonlinear.polynomial import term_name
-from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.polynomial import PolynomialFunction, term_name
+from ambid.nonlinear.records import Parts, scaled_records
 
 _CLEAR = 10.0  # of the information criterion, which all candidates have to gain over those of the ratios
 _MOST_AT_ONCE = 60  # candidates of an output: searches and prunings of more take minutes
@@ -46,7 +45,7 @@ DIVERGED = "no finite one-step predictor was found; lower ne, degree or terms, o
 
 
 @dataclass(slots=True, kw_only=True)
-class _Fitting(Draft):
+class _Fitting(Draft[PolynomialFunction]):
     """The best model so far that runs, and how its terms were chosen."""
 
     choice: Choice
@@ -68,20 +67,20 @@ def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick
     _check_magnitude(s, records)
     # a linear model: something to hand over when the very next thing is an interruption
     linear = process_terms(replace(s, degree=1, ne=0, selection="frols"), data.parts, None)
-    fitting = _Fitting(choice=linear, function=linear.function, theta=linear.theta)
+    fitting = _Fitting(
+        structure="narmax", records=records, settings=asdict(s), seed=seed, data=data, choice=linear,
+        function=linear.function, theta=linear.theta,
+    )  # fmt: skip
 
     def identify() -> None:
         _fit_terms(s, data.parts, fitting, tick)
         if fitting.status == "stalled":
             fitting.warnings.insert(0, "the search did not converge: treat the values as a first guess")
 
-    def fail(why: str) -> NonlinearFit:
-        return failed_fit("narmax", records, asdict(s), seed, why, fitting.timing_s)
-
-    failed = guarded(identify, fitting, fail)
-    if failed or not np.isfinite(fitting.choice.cost(data.parts)):
-        return failed or fail(DIVERGED)
-    return _finish(records, s, data, fitting, seed)
+    reason = fitting.guarded(identify)
+    if reason or not np.isfinite(fitting.choice.cost(data.parts)):
+        return fitting.failed(reason or DIVERGED)
+    return _finish(s, fitting)
 
 
 def _check_magnitude(s: NarmaxSettings, records: Sequence[IOData]) -> None:
@@ -192,9 +191,8 @@ def _search(
     ended = found.search(parts, weight=weight, free=free, most=most, tick=tick, keep=keep)
     if not np.isfinite(ended.cost):
         return found
-    fitting.status = "converged" if ended.converged else "stalled"
     problem = found.problem(parts, free=free, weight=weight)
-    fitting.note(ended, problem, f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors")
+    fitting.settle(ended, problem, f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors")
     keep(ended.theta)
     return found.with_theta(ended.theta)
 
@@ -240,31 +238,29 @@ def _value(s: NarmaxSettings, parts: Parts, found: Choice, weight: Array) -> flo
     return found.value(s.criterion, parts, n, weight=weight)
 
 
-def _finish(records: Sequence[IOData], s: NarmaxSettings, data: Scaled, fitting: _Fitting, seed: int) -> NonlinearFit:
+def _finish(s: NarmaxSettings, fitting: _Fitting) -> NonlinearFit:
     """Return the fit of a model that runs."""
-    of, theta = fitting.choice.function, fitting.theta
-    problem = fitting.choice.problem(data.parts, free=fitting.free).at(theta)
+    of, theta, first = fitting.function, fitting.theta, fitting.records[0]
+    problem = fitting.choice.problem(fitting.data.parts, free=fitting.free).at(theta)
     found = laplace(problem, theta)
     terms = {
-        records[0].outputs[o]: [
+        first.outputs[o]: [
             {"term": term_name(x, of.n_outputs, of.m), "err": fitting.choice.err.get((o, x))} for x in own
         ]
         for o, own in enumerate(of.numerators)
     }
     fitting.details = {
         "terms": terms, "candidates": fitting.choice.n_candidates, "passes": fitting.choice.passes,
-        "levels": data.levels(records[0]),
+        "levels": fitting.data.levels(first),
     }  # fmt: skip
-    used = {**asdict(s), "focus": "simulation" if fitting.free else "prediction"}
-    if of.is_rational and any(_vanishes(of.terms_block, theta, of.predict(theta, r)[1]) for r in problem.rows()):
-        fitting.warnings.append("a denominator comes near zero on the training data: predictions there are unreliable")
+    fitting.settings["focus"] = "simulation" if fitting.free else "prediction"
+    for rows in problem.rows() if of.is_rational else ():
+        below = of.terms_block.denominators(theta, of.predict(theta, rows)[1].prepared[0])
+        if np.any(np.min(below, axis=0) < _NEAR_ZERO * np.max(np.abs(below), axis=0)):
+            near_zero = "a denominator comes near zero on the training data: predictions there are unreliable"
+            fitting.warnings.append(near_zero)
+            break
     return finish(
-        "narmax", records, used, data, fitting, problem, found, units="terms", noise=s.ne > 0 and not fitting.free,
-        instead="Give focus = prediction" if fitting.free else "Raise ne", seed=seed,
+        fitting, problem, found, units="terms", noise=s.ne > 0 and not fitting.free,
+        instead="Give focus = prediction" if fitting.free else "Raise ne",
     )  # fmt: skip
-
-
-def _vanishes(block: Terms, theta: Array, rows: Rows) -> bool:
-    """Whether a denominator comes near zero."""
-    below = block.denominators(theta, rows.prepared[0])
-    return bool(np.any(np.min(below, axis=0) < _NEAR_ZERO * np.max(np.abs(below), axis=0)))

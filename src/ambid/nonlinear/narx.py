@@ -12,7 +12,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from functools import cached_property, partial
-from time import perf_counter
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -23,7 +22,7 @@ from ambid.errors import EstimationError
 from ambid.estimation.progress import Tick, portions
 from ambid.estimation.search import Found, search
 from ambid.estimation.uncertainty import bootstrapped
-from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, failed_fit, number, read_settings, whole
+from ambid.nonlinear.fit import NO_WEIGHTS, NonlinearFit, Settings, choice, number, read_settings, whole
 from ambid.nonlinear.lagged import Block, LaggedFunction, Linear, Regressors, Tanh, channel_names, lags
 from ambid.nonlinear.lagged_problem import (
     Draft,
@@ -32,7 +31,6 @@ from ambid.nonlinear.lagged_problem import (
     choose_smallest,
     draw_start,
     finish,
-    guarded,
     lag_sizes,
     laplace,
     linear_start,
@@ -43,7 +41,7 @@ from ambid.nonlinear.lagged_problem import (
     split,
     train_watched,
 )
-from ambid.nonlinear.records import Parts, Scaled, scaled_records
+from ambid.nonlinear.records import Parts, scaled_records
 
 _LINEAR_PRIOR = 1e3  # times that of the hidden layer: next to none
 _DRAWS = 5  # of the hidden layer of a start
@@ -145,14 +143,19 @@ def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: 
     data = scaled_records("narx", records, lag=max(s.ny or 1, s.nk + (s.nu or 1) - 1))
     function = _function(data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, s.nk, 0)
     draft = Draft(
-        function=function, theta=linear_start(function, data.parts, int(function.edges[1]))
-    )  # for an interruption at once
-    spread: list[Array] = []
-    failed = guarded(
-        lambda: _identify(s, data, draft, spread, seed, tick), draft,
-        lambda why: failed_fit("narx", records, asdict(s), seed, why, draft.timing_s),
+        structure="narx", records=records, settings=asdict(s), seed=seed, data=data, function=function,
+        theta=linear_start(function, data.parts, int(function.edges[1])),  # for an interruption at once
     )  # fmt: skip
-    return failed or _finish(s, records, data, draft, spread, seed)
+    if reason := draft.guarded(lambda: _identify(s, draft, tick)):
+        return draft.failed(reason)
+    of = draft.function
+    draft.settings |= {"ny": of.ny, "nu": of.nu, "neurons": of.neurons}
+    draft.settings["focus"] = "simulation" if draft.free else "prediction"
+    problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
+    if not np.isfinite(problem.cost(draft.theta)):
+        return draft.failed(NO_WEIGHTS)
+    draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
+    return finish(draft, problem, laplace(problem, draft.theta), units="neurons or lags", how=s.uncertainty)
 
 
 def _function(parts: Parts, ny: int, nu: int, nk: int, neurons: int) -> NarxFunction:
@@ -161,45 +164,41 @@ def _function(parts: Parts, ny: int, nu: int, nk: int, neurons: int) -> NarxFunc
 
 
 def narx_problem(
-    function: LaggedFunction, parts: Parts, theta: Array, prior: float, *, free: bool = False
+    function: NarxFunction, parts: Parts, theta: Array, prior: float, *, free: bool = False
 ) -> LaggedProblem:
     """Return the problem whose errors have unit variance at given weights."""
-    assert isinstance(function, NarxFunction)
     return problem_at(function, parts, theta, function.precision(prior), free=free)
 
 
-def _identify(s: NarxSettings, data: Scaled, draft: Draft, spread: list[Array], seed: int, tick: Tick | None) -> None:
-    free, many = s.focus == "simulation", s.uncertainty == "bootstrap"
+def _identify(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None) -> None:
+    free, many, parts = s.focus == "simulation", s.uncertainty == "bootstrap", draft.data.parts
     choosing, training, refining, last = portions(tick, (3.0, 5.0, 8.0 * free, 4.0 * many))
-    began = perf_counter()
-    function = _choose_sizes(s, data.parts, draft, seed, choosing)
-    began = draft.timed("choice", began)
-    _train_all(s, function, data, draft, seed, training)
-    began = draft.timed("training", began)
+    with draft.stage("choice"):
+        function = _choose_sizes(s, draft, choosing)
+    with draft.stage("training"):
+        _train_all(s, function, draft, training)
     if free:
-        refine(
-            draft, lambda theta: narx_problem(function, data.parts, theta, s.prior, free=True), s.iterations, refining,
-            "neurons",
-        )  # fmt: skip
-        began = draft.timed("simulation errors", began)
+        with draft.stage("simulation errors"):
+            problem_of = partial(narx_problem, function, parts, prior=s.prior, free=True)
+            refine(draft, problem_of, s.iterations, refining, "neurons")
     if many:
-        problem = narx_problem(function, data.parts, draft.theta, s.prior, free=draft.free)
-        rows = problem.sample_rows(draft.theta)
-        spread.append(bootstrapped(rows, problem.prior_rows(draft.theta), seed, last))
-        draft.timed("bootstrap", began)
+        with draft.stage("bootstrap"):
+            problem = narx_problem(function, parts, draft.theta, s.prior, free=draft.free)
+            rows = problem.sample_rows(draft.theta)
+            draft.sampled = bootstrapped(rows, problem.prior_rows(draft.theta), draft.seed, last)
 
 
-def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: Tick | None) -> NarxFunction:
+def _choose_sizes(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None) -> NarxFunction:
     """Choose what is left open of lags and neurons; each candidate is trained for a while on part of the data."""
-    share, tried = s.held_out or 0.2, list[Size]()
+    share, tried, parts = s.held_out or 0.2, list[Size](), draft.data.parts
     draft.details["tried"] = tried
 
-    def score(of: Size, tick: Tick | None) -> float:
-        function = _function(parts, of["ny"], of["nu"], s.nk, of["neurons"])
+    def score(size: Size, tick: Tick | None) -> float:
+        function = _function(parts, size["ny"], size["nu"], s.nk, size["neurons"])
         most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
         training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
         problem = narx_problem(function, training, linear_start(function, training, int(function.edges[1])), s.prior)
-        start = _random_start(problem, function, np.random.default_rng(seed))
+        start = _random_start(problem, function, np.random.default_rng(draft.seed))
         watch = partial(_error, function, held)
         return min(
             _train(problem, function, start, stage="choice", most=_ITERATIONS, held_out=watch, tick=tick).held_out
@@ -208,10 +207,10 @@ def _choose_sizes(s: NarxSettings, parts: Parts, draft: Draft, seed: int, tick: 
     few = {"neurons": _FIRST_NEURONS if s.neurons is None else s.neurons}
     sizes = [{**x, **few} for x in lag_sizes(s.ny, s.nu, s.nk, parts, share)]
     lags_tick, units_tick = portions(tick, (1.0, 1.0))
-    found = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
-    sizes = [{**found, "neurons": h} for h in (_NEURONS if s.neurons is None else (s.neurons,))]
-    found = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
-    return _function(parts, found["ny"], found["nu"], s.nk, found["neurons"])
+    best = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
+    sizes = [{**best, "neurons": h} for h in (_NEURONS if s.neurons is None else (s.neurons,))]
+    best = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
+    return _function(parts, best["ny"], best["nu"], s.nk, best["neurons"])
 
 
 def _random_start(problem: LaggedProblem, function: NarxFunction, rng: np.random.Generator) -> Array:
@@ -229,48 +228,29 @@ def _train(problem: LaggedProblem, function: NarxFunction, start: Array, **optio
     return search(problem, start, slack=0.0, solved=partial(solve_linear, problem, n), n_linear=n, **options)
 
 
-def _train_all(
-    s: NarxSettings, function: NarxFunction, data: Scaled, draft: Draft, seed: int, tick: Tick | None
-) -> None:
+def _train_all(s: NarxSettings, function: NarxFunction, draft: Draft[NarxFunction], tick: Tick | None) -> None:
     """Train from several starts, and go on with the best."""
-    training, held = split(data.parts, s.held_out, function.lag)
+    training, held = split(draft.data.parts, s.held_out, function.lag)
     draft.function, draft.theta = function, linear_start(function, training, int(function.edges[1]))
     problem = narx_problem(function, training, draft.theta, s.prior)
-    rng, least = np.random.default_rng(seed), np.inf
+    rng, least = np.random.default_rng(draft.seed), np.inf
     watch = partial(_error, function, held) if held else None
     starts = s.starts if function.neurons else 1
     first, second = portions(tick, (starts * _FIRST, 2 * _FIRST * (1 + bool(held))))
     for share in portions(first, (1.0,) * starts):
         start, most = _random_start(problem, function, rng), min(_FIRST, s.iterations)
-        found = _train(problem, function, start, stage="starts", most=most, held_out=watch, tick=share)
-        error = min(found.held_out) if held else found.cost
+        ended = _train(problem, function, start, stage="starts", most=most, held_out=watch, tick=share)
+        error = min(ended.held_out) if held else ended.cost
         if error < least:
             least = error
-            draft.keep(found.theta)
-    found = train_watched(
-        draft, lambda parts, theta: narx_problem(function, parts, theta, s.prior), data.parts, s.held_out,
-        "Levenberg-Marquardt, prediction errors", second, most=s.iterations, enough=_ENOUGH, n_linear=function.n_linear,
+            draft.keep(ended.theta)
+    ended = train_watched(
+        draft, partial(narx_problem, function, prior=s.prior), s.held_out, "Levenberg-Marquardt, prediction errors",
+        second, most=s.iterations, enough=_ENOUGH, n_linear=function.n_linear,
     )  # fmt: skip
-    if not found.converged and len(found.costs) > s.iterations:  # a valley of networks that differ little
-        lately = 50.0 * (1.0 - found.costs[-1] / found.costs[-min(11, len(found.costs))])
+    if not ended.converged and len(ended.costs) > s.iterations:  # a valley of networks that differ little
+        lately = 50.0 * (1.0 - ended.costs[-1] / ended.costs[-min(11, len(ended.costs))])
         draft.warnings.append(
             f"training was still improving at its limit of {s.iterations} iterations, by {lately:.1g} % over the "
             "last ten: raise iterations if that matters. Standard deviations are those of a linearisation there"
         )
-
-
-def _finish(
-    s: NarxSettings, records: Sequence[IOData], data: Scaled, draft: Draft, spread: list[Array], seed: int
-) -> NonlinearFit:
-    of = draft.function
-    assert isinstance(of, NarxFunction)
-    used = {**asdict(s), "ny": of.ny, "nu": of.nu, "neurons": of.neurons}
-    used["focus"] = "simulation" if draft.free else "prediction"
-    problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
-    if not np.isfinite(problem.cost(draft.theta)):
-        return failed_fit("narx", records, used, seed, NO_WEIGHTS, draft.timing_s)
-    draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
-    return finish(
-        "narx", records, used, data, draft, problem, laplace(problem, draft.theta), units="neurons or lags",
-        how=s.uncertainty, sampled=spread[0] if spread else None, seed=seed,
-    )  # fmt: skip

@@ -121,7 +121,8 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
     s: dict[str, Any] = {"starts": 20, **chosen, **_MAGNITUDE} if unsigned else {**_SIGNED, **chosen}
     data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
     s["form"] = _choose_form(str(s["form"]), records[0])
-    fitting, reason = Fitting(records=records, settings=s, seed=seed, whole=data, data=data), NO_START
+    fitting = Fitting(structure="nn", records=records, settings=s, seed=seed, whole=data, data=data)
+    reason = NO_START
     try:
         if unsigned:
             _train_magnitude(fitting, tick)

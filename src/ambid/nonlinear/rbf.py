@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, replace
 from functools import cache, cached_property, partial
 from itertools import pairwise
 from time import perf_counter
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -36,7 +36,6 @@ from ambid.nonlinear.fit import (
     NonlinearFit,
     Settings,
     choice,
-    failed_fit,
     number,
     read_settings,
     whole,
@@ -48,7 +47,6 @@ from ambid.nonlinear.lagged_problem import (
     Size,
     choose_smallest,
     finish,
-    guarded,
     lag_sizes,
     laplace,
     linear_start,
@@ -58,7 +56,7 @@ from ambid.nonlinear.lagged_problem import (
     split,
     train_watched,
 )
-from ambid.nonlinear.records import Parts, Scaled, finite, scaled_records
+from ambid.nonlinear.records import Parts, finite, scaled_records
 
 _NEURONS = (2, 4, 8, 16, 32, 48)  # that are compared
 _WIDTHS = (0.35, 0.7, 1.4, 2.8, 5.6)
@@ -225,7 +223,7 @@ def rbf_problem(
 
 
 @dataclass(slots=True, kw_only=True)
-class _Work(Draft):
+class _Work(Draft[RbfFunction]):
     """A draft with what is known of its units."""
 
     start: Array  # (n_theta,), where centres and widths were put
@@ -234,15 +232,9 @@ class _Work(Draft):
     at_optimum: bool = True  # so that a covariance makes sense
     width: float = float("nan")
 
-    @property
-    def network(self) -> RbfFunction:
-        """Its function."""
-        assert isinstance(self.function, RbfFunction)
-        return self.function
-
     def problem(self, parts: Parts, theta: Array, *, free: bool = False) -> LaggedProblem:
         """Return what is trained, its errors of unit variance at `theta`."""
-        return rbf_problem(self.network, parts, theta, self.prior, self.start, all_numbers=self.all_numbers, free=free)
+        return rbf_problem(self.function, parts, theta, self.prior, self.start, all_numbers=self.all_numbers, free=free)
 
 
 def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
@@ -269,14 +261,14 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     # a model without units: something to hand over when the very next thing is an interruption
     function = _function(s, data.parts, 1 if s.ny is None else s.ny, 1 if s.nu is None else s.nu, 0)
     theta = linear_start(function, data.parts, function.n_theta)
-    work = _Work(function=function, theta=theta, start=theta, prior=np.ones(function.p))
-    failed = guarded(
-        lambda: _identify(s, data, work, seed, tick), work,
-        lambda why: failed_fit("rbf", records, asdict(s), seed, why, work.timing_s),
+    work = _Work(
+        structure="rbf", records=records, settings=asdict(s), seed=seed, data=data, function=function, theta=theta,
+        start=theta, prior=np.ones(function.p),
     )  # fmt: skip
+    reason = work.guarded(lambda: _identify(s, work, tick))
     if work.warnings and work.warnings[0].startswith("interrupted"):
         work.at_optimum = False
-    return failed or _finish(s, records, data, work, seed)
+    return work.failed(reason) if reason else _finish(s, work)
 
 
 def _function(s: RbfSettings, parts: Parts, ny: int, nu: int, neurons: int, seen: str = "all") -> RbfFunction:
@@ -295,44 +287,51 @@ def _measured(function: LaggedFunction, parts: Parts) -> tuple[Array, Array]:
     return np.concatenate([r.x for r in rows]), np.concatenate([r.y for r in rows])
 
 
-def _identify(s: RbfSettings, data: Scaled, work: _Work, seed: int, tick: Tick | None) -> None:
-    free = s.focus == "simulation"
+def _identify(s: RbfSettings, work: _Work, tick: Tick | None) -> None:
+    free, parts = s.focus == "simulation", work.data.parts
     more = s.training != "linear" or s.trained == "all"
     ticks = portions(tick, (3.0, 0.5, 3.0 * more, 10.0 * free))
-    began = perf_counter()
     if tick is not None:
         tick("start", 0.0)
-    function, start = _choose(s, data.parts, work, seed, ticks[0])
+    with work.stage("choice"):
+        function, start = _choose(s, work, ticks[0])
     if s.neurons is not None and function.neurons < s.neurons:
         work.warnings.append(
             f"{function.neurons} units instead of {s.neurons}: the others would coincide in the data, or there are "
             "fewer than two samples for each"
         )
-    began = work.timed("choice", began)
     if ticks[1] is not None:
         ticks[1]("output weights", 0.0)
-    noise = _solve(s, function, start, data, work)
-    began = work.timed("output weights", began)
+    with work.stage("output weights"):
+        began = perf_counter()
+        x, y = _measured(function, parts)
+        theta, noise, prior, _ = solve_weights(function, start, x, y, s.prior)
+        seconds = np.array([0.0, perf_counter() - began])
+        work.function, work.theta, work.start, work.prior = function, theta, start, prior
+        training = np.array([_rms(y), rms_error(function, theta, parts)])
+        method = "linear least squares, output weights"
+        work.curves.append(LearningCurve(method=method, seconds=seconds, training=training))
     work.all_numbers = s.trained == "all" and function.neurons > 0
-    if s.training != "linear":
-        _recur(s, data, work, noise, ticks[2])
-    elif work.all_numbers:
-        train_watched(
-            work, work.problem, data.parts, s.held_out, "Levenberg-Marquardt, all numbers, one-step errors", ticks[2],
-            most=s.iterations, n_linear=function.n_weights,
-        )  # fmt: skip
-    began = work.timed("training", began)
+    with work.stage("training"):
+        if s.training != "linear":
+            _train_by_sample(s, work, noise, ticks[2])
+        elif work.all_numbers:
+            train_watched(
+                work, work.problem, s.held_out, "Levenberg-Marquardt, all numbers, one-step errors", ticks[2],
+                most=s.iterations, n_linear=function.n_weights,
+            )  # fmt: skip
     if free:
-        refine(work, partial(work.problem, data.parts, free=True), s.iterations, ticks[3], "units")
-        work.at_optimum = work.at_optimum or (work.free and work.status == "converged")
-        work.timed("simulation errors", began)
+        with work.stage("simulation errors"):
+            refine(work, partial(work.problem, parts, free=True), s.iterations, ticks[3], "units")
+            work.at_optimum = work.at_optimum or (work.free and work.status == "converged")
 
 
 # --- choice of lags and units ----------------------------------------------------------------------------------------
 
 
-def _choose(s: RbfSettings, parts: Parts, work: _Work, seed: int, tick: Tick | None) -> tuple[RbfFunction, Array]:
+def _choose(s: RbfSettings, work: _Work, tick: Tick | None) -> tuple[RbfFunction, Array]:
     """Choose what is left open, and place the units, weights of zero: the least that do about as well as the best."""
+    parts, seed = work.data.parts, work.seed
     tried, counts = list[Size](), _NEURONS if s.neurons is None else (s.neurons,)
 
     @cache
@@ -465,25 +464,11 @@ def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
 # --- output weights ---------------------------------------------------------------------------------------------------
 
 
-def _solve(s: RbfSettings, function: RbfFunction, start: Array, data: Scaled, work: _Work) -> Array:
-    """Find the output weights; returns the variance of the errors of each output."""
-    began = perf_counter()
-    x, y = _measured(function, data.parts)
-    found = solve_weights(function, start, x, y, s.prior)
-    seconds = np.array([0.0, perf_counter() - began])
-    work.function, work.theta, work.start, work.prior = function, found.theta, start, found.prior
-    error = rms_error(function, found.theta, data.parts)
-    training = np.array([float(np.sqrt(np.mean(y**2))), error])
-    work.curves.append(LearningCurve(method="linear least squares, output weights", seconds=seconds, training=training))
-    return found.noise
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Weights:
+class Weights(NamedTuple):
     """Weights with what they came from."""
 
-    theta: Array  # (n_theta,), with the centres and widths that were given
-    noise: Array  # (n_outputs,), variance of the errors, scaled
+    theta: Array  # (n_theta,), with the centres and widths of the units
+    noise: Array  # (n_outputs,), variance of the errors, scaled, sigma^2
     prior: Array  # (n_outputs,), standard deviation of the units' weights before the data, alpha
     effective: Array  # (n_outputs,), numbers that the data determine
 
@@ -519,8 +504,7 @@ def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior
         alpha[o] = np.sqrt(noise[o] / ratio)
         effective[o] = rank + np.sum(s**2 / (s**2 + ratio))
     line = np.linalg.lstsq(R[:, :d], R[:, d + h :] - R[:, d : d + h] @ w, rcond=_BLIND)[0]
-    found = function.with_matrix(theta, np.concatenate([line, w]).T)
-    return Weights(theta=found, noise=noise, prior=alpha, effective=effective)
+    return Weights(function.with_matrix(theta, np.concatenate([line, w]).T), noise, alpha, effective)
 
 
 def _beyond(known: Array, others: Array) -> tuple[Array, int]:
@@ -562,13 +546,13 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
 # --- sample by sample -------------------------------------------------------------------------------------------------
 
 
-def _recur(s: RbfSettings, data: Scaled, work: _Work, noise: Array, tick: Tick | None) -> None:
+def _train_by_sample(s: RbfSettings, work: _Work, noise: Array, tick: Tick | None) -> None:
     """Train the output weights sample by sample, from zero."""
-    of, rate = work.network, s.rate if s.training == "descent" else None
-    pull = of.matrix(work.problem(data.parts, work.theta).precision) * np.sqrt(noise)[:, None]
-    work.theta, curve = train_by_sample(of, work.theta, *_measured(of, data.parts), pull, rate, tick)
+    of, rate, parts = work.function, s.rate if s.training == "descent" else None, work.data.parts
+    pull = of.matrix(work.problem(parts, work.theta).precision) * np.sqrt(noise)[:, None]
+    work.theta, curve = train_by_sample(of, work.theta, *_measured(of, parts), pull, rate, tick)
     work.curves.append(curve)
-    problem = work.problem(data.parts, work.theta)
+    problem = work.problem(parts, work.theta)
     R = problem.triangle(work.theta[problem.live])
     left = directions(R[:, :-1]).explain(R[:, -1]) if np.all(np.isfinite(R)) else np.inf
     if not left < _NEAR:
@@ -621,14 +605,14 @@ def _rms(e: Array) -> float:
 # --- the fit ----------------------------------------------------------------------------------------------------------
 
 
-def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work, seed: int) -> NonlinearFit:
-    of = work.network
-    used = {**asdict(s), "ny": of.ny, "nu": of.nu, "neurons": of.neurons, "width": work.width}
-    used["prior"] = float(np.exp(np.mean(np.log(work.prior))))
-    used["focus"] = "simulation" if work.free else "prediction"
-    problem = work.problem(data.parts, work.theta, free=work.free)
+def _finish(s: RbfSettings, work: _Work) -> NonlinearFit:
+    of = work.function
+    work.settings |= {"ny": of.ny, "nu": of.nu, "neurons": of.neurons, "width": work.width}
+    work.settings["prior"] = float(np.exp(np.mean(np.log(work.prior))))
+    work.settings["focus"] = "simulation" if work.free else "prediction"
+    problem = work.problem(work.data.parts, work.theta, free=work.free)
     if not np.isfinite(problem.cost(work.theta)):
-        return failed_fit("rbf", records, used, seed, NO_WEIGHTS, work.timing_s)
+        return work.failed(NO_WEIGHTS)
     found = laplace(problem, work.theta)
     why_not = ""
     if of.neurons and not work.all_numbers:
@@ -638,7 +622,14 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
         )
     elif not work.at_optimum:
         why_not = "no standard deviations: training has not reached an optimum"
-    work.warnings += _open(problem, None if why_not else found.covariance)
+    if found.covariance is not None and not why_not:  # numbers of the linear part that only the prior holds
+        left = np.diag(found.covariance) * problem.precision[problem.live] ** 2
+        names = [name for name, x in zip(of.names[: of.n_line], left, strict=False) if x > _HELD]
+        if names:
+            work.warnings.append(
+                f"the data do not distinguish these parameters, whose values are meaningless: {', '.join(names)}. Use "
+                "fewer lags, or a richer excitation"
+            )
     work.details = {
         "condition": found.condition,
         "prior_by_output": work.prior.tolist(),
@@ -646,23 +637,4 @@ def _finish(s: RbfSettings, records: Sequence[IOData], data: Scaled, work: _Work
         "held_out_rms": work.held_out,
         **work.details,
     }
-    return finish(
-        "rbf", records, used, data, work, problem, found, units="units or lags", how=s.uncertainty, why_not=why_not,
-        seed=seed,
-    )  # fmt: skip
-
-
-def _open(problem: LaggedProblem, covariance: Array | None) -> list[str]:
-    """Name the numbers of the linear part that only the prior holds, which is next to none."""
-    of = problem.function
-    assert isinstance(of, RbfFunction)
-    if covariance is None:
-        return []
-    held = np.diag(covariance) * problem.precision[problem.live] ** 2
-    names = [name for name, x in zip(of.names[: of.n_line], held, strict=False) if x > _HELD]
-    if not names:
-        return []
-    return [
-        f"the data do not distinguish these parameters, whose values are meaningless: {', '.join(names)}. Use "
-        "fewer lags, or a richer excitation"
-    ]
+    return finish(work, problem, found, units="units or lags", how=s.uncertainty, why_not=why_not)

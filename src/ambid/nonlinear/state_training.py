@@ -6,7 +6,7 @@ anchored, without value and slope at the operating point, so that A and B are th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -18,7 +18,7 @@ from ambid.estimation.linear import information_inverse
 from ambid.estimation.progress import Tick, part_of, portions
 from ambid.estimation.search import search
 from ambid.estimation.uncertainty import bootstrapped, explained_by_past
-from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit, failed_fit
+from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit
 from ambid.nonlinear.lagged_problem import sandwich_at
 from ambid.nonlinear.records import Scaled, cloud_of
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
@@ -131,9 +131,6 @@ class Training:
 class Fitting(Attempt):
     """What a fit has come to."""
 
-    records: Sequence[IOData]
-    settings: Mapping[str, Any]
-    seed: int
     whole: Scaled
     data: Scaled  # each output beside the input that acts at its time
     delay: int = 0
@@ -408,16 +405,15 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
 
     `reason` says why there is no network.
     """
-    state, data, records, seed = fitting.state, fitting.data, fitting.records, fitting.seed
-    used = {"states": 0, "neurons": 0, **fitting.settings, "delay": fitting.delay}
+    state, data, records = fitting.state, fitting.data, fitting.records
+    fitting.settings = {"states": 0, "neurons": 0, **fitting.settings, "delay": fitting.delay}
     if state is None:
-        return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
-    used |= {"states": state.layout.n, "neurons": state.layout.neurons}
+        return fitting.failed(reason)
+    fitting.settings |= {"states": state.layout.n, "neurons": state.layout.neurons}
     state = state.at(state.problem(data), state.vector)
     model = None if state is None else _make_model(records, data, state, fitting.delay)
     if state is None or model is None:
-        reason = "the network does not stay finite on its training records: check the columns"
-        return failed_fit("nn", records, used, seed, reason, fitting.timing_s)
+        return fitting.failed("the network does not stay finite on its training records: check the columns")
     if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
         way_out = "" if state.layout.sensor else "give noise = innovations, or "
         fitting.warnings.append(
@@ -434,7 +430,7 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
         "K": state.K.tolist(),
     }  # fmt: skip
     return fitting.result(
-        "nn", records, used, seed, model=model, covariance=covariance, covariance_from=origin,
+        model=model, covariance=covariance, covariance_from=origin,
         n_estimated=int(state.theta.size), noise_covariance=noise * data.y_scale[:, None] * data.y_scale,
     )  # fmt: skip
 
