@@ -5,8 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.recursive.arx import RecursiveArx, RecursiveIvArx
-from ambid.recursive.regression import Lms, Nlms, RecursiveInstrumentalVariables, RecursiveLeastSquares
+from ambid.recursive.regression import (
+    Lms,
+    Nlms,
+    RecursiveArx,
+    RecursiveInstrumentalVariables,
+    RecursiveIvArx,
+    RecursiveLeastSquares,
+)
 from tests.recursive.cases import Case
 
 Array = NDArray[np.float64]
@@ -63,7 +69,6 @@ CASES = [
         make=lambda: RecursiveLeastSquares(4, forgetting="directional", factor=0.98),
         signals=regression,
     ),
-    Case(name="rls-reset", make=lambda: RecursiveLeastSquares(4, memory=500, reset_every=90), signals=regression),
     Case(name="iv", make=lambda: RecursiveInstrumentalVariables(3, n_instruments=4), signals=instruments),
     Case(
         name="iv-forgetting",

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.recursive.arx import RecursiveArx, RecursiveIvArx
-from ambid.recursive.regression import RecursiveLeastSquares
+from ambid.recursive.regression import RecursiveArx, RecursiveIvArx, RecursiveLeastSquares
 from tests.recursive.cases_adaptive import input_alone, loop
 
 

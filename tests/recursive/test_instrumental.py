@@ -21,8 +21,7 @@ def data(m: int, n: int = 400) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 def test_is_weighted_two_stage_least_squares(m: int, factor: float | None) -> None:
     phi, zeta, y = data(m)
     w = (1.0 if factor is None else factor) ** np.arange(y.size - 1, -1, -1.0)
-    vague = {"prior": 1e14, "instrument_size": 1e-7, "limit": 1e12}
-    iv = RecursiveInstrumentalVariables(3, n_instruments=m, factor=factor, **vague)  # type: ignore[arg-type]
+    iv = RecursiveInstrumentalVariables(3, n_instruments=m, factor=factor, limit=1e12)
     iv.update(np.column_stack([phi, zeta]), y)
     Zw = w[:, None] * zeta
     weight = np.linalg.inv(Zw.T @ zeta)
@@ -33,7 +32,7 @@ def test_is_weighted_two_stage_least_squares(m: int, factor: float | None) -> No
 
 def test_with_the_regressor_as_instrument_it_is_least_squares() -> None:
     phi, _, y = data(3)
-    iv = RecursiveInstrumentalVariables(3, prior=1e14, instrument_size=1e-7, correlation=1)
+    iv = RecursiveInstrumentalVariables(3, correlation=1)
     iv.update(np.column_stack([phi, phi]), y)
     theta, rest, _, _ = np.linalg.lstsq(phi, y, rcond=None)
     np.testing.assert_allclose(iv.estimate, theta, rtol=1e-8)
@@ -44,7 +43,7 @@ def test_with_the_regressor_as_instrument_it_is_least_squares() -> None:
 
 def test_silent_instruments_neither_wind_up_nor_move_the_estimate() -> None:
     phi, zeta, y = data(4)
-    iv = RecursiveInstrumentalVariables(3, n_instruments=4, memory=50, prior=10.0, limit=5.0)
+    iv = RecursiveInstrumentalVariables(3, n_instruments=4, memory=50, limit=5.0)
     iv.update(np.column_stack([phi, zeta]), y)
     at, covariance = iv.estimate, iv.covariance
     silence = np.zeros((50_000, 7))
@@ -68,7 +67,5 @@ def test_instruments_without_bearing_on_the_regressor_give_a_large_covariance() 
 def test_too_few_instruments_are_refused() -> None:
     with pytest.raises(EstimationError, match="do not determine"):
         RecursiveInstrumentalVariables(3, n_instruments=2)
-    with pytest.raises(EstimationError):
-        RecursiveInstrumentalVariables(3, prior=0.0)
     with pytest.raises(EstimationError):
         RecursiveInstrumentalVariables(3, factor=0.9, memory=10)

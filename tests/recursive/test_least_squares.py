@@ -140,25 +140,6 @@ def test_numbers_that_lead_out_of_range_are_rejected() -> None:
     np.testing.assert_array_equal(rls.estimate, at)
 
 
-@pytest.mark.parametrize("settings", [{}, {"memory": 50.0}, {"forgetting": "directional", "memory": 50.0}])
-def test_a_reset_forgets_the_covariance_and_keeps_the_estimate(settings: dict[str, object]) -> None:
-    phi, y = data(4)
-    rls = RecursiveLeastSquares(4, prior=5.0, noise_sd=0.2, **settings)  # type: ignore[arg-type]
-    rls.update(phi, y)
-    at = rls.estimate
-    rls.reset()
-    np.testing.assert_array_equal(rls.estimate, at)
-    np.testing.assert_allclose(rls.P, 5 * np.eye(4), rtol=1e-12)
-    np.testing.assert_allclose(rls.covariance, 0.2 * np.eye(4), rtol=1e-12)
-    fresh = RecursiveLeastSquares(4, start=at, prior=5.0, noise_sd=0.2, **settings)  # type: ignore[arg-type]
-    rls.reset()
-    rls.update(phi[:8], y[:8])
-    fresh.update(phi[:8], y[:8])
-    if not settings:
-        np.testing.assert_allclose(rls.estimate, fresh.estimate, rtol=1e-12)
-    assert np.isfinite(rls.covariance).all()
-
-
 def test_noise_is_found_from_few_samples_and_kept_in_silence() -> None:
     rng = np.random.default_rng(0)
     found = []
@@ -187,7 +168,6 @@ def test_noise_is_found_from_few_samples_and_kept_in_silence() -> None:
         {"start": [1.0, np.nan, 0, 0]},
         {"limit": 0.0},
         {"noise_sd": 0.0},
-        {"reset_every": -3},
     ],
 )
 def test_settings_out_of_range_are_refused(settings: dict[str, object]) -> None:
@@ -234,8 +214,6 @@ def test_a_stuck_signal_makes_no_coefficient_surer(forgetting: Forgetting, n: in
     assert rls.noise_variance < 0.1 * noise  # the calm itself is told as it is
     assert (np.sqrt(np.diag(rls.covariance))[:-1] > 0.65 * sd[:-1]).all()
     assert np.linalg.eigvalsh(rls.covariance)[0] > 0
-    rls.reset()
-    assert (np.diag(rls.covariance) > sd**2).all()
     rls.update(phi[10_000:], y[10_000:])
     assert rls.noise_variance > 0.1 * noise
     assert (np.abs(rls.estimate - truth) < 5 * sd).all()

@@ -10,8 +10,8 @@ from scipy.signal import lfilter
 
 from ambid.blackbox import polynomial
 from ambid.errors import EstimationError
+from ambid.recursive.estimator import covariance_of
 from ambid.recursive.polynomial import RecursivePolynomial
-from ambid.recursive.square_root import covariance_of
 from tests.blackbox.polynomial.systems import SYSTEMS, System, record, two_outputs, unstable_loop
 from tests.recursive.cases_polynomial import ORDERS, fit_of, signals
 from tests.tiers import ALL

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive import square_root_kernels as core
-from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.estimator import covariance_of, factors_of
 
 SCALE = 10.0 ** np.array([-6, 0, 3, 6, -2])
 N = SCALE.size

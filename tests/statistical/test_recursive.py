@@ -53,7 +53,6 @@ RECURSIONS = {
     "memory of 400": lambda: RecursiveLeastSquares(4, memory=400),
     "memory of 50": lambda: RecursiveLeastSquares(4, memory=50),
     "directional": lambda: RecursiveLeastSquares(4, forgetting="directional", memory=100),
-    "reset": lambda: RecursiveLeastSquares(4, memory=200, reset_every=500),
 }
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.estimator import covariance_of, factors_of
 from ambid.tracking import rpem_kernels as kernels
 from ambid.tracking.evidence import Evidence, EvidenceSum
 from ambid.tracking.rpem import ParameterFilter

@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 from ambid.lazy import exports
 
 if TYPE_CHECKING:
-    from ambid.recursive.arx import RecursiveArx as RecursiveArx
-    from ambid.recursive.arx import RecursiveIvArx as RecursiveIvArx
     from ambid.recursive.estimator import RecursiveEstimator as RecursiveEstimator
     from ambid.recursive.fusion import FusedSensor as FusedSensor
     from ambid.recursive.fusion import SensorFusion as SensorFusion
@@ -28,7 +26,9 @@ if TYPE_CHECKING:
     from ambid.recursive.polynomial import RecursivePolynomial as RecursivePolynomial
     from ambid.recursive.regression import Lms as Lms
     from ambid.recursive.regression import Nlms as Nlms
+    from ambid.recursive.regression import RecursiveArx as RecursiveArx
     from ambid.recursive.regression import RecursiveInstrumentalVariables as RecursiveInstrumentalVariables
+    from ambid.recursive.regression import RecursiveIvArx as RecursiveIvArx
     from ambid.recursive.regression import RecursiveLeastSquares as RecursiveLeastSquares
 
 __getattr__, __dir__, __all__ = exports(__name__)

@@ -19,10 +19,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import Copied, as_block, check_channels, kernels
+from ambid.recursive.estimator import Copied, as_block, check_channels, covariance_of, kernels, root_of
 from ambid.recursive.kalman import constant_velocity
 from ambid.recursive.lines import Event, EventKind
-from ambid.recursive.square_root import covariance_of, root_of
 
 _CONTINUOUS = 3.0  # equal values in succession that a signal without steps does not give
 _SECONDS = 2.0  # the longest run of equal values worth waiting for
@@ -176,7 +175,20 @@ class SensorFusion(Copied):
         self.rate_hz, self.start_s, self.sensors = rate_hz, start_s, tuple(sensors)
         motion = constant_velocity(rate_hz, q=q, r=1.0)
         self.names = tuple(s.name for s in self.sensors)
-        _check(self.names, start_sd, false_alarms_per_hour, restore_s, temperature_rate)
+        if len(self.names) < 2 or len(set(self.names)) < len(self.names):
+            raise EstimationError(
+                f"sensor fusion: sensors {self.names}; two or more with distinct names are needed. Correct the list"
+            )
+        for name, value, least in (
+            ("false_alarms_per_hour", false_alarms_per_hour, 1e-300),
+            ("restore_s", restore_s, 1e-300),
+            ("temperature_rate", temperature_rate, 0.0),
+        ):
+            if not least <= value < inf:
+                rule = "positive" if least else "at least 0"
+                raise EstimationError(f"sensor fusion: {name} is {value}; it must be {rule}. Correct it")
+        if len(start_sd) != 2 or not all(0.0 < sd < np.inf for sd in start_sd):
+            raise EstimationError(f"sensor fusion: start_sd {start_sd}; give two positive numbers, in m and m/s")
         at, m, n = self._at, len(self.sensors), motion.A.shape[0]
         warm = any(s.warmth for s in self.sensors) and temperature_rate > 0.0
         self._n, self._m, self._first = n, m, n + warm  # first: row of the first offset
@@ -264,19 +276,19 @@ class SensorFusion(Copied):
     def _test_alone(self) -> None:
         """Exclude sensors that give nothing, stand at a rail or stand still."""
         at, watch, now = self._at, self._watch, self.n_samples
-        found: list[tuple[int, float, str, str, dict[str, float]]] = []
+        faults: list[tuple[int, float, str, str, dict[str, float]]] = []
         for i in map(int, np.flatnonzero(watch[:, at.OUT] == 0.0)):
             gone, railed, same = watch[i, [at.GONE, at.RAILED, at.SAME]]
             value = {"value": float(watch[i, at.LAST])}
             if gone >= at.GONE_N:
-                found.append((i, now - gone + 1.0, "its values are missing", "missing", {}))
+                faults.append((i, now - gone + 1.0, "its values are missing", "missing", {}))
             elif railed >= at.GONE_N:
-                found.append((i, now - railed + 1.0, f"at its rail, {value['value']:.4g}", "rail", value))
+                faults.append((i, now - railed + 1.0, f"at its rail, {value['value']:.4g}", "rail", value))
             elif same >= self._table[i, at.STUCK] > 0.0:
-                found.append((i, now - same, f"is constant at {value['value']:.4g}", "stuck", value))
-        for i, onset, *_ in found:
+                faults.append((i, now - same, f"is constant at {value['value']:.4g}", "stuck", value))
+        for i, onset, *_ in faults:
             self._exclude(i, onset)
-        for i, onset, why, cause, values in found:
+        for i, onset, why, cause, values in faults:
             self._tell("excluded", onset, why + self._left(), cause, self.names[i], **values)
 
     def _judge(self) -> None:
@@ -294,8 +306,7 @@ class SensorFusion(Copied):
         # of two sensors the motion can only name one that jumps: a slow difference draws the filter after it first
         shown = apart or watch[worst, at.JUMPS] > _JUMPING * watch[worst, at.SUM_TT]
         if not (disputed or moved) and shown and second < most - at.MARGIN * (1.0 if apart else 2.0):
-            x = float(self._H[self._m] @ self._memory[-1])
-            cause, why, values = self._looks(worst, shift, x)
+            cause, why, values = self._looks(worst, shift)
             self._exclude(worst, onset)
             self._tell("excluded", onset, why + self._left(), cause, self.names[worst], **values)
             return
@@ -316,7 +327,7 @@ class SensorFusion(Copied):
             watch[:, at.ZERO] = self._H[: self._m, self._n :] @ self._kept[0, -1, self._n :]
         self._begin_tests(now)
 
-    def _looks(self, i: int, shift: float, x: float) -> tuple[str, str, dict[str, float]]:
+    def _looks(self, i: int, shift: float) -> tuple[str, str, dict[str, float]]:
         """Return what says most of the sums that are near the highest: a name, words and numbers."""
         at, w = self._at, self._watch[i]
         step = max(w[at.UP], w[at.DOWN])
@@ -327,7 +338,7 @@ class SensorFusion(Copied):
             cause = "step"
         if cause == "noise":
             return cause, "noisier than it should be", {}
-        words = "it stepped" if cause == "step" else "its gain fell"
+        x, words = float(self._H[self._m] @ self._memory[-1]), "it stepped" if cause == "step" else "its gain fell"
         why = f"{words}: {shift * 1e6:+.3g} um from the others at {x * 1e6:.3g} um"
         return cause, why, {"shift": shift, "position": x}
 
@@ -360,7 +371,11 @@ class SensorFusion(Copied):
         clock[at.STAGE] = at.READ
         for i in map(int, np.flatnonzero(watch[:, at.BACK])):
             out_s = (now - watch[i, at.SINCE]) / self.rate_hz
-            self._restore(i, now)
+            watch[i, at.OUT], watch[i, at.BACK], watch[i, at.SINCE] = 0.0, 0.0, now
+            self._begin_tests(now)
+            if (watch[:, at.OUT] == 0.0).sum() > 2:
+                watch[:, at.DOUBT] = clock[at.DISPUTED] = 0.0
+            clock[at.FRESH] = 1.0
             why = f"agrees with the others again, after {out_s:.3g} s"
             self._tell("restored", now, why, "restored", self.names[i], out_s=out_s)
         need = self._settings[at.RESTORE_N]
@@ -368,14 +383,6 @@ class SensorFusion(Copied):
             watch[:, at.DOUBT] = clock[at.DISPUTED] = 0.0
             why = f"{', '.join(self.working)} agree again, for {need / self.rate_hz:.3g} s"
             self._tell("restored", now, why, "agreement")
-
-    def _restore(self, i: int, now: int) -> None:
-        at, watch, clock = self._at, self._watch, self._clock
-        watch[i, at.OUT], watch[i, at.BACK], watch[i, at.SINCE] = 0.0, 0.0, now
-        self._begin_tests(now)
-        if (watch[:, at.OUT] == 0.0).sum() > 2:
-            watch[:, at.DOUBT] = clock[at.DISPUTED] = 0.0
-        clock[at.FRESH] = 1.0
 
     def _begin_tests(self, now: int) -> None:
         """Begin the tests of all sensors again."""
@@ -462,23 +469,3 @@ class SensorFusion(Copied):
             if self._first > self._n:
                 h[self._n] = float(self._H[: self._m, self._n][at_work].mean())
         return float(np.sqrt(h @ self.covariance @ h))
-
-
-def _check(
-    names: tuple[str, ...],
-    start_sd: tuple[float, float],
-    alarms: float,
-    restore_s: float,
-    temperature_rate: float,
-) -> None:
-    if len(names) < 2 or len(set(names)) < len(names):
-        raise EstimationError(
-            f"sensor fusion: sensors {names}; two or more with distinct names are needed. Correct the list"
-        )
-    if not (0.0 < alarms < np.inf and isfinite(restore_s) and restore_s > 0.0 and 0.0 <= temperature_rate < np.inf):
-        raise EstimationError(
-            f"sensor fusion: false_alarms_per_hour {alarms}, restore_s {restore_s}, temperature_rate "
-            f"{temperature_rate}; the first two must be positive, the last at least 0. Correct them"
-        )
-    if len(start_sd) != 2 or not all(0.0 < sd < np.inf for sd in start_sd):
-        raise EstimationError(f"sensor fusion: start_sd {start_sd}; give two positive numbers, in m and m/s")

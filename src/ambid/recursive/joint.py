@@ -18,10 +18,9 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.predictor import scales_for
-from ambid.physics.linear_model import DiscreteSpace, LinearModel, StateSpace, discretise
+from ambid.physics.linear_model import LinearModel, StateSpace, discretise
 from ambid.physics.linear_model import model as model_named
-from ambid.recursive.estimator import Copied, as_blocks, kernels
-from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.estimator import Copied, as_blocks, covariance_of, factors_of, kernels
 
 if TYPE_CHECKING:
     from ambid.estimation.estimate import Estimate
@@ -81,16 +80,16 @@ class JointStart:
     rates: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        for kept in ("values", "sensor_sd", "disturbance_sd", "operating_point", "offset_sd", "rates"):
-            object.__setattr__(self, kept, dict(getattr(self, kept)))  # a copy, and one that can be pickled
-        known = [p.name for p in self.model.parameters]
-        _named("values", self.values, known, complete=True)
-        _named("free parameters", dict.fromkeys(self.free, 1.0), known)
-        _named("sensor_sd", self.sensor_sd, self.model.outputs, complete=True)
-        _named("disturbance_sd", self.disturbance_sd, self.model.disturbances, complete=True)
-        _named("operating_point", self.operating_point, (*self.model.inputs, *self.model.outputs))
-        _named("offset_sd", self.offset_sd, self.model.disturbances)
-        _named("rates", self.rates, self.names)
+        for name in ("values", "sensor_sd", "disturbance_sd", "operating_point", "offset_sd", "rates"):
+            object.__setattr__(self, name, dict(getattr(self, name)))  # a copy, and one that can be pickled
+        parameters = [p.name for p in self.model.parameters]
+        _check_names("values", self.values, parameters, complete=True)
+        _check_names("free parameters", dict.fromkeys(self.free, 1.0), parameters)
+        _check_names("sensor_sd", self.sensor_sd, self.model.outputs, complete=True)
+        _check_names("disturbance_sd", self.disturbance_sd, self.model.disturbances, complete=True)
+        _check_names("operating_point", self.operating_point, (*self.model.inputs, *self.model.outputs))
+        _check_names("offset_sd", self.offset_sd, self.model.disturbances)
+        _check_names("rates", self.rates, self.names)
         if not (np.isfinite(self.rate_hz) and self.rate_hz > 0 and np.isfinite(self.delay) and self.delay >= 0):
             raise EstimationError(
                 f"rate_hz {self.rate_hz} must be positive and delay {self.delay} not negative. Correct them"
@@ -119,7 +118,7 @@ class JointStart:
         return (*self.free, *(f"{d}_offset" for d in self.model.disturbances))
 
 
-def _named(
+def _check_names(
     what: str, table: Mapping[str, float], known: tuple[str, ...] | list[str], *, complete: bool = False
 ) -> None:
     for name in table:
@@ -238,15 +237,15 @@ class JointFilter(Copied):
                 f"the estimate is of a record at {rate:g} Hz and the samples come at {rate_hz:g} Hz; noise and delay "
                 "are per sample. Identify at the rate of the samples"
             )
-        of, noise = model_named(estimate.model), estimate.noise
+        plant, noise = model_named(estimate.model), estimate.noise
         if not noise.sensor_sd or not noise.disturbance_sd:
             raise EstimationError(
                 f"the estimate describes its noise as a {noise.form}; a joint filter needs levels. Identify with "
                 "noise levels, or give a JointStart"
             )
-        delay = estimate.delay[of.inputs[0]]
+        delay = estimate.delay[plant.inputs[0]]
         start = JointStart(
-            model=of,
+            model=plant,
             rate_hz=rate_hz,
             values=estimate.values,
             free=estimate.covariance_names,
@@ -254,7 +253,7 @@ class JointFilter(Copied):
             sensor_sd=noise.sensor_sd,
             disturbance_sd=noise.disturbance_sd,
             delay=delay.samples + delay.fraction,
-            operating_point={r: estimate.operating_point.get(r, 0.0) for r in (*of.inputs, *of.outputs)},
+            operating_point={r: estimate.operating_point.get(r, 0.0) for r in (*plant.inputs, *plant.outputs)},
             rates=rates or {},
         )
         return cls(start)
@@ -404,7 +403,7 @@ class JointEkf(JointFilter):
     def _run(self, u: Array, y: Array, e: Array) -> None:
         done = 0
         while True:
-            done = kernels("joint").ekf_block(
+            done = kernels("kalman").ekf_block(
                 done, u, y, e, self._z, self._F, self._at, self._M, self._dM, self._C, self._dist, self._walk, self._io,
                 self._wide, self._past, self._counts, EVERY, _AMOUNT,
             )  # fmt: skip
@@ -416,8 +415,22 @@ class JointEkf(JointFilter):
 
     def _renew(self) -> None:
         """Put the linearisation point at the estimate: exact matrices, exact derivatives by the scaled parameters."""
+        model, free, unit, theta = self.start.model, self.start.free, self._unit(), self.values
         with np.errstate(over="ignore", invalid="ignore"):
-            now, slopes = self._discrete()
+            spaces = [model.matrices(theta), *(model.derivative(theta, name) for name in free)]
+            scaled = [
+                StateSpace(
+                    A=k * s.A * self._state / self._state[:, None],
+                    B=k * s.B / self._state[:, None],
+                    E=k * s.E * self._disturbance / self._state[:, None],
+                    C=s.C,
+                )
+                for k, s in zip(np.r_[1.0, unit[: len(free)]], spaces, strict=True)
+            ]
+            now, slopes = discretise(
+                scaled[0], 1.0 / self.start.rate_hz, fraction=self._fraction, derivatives=scaled[1:]
+            )
+        slopes = slopes[: len(free)]
         if not all(np.isfinite(d.A).all() and np.isfinite(d.E).all() for d in (now, *slopes)):
             return  # an estimate beyond all numbers: the last matrices stay, innovations say the rest
         self._at[:] = self._scaled_parameters
@@ -425,22 +438,6 @@ class JointEkf(JointFilter):
         for j, d in enumerate(slopes):
             self._dM[j] = np.hstack([d.A, d.B, d.B_late, d.E])
         self.n_renewed += 1
-
-    def _discrete(self) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
-        """Discrete matrices at the estimate and their derivatives, in scaled units."""
-        model, theta, unit = self.start.model, self.values, self._unit()
-        spaces = [model.matrices(theta), *(model.derivative(theta, name) for name in self.start.free)]
-        scaled = [
-            StateSpace(
-                A=k * s.A * self._state / self._state[:, None],
-                B=k * s.B / self._state[:, None],
-                E=k * s.E * self._disturbance / self._state[:, None],
-                C=s.C,
-            )
-            for k, s in zip(np.r_[1.0, unit[: len(self.start.free)]], spaces, strict=True)
-        ]
-        now, slopes = discretise(scaled[0], 1.0 / self.start.rate_hz, fraction=self._fraction, derivatives=scaled[1:])
-        return now, slopes[: len(self.start.free)]
 
 
 class JointUkf(JointFilter):
@@ -471,36 +468,31 @@ class JointUkf(JointFilter):
     def __init__(self, start: JointStart) -> None:
         super().__init__(start)
         self._logs = self._logs.astype(np.int64)
-        self._place, self._entry, self._power = self._matrices()
-        self._terms = self._series()
-
-    def _matrices(self) -> tuple[Ints, Array, Ints]:
-        """[A, B, E] T in scaled units as products of powers of the followed numbers: places, sizes, exponents."""
-        model, start = self.start.model, self.start
+        # [A, B, E] T in scaled units as products of powers of the followed numbers: places, sizes, exponents
+        model = start.model
         nonzero = np.where(self._values0 != 0.0, self._values0, self._size)
         at = {**start.values, **dict(zip(start.free, nonzero.tolist(), strict=True))}
-        place, entries, power = powers_of(model, at, start.free)
+        self._place, entries, self._power = powers_of(model, at, start.free)
         columns = np.r_[self._state, np.ones(len(model.inputs)), self._disturbance]
-        entries = entries * columns[place[:, 1]] / self._state[place[:, 0]] / start.rate_hz
+        entries = entries * columns[self._place[:, 1]] / self._state[self._place[:, 0]] / start.rate_hz
         # a followed number stands in units of its start (a logarithm) or of its size
         unit = nonzero / np.where(self._logs, self._values0, self._size)
-        return place, entries / np.prod(unit ** power.astype(float), axis=1), power
-
-    def _series(self) -> int:
-        """Terms of the Taylor series that leave nothing, with parameters twice as large as at the start."""
-        A = self.start.model.matrices(self.start.values).A * self._state / self._state[:, None] / self.start.rate_hz
-        norm, term = 2.0 * float(np.abs(A).sum(axis=1).max()), 1.0
-        for order in range(1, _MOST_TERMS + 1):
+        self._entry = entries / np.prod(unit ** self._power.astype(float), axis=1)
+        # terms of the Taylor series that leave nothing, with parameters twice as large as at the start
+        A = model.matrices(start.values).A * self._state / self._state[:, None] / start.rate_hz
+        norm, order, term = 2.0 * float(np.abs(A).sum(axis=1).max()), 0, 1.0
+        while order <= norm or term >= _REST:
+            order += 1
             term *= norm / order
-            if order > norm and term < _REST:
-                return order
-        raise EstimationError(
-            f"at {self.start.rate_hz:g} Hz the plant moves too far per sample (|A| T = {norm / 2:.3g}) for the "
-            "series of the unscented filter. Use JointEkf, or sample faster"
-        )
+            if order > _MOST_TERMS:
+                raise EstimationError(
+                    f"at {start.rate_hz:g} Hz the plant moves too far per sample (|A| T = {norm / 2:.3g}) for the "
+                    "series of the unscented filter. Use JointEkf, or sample faster"
+                )
+        self._terms = order
 
     def _run(self, u: Array, y: Array, e: Array) -> None:
-        kernels("joint").ukf_block(
+        kernels("kalman").ukf_block(
             u, y, e, self._z, self._F, self._logs, self._place, self._entry, self._power, self._C, self._dist,
             self._walk, self._io, self._wide, self._past, self._counts, EVERY, self._terms, self._fraction,
         )  # fmt: skip

@@ -15,8 +15,7 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import Copied, as_block, check_channels, kernels
-from ambid.recursive.square_root import covariance_of, factors_of, root_of
+from ambid.recursive.estimator import Copied, as_block, check_channels, covariance_of, factors_of, kernels, root_of
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

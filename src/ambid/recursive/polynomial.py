@@ -18,7 +18,15 @@ from ambid.blackbox.data import IOData, Orders
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit import structure as structure_named
 from ambid.blackbox.model import PolynomialModel
-from ambid.blackbox.polynomial_predictor import compact_orders, read_orders
+from ambid.blackbox.polynomial import polynomial_fit
+from ambid.blackbox.polynomial_predictor import (
+    coefficient_units,
+    compact_orders,
+    predictor,
+    read_orders,
+    scale_data,
+)
+from ambid.blackbox.polynomial_search import search
 from ambid.errors import EstimationError
 from ambid.recursive.estimator import Copied, as_blocks, kernels
 from ambid.recursive.polynomial_state import (
@@ -231,7 +239,45 @@ class RecursivePolynomial(Copied):
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a reader of the estimate has to know."""
-        return _warnings_of(self._who, self._state, self._memory, open_loop=self._open_loop, doubtful=self._doubtful)
+        name, state, notes = self._who.structure, self._state, list[str]()
+        if state is None:
+            notes.append(f"{name}: the first window is not full: there is no estimate yet")
+        if self._doubtful:
+            notes.append(
+                f"{name}: the search for the first estimate did not converge: coefficients may be wrong by their own "
+                "size, which the standard deviations include. Lower the orders, or start from a fit that converged"
+            )
+        x = self._who.layout
+        least = _FEW * (x.free.size + 1)
+        if self._memory < least and (x.nc or x.nd or any(x.nf)):
+            notes.append(
+                f"{name}: a memory of {self._memory:.3g} samples is short for {x.free.size} coefficients and a "
+                "constant: the estimate may stick at the stability limit after a standstill, and standard deviations "
+                f"are too small. Use a memory of {least} samples or more, or arx"
+            )
+        if structure_named(name).feedback == "biased" and not self._open_loop:
+            notes.append(f"{name} is biased by feedback: use bj or armax, or give open_loop if there is no feedback")
+        if state is None:
+            return tuple(notes)
+        if state.at_border:
+            notes.append(
+                f"{name}: the data often require an unstable C or F; stable coefficients are shown, and their standard "
+                "deviations are unreliable. If the plant integrates or is unstable, use armax or arx"
+            )
+        if state.worse > _WORSE:
+            notes.append(
+                f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has grown, or "
+                "the structure no longer fits. Raise the orders, or forget faster"
+            )
+        if state.worse < 1.0 / _WORSE:
+            notes.append(
+                f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has fallen, or "
+                "the signals are constant; without forgetting, standard deviations are then too small. Check the "
+                "signals"
+            )
+        if state.waits:
+            notes.append(f"{name}: learning is suspended: the filters need history after the start or a gap")
+        return tuple(notes)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
         """Take in one sample or a block.
@@ -289,7 +335,7 @@ class RecursivePolynomial(Copied):
         y = v[:, 0]
         errors, first = np.full(y.size, np.nan), 0
         if self._window is not None:
-            first = self._with_window(u, y, errors)
+            first = self._with_window(self._window, u, y, errors)
         if first < y.size:
             self._run(u[first:], y[first:], errors[first:], learn=learn)
         return errors.reshape(shape)
@@ -297,45 +343,42 @@ class RecursivePolynomial(Copied):
     def _run(self, u: Array, y: Array, errors: Array, *, learn: bool = True) -> None:
         kernels("polynomial").run(u, y, errors, learn, *self._arrays)
 
-    def _with_window(self, u: Array, y: Array, errors: Array) -> int:
+    def _with_window(self, window: _Window, u: Array, y: Array, errors: Array) -> int:
         """Store samples and fit them at fixed counts; return how many of the block were dealt with."""
         at = 0
         while self._window is not None and at < y.size:
-            n, gap = self._window.take(u[at:], y[at:])
+            n, gap = window.take(u[at:], y[at:])
             if self._state is not None and n:
                 self._run(u[at : at + n], y[at : at + n], errors[at : at + n])
             at += n
             if gap and self._state is not None and not self._doubtful:
                 self._window = None  # the recursion goes on alone
             elif gap:
-                n = self._window.clear()
+                n = window.clear()
                 if self._state is None:
                     self._used_before, self._rejected_before = self._used_before + n, self._rejected_before + 1
                 else:
                     self._run(u[at : at + 1], y[at : at + 1], errors[at : at + 1])
                 at += 1
-            elif self._window.filled == self._window.target:
-                self._fit_window(self._window)
+            elif window.filled == window.target:
+                self._fit_window(window)
         return at
 
     def _fit_window(self, window: _Window) -> None:
-        lost, none = self._state is None or self._doubtful, self._state is None
-        fit = window.fit(self._who, None if lost else self.model.theta, stalled=none)
+        """Begin, or go on, from an off-line fit of all samples so far."""
+        before, n = self._state, window.filled
+        lost = before is None or self._doubtful
+        fit = window.fit(self._who, None if lost else self.model.theta, stalled=before is None)
         if fit is not None:
-            self._begin_anew(fit, window)
-        self._failed_starts += fit is None and none
+            now = self._begin(fit, n)
+            self._run(window.u[:n], window.y[:n], np.empty(n), learn=False)
+            now.count[list(COUNTED)] = [n, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
+        self._failed_starts += fit is None and before is None
         grown, none = window.grow(), self._state is None
         if none or self._doubtful:  # a later window may do better
             self._used_before += (0 if grown else window.drop_half()) * none
         elif not (grown and window.target <= self._memory):
             self._window = None  # later samples would count more than these
-
-    def _begin_anew(self, fit: BlackBoxFit, window: _Window) -> None:
-        """Go on from an off-line fit of all samples so far."""
-        before, n = self._state, window.filled
-        now = self._begin(fit, n)
-        self._run(window.u[:n], window.y[:n], np.empty(n), learn=False)
-        now.count[list(COUNTED)] = [n, 0, 0, 0, 0] if before is None else before.count[list(COUNTED)]
 
     def _count(self, k: int) -> int:
         return 0 if self._state is None else int(self._state.count[k])
@@ -415,70 +458,14 @@ class _Window:
                 open_loop=True,  # whether it is, is no question of the coefficients
             )
             if near is None:
-                found = structure_named(who.structure).estimator(data, compact_orders(who.structure, who.layout))
+                fit = structure_named(who.structure).estimator(data, compact_orders(who.structure, who.layout))
             else:
-                found = _fit_near(who, data, near)
+                scaled = scale_data(who.structure, data)
+                start = near / coefficient_units(who.layout, scaled, 0)
+                path = search(predictor(who.layout), scaled.y[0], scaled.u, start, most=_MOST)
+                fit = polynomial_fit(who.structure, data, scaled, [who.layout], [path], estimated_delay=False)
         except EstimationError:
             return None
         last_resort = stalled and self.filled == self.y.size
-        usable = found.status == "converged" or last_resort
-        return found if usable and float(found.noise_covariance[0, 0]) > 0.0 else None
-
-
-def _fit_near(who: Identity, data: IOData, near: Array) -> BlackBoxFit:
-    from ambid.blackbox.polynomial import polynomial_fit
-    from ambid.blackbox.polynomial_predictor import coefficient_units, predictor, scale_data
-    from ambid.blackbox.polynomial_search import search
-
-    scaled = scale_data(who.structure, data)
-    worth = coefficient_units(who.layout, scaled, 0)
-    found = search(predictor(who.layout), scaled.y[0], scaled.u, near / worth, most=_MOST)
-    return polynomial_fit(who.structure, data, scaled, [who.layout], [found], estimated_delay=False)
-
-
-def _warnings_of(
-    who: Identity, state: State | None, memory: float, *, open_loop: bool, doubtful: bool
-) -> tuple[str, ...]:
-    """Return what a reader of the estimate has to know.
-
-    `state`: none where there is no estimate yet; `open_loop`: whether the user says that no feedback is at work;
-    `doubtful`: whether the fit with which it began did not converge.
-    """
-    name, found = who.structure, []
-    if state is None:
-        found.append(f"{name}: the first window is not full: there is no estimate yet")
-    if doubtful:
-        found.append(
-            f"{name}: the search for the first estimate did not converge: coefficients may be wrong by their own "
-            "size, which the standard deviations include. Lower the orders, or start from a fit that converged"
-        )
-    x, least = who.layout, _FEW * (who.layout.free.size + 1)
-    if memory < least and (x.nc or x.nd or any(x.nf)):
-        found.append(
-            f"{name}: a memory of {memory:.3g} samples is short for {x.free.size} coefficients and a constant: the "
-            "estimate may stick at the stability limit after a standstill, and standard deviations are too small. "
-            f"Use a memory of {least} samples or more, or arx"
-        )
-    if structure_named(name).feedback == "biased" and not open_loop:
-        found.append(f"{name} is biased by feedback: use bj or armax, or give open_loop if there is no feedback")
-    if state is None:
-        return tuple(found)
-    if state.at_border:
-        found.append(
-            f"{name}: the data often require an unstable C or F; stable coefficients are shown, and their standard "
-            "deviations are unreliable. If the plant integrates or is unstable, use armax or arx"
-        )
-    if state.worse > _WORSE:
-        found.append(
-            f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has grown, or "
-            "the structure no longer fits. Raise the orders, or forget faster"
-        )
-    if state.worse < 1.0 / _WORSE:
-        found.append(
-            f"{name}: prediction errors are {state.worse:.2g} times those at the start: the noise has fallen, or "
-            "the signals are constant; without forgetting, standard deviations are then too small. Check the "
-            "signals"
-        )
-    if state.waits:
-        found.append(f"{name}: learning is suspended: the filters need history after the start or a gap")
-    return tuple(found)
+        usable = fit.status == "converged" or last_resort
+        return fit if usable and float(fit.noise_covariance[0, 0]) > 0.0 else None

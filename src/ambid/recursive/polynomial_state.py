@@ -24,7 +24,7 @@ from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import PolynomialModel
 from ambid.blackbox.polynomial_predictor import Layout
 from ambid.errors import EstimationError
-from ambid.recursive.square_root import factors_of, root_of, root_of_factors
+from ambid.recursive.estimator import factors_of, root_of, root_of_factors
 
 Table = NDArray[np.int64]
 Term = tuple[int, int, int, int]  # source row, first coefficient, how many, lag
@@ -62,7 +62,12 @@ def plan_of(layout: Layout) -> tuple[Table, Table, int]:
     Rows of the table (5,): filters (destination, first coefficient and length of the denominator, first and last term),
     terms, columns of the gradient (row, lag, sign), polynomials that have to be stable (first coefficient, length).
     """
-    n_u, place, n = layout.n_inputs, _coefficients(layout), layout.free.size + 1
+    n_u, n = layout.n_inputs, layout.free.size + 1
+    place: dict[tuple[str, int | None], tuple[int, int]] = {}  # first free coefficient of each polynomial, how many
+    first = FIRST
+    for key in layout.places:
+        place[key] = first, len(layout.free_lags(key))
+        first += place[key][1]
     A, C, D, none = place["A", None], place["C", None], place["D", None], (0, 0)
     B, F = [place["B", i] for i in range(n_u)], [place["F", i] for i in range(n_u)]
     out = _Writer(n_rows=_U + n_u)
@@ -104,24 +109,11 @@ def plan_of(layout: Layout) -> tuple[Table, Table, int]:
     for first, part in zip(starts, parts, strict=False):
         for k, row in enumerate(part):
             rows[first + k, : len(row)] = row
-    meta = np.array([n, n_u, _longest(layout), *ends, *starts[1:4], len(stable), v, e, first_w], dtype=np.int64)
-    return rows, meta, out.n_rows
-
-
-def _coefficients(layout: Layout) -> dict[tuple[str, int | None], tuple[int, int]]:
-    """First free coefficient of every polynomial, and how many it has."""
-    out, first = {}, FIRST
-    for key in layout.places:
-        n = len(layout.free_lags(key))
-        out[key] = (first, n)
-        first += n
-    return out
-
-
-def _longest(layout: Layout) -> int:
-    """Samples of history after which w, v and e can be computed, and then reach back as far as C, D and F want."""
+    # history after which w, v and e can be computed, and then reach back as far as C, D and F want
     reach = max([1, layout.na, *(b + k for b, k in zip(layout.nb, layout.nk, strict=True))])
-    return int(reach + max([layout.nc, layout.nd, *layout.nf]))
+    longest = reach + max([layout.nc, layout.nd, *layout.nf])
+    meta = np.array([n, n_u, longest, *ends, *starts[1:4], len(stable), v, e, first_w], dtype=np.int64)
+    return rows, meta, out.n_rows
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -260,7 +252,8 @@ def identity_of(fit: BlackBoxFit) -> Identity:
             f"the fit has {model.n_outputs} outputs; the recursion tracks one. Fit and track each output by itself"
         )
     p = model.outputs[0]
-    nk = tuple(int(x) for x in _per_input(fit.orders.get("nk", 0), len(p.B)))
+    delay = fit.orders.get("nk", 0)
+    nk = tuple(int(x) for x in (delay if isinstance(delay, tuple) else (delay,) * len(p.B)))
     layout = Layout(
         na=p.A.size - 1,
         nb=tuple(b.size - k for b, k in zip(p.B, nk, strict=True)),
@@ -270,12 +263,7 @@ def identity_of(fit: BlackBoxFit) -> Identity:
         nk=nk,
     )
     return Identity(
-        structure=fit.structure,
-        layout=layout,
-        dt=fit.dt,
-        inputs=fit.inputs,
-        outputs=fit.outputs,
-        units=dict(fit.units),
+        structure=fit.structure, layout=layout, dt=fit.dt, inputs=fit.inputs, outputs=fit.outputs, units=dict(fit.units)
     )
 
 
@@ -292,7 +280,11 @@ def state_from_fit(fit: BlackBoxFit, layout: Layout, forgetting: float, *, sampl
     theta, P = np.zeros(n), np.zeros((n, n))
     theta[: free.size] = full[free]
     P[: free.size, : free.size] = fit.covariance[np.ix_(free, free)] / noise
-    scale = _magnitudes(full, layout)
+    size = np.ones(full.size)  # of each coefficient: one for A, C, D and F, that of the polynomial for B
+    for (letter, _), place in layout.places.items():
+        if letter == "B" and place.stop > place.start:
+            size[place] = np.max(np.abs(full[place])) or 1.0
+    scale = size[free]
     floor = (_FIXED * scale) ** 2 / noise
     k = np.arange(free.size)
     P[k, k] = np.maximum(P[k, k], floor)
@@ -312,17 +304,3 @@ def state_from_fit(fit: BlackBoxFit, layout: Layout, forgetting: float, *, sampl
         centre=np.concatenate([fit.offsets.y, fit.offsets.u]),
         forgetting=forgetting,
     )
-
-
-def _per_input(value: int | tuple[int, ...], n: int) -> tuple[int, ...]:
-    return value if isinstance(value, tuple) else (value,) * n
-
-
-def _magnitudes(full: Array, layout: Layout) -> Array:
-    """Size of each free coefficient: one for A, C, D and F, that of the polynomial for B."""
-    out = np.ones(full.size)
-    for (letter, _), place in layout.places.items():
-        if letter == "B" and place.stop > place.start:
-            size = float(np.max(np.abs(full[place])))
-            out[place] = size if size > 0.0 else 1.0
-    return np.asarray(out[layout.free])

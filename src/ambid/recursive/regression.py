@@ -8,11 +8,15 @@ LMS steps along the regressor, θ(t) = θ(t-1) + μ(t) φ(t) e(t): robust, but s
 With instruments ζ, e may be coloured and in the regressor: Σ λ^(t-k) ζ (y - φᵀθ) = 0 is solved, with more instruments
 than coefficients in the sense of two-stage least squares. The rows [ζᵀ φᵀ y] are rotated into a triangle, so nothing is
 squared and no unsymmetric P, which can pass through infinity, is carried (Söderström & Stoica 1983, ch. 4 and 8).
+
+ARX models are estimated as their signals come, by any of these: A(q) y = B(q) u + constant + v, φ(t) =
+[-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7). Least squares needs white v; instruments
+leave v free.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -20,10 +24,24 @@ from numpy.typing import ArrayLike
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.recursive.estimator import Copied, as_blocks, count, forgetting_factor, kernels, numbers, positive, prior_of
-from ambid.recursive.square_root import covariance_of, factors_of, root_of, root_of_factors
+from ambid.recursive.estimator import (
+    Copied,
+    RecursiveEstimator,
+    as_blocks,
+    count,
+    covariance_of,
+    factors_of,
+    forgetting_factor,
+    kernels,
+    numbers,
+    positive,
+    prior_of,
+    root_of,
+    root_of_factors,
+)
 
 Forgetting = Literal["none", "exponential", "directional"]
+Instruments = Literal["reference", "auxiliary model"]
 
 VAGUE = 1e22  # variance of a coefficient of which nothing is known, whatever its unit
 ENOUGH = 0.5  # samples' worth of noise, before which its variance is not known
@@ -34,6 +52,8 @@ _NOISE_RATE = 1e-4  # of forgetting of the noise variance, a sample, for recursi
 _LOOKS = 32  # most samples between two looks at the limit
 _FAR = 1e12  # variance of the start's error in units of step or of 1 / small, which have the signals' units
 _FLOAT = np.dtype(np.float64)
+_REFRESH = 64  # samples with one auxiliary model
+_NO_MODEL = np.zeros(0)
 
 
 class Recursion(Copied):
@@ -121,18 +141,13 @@ class _Factored(Recursion):
     def __init__(self, names: Sequence[str] | int, start: ArrayLike | None, noise_sd: float | None) -> None:
         found = coefficient_names(names)
         p = len(found)
-        super().__init__(found, p, 6 * p + 4 * p * p, start, noise_sd)
+        super().__init__(found, p, 6 * p + 2 * p * p, start, noise_sd)
 
     def _factors(self, which: int) -> Array:
-        """Return a view of the factors (p, p) of P (0), of its companion (1), or of both at the start (2, 3)."""
+        """Return a view of the factors (p, p) of P (0) or of its companion (1)."""
         p = len(self._names)
         first = self._at.HEAD + p + which * p * p
         return self._s[first : first + p * p].reshape(p, p)
-
-    def _rest(self) -> Array:
-        """Return a view of the rows prior and scratch, shape (5, p)."""
-        p = len(self._names)
-        return self._s[self._at.HEAD + p + 4 * p * p :].reshape(5, p)
 
 
 class RecursiveLeastSquares(_Factored):
@@ -179,8 +194,6 @@ class RecursiveLeastSquares(_Factored):
     limit : float
         Of forgetting: largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
         Without effect where nothing is forgotten.
-    reset_every : int, optional
-        P and C are set back to the prior after so many samples, the estimate kept.
     noise_sd : float, optional
         Standard deviation of e, where known; else it is tracked.
 
@@ -207,7 +220,6 @@ class RecursiveLeastSquares(_Factored):
         factor: float | None = None,
         memory: float | None = None,
         limit: float = 100.0,
-        reset_every: int | None = None,
         noise_sd: float | None = None,
     ) -> None:
         forgets = factor is not None or memory is not None
@@ -222,7 +234,6 @@ class RecursiveLeastSquares(_Factored):
         s[at.KIND] = at.DIRECTIONAL if forgetting == "directional" else at.LEAST_SQUARES
         self._forget(factor, memory, limit)
         s[at.VAGUE] = float(prior is None)
-        s[at.RESET_EVERY] = 0 if reset_every is None else count("reset_every", reset_every)
         s[at.TYPICAL], s[at.NOW] = 0.1 * p, 1.0
         settle = _SETTLES * _NOISE_MEMORIES * s[at.MEMORY]
         s[at.SETTLED] = np.inf if noise_sd is not None else min(s[at.MEMORY], settle)
@@ -231,10 +242,9 @@ class RecursiveLeastSquares(_Factored):
         inverse = np.linalg.inv(prior / np.outer(scale, scale)) / np.outer(scale, scale)
         # the companion begins as the covariance of the error, or as the information of squared weights
         directional = s[at.KIND] == at.DIRECTIONAL
-        self._factors(2)[:] = factors_of(prior)
-        self._factors(3)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
-        self._rest()[0] = np.diag(prior)
-        self.reset()
+        self._factors(0)[:] = factors_of(prior)
+        self._factors(1)[:] = factors_of(prior if directional else (inverse + inverse.T) / 2)
+        s[at.HEAD + p + 2 * p * p :][:p] = np.diag(prior)
 
     @property
     def P(self) -> Array:
@@ -252,14 +262,6 @@ class RecursiveLeastSquares(_Factored):
             return self.noise_variance * self.P
         half = root_of_factors(self._factors(1)).T @ self.P
         return np.asarray(unit * (half.T @ half))
-
-    def reset(self) -> None:
-        """Say that the coefficients may have moved: P and C become the prior, the estimate stays."""
-        s, at = self._s, self._at
-        self._factors(0)[:], self._factors(1)[:] = self._factors(2), self._factors(3)
-        if s[at.UNIT]:
-            s[at.UNIT] = max(s[at.UNIT], self.noise_variance)
-            s[at.NOW] = at.noise_of_now(s)
 
 
 class _Gradient(_Factored):
@@ -394,7 +396,7 @@ class RecursiveInstrumentalVariables(Recursion):
     θ̂ = A Σ λ^(t-k) ζ y and N the covariance of Σ λ^(t-k) ζ v: the long-run covariance of ζ v (Bartlett's weights over
     `correlation` samples; Newey & West 1987), tracked with ten times the memory of the estimate, times the sum of
     squared weights. So v may be coloured. The lag behind moving coefficients is not in it. While instruments are
-    silent the information is forgotten until the mean of the variances over their prior is `limit`.
+    silent the information is forgotten until the variances reach `limit`. Nothing is known before the first sample.
 
     Parameters
     ----------
@@ -402,19 +404,12 @@ class RecursiveInstrumentalVariables(Recursion):
         Names of the p coefficients, or p.
     n_instruments : int, optional
         m, p or more; p if not given.
-    start : array_like, shape (p,), optional
-        Estimate to begin with; zero if not given.
-    prior : array_like, shape () or (p,), optional
-        Variances of the start's error over the variance of v, in the coefficients' units. If not given, nothing is
-        known of the coefficients, whatever the units of the signals: the start has no weight.
-    instrument_size : array_like, shape () or (m,), optional
-        Usual size of the instruments: a prior that is given counts like one sample of that size; 1 if not given.
     factor : float, optional
         Of forgetting, 0 < factor < 1; nothing is forgotten if neither it nor `memory` is given.
     memory : float, optional
         The same as a time constant in samples, 1 / (1 - factor).
     limit : float
-        Of the wind-up, see above; over 1e9 times the best variances so far where no prior is given.
+        Of the wind-up, see above: of the mean of the variances over 1e9 times the best so far.
     correlation : int
         Samples; several times the time over which v is correlated. 1 for white v.
 
@@ -440,9 +435,6 @@ class RecursiveInstrumentalVariables(Recursion):
         names: Sequence[str] | int,
         *,
         n_instruments: int | None = None,
-        start: ArrayLike | None = None,
-        prior: ArrayLike | None = None,
-        instrument_size: ArrayLike | None = None,
         factor: float | None = None,
         memory: float | None = None,
         limit: float = 100.0,
@@ -455,30 +447,17 @@ class RecursiveInstrumentalVariables(Recursion):
             raise EstimationError(f"{m} instruments do not determine {p} coefficients. Give {p} or more")
         lags = count("correlation", correlation)
         size = p + m * (m + p + 1) + p * p + m * m + lags * m + m + p + m + m * (p + 1) + 2 * (m + p) + 1
-        super().__init__(found, p + m, size, start, None)
+        super().__init__(found, p + m, size, None, None)
         s, at = self._s, self._at
-        s[at.INSTRUMENTS], s[at.LAGS] = m, lags
+        s[at.INSTRUMENTS], s[at.LAGS], s[at.PRIOR_LEFT] = m, lags, 1.0
         self._forget(factor, memory, limit)
-        s[at.PRIOR_LEFT] = 1.0
-        s[at.VAGUE] = float(prior is None)
-        if instrument_size is None:
-            instrument_size = 1.0 / np.sqrt(VAGUE) if prior is None else 1.0
-        self._begin(numbers("prior", VAGUE if prior is None else prior, p), instrument_size)
-
-    def _begin(self, prior: Array, instrument_size: ArrayLike) -> None:
-        """Enter the prior as samples whose instruments are the coefficients' own directions."""
-        p, m = prior.size, self._m
-        size = numbers("instrument_size", instrument_size, m)
-        if (prior <= 0).any() or (size <= 0).any():
-            raise EstimationError("prior and instrument_size must be positive")
         part = self._parts()
-        part["prior"][...] = prior
-        part["size"][...] = size
-        T = np.diag(1 / np.sqrt(prior))
-        part["T"][...] = T
-        part["R"][:, :m] = np.diag(size)
-        part["R"][:p, m:-1] = T
-        part["R"][:p, -1] = T @ part["estimate"]
+        # the vague prior is entered as samples whose instruments are the coefficients' own directions
+        part["prior"][...] = VAGUE
+        part["size"][...] = 1.0 / np.sqrt(VAGUE)
+        np.fill_diagonal(part["T"], 1.0 / np.sqrt(VAGUE))
+        np.fill_diagonal(part["R"], 1.0 / np.sqrt(VAGUE))
+        part["R"][:p, m:-1] = part["T"]
 
     def _run(self, rows: Array, y: Array, out: Array) -> None:
         kernels("regression").instrumental(self._s, rows, y, out)
@@ -538,10 +517,284 @@ class RecursiveInstrumentalVariables(Recursion):
         N = np.diag(s[at.PRIOR_LEFT] * self.noise_variance * part["size"] ** 2)
         if s[at.NOISE_WEIGHT] >= ENOUGH:
             N = N + part["omega"] * (s[at.SUM_OF_SQUARES] / s[at.NOISE_WEIGHT])
-        half = solve_triangular(part["R"][:, :m], _root(N), trans="T")
+        scale = np.sqrt(np.diag(N))  # what rounding made of the smallest eigenvalues does not count
+        root = scale[:, None] * root_of(N / np.outer(scale, scale), floor=float(np.finfo(float).eps))
+        half = solve_triangular(part["R"][:, :m], root, trans="T")
         Q, T = np.linalg.qr(part["R"][:, m:-1])  # no singular value is cut: what the data do not see is vague
         B = solve_triangular(T, Q.T @ half)
         return np.asarray(B @ B.T)
+
+
+class _OnSignals(Copied):
+    """A recursion on regressors that is fed with signals: names, estimate and counts are its own.
+
+    `columns`: channel, lag and sign of each column of the regressor; channel 0 is the output, then come the inputs, and
+    -1 is the constant 1.
+    """
+
+    def __init__(
+        self, columns: Sequence[tuple[int, int, int]], n_inputs: int, spare: int, estimator: RecursiveEstimator
+    ) -> None:
+        self._table = np.array(columns, dtype=np.int64).reshape(-1, 3)
+        self._past = np.full((max(1, int(self._table[:, 1].max())), 1 + n_inputs + spare), np.nan)
+        self._n_inputs, self._spare, self._estimator = n_inputs, spare, estimator
+
+    def _signals(self, u: ArrayLike, y: ArrayLike) -> tuple[Array, Array, tuple[int, ...]]:
+        """Return channels [y, u] and spare columns of zeros, the outputs (n_samples,) and the shape of `y`."""
+        if isinstance(y, float) and isinstance(u, float) and self._n_inputs == 1 and not self._spare:  # quickly
+            return np.array([[y, u]]), np.array([y]), ()
+        inputs, outputs, shape = as_blocks("ARX", u, y, self._n_inputs)
+        return np.hstack([outputs, inputs, np.zeros((outputs.shape[0], self._spare))]), outputs[:, 0], shape
+
+    def _rows(self, x: Array, theta: Array = _NO_MODEL, first: int = 0) -> Array:
+        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels).
+
+        With `theta` (p,), the last channel of x is filled in: the output of a model without noise, of these
+        coefficients, whose regressor begins at column `first`.
+        """
+        rows = np.empty((x.shape[0], self._table.shape[0]))
+        kernels("regression").tapped(self._past, self._table, x, rows, theta, first)
+        return rows
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The coefficients."""
+        return self._estimator.names
+
+    @property
+    def estimate(self) -> Array:
+        """A copy, shape (p,)."""
+        return self._estimator.estimate
+
+    @property
+    def covariance(self) -> Array:
+        """A copy, shape (p, p)."""
+        return self._estimator.covariance
+
+    @property
+    def n_used(self) -> int:
+        """Samples that were used."""
+        return self._estimator.n_used
+
+    @property
+    def n_rejected(self) -> int:
+        """Samples that were not: not finite, or in need of past signals that are unknown."""
+        return self._estimator.n_rejected
+
+
+class RecursiveArx(_OnSignals):
+    """A recursion on regressors, fed with signals: a `RecursiveEstimator` of an ARX model.
+
+    Biased where v is coloured, and under feedback with noise that is not white: see `RecursiveIvArx`.
+
+    Parameters
+    ----------
+    na : int
+        Past outputs.
+    nb, nk : int or sequence of int
+        Coefficients and delay of each input; a single delay is for all.
+    offset : bool
+        Whether a constant is estimated.
+    estimator : callable
+        Makes the recursion from the names of the coefficients, as ``RecursiveLeastSquares`` does.
+
+    Attributes
+    ----------
+    names : tuple of str
+        ``a1``, ...; ``b1``, ... by their lag (``b1.0`` for the first of several inputs); ``offset``.
+    estimate : ndarray, shape (p,)
+    covariance : ndarray, shape (p, p)
+    n_used, n_rejected : int
+
+    Raises
+    ------
+    EstimationError
+        If an order is negative.
+    """
+
+    def __init__(
+        self,
+        na: int,
+        nb: int | Sequence[int],
+        nk: int | Sequence[int] = 1,
+        *,
+        offset: bool = False,
+        estimator: Callable[[tuple[str, ...]], RecursiveEstimator],
+    ) -> None:
+        orders = [nb] if isinstance(nb, int) else list(nb)
+        delays = [nk] * len(orders) if isinstance(nk, int) else list(nk)
+        columns, names = columns_of(na, orders, delays, offset=offset)
+        super().__init__(columns, len(orders), 0, estimator(tuple(names)))
+
+    def update(self, u: ArrayLike, y: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        u : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+            A number, or (n_samples,), where there is one input.
+        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
+
+        Returns
+        -------
+        ndarray, shape of `y`
+            Errors of prediction one sample ahead; NaN where the sample was rejected.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        x, outputs, shape = self._signals(u, y)
+        return self._estimator.update(self._rows(x), outputs).reshape(shape)
+
+
+class RecursiveIvArx(_OnSignals):
+    """An ARX model by recursive instrumental variables, a `RecursiveEstimator`; v may be coloured.
+
+    Instruments:
+
+    - ``"reference"``: na + nb + 2 past values of an external signal r, the last input column, that enters the loop.
+      Consistent under feedback.
+    - ``"auxiliary model"``: past inputs and outputs of the model without noise, with the estimate of up to 64 samples
+      ago while it is stable. Near the best in **open loop; biased under feedback** with coloured v, because then u
+      itself holds v. Before the first stable estimate the model is a delay: the instruments are past inputs.
+
+    Parameters
+    ----------
+    na, nb, nk : int
+        One input: orders and delay.
+    instruments : {"reference", "auxiliary model"}
+    offset : bool
+        Whether a constant is estimated; it is its own instrument.
+    open_loop : bool
+        Declare the loop open: the auxiliary model needs that, and `warnings` tells it.
+    **settings : object
+        Of `RecursiveInstrumentalVariables`.
+
+    Attributes
+    ----------
+    names : tuple of str
+    estimate : ndarray, shape (p,)
+    covariance : ndarray, shape (p, p)
+    n_used, n_rejected : int
+    warnings : tuple of str
+
+    Raises
+    ------
+    EstimationError
+        If a setting is out of its range.
+    """
+
+    _estimator: RecursiveInstrumentalVariables
+
+    def __init__(
+        self,
+        na: int,
+        nb: int,
+        nk: int = 1,
+        *,
+        instruments: Instruments,
+        offset: bool = False,
+        open_loop: bool = False,
+        **settings: Any,
+    ) -> None:
+        columns, names = columns_of(na, [nb], [nk], offset=offset)
+        p = len(columns)
+        if instruments == "reference":
+            more = [(2, lag, 1) for lag in range(1, na + nb + 3)]
+        elif instruments == "auxiliary model":
+            more = [(2, lag, -1) for lag in range(1, na + 1)] + columns[na : na + nb]
+        else:
+            raise EstimationError(f"instruments is {instruments!r}; it is reference or auxiliary model")
+        more += columns[na + nb :]
+        spare = int(instruments == "auxiliary model")
+        estimator = RecursiveInstrumentalVariables(names, n_instruments=len(more), **settings)
+        super().__init__([*columns, *more], 2 - spare, spare, estimator)
+        self._na, self._nb, self._p, self._open_loop = na, nb, p, open_loop
+        self._model, self._count = np.zeros(p), 0
+        self._modelled = nb == 0
+        if nb:  # a model without output would leave the first a to the prior alone, and never be replaced
+            self._model[na + nb - 1] = 1.0
+        if spare:
+            self._past[:, 2] = 0.0
+
+    def update(self, u: ArrayLike, y: ArrayLike) -> Array:
+        """Take in one sample or a block.
+
+        Parameters
+        ----------
+        u : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
+            The input, and the reference where it is the instrument; a number, or (n_samples,), for the input alone.
+        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
+
+        Returns
+        -------
+        ndarray, shape of `y`
+            Errors of prediction one sample ahead; NaN where the sample was rejected.
+
+        Raises
+        ------
+        EstimationError
+            If the shapes do not fit.
+        """
+        x, outputs, shape = self._signals(u, y)
+        if not self._spare:
+            return self._estimator.update(self._rows(x), outputs).reshape(shape)
+        errors, start = np.empty(outputs.size), 0
+        while start < outputs.size:
+            stop = min(outputs.size, start + _REFRESH - self._count % _REFRESH)
+            rows = self._rows(x[start:stop], self._model, self._p)
+            errors[start:stop] = self._estimator.update(rows, outputs[start:stop])
+            self._count += stop - start
+            if self._count % _REFRESH == 0:
+                self._renew()
+            start = stop
+        return errors.reshape(shape)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a reader of the estimate has to know."""
+        if not self._spare or self._open_loop:
+            return ()
+        return (
+            "instruments are made of the input (auxiliary model): biased by feedback. Use the reference of the loop, "
+            "or give open_loop if there is no feedback",
+        )
+
+    def _renew(self) -> None:
+        """Take over the estimate as auxiliary model if it is stable."""
+        from scipy.signal import lfilter
+
+        theta = self._estimator.estimate
+        A, B = np.concatenate([[1.0], theta[: self._na]]), theta[self._na : self._na + self._nb]
+        if not np.all(np.abs(np.roots(A)) < 1):
+            return
+        if not self._modelled:  # the delay was of the input's unit: what it gave has to count as the output's does
+            gain = float(np.sqrt(np.sum(lfilter(B, A, np.eye(1, 1000)[0]) ** 2)))  # rms over that of white noise
+            gain = gain if 0 < gain < np.inf else 1.0
+            self._estimator.scale_instruments(self._na, gain)
+            self._past[:, 2] *= gain
+        self._model, self._modelled = theta, True
+
+
+def columns_of(
+    na: int, nb: Sequence[int], nk: Sequence[int], *, offset: bool
+) -> tuple[list[tuple[int, int, int]], list[str]]:
+    """Return columns (channel, lag, sign) and their names; channel 0 is the output, then come the inputs."""
+    if na < 0 or len(nb) != len(nk) or any(n < 0 for n in (*nb, *nk)) or na + sum(nb) == 0:
+        raise EstimationError(
+            f"na={na}, nb={list(nb)}, nk={list(nk)}: orders must be at least 0, and not all 0. Correct them"
+        )
+    columns, names = [(0, lag, -1) for lag in range(1, na + 1)], [f"a{lag}" for lag in range(1, na + 1)]
+    for i, (order, delay) in enumerate(zip(nb, nk, strict=True), start=1):
+        for lag in range(delay, delay + order):
+            columns.append((i, lag, 1))
+            names.append(f"b{lag}" if len(nb) == 1 else f"b{lag}.{i - 1}")
+    if offset:
+        columns.append((-1, 0, 1))
+        names.append("offset")
+    return columns, names
 
 
 def coefficient_names(names: Sequence[str] | int) -> tuple[str, ...]:
@@ -550,9 +803,3 @@ def coefficient_names(names: Sequence[str] | int) -> tuple[str, ...]:
     if not found or len(set(found)) < len(found):
         raise EstimationError(f"names is {names!r}; give at least one coefficient, each name once")
     return found
-
-
-def _root(N: Array) -> Array:
-    """Return a square root of N; what rounding made of its smallest eigenvalues does not count."""
-    scale = np.sqrt(np.diag(N))
-    return np.asarray(scale[:, None] * root_of(N / np.outer(scale, scale), floor=float(np.finfo(float).eps)))

@@ -1,9 +1,9 @@
 """Compiled recursions of linear regressions: least squares and LMS, instrumental variables, delay lines.
 
 A recursion is one array, since a call from Python costs by the number of arrays. Over the square-root core: head |
-estimate p | factors of P p p | factors of its companion p p | both at the start | prior variance p | scratch
-4 p. The companion is the information of squared weights for least squares, else the covariance of the error. Least
-squares of four coefficients stay in registers.
+estimate p | factors of P p p | factors of its companion p p | prior variance p | scratch 4 p. The companion is the
+information of squared weights for least squares, else the covariance of the error. Least squares of four coefficients
+stay in registers.
 
 Instrumental variables: head | estimate p | R m (m + p + 1) | T p p | long-run covariance m m | ring lags m | its sum m
 | prior p | size of the instruments m | work. R is the upper part of the triangle of the weighted rows [ζᵀ φᵀ y], T the
@@ -31,7 +31,6 @@ Table = NDArray[np.int64]
     FACTOR_NOW,  # the same, nearer to 1 where P is about to pass its limit
     EVERY,  # samples between two looks at the limit
     LIMIT,  # of the mean of P_ii over prior variance
-    RESET_EVERY,  # samples; 0 for never
     MEMORY,  # of the estimate, samples
     NOISE_RATE,  # of forgetting of the noise variance
     NOISE_SUM,
@@ -49,8 +48,8 @@ Table = NDArray[np.int64]
     SINGULAR,  # samples after which the instruments did not determine the estimate
     SUM_OF_SQUARES,  # of the weights of the samples
     PRIOR_LEFT,  # squared weight that the prior still has
-) = range(26)
-HEAD = 26
+) = range(25)
+HEAD = 25
 
 LEAST_SQUARES, DIRECTIONAL, LMS, NLMS = range(4)
 
@@ -172,7 +171,7 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
     """Take in samples t, ... until so many have been used; return the first that was not taken."""
     first, q = HEAD + p, p * p
     theta, F, G = s[HEAD:first], s[first : first + q].reshape(p, p), s[first + q : first + 2 * q].reshape(p, p)
-    rest = s[first + 4 * q :].reshape(5, p)
+    rest = s[first + 2 * q :].reshape(5, p)
     f, k, a, x = rest[1], rest[2], rest[3], rest[4]  # views here: in the loop they would be counted
     kind, gradient, now = s[KIND], s[KIND] >= LMS, s[NOW]
     grow, drop, one = 1.0 / s[FACTOR_NOW], s[FACTOR_NOW] * s[FACTOR_NOW], 1.0
@@ -246,28 +245,19 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
 def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
     """Take in rows of phi (n, p) and y (n,); write errors of prediction into out (n,), NaN where one is rejected.
 
-    At fixed counts P is reset where that is due, and the factor chosen with which it cannot pass its limit before the
-    next look.
+    At fixed counts the factor is chosen with which P cannot pass its limit before the next look.
     """
     p, t = int(s[SIZE]), int(0.0)  # a plain 0 has a type of its own: what takes it would be compiled twice
     four, a, q = p == 4 and s[KIND] == LEAST_SQUARES, HEAD + p, p * p
     while t < y.size:
-        until = np.inf
-        if s[KIND] < LMS:
-            until = (np.floor(s[USED] / s[EVERY]) + 1.0) * s[EVERY]
-            if s[RESET_EVERY] > 0:
-                until = min(until, (np.floor(s[USED] / s[RESET_EVERY]) + 1.0) * s[RESET_EVERY])
+        until = (np.floor(s[USED] / s[EVERY]) + 1.0) * s[EVERY] if s[KIND] < LMS else np.inf
         t = _four(s, phi, y, out, t, until) if four else _any(s, p, phi, y, out, t, until)
         if s[USED] < until:
             continue
-        if s[RESET_EVERY] > 0 and s[USED] % s[RESET_EVERY] == 0:
-            for i in range(a, a + 2 * q):
-                s[i] = s[i + 2 * q]
-            s[UNIT] *= max(1.0, noise_of_now(s))
         if s[UNIT] == 0 and s[NOISE_WEIGHT] > s[SETTLED]:
             s[UNIT] = s[NOISE_SUM] / s[NOISE_WEIGHT]
         s[NOW] = noise_of_now(s)
-        F, prior, total = s[a : a + q].reshape(p, p), s[a + 4 * q :], 0.0
+        F, prior, total = s[a : a + q].reshape(p, p), s[a + 2 * q :], 0.0
         for i in range(p):
             now = variance(F, i)
             if s[VAGUE] > 0:
@@ -389,8 +379,7 @@ def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
                 for j in range(p):
                     unit[j] = 1.0 if j == i else 0.0
                 now = _length(T, unit, solved)
-                if s[VAGUE] > 0:
-                    prior[i] = min(prior[i], _WORSE * now)
+                prior[i] = min(prior[i], _WORSE * now)
                 mean += now / (prior[i] * p * s[LIMIT])
             s[FACTOR_NOW] = min(1.0, mean ** (1.0 / s[EVERY])) if mean > s[FACTOR] ** s[EVERY] else s[FACTOR]
         out[t] = e

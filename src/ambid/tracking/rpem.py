@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ambid.arrays import Array
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Estimate
-from ambid.recursive.square_root import covariance_of, factors_of
+from ambid.recursive.estimator import covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk
 from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
