@@ -9,11 +9,10 @@ from dataclasses import asdict
 import numpy as np
 
 from ambid.recursive.lines import Latency
-from ambid.tracking.blocks import Stretch
+from ambid.tracking.blocks import Stretch, blocks_of
 from ambid.tracking.engine import StreamReport, run
 from ambid.tracking.evidence import Samples
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.replay import blocks_of
 from ambid.tracking.reporter import Reporter
 from table import Table
 from timing import quantity

@@ -11,7 +11,7 @@ from rich.console import Console
 
 from ambid.recursive.lines import Event
 from ambid.report.track_text import interval_bar, live_view, sparkline
-from ambid.tracking.live_state import LiveState
+from ambid.tracking.lines_file import LiveState
 from tests.tracking.tracks import track_of
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from ambid.tracking.change import ChangeDetector
+from ambid.tracking.monitors import ChangeDetector
 from tests.tiers import ALL
 from tests.tracking.evidences import BLOCK_S, Filter, evidence, triangle
 

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from ambid.errors import EstimationError
-from ambid.tracking.change import ChangeDetector
+from ambid.tracking.monitors import ChangeDetector
 from tests.tracking.evidences import (
     BLOCK,
     BLOCK_S,
@@ -30,7 +30,7 @@ def started(J, blocks=200, seed=0, walk=1e-9):
 
 
 def test_whitened_windows_are_standard_normal_whatever_the_filter_knew():
-    from ambid.tracking.supervise_kernels import whiten
+    from ambid.tracking.kernels import whiten
 
     J, rng, values = triangle(5, 3, condition=1e4), np.random.default_rng(4), []
     for _ in range(300):

@@ -13,10 +13,9 @@ import pytest
 
 from ambid.errors import EstimationError, RecordError
 from ambid.record import Channel, Record
-from ambid.tracking.blocks import Block
+from ambid.tracking.blocks import Block, blocks_of
 from ambid.tracking.engine import run
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.replay import blocks_of
 from ambid.tracking.ring import BlockRing
 from tests.tracking.damage import RATE, blocks
 from tests.tracking.damage import signal as noise
@@ -229,7 +228,7 @@ import numpy as np
 from ambid.record import Channel, Record
 from ambid.tracking.engine import run
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.replay import blocks_of
+from ambid.tracking.blocks import blocks_of
 
 def consume(stretch):
     if stretch.first == 2000:

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.recursive.estimator import covariance_of, factors_of
-from ambid.tracking import rpem_kernels as kernels
+from ambid.tracking import kernels
 from ambid.tracking.evidence import Evidence, EvidenceSum
 from ambid.tracking.rpem import ParameterFilter
 

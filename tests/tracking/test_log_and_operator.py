@@ -4,7 +4,7 @@ import pytest
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Event
-from ambid.tracking.publication import DecisionLog, Operator
+from ambid.tracking.gate import DecisionLog, Operator
 
 
 def event(t, kind="accepted"):

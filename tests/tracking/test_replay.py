@@ -8,9 +8,8 @@ import pytest
 
 from ambid.errors import RecordError
 from ambid.record import Channel, Record, read_rows
-from ambid.tracking.blocks import Block, Stretch
+from ambid.tracking.blocks import Block, Stretch, blocks_of, numbers_from_time, paced
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.replay import blocks_of, numbers_from_time, paced
 from tests.tracking.damage import blocks, signal
 
 RATE = 20e3

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
     from ambid.recursive.lines import Track, TrackHeader, TrackLine, TrackSummary
     from ambid.report.track_figures import TrackHistory
-    from ambid.tracking.live_state import LiveState
+    from ambid.tracking.lines_file import LiveState
 
 Flag = Literal["track", "hold", "accept", "revert"]
 
@@ -172,7 +172,7 @@ class Follower:
         """Take the header: the live view begins; the file with the first line, so that a refusal leaves an older
         one.
         """
-        from ambid.tracking.live_state import LiveState
+        from ambid.tracking.lines_file import LiveState
 
         self._before_header.close()
         if self._keep:

@@ -29,7 +29,7 @@ from ambid.record.calibration import INSIDE
 
 if TYPE_CHECKING:
     from ambid.recursive.lines import Event
-    from ambid.tracking.live_state import LiveState
+    from ambid.tracking.lines_file import LiveState
 
 _LISTEN_S = 0.02
 _BEAT_S = 0.5  # between two signs of life
@@ -343,7 +343,7 @@ class _Lines:
         self._state: LiveState | None = None
 
     def header(self, header: Any) -> None:
-        from ambid.tracking.live_state import LiveState
+        from ambid.tracking.lines_file import LiveState
 
         self._state = state = LiveState(header)
         start = {n: {"value": _number(v.value), "sd": _number(v.sd)} for n, v in header.start.items()}

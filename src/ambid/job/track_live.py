@@ -33,8 +33,7 @@ from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
 from ambid.rig import Rig
 from ambid.rig.load import SELECTED
-from ambid.tracking.blocks import Block, Frame
-from ambid.tracking.replay import Replay
+from ambid.tracking.blocks import Block, Frame, Replay
 from ambid.tracking.ring import BlockRing
 
 _BLOCK_SAMPLES = 256  # longest block in the ring; longer ones are divided

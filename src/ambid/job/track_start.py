@@ -20,9 +20,9 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
+from ambid.tracking.blocks import Replay, blocks_of
 from ambid.tracking.guard import ABSURD
 from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
-from ambid.tracking.replay import Replay, blocks_of
 from ambid.tracking.rpem import PhysicalRpem
 
 _START_S, _START_SAMPLES = 1.0, 10_000  # at least, where the record has three times as much

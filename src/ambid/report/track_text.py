@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rich.console import Group
     from rich.table import Table
 
-    from ambid.tracking.live_state import LiveState
+    from ambid.tracking.lines_file import LiveState
 
 STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
 KEYS = "h hold   t track   a accept   r revert   q end"

@@ -1,11 +1,27 @@
-"""Blocks of samples on their way from acquisition to tracking; what a guard gives of them: stretches and rejections."""
+"""Blocks of samples on their way from acquisition to tracking, and records as streams of them.
+
+A record comes at the pace at which it was taken or as fast as possible, with all its damage. Sample numbers come from
+the time column where there is one: a stamp that lies k periods after the one before it has a number larger by k. A
+stamp that runs back means repeated samples if the rows are the same as before, late samples if they fill a gap, and
+otherwise a clock that was set back.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import time
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Literal
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 from ambid.arrays import Array
+from ambid.errors import RecordError
+from ambid.record import Record
+from ambid.record.sampling import JITTER
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -58,56 +74,172 @@ class Rejection:
 Passed = Stretch | Rejection
 
 
+_LONGEST_GAP_S = 60.0  # or ten times the record: a stamp that leads by more is a clock that was set
+_EQUAL = 0.05  # of a period: stamps that are as close are the same
+_COARSE = 0.1  # of the rows: so many different ones under equal stamps are no accident
+_REMEMBERED = 256  # runs of rows that one that runs back is compared with
+_LONGEST_PAUSE_S = 1.0  # a gap in the numbers takes its time, up to this
+
+
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Part:
-    """A block under its number in the stream."""
-
-    first: int  # number of the first sample, with wrap-arounds and new counts taken out
-    time_s: float  # its stamp, s; NaN if it has none
-    values: Array  # (n_samples, n_channels)
-
-    @property
-    def size(self) -> int:
-        """Number of samples."""
-        return int(self.values.shape[0])
-
-    @property
-    def end(self) -> int:
-        """Number of the sample after the last."""
-        return self.first + int(self.values.shape[0])
-
-
-class Ledger:
-    """Collects what is given in the order of the stream, and counts.
-
-    `rate_hz`: turns sample numbers into times.
-
-    `events`: rejections of each kind, and samples in them; `samples`: rejections of each kind, and samples in them;
-    `n_given`: samples in stretches.
+class Replay:
+    """Rows of a record that come as blocks of consecutive numbers. Can be iterated again, and sent to another
+    process.
     """
 
-    def __init__(self, rate_hz: float) -> None:
-        self._rate = rate_hz
-        self._entries: list[Passed] = []
-        self.events: dict[RejectionKind, int] = {}
-        self.samples: dict[RejectionKind, int] = {}
-        self.n_given = 0
+    values: Array  # (n_rows, n_channels), SI, may hold NaN
+    numbers: NDArray[np.int64]  # (n_rows,), int64, sample number of each row
+    time_s: Array  # (n_rows,), s, stamp of each row
+    rate_hz: float
+    block_samples: int  # a block is shorter where the numbers do not follow on each other, and at the end
+    irregular: int = 0  # stamps that are more than 1 % of a period off the grid of the samples beside them
 
-    def reject(self, kind: RejectionKind, samples: int, first: int, why: str) -> None:
-        """Enter a rejection.
+    def since(self, first: int) -> Replay:
+        """Return the rows whose numbers are `first` or more, in the order in which they come."""
+        kept = self.numbers >= first
+        if kept.all():
+            return self
+        return replace(self, values=self.values[kept], numbers=self.numbers[kept], time_s=self.time_s[kept])
 
-        `first`: number of the first of them; `why`: one line for people.
-        """
-        self.events[kind] = self.events.get(kind, 0) + 1
-        self.samples[kind] = self.samples.get(kind, 0) + samples
-        self._entries.append(Rejection(kind=kind, samples=samples, t=first / self._rate, why=why))
+    def __iter__(self) -> Iterator[Block]:
+        steps = np.diff(self.numbers)
+        jumps = np.abs(np.diff(self.time_s) * self.rate_hz - steps) > 0.5  # of the clock alone
+        breaks = np.flatnonzero((steps != 1) | jumps) + 1
+        for start, stop in pairwise([0, *breaks.tolist(), self.numbers.size]):
+            for k in range(start, stop, self.block_samples):
+                end = min(k + self.block_samples, stop)
+                yield Block(first=int(self.numbers[k]), time_s=float(self.time_s[k]), values=self.values[k:end])
 
-    def give(self, stretch: Stretch) -> None:
-        """Enter a stretch."""
-        self.n_given += stretch.values.shape[0]
-        self._entries.append(stretch)
 
-    def taken(self) -> list[Passed]:
-        """Return the entries since the last call."""
-        entries, self._entries = self._entries, []
-        return entries
+def blocks_of(
+    record: Record,
+    block_samples: int,
+    *,
+    channels: Sequence[str] | None = None,
+    time_s: ArrayLike | None = None,
+) -> Replay:
+    """Return a record as a stream.
+
+    `record`: rows in the order in which they were written; may hold NaN; `block_samples`: samples of a block;
+    `channels`: which, in which order; default all; `time_s`: (n_samples,). Returns samples are numbered from 0 at the
+    first row.
+    """
+    if block_samples < 1:
+        raise RecordError(f"a block of {block_samples} samples holds nothing; it must have at least one. Correct it")
+    names = record.names if channels is None else tuple(channels)
+    values = np.column_stack([record[name].values for name in names])
+    if time_s is None:
+        numbers, stamps, irregular = np.arange(record.n_samples, dtype=np.int64), record.time_s, 0
+    else:
+        stamps = np.array(time_s, dtype=np.float64)
+        if stamps.shape != (record.n_samples,):
+            raise RecordError(
+                f"{stamps.size} time stamps do not fit {record.n_samples} samples; each row has one. Correct time_s"
+            )
+        numbers, placed, irregular = numbers_from_time(stamps, values, record.rate_hz)
+        values[~placed] = np.nan
+        stamps = _without_holes(stamps, numbers, record.rate_hz)
+    values.flags.writeable = False
+    return Replay(
+        values=values,
+        numbers=numbers,
+        time_s=stamps,
+        rate_hz=record.rate_hz,
+        block_samples=block_samples,
+        irregular=irregular,
+    )
+
+
+def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
+    """Number the rows of a damaged record by their stamps.
+
+    `time_s`: (n_rows,); `values`: (n_rows, n_channels), tell repeated rows from a clock that was set back. Returns
+    `numbers`: (n_rows,), int64, sample numbers, 0 for the first row. A row without a stamp follows on the one before
+    it; `placed`: (n_rows,), bool, false for rows without a stamp where those beside it leave open which samples they
+    are; `irregular`: number of intervals that are off a whole number of periods by more than 1 % of a period.
+    """
+    known = np.flatnonzero(np.isfinite(time_s))
+    rows = np.diff(known)
+    advance = np.diff(time_s[known]) * rate_hz
+    if known.size < 2 or (np.abs(advance / rows - 1) <= 0.05).sum() * 2 < rows.size:
+        raise RecordError(
+            f"less than half of the time stamps are one period of {rate_hz:g} Hz apart; samples cannot be numbered."
+            " Print time with more digits, or correct the rate"
+        )
+    equal = known[1:][(rows == 1) & (np.abs(advance) <= _EQUAL)]
+    coarse = int((values[equal] != values[equal - 1]).any(axis=1).sum())
+    if coarse > _COARSE * rows.size:
+        raise RecordError(
+            f"{coarse} of {time_s.size} rows repeat the time stamp of the row before with other values; at "
+            f"{rate_hz:g} Hz they are not separate samples. Print time with more digits, or correct the rate"
+        )
+    longest = max(_LONGEST_GAP_S * rate_hz, 10.0 * time_s.size)
+    whole = np.rint(np.clip(advance, -(2.0**53), 2.0**53)).astype(np.int64)
+    irregular = int((np.abs(advance - whole) > JITTER * rows).sum())
+    whole = np.where(whole > longest, rows, whole)  # the clock was set: nobody waits so long within a record
+    placed = np.zeros(time_s.size, dtype=bool)
+    placed[known] = True
+    for k in np.flatnonzero((rows > 1) & (whole == rows)):
+        placed[known[k] : known[k + 1]] = True
+    steps = np.ones(time_s.size - 1, dtype=np.int64)
+    steps[known[1:] - 1] = whole - (rows - 1)
+    return _counted(steps, values), placed, irregular
+
+
+def _counted(steps: NDArray[np.int64], values: Array) -> NDArray[np.int64]:
+    """Add up the steps; one that runs back counts only if its rows came before, or fill a gap that was left."""
+    numbers = np.arange(steps.size + 1, dtype=np.int64)
+    runs: deque[tuple[int, int, int]] = deque(maxlen=_REMEMBERED)  # first row, first number, number after the last
+    row = number = 0
+    for k in (np.flatnonzero(steps != 1) + 1).tolist():
+        after = number + k - row
+        numbers[row:k] = np.arange(number, after)
+        runs.append((row, number, after))
+        target = after - 1 + int(steps[k - 1])
+        if target < after and not _known(values, k, target, runs):
+            target = after  # the clock was set back
+        row, number = k, target
+    numbers[row:] = np.arange(number, number + numbers.size - row)
+    return numbers
+
+
+def _known(values: Array, k: int, target: int, runs: Sequence[tuple[int, int, int]]) -> bool:
+    """Tell whether row k is sample `target` again, or one that was left out after others."""
+    for row, first, stop in runs:
+        if first <= target < stop:
+            before = row + target - first
+            n = min(stop - target, values.shape[0] - k, 8)
+            if np.array_equal(values[k : k + n], values[before : before + n], equal_nan=True):
+                return True
+    lowest = min(first for _, first, _ in runs)
+    return target > lowest and not any(first <= target < stop for _, first, stop in runs)
+
+
+def _without_holes(time_s: Array, numbers: NDArray[np.int64], rate_hz: float) -> Array:
+    """Return the stamps with each missing one replaced by what its number says."""
+    known = np.flatnonzero(np.isfinite(time_s))
+    last = known[np.maximum(np.searchsorted(known, np.arange(time_s.size), side="right") - 1, 0)]
+    return np.where(np.isfinite(time_s), time_s, time_s[last] + (numbers - numbers[last]) / rate_hz)
+
+
+def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool] = lambda: False) -> Iterator[Frame]:
+    """Yield blocks at the time at which an acquisition would have them.
+
+    The pace is that of the sample numbers. A gap takes its time, at most one second; numbers that run back take none
+    but that of their samples.
+
+    `stopped`: asked while waiting; True ends the stream. Returns with the time at which it was due, however late it is
+    taken.
+    """
+    due, after = time.perf_counter(), None
+    for block in blocks:
+        n = len(block.values) if np.ndim(block.values) else 0
+        first = block.first if isinstance(block.first, int) else None
+        gap = (first - after) / rate_hz if first is not None and after is not None else 0.0
+        due += n / rate_hz + min(max(gap, 0.0), _LONGEST_PAUSE_S)
+        after = first + n if first is not None else after
+        while (left := due - time.perf_counter()) > 0:
+            if stopped():
+                return
+            time.sleep(min(left, 0.05))
+        yield Frame(block=block, arrived_s=due)

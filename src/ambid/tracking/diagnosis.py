@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 
 from ambid.recursive.lines import Event
-from ambid.tracking.change import Alarm, ChangeDetector
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
-from ambid.tracking.publication import DecisionLog, Publication
+from ambid.tracking.gate import DecisionLog, Publication
+from ambid.tracking.monitors import Alarm, ChangeDetector
 from ambid.tracking.recovery import Recovered, Recovery, begin
 from ambid.tracking.rpem import ParameterFilter, PhysicalRpem
 

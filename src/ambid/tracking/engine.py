@@ -22,9 +22,8 @@ from typing import Any, Literal, cast
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
-from ambid.tracking.blocks import Block, Frame, Passed, Rejection, RejectionKind, Stretch
+from ambid.tracking.blocks import Block, Frame, Passed, Rejection, RejectionKind, Stretch, paced
 from ambid.tracking.guard import StreamGuard
-from ambid.tracking.replay import paced
 from ambid.tracking.ring import BlockRing
 
 _LOWEST = 1e-7  # s: upper edge of the first bin

@@ -17,8 +17,8 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
+from ambid.tracking.kernels import advance, fold
 from ambid.tracking.numbers import TrackedNumbers
-from ambid.tracking.rpem_kernels import advance, fold
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -21,8 +21,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, counted
-from ambid.tracking.blocks import Block, Ledger, Part, Passed, RejectionKind, RowKind, Stretch
-from ambid.tracking.order import BlockOrder, SampleClock
+from ambid.tracking.blocks import Block, Passed, RejectionKind, RowKind, Stretch
+from ambid.tracking.order import BlockOrder, Ledger, Part, SampleClock
 
 Mask = NDArray[np.bool_]
 Stuck = Literal["auto"] | None | int | Sequence[int | Literal["auto"] | None]

@@ -11,12 +11,70 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from math import isfinite, sqrt
 
 import numpy as np
 
+from ambid.arrays import Array
 from ambid.errors import EstimationError, counted
-from ambid.tracking.blocks import Ledger, Part, RejectionKind
+from ambid.tracking.blocks import Passed, Rejection, RejectionKind, Stretch
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Part:
+    """A block under its number in the stream."""
+
+    first: int  # number of the first sample, with wrap-arounds and new counts taken out
+    time_s: float  # its stamp, s; NaN if it has none
+    values: Array  # (n_samples, n_channels)
+
+    @property
+    def size(self) -> int:
+        """Number of samples."""
+        return int(self.values.shape[0])
+
+    @property
+    def end(self) -> int:
+        """Number of the sample after the last."""
+        return self.first + int(self.values.shape[0])
+
+
+class Ledger:
+    """Collects what is given in the order of the stream, and counts.
+
+    `rate_hz`: turns sample numbers into times.
+
+    `events`: rejections of each kind, and samples in them; `samples`: rejections of each kind, and samples in them;
+    `n_given`: samples in stretches.
+    """
+
+    def __init__(self, rate_hz: float) -> None:
+        self._rate = rate_hz
+        self._entries: list[Passed] = []
+        self.events: dict[RejectionKind, int] = {}
+        self.samples: dict[RejectionKind, int] = {}
+        self.n_given = 0
+
+    def reject(self, kind: RejectionKind, samples: int, first: int, why: str) -> None:
+        """Enter a rejection.
+
+        `first`: number of the first of them; `why`: one line for people.
+        """
+        self.events[kind] = self.events.get(kind, 0) + 1
+        self.samples[kind] = self.samples.get(kind, 0) + samples
+        self._entries.append(Rejection(kind=kind, samples=samples, t=first / self._rate, why=why))
+
+    def give(self, stretch: Stretch) -> None:
+        """Enter a stretch."""
+        self.n_given += stretch.values.shape[0]
+        self._entries.append(stretch)
+
+    def taken(self) -> list[Passed]:
+        """Return the entries since the last call."""
+        entries, self._entries = self._entries, []
+        return entries
+
 
 DRIFT_SD = 1e-4  # of a crystal against its stated rate, before anything is known
 _DRIFT_WALK = 1e-6  # wander of the drift in one second

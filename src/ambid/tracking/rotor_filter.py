@@ -5,7 +5,7 @@ stiffnesses, resistances, modes) are forgotten: from block to block P becomes D 
 geometry and mass, M the memory (Jazwinski 1970, sec. 8.12). Several memories run side by side; the likelihood of their
 predictions says which one is published.
 
-A change is found by `ambid.tracking.change.ChangeDetector`, on blocks as its evidence. Then the numbers that age are
+A change is found by `ambid.tracking.monitors.ChangeDetector`, on blocks as its evidence. Then the numbers that age are
 released and the blocks since are fitted again, so that a jump far beyond the linear range is followed; a block that no
 numbers explain, such as that in which the jump is, is left out. Which numbers jumped is told one by one by the gain in
 likelihood, at the new point.
@@ -24,8 +24,8 @@ from ambid.estimation.linear import triangle_of
 from ambid.recursive.lines import Event
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
 from ambid.rotor.unknowns import Unknowns
-from ambid.tracking.change import Alarm, ChangeDetector
 from ambid.tracking.evidence import Evidence
+from ambid.tracking.monitors import Alarm, ChangeDetector
 
 _MEMORIES = (np.inf, 60.0, 20.0, 6.0)  # blocks
 _SCORED = 0.9  # by which the score of a memory fades from block to block

@@ -26,8 +26,8 @@ from ambid.estimation.estimate import Estimate
 from ambid.recursive.estimator import covariance_of, factors_of
 from ambid.recursive.square_root_kernels import deviations, walk
 from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
+from ambid.tracking.kernels import absorb, filter_ring, smooth_ring
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
-from ambid.tracking.rpem_kernels import absorb, filter_ring, smooth_ring
 
 Flags = NDArray[np.bool_]
 

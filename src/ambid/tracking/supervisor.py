@@ -15,10 +15,9 @@ from ambid.arrays import Array
 from ambid.recursive.lines import Event, State, TrackedValue
 from ambid.tracking.diagnosis import LONGEST_S, Diagnosis
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
-from ambid.tracking.gate import Accepted, Gate
+from ambid.tracking.gate import Accepted, DecisionLog, Gate, Operator, Publication, beside, published
 from ambid.tracking.monitors import ErrorLevel, ExcitationMonitor
 from ambid.tracking.numbers import TrackedNumbers
-from ambid.tracking.publication import DecisionLog, Operator, Publication, beside, published
 from ambid.tracking.recovery import begin
 from ambid.tracking.rpem import Memory, PhysicalRpem
 

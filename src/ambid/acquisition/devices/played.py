@@ -35,8 +35,7 @@ from ambid.errors import DeviceError, RecordError
 from ambid.physics.linear_model import model
 from ambid.record import Record, read_rows
 from ambid.rig.rig import Rig, role_units
-from ambid.tracking.blocks import Block, Frame
-from ambid.tracking.replay import Replay, blocks_of
+from ambid.tracking.blocks import Block, Frame, Replay, blocks_of
 from ambid.units import UNKNOWN
 
 ROOM = 4_000_000
