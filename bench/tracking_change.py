@@ -70,7 +70,7 @@ def followed(bench: TrackBench, seed: int) -> Followed:
         seed=seed,
         detected_s=after[0].values["detected"] - AT_S if after else np.inf,
         within_s=_settled(np.array(times), np.array(values) / (TO * bench.truth["k_i"])) - AT_S,
-        update_s=supervisor.update_s or np.inf,
+        update_s=supervisor.diagnosis.update_s or np.inf,
         first_name=after[0].parameter or "none" if after else "none",
         last_name=named[-1] or "none" if named else "none",
         alarms=len(after),

@@ -95,7 +95,8 @@ def hours_of(bench: str, scenario: str, seed: int, seconds: float) -> Hours:
 def _covariance(found: Hours, supervisor: Supervisor) -> None:
     """Count a second in which both covariances, published and working, are symmetric and positive definite."""
     smallest = min(
-        smallest_eigenvalue(supervisor.gate.accepted.covariance), smallest_eigenvalue(supervisor.rpem.filter.covariance)
+        smallest_eigenvalue(supervisor.publication.gate.accepted.covariance),
+        smallest_eigenvalue(supervisor.rpem.filter.covariance),
     )
     found.smallest_eigenvalue = min(found.smallest_eigenvalue, smallest)
     found.definite += smallest > 0.0

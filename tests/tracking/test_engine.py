@@ -80,9 +80,15 @@ def test_a_record_is_delivered_whole(producer):
     sink = Sink()
     report = engine(replay(), sink, producer=producer, ring_blocks=4)
     np.testing.assert_array_equal(sink.values(), X)
-    assert (report.blocks, report.samples, report.given, report.rejected, report.missing) == (30, 3000, 3000, 0, 0)
-    assert (report.torn, report.interrupted, dict(report.events)) == (0, False, {})
-    assert (report.reordered, report.latency.overruns) == (0, 0)
+    assert (
+        report.blocks,
+        report.guard.n_received,
+        report.guard.n_given,
+        report.guard.n_rejected,
+        report.guard.n_missing,
+    ) == (30, 3000, 3000, 0, 0)
+    assert (report.torn, report.interrupted, dict(report.guard.events)) == (0, False, {})
+    assert (report.guard.n_reordered, report.latency.overruns) == (0, 0)
     assert 0 < report.latency.median <= report.latency.p99 <= report.latency.largest <= report.seconds
     assert 0 < report.working_s < report.seconds
 
@@ -95,9 +101,9 @@ def test_damage_is_reported_whichever_way_it_comes(producer):
     del stream[20]
     sink = Sink()
     report = engine(stream, sink, producer=producer)
-    assert dict(report.rejected_samples) == {"type": 100, "shape": 100, "gap": 100}
+    assert dict(report.guard.samples) == {"type": 100, "shape": 100, "gap": 100}
     assert [(r.kind, r.samples) for r in sink.rejections] == [("type", 100), ("shape", 100), ("gap", 100)]
-    assert (report.given, report.rejected, report.missing) == (2700, 200, 100)
+    assert (report.guard.n_given, report.guard.n_rejected, report.guard.n_missing) == (2700, 200, 100)
     np.testing.assert_array_equal(sink.values(), np.delete(X, np.r_[700:800, 900:1000, 2000:2100], axis=0))
 
 
@@ -105,7 +111,7 @@ def test_real_time_takes_its_time():
     sink = Sink()
     report = engine(replay(), sink, pace="real-time")
     assert report.seconds >= 3000 / RATE
-    assert report.given == 3000
+    assert report.guard.n_given == 3000
 
 
 def test_a_slow_consumer_costs_blocks_never_the_order():
@@ -117,7 +123,7 @@ def test_a_slow_consumer_costs_blocks_never_the_order():
     assert report.latency.start is None  # it never caught up
     for s in sink.stretches:
         np.testing.assert_array_equal(s.values, X[s.first : s.first + len(s.values)])
-    assert report.given == 3000 - 100 * report.latency.overruns
+    assert report.guard.n_given == 3000 - 100 * report.latency.overruns
 
 
 @pytest.mark.parametrize("producer", EVERYWHERE)
@@ -170,8 +176,8 @@ def test_an_interrupt_ends_with_everything_up_to_then_delivered(producer):
     sink = Sink(at=5000, do=lambda: signal.raise_signal(signal.SIGINT))
     report = engine(source, sink, producer=producer)
     assert report.interrupted
-    assert report.given == report.samples == len(sink.values()) >= 5100
-    assert report.given < 400_000
+    assert report.guard.n_given == report.guard.n_received == len(sink.values()) >= 5100
+    assert report.guard.n_given < 400_000
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
@@ -186,7 +192,7 @@ def test_an_interrupt_reaches_a_source_that_keeps_waiting():
 
     report = engine(stuck(), Sink())
     assert report.interrupted
-    assert report.given == 500
+    assert report.guard.n_given == 500
     assert not waited
 
 
@@ -203,7 +209,7 @@ def test_a_second_interrupt_reaches_the_consumer():
 def test_whoever_calls_may_end_it():
     sink = Sink()
     report = engine(replay(), sink, stopped=lambda: len(sink.stretches) >= 10)
-    assert report.given == 1000
+    assert report.guard.n_given == 1000
     assert not report.interrupted
 
 
@@ -213,7 +219,7 @@ def test_a_ring_of_others_is_read_and_left_to_them():
             ring.put(block)
         sink = Sink()
         report = engine(ring, sink, stopped=lambda: len(sink.stretches) >= 5)
-        assert report.given == 2000  # all that had been acquired when it was to end
+        assert report.guard.n_given == 2000  # all that had been acquired when it was to end
         assert not ring.stopping
         for block in blocks(X)[20:]:
             ring.put(block)
@@ -238,7 +244,7 @@ if __name__ == "__main__":
     x = np.random.default_rng(0).standard_normal(600_000)
     source = blocks_of(Record(rate_hz=20e3, channels=(Channel(name="a", unit="1", values=x),)), 100)
     report = run(source, consume, guard=StreamGuard(20e3, 1), producer=sys.argv[1], pace="real-time")
-    print(report.interrupted, report.given == report.samples, report.given, flush=True)
+    print(report.interrupted, report.guard.n_given == report.guard.n_received, report.guard.n_given, flush=True)
 """
 
 

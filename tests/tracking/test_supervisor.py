@@ -33,7 +33,7 @@ def test_a_parameter_that_jumps_is_named_found_anew_and_confirmed(name, factor):
     assert near(run, AT + 0.25, **{name: factor * TRUE[name]}) == {}
     assert near(run, 2.2, **{name: factor * TRUE[name]}) == {}
     assert run.at(AT + 0.25).parameters[name].value == pytest.approx(factor * TRUE[name], rel=0.02)
-    assert run.supervisor.changes == [change]
+    assert run.supervisor.diagnosis.changes == [change]
 
 
 @pytest.mark.parametrize("seed", range(1, 5))
@@ -117,7 +117,7 @@ def test_nothing_happens_where_nothing_happens(steady):
     assert [e for e in run.events if e.kind != "refused"] == []
     assert run.states() == ["tracking"]
     assert near(run, 2.5) == {}
-    assert run.supervisor.updates > 50
+    assert run.supervisor.publication.updates > 50
     first, last = run.lines[0].parameters, run.lines[-1].parameters
     assert all(last[n].sd < first[n].sd for n in ("m", "k_i", "R", "L"))
 

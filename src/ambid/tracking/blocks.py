@@ -42,7 +42,7 @@ class Frame:
     arrived_s: float
 
 
-RowKind = Literal["nan", "range", "saturated", "stuck"]
+RowKind = Literal["nan", "range", "stuck"]
 RejectionKind = (
     Literal["gap", "repeated", "overlap", "contradiction", "clock", "number", "shape", "type", "empty"] | RowKind
 )
@@ -64,7 +64,7 @@ class Rejection:
     # ``gap`` (numbers that never came), ``repeated`` and ``overlap`` (numbers that had been given or passed over),
     # ``contradiction`` (an overlap that differs from what was given), ``clock`` and ``number`` (the block does not fit
     # the stream; without samples: the clock or the counter jumped and the stream goes on), ``shape``, ``type`` and
-    # ``empty`` (of the block), ``nan``, ``range``, ``saturated`` and ``stuck`` (of rows)
+    # ``empty`` (of the block), ``nan``, ``range`` and ``stuck`` (of rows)
     kind: RejectionKind
     samples: int  # how many
     t: float  # number of the first of them divided by the rate, s

@@ -11,18 +11,20 @@ import signal
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from math import ceil, log10
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection
-from types import FrameType, MappingProxyType
+from types import FrameType
 from typing import Any, Literal, cast
+
+import numpy as np
 
 from ambid.errors import EstimationError
 from ambid.recursive.lines import Latency
-from ambid.tracking.blocks import Block, Frame, Passed, Rejection, RejectionKind, Stretch, paced
+from ambid.tracking.blocks import Block, Frame, Passed, Rejection, Stretch, paced
 from ambid.tracking.guard import StreamGuard
 from ambid.tracking.ring import BlockRing
 
@@ -40,33 +42,26 @@ class LatencyStatistics:
     """
 
     def __init__(self) -> None:
-        self.overruns = 0
+        self.overruns = self.late = self.count = 0
         self.start: float | None = None
-        self._begin()
-
-    def _begin(self) -> None:
-        self._bins = [0] * (_PER_DECADE * _DECADES + 1)
-        self.count = self.late = 0
         self.largest = 0.0
+        self._bins = np.zeros(_PER_DECADE * _DECADES + 1, dtype=np.int64)
 
     def caught_up(self) -> None:
         """Count from now on; what came before is of the start. Only the first call does something."""
         if self.start is None and self.count:
-            self.start = self.largest
-            self._begin()
+            self.start, self.largest, self.late, self.count = self.largest, 0.0, 0, 0
+            self._bins[:] = 0
 
     def add(self, latency_s: float) -> None:
         """Count a block."""
-        if latency_s <= _LOWEST:
-            at = 0
-        elif latency_s < float("inf"):
-            at = min(ceil(_PER_DECADE * log10(latency_s / _LOWEST)), len(self._bins) - 1)
-            self.largest = max(self.largest, latency_s)
-        else:
+        if not latency_s < float("inf"):
             raise EstimationError(
                 f"a latency of {latency_s} s cannot be counted; it must be a number. Correct the clock"
             )
-        self._bins[at] += 1
+        at = ceil(_PER_DECADE * log10(latency_s / _LOWEST)) if latency_s > _LOWEST else 0
+        self.largest = max(self.largest, latency_s)
+        self._bins[min(at, self._bins.size - 1)] += 1
         self.count += 1
 
     def quantile(self, fraction: float) -> float:
@@ -79,12 +74,8 @@ class LatencyStatistics:
             raise EstimationError(f"the fraction of a quantile is {fraction}; it must lie within 0 and 1. Correct it")
         if not self.count:
             return float("nan")
-        wanted, seen = max(fraction * self.count, 1.0), 0
-        for at, n in enumerate(self._bins):
-            seen += n
-            if seen >= wanted and at < len(self._bins) - 1:
-                return min(_LOWEST * float(10.0 ** (at / _PER_DECADE)), self.largest)
-        return self.largest
+        at = int(np.searchsorted(np.cumsum(self._bins), max(fraction * self.count, 1.0)))
+        return self.largest if at >= self._bins.size - 1 else min(_LOWEST * 10.0 ** (at / _PER_DECADE), self.largest)
 
     def summary(self) -> Latency | None:
         """Return what a track reports of them; None without any block."""
@@ -226,17 +217,10 @@ def _child(packed: bytes, name: str, rate_hz: float, pace: Pace, tell: Connectio
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StreamReport:
-    """What went through an engine."""
+    """What went through an engine; samples and rejections are counted by the `guard`."""
 
+    guard: StreamGuard
     blocks: int  # that came
-    samples: int
-    given: int  # samples that the consumer got; that came and were not given; that never came
-    rejected: int
-    missing: int
-    reordered: int  # blocks that came too late but in time to be put right
-    drift: float  # of the acquisition's clock, relative to the stated rate
-    events: Mapping[RejectionKind, int]  # rejections of each kind, and the samples in them
-    rejected_samples: Mapping[RejectionKind, int]
     seconds: float  # from the first wait to the end, s of clock
     working_s: float  # of these, in the guard and the consumer
     # none if nothing came. In real time from when a block was due; as fast as possible, with the time in the ring.
@@ -280,7 +264,7 @@ def run(
             frames = (
                 paced(cast("Iterable[Block]", source), guard.rate_hz, stopped=ending)
                 if pace == "real-time"
-                else _at_once(source)
+                else (x if isinstance(x, Frame) else Frame(block=x, arrived_s=time.perf_counter()) for x in source)
             )
             pump.pull(frames, ending, interrupt)
         else:
@@ -292,13 +276,7 @@ def run(
                 produced_beside(cast("Iterable[Block]", source), ring, guard.rate_hz, pace) as maker,
             ):
                 pump.drain(ring, ending, maker)
-        pump.finish()
-        return pump.report(interrupted=interrupt.came)
-
-
-def _at_once(source: Iterable[Block | Frame]) -> Iterator[Frame]:
-    for x in source:
-        yield x if isinstance(x, Frame) else Frame(block=x, arrived_s=time.perf_counter())
+        return pump.finish(interrupted=interrupt.came)
 
 
 class _Pump:
@@ -367,22 +345,12 @@ class _Pump:
                 break
         self._statistics.overruns, self.torn = ring.overruns, ring.torn
 
-    def finish(self) -> None:
-        """Deliver what waits in the guard."""
+    def finish(self, *, interrupted: bool) -> StreamReport:
+        """Deliver what waits in the guard, and say what went through."""
         self._deliver(self._guard.flush(), 0)
-
-    def report(self, *, interrupted: bool) -> StreamReport:
-        guard = self._guard
         return StreamReport(
+            guard=self._guard,
             blocks=self.blocks,
-            samples=guard.n_received,
-            given=guard.n_given,
-            rejected=guard.n_rejected,
-            missing=guard.n_missing,
-            reordered=guard.n_reordered,
-            drift=guard.drift,
-            events=MappingProxyType(dict(guard.events)),
-            rejected_samples=MappingProxyType(dict(guard.samples)),
             seconds=time.perf_counter() - self._begun,
             working_s=self._working,
             latency=self._statistics.summary(),

@@ -12,7 +12,7 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 from typing import Literal, get_args
 
@@ -65,17 +65,9 @@ class Comparison:
         )
 
     @property
-    def values(self) -> Mapping[str, float]:
+    def values(self) -> dict[str, float]:
         """All of it, for an event."""
-        return {
-            "blocks": float(self.blocks),
-            "gain": self.gain,
-            "separation": self.separation,
-            "sd": self.sd,
-            "misfit": self.misfit,
-            "claim": self.claim,
-            "scale": self.scale,
-        }
+        return {name: float(x) for name, x in asdict(self).items()}
 
 
 class Gate:
@@ -289,14 +281,14 @@ class Gate:
             kept.pop()
         kept.append(Accepted(values=new.values, covariance=new.covariance, t=t, why=new.why, refined=refined))
         self._candidate = None
-        values = dict(zip(self.names, moved.tolist(), strict=True)) if seen is None else dict(seen.values)
+        values = dict(zip(self.names, moved.tolist(), strict=True)) if seen is None else seen.values
         return Event(kind="accepted", t=t, why=why, values=values)
 
     def _refuse(self, t: float, seen: Comparison, why: str) -> Event:
         """Drop the candidate."""
         reason = "" if self._candidate is None else f"{self._candidate.why}: "
         self._candidate = None
-        return Event(kind="refused", t=t, why=f"{reason}{why} ({seen.text})", values=dict(seen.values))
+        return Event(kind="refused", t=t, why=f"{reason}{why} ({seen.text})", values=seen.values)
 
     def _checked(self, values: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         """Return copies, or refuse them."""

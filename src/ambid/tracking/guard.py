@@ -1,7 +1,7 @@
 """Guard of a stream: whatever happens to the blocks, only clean samples under their right numbers go on, in order.
 
 Three judgements: is it a block of this stream, where does it belong (order.py), and which rows are sound: not those
-that hold NaN, are absurd or saturated, or belong to a frozen channel.
+that hold NaN, are absurd, or belong to a frozen channel.
 
 A frozen channel repeats its last value. It is noticed where a channel that normally moves holds one value much longer
 than it ever did; the rows of such a run are refused from the first repetition on, so a run that has not been decided
@@ -11,7 +11,6 @@ at the end of a block is held back until the next.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from math import isinf
 from operator import index
 from types import MappingProxyType
 from typing import Literal
@@ -38,46 +37,37 @@ _NEVER = np.iinfo(np.int64).max
 class RowCheck:
     """Judges rows in the order of their numbers, remembering what each channel last held and how long.
 
-    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2).
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI.
     """
 
-    def __init__(
-        self,
-        n_channels: int,
-        *,
-        limits: ArrayLike | None = None,
-        saturation: ArrayLike | None = None,
-        stuck: Stuck = "auto",
-    ) -> None:
+    def __init__(self, n_channels: int, *, limits: ArrayLike | None = None, stuck: Stuck = "auto") -> None:
         if n_channels < 1:
             raise EstimationError(f"the stream has {n_channels} channels; it needs at least one. Correct n_channels")
-        self._limits = np.full(n_channels, ABSURD) if limits is None else _per_channel(limits, n_channels, "limits")
+        try:
+            self._limits = np.full(n_channels, ABSURD if limits is None else np.asarray(limits, dtype=np.float64))
+        except ValueError:
+            self._limits = np.array([np.nan])
+        if not (self._limits > 0).all():
+            raise EstimationError(
+                f"limits does not hold a positive number for each of {n_channels} channels. Correct it"
+            )
+        self._limits = np.minimum(self._limits, np.finfo(np.float64).max)
         self._widest = float(self._limits.min())
-        self._rails = None if saturation is None else _rails(saturation, n_channels)
-        self._learns = np.zeros(n_channels, dtype=bool)
-        self._threshold = np.full(n_channels, _NEVER, dtype=np.int64)
-        self._set_stuck(stuck, n_channels)
+        every = stuck is None or isinstance(stuck, (str, int))
+        each = [stuck] * n_channels if every else list(stuck)  # type: ignore[arg-type]
+        wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
+        if wrong or len(each) != n_channels:
+            raise EstimationError(
+                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None or a run of at least"
+                " 2 samples, for all or for each. Correct stuck"
+            )
+        self._learns = np.array([n == "auto" for n in each])
+        self._threshold = np.array([n if isinstance(n, int) else _NEVER for n in each], dtype=np.int64)
         self._watches = bool(self._learns.any() or (self._threshold < _NEVER).any())
         self._usual = np.ones(n_channels, dtype=np.int64)  # longest run in normal work
         self._moving = np.zeros(n_channels, dtype=np.int64)  # samples of normal work
         self._last = np.full(n_channels, np.nan)
         self._run = np.zeros(n_channels, dtype=np.int64)
-
-    def _set_stuck(self, stuck: Stuck, n_channels: int) -> None:
-        if stuck is None:
-            return
-        if stuck == "auto":
-            self._learns[:] = True
-            return
-        each = [stuck] * n_channels if isinstance(stuck, int) else list(stuck)
-        wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
-        if isinstance(stuck, str) or len(each) != n_channels or wrong:
-            raise EstimationError(
-                f"stuck = {stuck!r} does not fit {n_channels} channels; it must be 'auto', None or a run of at least"
-                " 2 samples, for all or for each. Correct stuck"
-            )
-        self._learns[:] = [n == "auto" for n in each]
-        self._threshold[:] = [n if isinstance(n, int) else _NEVER for n in each]
 
     def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
         """Say which rows must not be used, and how many at the end are not decided yet.
@@ -86,27 +76,17 @@ class RowCheck:
         refused, by kind; a kind without any is not there, and no row is in two kinds; rows at the end that have to be
         given again, before the next ones.
         """
-        found = self.unsound(values)
-        if not self._watches:
-            return found, 0
-        stuck, held = self._frozen(self._filled(values) if "nan" in found else values, last)
-        if stuck is not None:
-            _add(found, "stuck", stuck[:, None])
-        return found, held
-
-    def unsound(self, values: Array) -> dict[RowKind, Mask]:
-        """Say which rows must not be used by their own values alone.
-
-        `values`: (n_samples, n_channels). Returns (n_samples,), as `judge` gives it.
-        """
-        found: dict[RowKind, Mask] = {}
+        refused: dict[RowKind, Mask] = {}
         # The peak is NaN if anything is: one comparison tells that all is well.
         if not np.abs(values).max() <= self._widest:
-            _add(found, "nan", ~np.isfinite(values))
-            _add(found, "range", np.abs(values) > self._limits)
-        if self._rails is not None:
-            _add(found, "saturated", (values <= self._rails[:, 0]) | (values >= self._rails[:, 1]))
-        return found
+            _add(refused, "nan", ~np.isfinite(values))
+            _add(refused, "range", np.abs(values) > self._limits)
+        if not self._watches:
+            return refused, 0
+        stuck, undecided = self._frozen(self._filled(values) if "nan" in refused else values, last)
+        if stuck is not None:
+            _add(refused, "stuck", stuck[:, None])
+        return refused, undecided
 
     def _filled(self, values: Array) -> Array:
         """Return the values with each one that is not a number replaced by the one before: no frozen run ends there."""
@@ -121,7 +101,10 @@ class RowCheck:
         np.equal(values[0], self._last, out=same[0])
         np.equal(values[1:], values[:-1], out=same[1:])
         if not same.any():
-            self._learn_all(np.maximum(self._run, 1), n)
+            ended = np.maximum(self._run, 1)  # at most the runs before this block ended
+            if (self._learns & (self._moving < _LEARN)).any() or (ended > self._usual).any():
+                for j in np.flatnonzero(self._learns):
+                    self._learn(int(j), ended[j : j + 1], n, 1)
             self._last[:], self._run[:] = values[-1], 1
             return None, 0
         stuck = np.zeros(n, dtype=bool)
@@ -165,12 +148,6 @@ class RowCheck:
         if self._moving[j] >= _LEARN:
             self._threshold[j] = max(_SHORTEST, _FACTOR * self._usual[j])
 
-    def _learn_all(self, ended: NDArray[np.int64], n: int) -> None:
-        """Learn from a block without any repetition: at most the runs before it ended."""
-        if (self._learns & (self._moving < _LEARN)).any() or (ended > self._usual).any():
-            for j in np.flatnonzero(self._learns):
-                self._learn(int(j), ended[j : j + 1], n, 1)
-
 
 def _add(found: dict[RowKind, Mask], kind: RowKind, cells: Mask) -> None:
     """Add the rows that hold such a cell and are of no other kind yet."""
@@ -181,36 +158,12 @@ def _add(found: dict[RowKind, Mask], kind: RowKind, cells: Mask) -> None:
         found[kind] = rows
 
 
-def _per_channel(limits: ArrayLike, n_channels: int, name: str) -> Array:
-    try:
-        each = np.array(np.broadcast_to(np.asarray(limits, dtype=np.float64), (n_channels,)))
-    except ValueError:
-        each = np.array([np.nan])
-    if not (each > 0).all():
-        raise EstimationError(f"{name} does not hold a positive number for each of {n_channels} channels. Correct it")
-    return np.minimum(each, np.finfo(np.float64).max)
-
-
-def _rails(saturation: ArrayLike, n_channels: int) -> Array:
-    rails = np.asarray(saturation, dtype=np.float64)
-    if rails.shape != (n_channels, 2) or (rails[:, 0] >= rails[:, 1]).any():
-        raise EstimationError(
-            f"saturation has shape {rails.shape}; it must hold a lower and a higher rail for each of {n_channels}"
-            " channels. Correct it"
-        )
-    out = rails.copy()
-    out[np.isnan(out[:, 0]), 0] = -np.inf
-    out[np.isnan(out[:, 1]), 1] = np.inf
-    return out
-
-
 _LARGEST = 2**62  # of a sample number
 _TOLERANCE = 0.75  # of a sample: a stamp rounded to samples lies within half of one
 _WHY: Mapping[RowKind, str] = MappingProxyType(
     {
         "nan": "not finite",
         "range": "beyond the credible limits",
-        "saturated": "at a rail",
         "stuck": "repeating the last value of a channel, which is frozen",
     }
 )
@@ -222,13 +175,9 @@ class StreamGuard:
     Every sample given out stands under its own number, later than all before. Blocks in wrong order are put right as
     far as `reorder` blocks wait for a missing one. After any damage the stream goes on with the next sound block; only
     an acquisition that sets both its counter and its clock back is taken for a repetition until `patience_s` is over.
-    Without stamps a single wrong number is noticed only if it leads by more than one second.
 
-    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `saturation`: (n_channels, 2),
-    rails of each channel; NaN for none; `reorder`: blocks that may wait for a missing one; a gap delays as many;
-    `counter_bits`: width of a sample counter that wraps around, e.g. 32.
-
-    `n_received`: samples that came.
+    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `reorder`: blocks that may wait
+    for a missing one; a gap delays as many. `n_received`: samples that came.
     """
 
     def __init__(
@@ -237,27 +186,22 @@ class StreamGuard:
         n_channels: int,
         *,
         limits: ArrayLike | None = None,
-        saturation: ArrayLike | None = None,
         stuck: Stuck = "auto",
         reorder: int = 1,
-        clock_tolerance_s: float | None = None,
-        counter_bits: int | None = None,
         patience_s: float = 1.0,
     ) -> None:
-        if reorder < 0 or not patience_s > 0 or (counter_bits is not None and not 8 <= counter_bits <= 62):
+        if reorder < 0 or not patience_s > 0:
             raise EstimationError(
-                f"a guard with reorder = {reorder}, patience_s = {patience_s}, counter_bits = {counter_bits} cannot"
-                " work: reorder must not be negative, patience positive, a counter of 8 to 62 bits. Correct it"
+                f"a guard with reorder = {reorder}, patience_s = {patience_s} cannot work: reorder must not be"
+                " negative, patience positive. Correct it"
             )
-        self._rows = RowCheck(n_channels, limits=limits, saturation=saturation, stuck=stuck)
-        tolerance = _TOLERANCE / max(rate_hz, 1e-300) if clock_tolerance_s is None else clock_tolerance_s
-        self._clock = SampleClock(rate_hz, tolerance)
+        self._rows = RowCheck(n_channels, limits=limits, stuck=stuck)
+        self._clock = SampleClock(rate_hz, _TOLERANCE / max(rate_hz, 1e-300))
         self.rate_hz, self.n_channels = rate_hz, n_channels
-        self._wrap = None if counter_bits is None else 1 << counter_bits
         self._ledger = Ledger(rate_hz)
         self._order = BlockOrder(
             rate_hz=rate_hz,
-            clock=None if isinf(tolerance) else self._clock,
+            clock=self._clock,
             depth=reorder,
             patience_s=patience_s,
             ledger=self._ledger,
@@ -333,11 +277,15 @@ class StreamGuard:
         raw: object = block.values
         size = int(raw.shape[0]) if isinstance(raw, np.ndarray) and raw.ndim else 0
         self.n_received += size
-        number = self._number(block.first)
-        if number is None:
+        try:
+            number = index(block.first)
+        except TypeError:
+            number = _LARGEST
+        if not -_LARGEST < number < _LARGEST:
             why = f"the block claims to start at sample {str(block.first)[:40]}"
             self._ledger.reject("number", size, self._order.next, why)
             return None
+        number += self._order.offset
         try:
             time_s = float(block.time_s)
         except (TypeError, ValueError, OverflowError):
@@ -356,22 +304,6 @@ class StreamGuard:
         if self._order.fits(stamp):
             self._order.pass_over(stamp)
         return None
-
-    def _number(self, first: object) -> int | None:
-        """Return a block's number in the stream, unwrapped; None if it is none."""
-        try:
-            number = index(first)  # type: ignore[arg-type]
-        except TypeError:
-            return None
-        if self._wrap is None:
-            return number + self._order.offset if -_LARGEST < number < _LARGEST else None
-        if not 0 <= number < self._wrap:
-            return None
-        near = self._order.near
-        if near is None:
-            return number
-        half = self._wrap // 2
-        return near + (number + self._order.offset - near + half) % self._wrap - half
 
     def _judge(self, part: Part) -> None:
         """Give out the sound rows of a part that is next; undecided ones wait for the part after it."""

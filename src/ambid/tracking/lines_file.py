@@ -177,43 +177,25 @@ def most_important(events: Sequence[Event]) -> Event:
 
 
 class Tally:
-    """Counts of a track."""
+    """Counts of a track, as its lines come.
+
+    `updates`: lines in which the published values differ from those before; `counts`: how many events of each kind.
+    """
 
     def __init__(self, header: TrackHeader) -> None:
-        """Begin before the first line."""
         self._header = header
         self._begin_s: float | None = None
         self._end_s = 0.0
         self._values = tuple(v.value for v in header.start.values()) or None
-        self._updates = self._rejected = 0
         self._changes: list[Event] = []
         self._open: dict[str | None, Event] = {}
-        self._counts: Counter[str] = Counter()
+        self.updates = self.rejected_samples = 0
+        self.counts: Counter[str] = Counter()
 
     @property
     def open_changes(self) -> tuple[Event, ...]:
         """Changes after which no new value of that parameter was accepted."""
         return tuple(self._open.values())
-
-    @property
-    def rejected_samples(self) -> int:
-        """Samples that were not used."""
-        return self._rejected
-
-    @property
-    def updates(self) -> int:
-        """Lines in which the published values differ from those before."""
-        return self._updates
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        """How many events of each kind there were."""
-        return dict(self._counts)
-
-    @property
-    def seconds_of_record(self) -> float:
-        """From the beginning of the first reporting interval to the end of the last, s."""
-        return 0.0 if self._begin_s is None else self._end_s - self._begin_s
 
     def add(self, line: TrackLine) -> None:
         """Count one line."""
@@ -222,38 +204,34 @@ class Tally:
         self._end_s = line.t
         values = tuple([v.value for v in line.parameters.values()])
         if values != self._values:
-            self._updates += self._values is not None
+            self.updates += self._values is not None
             self._values = values
         for event in line.events:
-            self._event(event)
-
-    def _event(self, event: Event) -> None:
-        self._counts[event.kind] += 1
-        if event.kind == "rejected":
-            self._rejected += event.samples or 0
-        elif event.kind == "change":
-            self._changes.append(event)
-            self._open[event.parameter] = event
-        elif event.kind == "accepted":  # without a name: all of them together
-            if event.parameter is None:
+            self.counts[event.kind] += 1
+            if event.kind == "rejected":
+                self.rejected_samples += event.samples or 0
+            elif event.kind == "change":
+                self._changes.append(event)
+                self._open[event.parameter] = event
+            elif event.kind == "accepted" and event.parameter is None:  # all of them together
                 self._open.clear()
-            else:
+            elif event.kind == "accepted":
                 self._open.pop(event.parameter, None)
 
     def summary(self, *, computing_s: float = float("nan"), complete: bool = True) -> TrackSummary:
-        """Return what was counted.
+        """Return what was counted, without latency; `samples` follows from time and rate, `updates` counts lines.
 
-        `computing_s`: time that was spent on it, s; NaN where it is not known; `complete`: whether the run came to the
-        end of its record. Returns without latency; `samples` follows from time and rate, `updates` counts lines.
+        `computing_s`: time that was spent on it, s; `complete`: whether the run came to the end of its record.
         """
+        seconds = 0.0 if self._begin_s is None else self._end_s - self._begin_s
         return TrackSummary(
-            samples=round(self.seconds_of_record * self._header.rate_hz),
-            seconds_of_record=self.seconds_of_record,
+            samples=round(seconds * self._header.rate_hz),
+            seconds_of_record=seconds,
             computing_s=computing_s,
-            updates=self._updates,
-            rejected_samples=self._rejected,
+            updates=self.updates,
+            rejected_samples=self.rejected_samples,
             changes=tuple(self._changes),
-            counts=self.counts,
+            counts=dict(self.counts),
             complete=complete,
             unanswered=self.open_changes,
         )

@@ -93,9 +93,7 @@ class SampleClock:
         if not 0 < rate_hz < float("inf"):
             raise EstimationError(f"the clock's rate is {rate_hz}; it must be a positive number of Hz. Correct rate_hz")
         if not tolerance_s > 0:
-            raise EstimationError(
-                f"the clock's tolerance is {tolerance_s} s; it must be positive. Give math.inf without stamps"
-            )
+            raise EstimationError(f"the clock's tolerance is {tolerance_s} s; it must be positive. Give seconds")
         self._period = 1.0 / rate_hz
         self._tolerance = tolerance_s
         self._jitter = (tolerance_s / 3.0) ** 2
@@ -166,7 +164,7 @@ _LEAP_S = 1.0  # a number that leads by more is doubted where no clock says that
 class BlockOrder:
     """Places blocks: each sample once, later than all before.
 
-    `clock`: none for a stream without stamps; `depth`: blocks that may wait for a missing one; `ledger`: takes the
+    `depth`: blocks that may wait for a missing one; `ledger`: takes the
     rejections; `place`: given each part in order, less what had been passed before.
 
     `next`: number of the sample that is wanted next; `offset`: of the stream's numbers against the acquisition's;
@@ -177,7 +175,7 @@ class BlockOrder:
         self,
         *,
         rate_hz: float,
-        clock: SampleClock | None,
+        clock: SampleClock,
         depth: int,
         patience_s: float,
         ledger: Ledger,
@@ -195,13 +193,6 @@ class BlockOrder:
         self._old: Part | None = None  # the last one whose numbers had passed
         self._old_samples = 0  # in sequence up to that
         self.next = self.offset = self.n_reordered = 0
-
-    @property
-    def near(self) -> int | None:
-        """A number close to that of the next block; None before the first."""
-        if self._started:
-            return self.next
-        return None if self._doubtful is None else self._doubtful.end
 
     @property
     def n_waiting(self) -> int:
@@ -234,11 +225,7 @@ class BlockOrder:
 
         Returns false before the stream has begun.
         """
-        if not self._started:
-            return False
-        if self._clock is None:
-            return part.first - self.next <= self._leap
-        return self._clock.agrees(part.first, part.time_s)
+        return self._started and self._clock.agrees(part.first, part.time_s)
 
     def pass_over(self, part: Part) -> None:
         """Remember numbers that came but were refused: they are not waited for."""
@@ -247,15 +234,12 @@ class BlockOrder:
 
     def _confirms(self, one: Part, other: Part) -> bool:
         """Tell whether two blocks belong to one stream, whatever was known before."""
-        if one.first == other.first:
-            return False
-        if self._clock is None:
-            return abs(other.first - one.first) <= self._leap
-        return self._clock.agree(one.first, one.time_s, other.first, other.time_s)
+        same = one.first == other.first
+        return not same and self._clock.agree(one.first, one.time_s, other.first, other.time_s)
 
     def _runs_on(self, part: Part) -> bool:
         """Tell whether a block is stamped as the next one should be, whatever its number."""
-        return self._clock is not None and self._clock.agrees(self.next, part.time_s)
+        return self._clock.agrees(self.next, part.time_s)
 
     def _begin(self, part: Part) -> None:
         """Hold the first block until another confirms it: a damaged number must not number the stream."""
@@ -278,8 +262,7 @@ class BlockOrder:
     def _start(self, part: Part) -> None:
         """Begin to count at a block."""
         self._started, self.next = True, part.first
-        if self._clock is not None:
-            self._clock.start(part.first, part.time_s)
+        self._clock.start(part.first, part.time_s)
 
     def _take_old(self, part: Part) -> None:
         """Refuse numbers that have passed, unless they show that the acquisition counts again."""
@@ -305,8 +288,7 @@ class BlockOrder:
         )
         self._broke()
         self._tail = None
-        if self._clock is not None:
-            self._clock.start(self.next, parts[0].time_s)
+        self._clock.start(self.next, parts[0].time_s)
         for part in parts:
             self._line_up(Part(first=part.first + shift, time_s=part.time_s, values=part.values))
 
@@ -323,24 +305,20 @@ class BlockOrder:
             self._count_anew([low, high])  # nobody lost so much in no time
             return
         self._release_all()  # what waits came before the jump
-        if self._clock is not None:
-            self._ledger.reject("clock", 0, low.first, f"the clock jumped {self._jump(low)} against the sample numbers")
-            self._clock.start(low.first, low.time_s)
+        off = self._clock.deviation(low.first, low.time_s)
+        jump = f"{'forward' if off > 0 else 'back'} by {abs(off):.4g} s" if isfinite(off) else "by an implausible time"
+        self._ledger.reject("clock", 0, low.first, f"the clock jumped {jump} against the sample numbers")
+        self._clock.start(low.first, low.time_s)
         self._broke()
         for each in (low, high):
             self._line_up(each)
-
-    def _jump(self, part: Part) -> str:
-        assert self._clock is not None
-        off = self._clock.deviation(part.first, part.time_s)
-        return f"{'forward' if off > 0 else 'back'} by {abs(off):.4g} s" if isfinite(off) else "by an implausible time"
 
     def _dismiss(self) -> None:
         """Refuse the doubtful block: nothing confirmed it."""
         part, self._doubtful = self._doubtful, None
         if part is None:
             return
-        number = self._clock is None or (self._started and part.first != self.next and self._runs_on(part))
+        number = self._started and part.first != self.next and self._runs_on(part)
         why = "are out of sequence" if number else f"are stamped {part.time_s:.9g} s"
         self._reject("number" if number else "clock", part, f"{why}, and no other block agrees")
         self.pass_over(part)
@@ -401,7 +379,7 @@ class BlockOrder:
                 self._broke()
                 return
             self._ledger.reject("overlap", again, part.first, f"the first {again} samples of a block had come before")
-        if self._clock is not None and self._clock.agrees(part.first, part.time_s):
+        if self._clock.agrees(part.first, part.time_s):
             self._clock.learn(part.first, part.time_s)
         self.next, self._tail = part.end, part
         while self._refused and self._refused[0][1] <= self.next:

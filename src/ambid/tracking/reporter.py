@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 _LONGEST_GAP_S = 60.0  # a longer gap has no lines
-_PASSING = ("gap", "nan", "range", "saturated", "stuck")  # rejections of samples that had their place in the stream
+_PASSING = ("gap", "nan", "range", "stuck")  # rejections of samples that had their place in the stream
 _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 
 
@@ -148,13 +148,13 @@ class Reporter:
             samples=self.samples,
             seconds_of_record=self.samples / self._rate,
             computing_s=computing_s,
-            updates=s.updates,
+            updates=s.publication.updates,
             rejected_samples=self.rejected,
-            changes=tuple(s.changes),
+            changes=tuple(s.diagnosis.changes),
             counts=s.log.counts,
             latency=latency,
             complete=complete,
-            update_s=s.update_s,
+            update_s=s.diagnosis.update_s,
         )
 
 

@@ -15,7 +15,7 @@ from ambid.arrays import Array
 from ambid.recursive.lines import Event, State, TrackedValue
 from ambid.tracking.diagnosis import LONGEST_S, Diagnosis
 from ambid.tracking.evidence import Evidence, RecentSamples, Samples
-from ambid.tracking.gate import Accepted, DecisionLog, Gate, Operator, Publication, beside, published
+from ambid.tracking.gate import Accepted, DecisionLog, Operator, Publication, beside, published
 from ambid.tracking.monitors import ErrorLevel, ExcitationMonitor
 from ambid.tracking.numbers import TrackedNumbers
 from ambid.tracking.recovery import begin
@@ -65,26 +65,6 @@ class Supervisor:
         self._fresh = dict(self._excitation.fresh)  # as of the last time that it changed
         self._shown: tuple[Accepted, dict[str, bool], bool] | None = None  # what the parameters were made of
         self._parameters: dict[str, TrackedValue] = {}
-
-    @property
-    def gate(self) -> Gate:
-        """What holds the published numbers."""
-        return self.publication.gate
-
-    @property
-    def updates(self) -> int:
-        """Times that published parameters or gains moved."""
-        return self.publication.updates
-
-    @property
-    def changes(self) -> list[Event]:
-        """Changes found, the name being that of the number which explains the data after it."""
-        return self.diagnosis.changes
-
-    @property
-    def update_s(self) -> float:
-        """Computing time of the slowest search after a change, s."""
-        return self.diagnosis.update_s
 
     @property
     def state(self) -> State:
