@@ -224,7 +224,7 @@ def test_a_ring_of_others_is_read_and_left_to_them():
         for block in blocks(X)[20:]:
             ring.put(block)
         ring.end()
-        assert engine(ring, sink).given == 1000
+        assert engine(ring, sink).guard.n_given == 1000
         np.testing.assert_array_equal(sink.values(), X)
 
 

@@ -115,8 +115,6 @@ def test_without_limits_only_what_no_bearing_can_show_is_refused():
         ({"limits": [1.0, 2.0]}, "limits"),
         ({"limits": -1.0}, "limits"),
         ({"limits": np.nan}, "limits"),
-        ({"saturation": [1.0, 2.0, 3.0]}, "saturation"),
-        ({"saturation": [[1.0, -1.0]] * 3}, "saturation"),
         ({"stuck": [1, 2, 3]}, "stuck"),
         ({"stuck": [5, None]}, "stuck"),
         ({"stuck": "often"}, "stuck"),

@@ -138,7 +138,9 @@ def blocks_of(
             )
         numbers, placed, irregular = numbers_from_time(stamps, values, record.rate_hz)
         values[~placed] = np.nan
-        stamps = _without_holes(stamps, numbers, record.rate_hz)
+        known = np.flatnonzero(np.isfinite(stamps))
+        last = known[np.maximum(np.searchsorted(known, np.arange(stamps.size), side="right") - 1, 0)]
+        stamps = np.where(np.isfinite(stamps), stamps, stamps[last] + (numbers - numbers[last]) / record.rate_hz)
     values.flags.writeable = False
     return Replay(
         values=values,
@@ -213,13 +215,6 @@ def _known(values: Array, k: int, target: int, runs: Sequence[tuple[int, int, in
                 return True
     lowest = min(first for _, first, _ in runs)
     return target > lowest and not any(first <= target < stop for _, first, stop in runs)
-
-
-def _without_holes(time_s: Array, numbers: NDArray[np.int64], rate_hz: float) -> Array:
-    """Return the stamps with each missing one replaced by what its number says."""
-    known = np.flatnonzero(np.isfinite(time_s))
-    last = known[np.maximum(np.searchsorted(known, np.arange(time_s.size), side="right") - 1, 0)]
-    return np.where(np.isfinite(time_s), time_s, time_s[last] + (numbers - numbers[last]) / rate_hz)
 
 
 def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool] = lambda: False) -> Iterator[Frame]:

@@ -184,7 +184,14 @@ class Diagnosis:
             self._recover(evidence, t)
             return False
         if self.unexplained.deaf:
-            self._listen(evidence, t)
+            sample = self._rpem.stream.sample
+            if unexplained(evidence) <= WILD * self._detector.noise:
+                self.unexplained.over()
+                self._detector.restart(sample)
+                self._log.add(Event(kind="thawed", t=t, why="the model explains the data again"))
+            elif self.unexplained.search_due(t):
+                why = "the model does not explain the data"
+                self._search(Event(kind="disturbed", t=t, why=why, values={"detected": t}), sample, self._bench)
             return False
         self._detector.drift = rpem.drift.variance * rpem.block_s
         alarm = self._detector.update(evidence, rpem.filter.q, rpem.filter.covariance)
@@ -244,17 +251,13 @@ class Diagnosis:
         if name is not None and kind in _BENCH:
             self.changes.append(event)
             if alarm.blocks > _SUDDEN:
-                self._hasten(name, alarm)
+                drift, place = self._rpem.drift, self._rpem.numbers.names.index(name)
+                if drift.adapts:  # it may go on as it has begun
+                    faster = alarm.size**2 / (alarm.blocks * self._rpem.block_s)
+                    drift.variance[place] = max(drift.variance[place], faster)
             suspects = (name, *[n for n, _ in alarm.rivals if self._kind(n) in _BENCH][:2])
         self._search(event, alarm.onset, suspects, size=alarm.size, blocks=alarm.blocks)
         return False
-
-    def _hasten(self, name: str, alarm: Alarm) -> None:
-        """Let a number walk faster that moved over a long window: it may go on as it has begun."""
-        drift, place = self._rpem.drift, self._rpem.numbers.names.index(name)
-        if drift.adapts:
-            faster = alarm.size**2 / (alarm.blocks * self._rpem.block_s)
-            drift.variance[place] = max(drift.variance[place], faster)
 
     def _noisy(self, alarm: Alarm, event: Event, variance: float) -> bool:
         """Deal with innovations that no number explains; tell whether the block may be used."""
@@ -281,17 +284,6 @@ class Diagnosis:
         self._detector.noise = variance
         self._detector.restart(self._rpem.stream.sample)
 
-    def _listen(self, evidence: Evidence, t: float) -> None:
-        """Wait until the model explains the data again; look now and then whether a change explains them."""
-        sample = self._rpem.stream.sample
-        if unexplained(evidence) <= WILD * self._detector.noise:
-            self.unexplained.over()
-            self._detector.restart(sample)
-            self._log.add(Event(kind="thawed", t=t, why="the model explains the data again"))
-        elif self.unexplained.search_due(t):
-            why = "the model does not explain the data"
-            self._search(Event(kind="disturbed", t=t, why=why, values={"detected": t}), sample, self._bench)
-
     def _search(
         self, event: Event, onset: int, suspects: tuple[str, ...], *, size: float = 0.0, blocks: int = 0
     ) -> None:
@@ -313,7 +305,12 @@ class Diagnosis:
             self.unexplained.count(unexplained(evidence))
             self._no_change(t)
         elif self._recovery.attempts >= _ATTEMPTS:
-            self._give_up(t)
+            for place in self._rpem.numbers.places("parameter"):  # the recursion has to find what no search has
+                self._rpem.filter.widen(int(place), _UNKNOWN)
+            why = "nothing explains the data after the change; all parameters are re-estimated"
+            self._log.add(Event(kind="disturbed", t=t, why=why))
+            self._fresh_start()
+            self._publication.unconfirmed = True
 
     def _adopt(self, found: Recovered, t: float) -> None:
         """Go on with numbers that were found again, as a candidate for publication."""
@@ -377,15 +374,6 @@ class Diagnosis:
         if not deaf:
             self._log.add(Event(kind="frozen", t=t, why=f"{seen}: the model does not fit, and learning is suspended"))
         self.unexplained.close_ears(t)
-
-    def _give_up(self, t: float) -> None:
-        """Let the recursion find what no search has found: all parameters are unknown again."""
-        for place in self._rpem.numbers.places("parameter"):
-            self._rpem.filter.widen(int(place), _UNKNOWN)
-        why = "nothing explains the data after the change; all parameters are re-estimated"
-        self._log.add(Event(kind="disturbed", t=t, why=why))
-        self._fresh_start()
-        self._publication.unconfirmed = True
 
     def _fresh_start(self) -> None:
         self._recovery = None

@@ -59,8 +59,10 @@ class LatencyStatistics:
             raise EstimationError(
                 f"a latency of {latency_s} s cannot be counted; it must be a number. Correct the clock"
             )
-        at = ceil(_PER_DECADE * log10(latency_s / _LOWEST)) if latency_s > _LOWEST else 0
-        self.largest = max(self.largest, latency_s)
+        at = 0  # of what the clock cannot resolve
+        if latency_s > _LOWEST:
+            at = ceil(_PER_DECADE * log10(latency_s / _LOWEST))
+            self.largest = max(self.largest, latency_s)
         self._bins[min(at, self._bins.size - 1)] += 1
         self.count += 1
 

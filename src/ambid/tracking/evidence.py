@@ -321,7 +321,9 @@ class EvidenceStream:
         if self._fresh and y.shape[0]:
             self._begin(u, y)
         errors = np.empty_like(y)
-        forcing = self._nothing_like(y.shape[0]) if samples.forcing is None else samples.forcing
+        if samples.forcing is None and self._nothing.shape[0] != y.shape[0]:
+            self._nothing = np.zeros((y.shape[0], self._nothing.shape[1]))
+        forcing = self._nothing if samples.forcing is None else samples.forcing
         used, counts, full = 0, self._counts, True
         while full and counts[2] < counts[4]:
             used = advance(
@@ -350,11 +352,6 @@ class EvidenceStream:
         n = int(self._counts[1])
         fold(self._triangle, self._rows, n, n)
         self._counts[1] = 0
-
-    def _nothing_like(self, n: int) -> Array:
-        if self._nothing.shape[0] != n:
-            self._nothing = np.zeros((n, self._nothing.shape[1]))
-        return self._nothing
 
     def _begin(self, u: Array, y: Array) -> None:
         """Start from what is measured; what is not settles."""

@@ -53,8 +53,7 @@ class RowCheck:
             )
         self._limits = np.minimum(self._limits, np.finfo(np.float64).max)
         self._widest = float(self._limits.min())
-        every = stuck is None or isinstance(stuck, (str, int))
-        each = [stuck] * n_channels if every else list(stuck)  # type: ignore[arg-type]
+        each = [stuck] * n_channels if stuck is None or isinstance(stuck, (str, int)) else list(stuck)
         wrong = any(n != "auto" if isinstance(n, str) else n is not None and n < 2 for n in each)
         if wrong or len(each) != n_channels:
             raise EstimationError(
@@ -103,8 +102,8 @@ class RowCheck:
         if not same.any():
             ended = np.maximum(self._run, 1)  # at most the runs before this block ended
             if (self._learns & (self._moving < _LEARN)).any() or (ended > self._usual).any():
-                for j in np.flatnonzero(self._learns):
-                    self._learn(int(j), ended[j : j + 1], n, 1)
+                for learning in np.flatnonzero(self._learns).tolist():
+                    self._learn(learning, ended[learning : learning + 1], n, 1)
             self._last[:], self._run[:] = values[-1], 1
             return None, 0
         stuck = np.zeros(n, dtype=bool)
@@ -340,13 +339,10 @@ class StreamGuard:
                 sound &= ~rows
                 at = first + int(np.argmax(rows))
                 self._ledger.reject(kind, count, at, f"{counted(count, 'sample')} from {at} on: {_WHY[kind]}")
-        for start, stop in [(0, values.shape[0])] if not found else _runs(sound):
+        edges = [0, values.shape[0]]
+        if found:
+            edges = np.flatnonzero(np.diff(np.concatenate([[0], sound.astype(np.int8), [0]]))).tolist()
+        for start, stop in zip(edges[::2], edges[1::2], strict=True):
             restart = self._restart or first + start != self._given_to
             self._ledger.give(Stretch(values=values[start:stop], first=first + start, restart=restart))
             self._restart, self._given_to = False, first + stop
-
-
-def _runs(sound: NDArray[np.bool_]) -> list[tuple[int, int]]:
-    """Return (start, stop) of every run of True."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], sound.astype(np.int8), [0]])))
-    return list(zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True))

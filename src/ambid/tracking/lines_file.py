@@ -372,18 +372,15 @@ class LiveState:
         self.tally.add(line)
         self._errors.append(line.error)
         for event in line.events:
-            self._tell(event)
+            if event.kind in _NOTABLE:
+                self._unanswered = self._unanswered or event.kind == "change"
+                self._notable.append(event)
+            elif self._unanswered and event.kind in ("accepted", "refused"):
+                self._unanswered = event.kind == "refused"
+                self._notable.append(event)
+            else:
+                self._latest[event.kind] = event
         self.line = line
-
-    def _tell(self, event: Event) -> None:
-        if event.kind in _NOTABLE:
-            self._unanswered = self._unanswered or event.kind == "change"
-            self._notable.append(event)
-        elif self._unanswered and event.kind in ("accepted", "refused"):
-            self._unanswered = event.kind == "refused"
-            self._notable.append(event)
-        else:
-            self._latest[event.kind] = event
 
     @property
     def events(self) -> tuple[Event, ...]:

@@ -377,14 +377,10 @@ class ChangeDetector:
         if not calm:
             self._wait -= 1
         elif evidence.freedom:
-            self._follow_noise(evidence, settling=settling)
+            gain = max(1.0 / (self._seen + _SETTLE_NOISE), _NOISE_GAIN) if settling else _NOISE_GAIN
+            middle = self.noise * (1.0 - 2.0 / (9.0 * evidence.freedom)) ** 3
+            self.noise *= math.exp(gain if evidence.rest / evidence.freedom > middle else -gain)
         return None
-
-    def _follow_noise(self, evidence: Evidence, *, settling: bool) -> None:
-        """Follow the median of the unexplained part in small steps, in larger ones while settling."""
-        gain = max(1.0 / (self._seen + _SETTLE_NOISE), _NOISE_GAIN) if settling else _NOISE_GAIN
-        middle = self.noise * (1.0 - 2.0 / (9.0 * evidence.freedom)) ** 3
-        self.noise *= math.exp(gain if evidence.rest / evidence.freedom > middle else -gain)
 
     def restart(self, from_sample: int) -> None:
         """Forget all windows, as after a change that was handled; what was learned of quiet times stays.

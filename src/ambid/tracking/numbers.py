@@ -142,7 +142,9 @@ def forcing_of(record: Record) -> Forcing | None:
     period = 1.0 / record.rate_hz
     if "speed" in record.names:
         speed = record["speed"].values
-        angle = record["angle"].values if "angle" in record else _integrated(speed, period)
+        filled = np.nan_to_num(speed)  # after a gap the phase is lost; the recursion finds it anew
+        turned = np.concatenate([[0.0], np.cumsum(0.5 * (filled[1:] + filled[:-1]) * period)])
+        angle = record["angle"].values if "angle" in record else turned
     else:
         angle = record["angle"].values
         speed = np.gradient(np.unwrap(angle), period)
@@ -159,12 +161,6 @@ def forcing_of(record: Record) -> Forcing | None:
     middle = angle + 0.5 * period * speed
     size = (speed / top) ** 2
     return Forcing(columns=np.column_stack([size * np.cos(middle), size * np.sin(middle)]), top_speed=top)
-
-
-def _integrated(speed: Array, period: float) -> Array:
-    """Angle from the speed by the trapezium rule, 0 at the first sample."""
-    known = np.nan_to_num(speed)  # after a gap the phase is lost; the recursion finds it anew
-    return np.concatenate([[0.0], np.cumsum(0.5 * (known[1:] + known[:-1]) * period)])
 
 
 def _check_agreement(speed: Array, angle: Array, period: float) -> None:
@@ -303,7 +299,8 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
     scales = _scales(plant, estimate)
     noise = noise_numbers(plant, estimate, scales)
     free = tuple(estimate.covariance_names)
-    sizes = [_size(plant, estimate, k) for k in free] + [1.0] * len(plant.gains)
+    values, reference = estimate.values, plant.references(estimate.values)
+    sizes = [max(abs(values[k]), reference.get(k, 0.0)) or 1.0 for k in free] + [1.0] * len(plant.gains)
     problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
     groups = _groups(problem, estimate, noise, free, top_speed if synchronous else None)
     found = TrackedNumbers(
@@ -437,11 +434,6 @@ def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
             covariance=np.array([[float(found.sd or 0.0) ** 2]]),
         )
     ]  # fmt: skip
-
-
-def _size(plant: LinearModel, estimate: Estimate, name: str) -> float:
-    value = estimate.values[name]
-    return max(abs(value), plant.references(estimate.values).get(name, 0.0)) or 1.0
 
 
 def _scales(plant: LinearModel, estimate: Estimate) -> Scales:

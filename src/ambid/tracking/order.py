@@ -204,7 +204,15 @@ class BlockOrder:
         if not self._started:
             self._begin(part)
         elif part.end <= self.next:
-            self._take_old(part)
+            before = self._old
+            follows = before is not None and part.first == before.end and self._confirms(before, part)
+            self._old_samples = part.size + (self._old_samples if follows else 0)
+            self._old = part
+            # A clock that runs on while the counter is set back shows a new count at once; else only its length does.
+            if before is not None and follows and (self._runs_on(before) or self._old_samples >= self._patience):
+                self._count_anew([part])
+            else:
+                self._reject("repeated", part, f"came again or too late: expected {self.next}")
         elif self.fits(part):
             self._dismiss()
             self._line_up(part)
@@ -263,18 +271,6 @@ class BlockOrder:
         """Begin to count at a block."""
         self._started, self.next = True, part.first
         self._clock.start(part.first, part.time_s)
-
-    def _take_old(self, part: Part) -> None:
-        """Refuse numbers that have passed, unless they show that the acquisition counts again."""
-        before = self._old
-        follows = before is not None and part.first == before.end and self._confirms(before, part)
-        self._old_samples = part.size + (self._old_samples if follows else 0)
-        self._old = part
-        # A clock that runs on while the counter is set back shows a new count at once; otherwise only its length does.
-        if before is not None and follows and (self._runs_on(before) or self._old_samples >= self._patience):
-            self._count_anew([part])
-        else:
-            self._reject("repeated", part, f"came again or too late: expected {self.next}")
 
     def _count_anew(self, parts: Sequence[Part]) -> None:
         """Follow a counter that jumped, under numbers that go on."""

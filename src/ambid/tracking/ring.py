@@ -19,12 +19,12 @@ import struct
 import sys
 import threading
 import time
-from collections.abc import Callable, Sequence, Sized
+from collections.abc import Callable, Sequence
 from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 from operator import index
 from pathlib import Path
-from typing import Any, Self
+from typing import Self
 from zlib import crc32
 
 import numpy as np
@@ -42,7 +42,11 @@ def created(size: int) -> SharedMemory:
     segment = None
     try:
         segment = SharedMemory(name=name, create=True, size=size)
-        _reserve(segment)
+        path = _PLACE / name
+        if path.exists() and hasattr(os, "posix_fallocate"):
+            # take the memory now: without room for it, whoever writes to it later would be killed
+            with path.open("r+b") as file:
+                os.posix_fallocate(file.fileno(), 0, segment.size)
     except OSError as failure:
         if segment is not None:
             removed(segment)
@@ -53,18 +57,6 @@ def created(size: int) -> SharedMemory:
     return segment
 
 
-def _reserve(segment: SharedMemory) -> None:
-    """Take the memory now, where it is a file of its own: one without room would kill whoever writes to it later."""
-    path = _PLACE / segment.name
-    if not path.exists() or not hasattr(os, "posix_fallocate"):
-        return
-    fd = os.open(path, os.O_RDWR)
-    try:
-        os.posix_fallocate(fd, 0, segment.size)
-    finally:
-        os.close(fd)
-
-
 def attached(name: str) -> SharedMemory:
     """Open a segment that is somebody else's: the resource tracker of this process must not remove it."""
     try:
@@ -72,7 +64,7 @@ def attached(name: str) -> SharedMemory:
             return SharedMemory(name=name, track=False)
         with _ATTACHING:
             register = resource_tracker.register
-            resource_tracker.register = _not_registered
+            resource_tracker.register = lambda *_: None
             try:
                 return SharedMemory(name=name)
             finally:
@@ -98,10 +90,6 @@ def removed(segment: SharedMemory) -> None:
         resource_tracker.unregister(f"/{segment.name}", "shared_memory")
 
 
-def _not_registered(name: Sized, rtype: str) -> None:
-    del name, rtype
-
-
 _HEAD = struct.Struct(
     "=QQqddqqqQ8s"
 )  # sequence, check, first, time, arrival, rows, columns (-1: none), bytes, spare, type
@@ -113,8 +101,22 @@ NOT_CARRIED = b"?"  # type of values that do not fit a slot: what arrives has a 
 
 def write_frame(buffer: memoryview, at: int, sequence: int, block: Block, arrived_s: float, capacity: int) -> None:
     """Write a block into a slot."""
-    data, rows, columns, kind = _carried(block.values, capacity)
-    head = (_number(block.first), _stamp(block.time_s), arrived_s, rows, columns, len(data), 0, kind)
+    values: object = block.values
+    data, rows, columns, kind = b"", 0, -1, NOT_CARRIED
+    if isinstance(values, np.ndarray) and values.ndim in (1, 2) and values.nbytes <= capacity:
+        code = values.dtype.str.encode()
+        if values.dtype.kind in "biufc" and len(code) <= 8:
+            data, rows, columns, kind = values.tobytes(), len(values), values.shape[1] if values.ndim == 2 else -1, code
+    try:
+        number = index(block.first)
+    except TypeError:
+        number = NO_NUMBER
+    try:
+        time_s = float(block.time_s)
+    except (TypeError, ValueError, OverflowError):
+        time_s = float("nan")
+    number = number if -(2**63) <= number < 2**63 else NO_NUMBER
+    head = (number, time_s, arrived_s, rows, columns, len(data), 0, kind)
     stop = at + _HEAD.size + len(data)
     _HEAD.pack_into(buffer, at, sequence, 0, *head)
     buffer[at + _HEAD.size : stop] = data
@@ -130,39 +132,11 @@ def read_frame(buffer: memoryview, at: int, sequence: int, capacity: int) -> Fra
     data = bytes(buffer[at + _UNCHECKED : at + _HEAD.size + size])
     if crc32(data, sequence & 0xFFFFFFFF) != check:
         return None
-    values = _values(data[_HEAD.size - _UNCHECKED :], rows, columns, kind.rstrip(b"\0"))
+    kind, values = kind.rstrip(b"\0"), np.empty(0, dtype=object)
+    if kind != NOT_CARRIED:
+        values = np.frombuffer(data[_HEAD.size - _UNCHECKED :], dtype=kind.decode())
+        values = values if columns < 0 else values.reshape(rows, columns)
     return Frame(block=Block(first=first, time_s=time_s, values=values), arrived_s=arrived_s)
-
-
-def _number(first: object) -> int:
-    try:
-        number = index(first)  # type: ignore[arg-type]
-    except TypeError:
-        return NO_NUMBER
-    return number if -(2**63) <= number < 2**63 else NO_NUMBER
-
-
-def _stamp(time_s: object) -> float:
-    try:
-        return float(time_s)  # type: ignore[arg-type]
-    except (TypeError, ValueError, OverflowError):
-        return float("nan")
-
-
-def _carried(values: object, capacity: int) -> tuple[bytes, int, int, bytes]:
-    """Return bytes, rows, columns and type of values; a mark instead of the type if no slot can carry them."""
-    if isinstance(values, np.ndarray) and values.ndim in (1, 2) and values.nbytes <= capacity:
-        kind = values.dtype.str.encode()
-        if values.dtype.kind in "biufc" and len(kind) <= 8:
-            return values.tobytes(), values.shape[0], values.shape[1] if values.ndim == 2 else -1, kind
-    return b"", 0, -1, NOT_CARRIED
-
-
-def _values(data: bytes, rows: int, columns: int, kind: bytes) -> Any:
-    if kind == NOT_CARRIED:
-        return np.empty(0, dtype=object)
-    flat = np.frombuffer(data, dtype=kind.decode())
-    return flat if columns < 0 else flat.reshape(rows, columns)
 
 
 VERSION = 2
@@ -333,21 +307,16 @@ class BlockRing:
             return None
         while self.filled:
             number = self._consumed[_READ]
-            frame = self._frame(number)
+            at = self._first_slot + (number % self.slots) * self._slot_size
+            for _ in range(_RETRIES):
+                frame = read_frame(self._bytes, at, number, self._capacity)
+                if frame is not None:
+                    break
+                time.sleep(0)
             self._consumed[_READ] = number + 1  # last: only now may the producer write there
             if frame is not None:
                 return frame
             self.torn += 1
-        return None
-
-    def _frame(self, number: int) -> Frame | None:
-        """Return the frame of this sequence number; None if it is torn."""
-        at = self._first_slot + (number % self.slots) * self._slot_size
-        for _ in range(_RETRIES):
-            frame = read_frame(self._bytes, at, number, self._capacity)
-            if frame is not None:
-                return frame
-            time.sleep(0)
         return None
 
     def _wait(self, ready: Callable[[], object], timeout_s: float) -> bool:

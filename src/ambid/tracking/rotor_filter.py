@@ -146,23 +146,15 @@ class RotorFilter:
             self._since, self._before = window[0][0].first, window[0][1]
             return self._changed([b for b, _ in window], error, alarm)
         events = self._confirmed(block)
-        for m in self._bank:
-            self._learn(m, self._tempered(evidence))
+        if evidence.rest > self._limit(evidence):  # it counts less where noise is larger than at the start
+            root = np.sqrt(evidence.rest / evidence.freedom)
+            evidence = replace(evidence, J=evidence.J / root, r=evidence.r / root)
+        for m in self._bank:  # each memory is scored by how well it predicted the block
+            prior = m.predicted(self.ages)
+            left, M = evidence.residual(prior.q), _spread(evidence.J, prior.P)
+            m.state = _updated(prior, evidence.J, left)
+            m.score = _SCORED * m.score - 0.5 * float(left @ np.linalg.solve(M, left) + np.linalg.slogdet(M)[1])
         return Step(error=error, used=True, settled=True, events=events)
-
-    def _learn(self, m: _Memory, evidence: Evidence) -> None:
-        """Update one memory by a block, and its score by how well it was predicted."""
-        prior = m.predicted(self.ages)
-        left, M = evidence.residual(prior.q), _spread(evidence.J, prior.P)
-        m.state = _updated(prior, evidence.J, left)
-        m.score = _SCORED * m.score - 0.5 * float(left @ np.linalg.solve(M, left) + np.linalg.slogdet(M)[1])
-
-    def _tempered(self, evidence: Evidence) -> Evidence:
-        """Return evidence that counts less where noise is larger than at the start."""
-        noise = evidence.rest / evidence.freedom
-        if evidence.rest <= self._limit(evidence):
-            return evidence
-        return replace(evidence, J=evidence.J / np.sqrt(noise), r=evidence.r / np.sqrt(noise))
 
     def _limit(self, evidence: Evidence) -> float:
         """Return up to what the unexplained part of a block is noise as usual."""
@@ -190,25 +182,22 @@ class RotorFilter:
         again, kept = self._fit(used, before, np.array([n in names for n in self.unknowns.names]), fitted.q)
         fitted = again if kept else fitted
         events = self._told(names, statistics, fitted, before)
-        if not names:
-            events = self._passed(alarm, self._time(last.last)) or self._confirmed(last)
+        if not names:  # something else than a number made the alarm
+            why = "a disturbance has passed: no number changed" if self._doubt else ""
+            if alarm is not None and alarm.by == "noise":
+                self._detector.noise *= alarm.noise
+                if alarm.noise > 1.0:
+                    why = (
+                        f"noise is {alarm.noise:.2f} times as much as before (variance), with the numbers as they were"
+                    )
+            event = Event(kind="disturbed", t=self._time(last.last), why=why)
+            events = (event,) if why else self._confirmed(last)
         for m in self._bank:
             m.state = fitted
         self._since, self._doubt, self._open = None, 0, names
         self._detector.restart(last.last)
         self._recent.clear()
         return Step(error=error, used=True, settled=True, events=events)
-
-    def _passed(self, alarm: Alarm | None, t: float) -> tuple[Event, ...]:
-        """Say what else than a number made an alarm; noise is followed."""
-        if alarm is not None and alarm.by == "noise":
-            self._detector.noise *= alarm.noise
-            if alarm.noise > 1.0:
-                why = f"noise is {alarm.noise:.2f} times as much as before (variance), with the numbers as they were"
-                return (Event(kind="disturbed", t=t, why=why),)
-        if self._doubt:
-            return (Event(kind="disturbed", t=t, why="a disturbance has passed: no number changed"),)
-        return ()
 
     def _unexplained(self, block: Block, error: float) -> Step:
         """Leave a block out that no numbers explain."""

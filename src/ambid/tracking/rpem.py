@@ -174,15 +174,9 @@ class DriftRates:
 
         `noise`: variance of the evidence's residual.
         """
-        if not self._chunk.blocks and self._count >= _FEWEST and self._since >= _EVERY:
-            self._since = 0
-            self._adapt(known, noise)
-
-    def restart(self) -> None:
-        """Forget the window: a jump in it would pass for drift."""
-        self._count = self._next = self._since = self._chunk.blocks = 0
-
-    def _adapt(self, known: ParameterFilter, noise: float) -> None:
+        if self._chunk.blocks or self._count < _FEWEST or self._since < _EVERY:
+            return
+        self._since = 0
         active, before = known.active, self.variance
         if self._looks % (_SELDOM // _EVERY) == 0:
             self._raise(self._ratio(self._count, active, noise))
@@ -194,7 +188,14 @@ class DriftRates:
                     break
                 self._raise(np.where(recent > _SURE, recent, 1.0))
         if np.any(self.variance > _NOTICED * before):
-            self._catch_up(known, noise)
+            # filter the recent past again: with the rates as they were, what moved was taken for chance
+            _, _, q, P = self._run(min(max(_RECENT), self._count), active, noise)
+            if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
+                known.set(np.where(active, q, known.q), P)
+
+    def restart(self) -> None:
+        """Forget the window: a jump in it would pass for drift."""
+        self._count = self._next = self._since = self._chunk.blocks = 0
 
     def _raise(self, ratio: Array) -> None:
         factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
@@ -205,15 +206,6 @@ class DriftRates:
         squares, powers, _, _ = self._run(count, active, noise)
         told = active & (powers > 0.0)
         return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
-
-    def _catch_up(self, known: ParameterFilter, noise: float) -> None:
-        """Filter the recent past again: with the rates as they were, what moved was taken for chance."""
-        _, _, q, P = self._run(min(max(_RECENT), self._count), known.active, noise)
-        held = ~known.active
-        if not (np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0)):
-            return
-        q[held] = known.q[held]
-        known.set(q, P)
 
     def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)

@@ -116,7 +116,14 @@ class Supervisor:
         (n_samples, n_outputs), SI, innovations of the working predictor.
         """
         if restart or first != self.rpem.stream.sample:
-            self._resume(first)
+            rpem = self.rpem
+            gap_s = max(first - rpem.stream.sample, 0) / self._rate
+            if gap_s > rpem.block_s:
+                rpem.filter.walk(rpem.drift.variance, gap_s)
+                if gap_s > LONGEST_S:  # whatever happened in it did not happen before it
+                    rpem.drift.restart()
+                    self.diagnosis.forget(first)
+            self.diagnosis.restart(first)
         errors = np.empty_like(samples.y)
         k, n = 0, samples.y.shape[0]
         while k < n:
@@ -162,17 +169,6 @@ class Supervisor:
     def _now(self) -> float:
         return self._t0 + self.rpem.stream.sample / self._rate
 
-    def _resume(self, first: int) -> None:
-        """Go on behind a gap: the signals before it are forgotten, the parameters have walked on meanwhile."""
-        rpem = self.rpem
-        gap_s = max(first - rpem.stream.sample, 0) / self._rate
-        if gap_s > rpem.block_s:
-            rpem.filter.walk(rpem.drift.variance, gap_s)
-            if gap_s > LONGEST_S:  # whatever happened in it did not happen before it
-                rpem.drift.restart()
-                self.diagnosis.forget(first)
-        self.diagnosis.restart(first)
-
     def _take(self, evidence: Evidence) -> None:
         """Judge a block, use it, and judge the outcome of it."""
         rpem, t = self.rpem, self._t0 + evidence.last / self._rate
@@ -193,7 +189,12 @@ class Supervisor:
         if self.diagnosis.renewed:
             self._activate()
         if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
-            self._watch_level(evidence, t)
+            before = self.level.above
+            error = self.level.update(evidence, self.publication.accepted.values)
+            told = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
+            if self.level.above and not (before or told):
+                why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
+                self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
         self._obey(t)
 
     def _absorb(self, evidence: Evidence, t: float) -> None:
@@ -208,15 +209,6 @@ class Supervisor:
     def _obey(self, t: float) -> None:
         if self.operator.waiting and self.publication.obey(t, searching=self.diagnosis.searching):
             self.level.restart()
-
-    def _watch_level(self, evidence: Evidence, t: float) -> None:
-        """Follow the error of the published numbers; say when it passes its limit, unless it was said why."""
-        before = self.level.above
-        error = self.level.update(evidence, self.publication.accepted.values)
-        told = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
-        if self.level.above and not (before or told):
-            why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
-            self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
 
     def _activate(self) -> None:
         """Let the recursion move what the data inform."""
