@@ -24,7 +24,7 @@ from multiprocessing import resource_tracker
 from multiprocessing.shared_memory import SharedMemory
 from operator import index
 from pathlib import Path
-from typing import Self
+from typing import Any, Self
 from zlib import crc32
 
 import numpy as np
@@ -132,7 +132,8 @@ def read_frame(buffer: memoryview, at: int, sequence: int, capacity: int) -> Fra
     data = bytes(buffer[at + _UNCHECKED : at + _HEAD.size + size])
     if crc32(data, sequence & 0xFFFFFFFF) != check:
         return None
-    kind, values = kind.rstrip(b"\0"), np.empty(0, dtype=object)
+    values: np.ndarray[Any, Any] = np.empty(0, dtype=object)
+    kind = kind.rstrip(b"\0")
     if kind != NOT_CARRIED:
         values = np.frombuffer(data[_HEAD.size - _UNCHECKED :], dtype=kind.decode())
         values = values if columns < 0 else values.reshape(rows, columns)
