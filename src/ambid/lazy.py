@@ -1,7 +1,7 @@
 """Names that a package exports without importing what is behind them until one is used (PEP 562).
 
 The names stand once, in the package's ``if TYPE_CHECKING:`` block as ``from home import name as name``: type checkers
-read them there, and so does `exports`. It keeps ``import ambid`` and ``ambid --help`` fast.
+read them there, and so does `exports`. It keeps ``import ambid`` and the command's help fast.
 """
 
 from __future__ import annotations

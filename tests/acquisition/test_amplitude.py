@@ -178,6 +178,6 @@ def test_a_bench_that_does_not_hover_has_no_amplitude():
     rig = prototype(("kd = 92.57", "kd = 0.0"))
     with (
         Spoiled(rig) as device,
-        pytest.raises(DeviceError, match=r"no suitable amplitude was found: .*out_of_gap.*--amplitude"),
+        pytest.raises(DeviceError, match=r"no suitable amplitude was found: .*out_of_gap.*Give amplitude"),
     ):
         fitting_amplitude(device, rig, TRIAL)

@@ -92,7 +92,7 @@ def test_a_wrong_unit_of_time_is_named(name, factor, words):
     assert not check.passed
     assert check.values["time_factor"] == factor
     assert words in check.detail
-    assert "--rate" in check.detail
+    assert "give rate_hz" in check.detail
 
 
 def test_a_rate_ten_times_wrong_is_named_where_a_mass_is_known():

@@ -45,7 +45,7 @@ def test_a_curved_record_is_used_with_caution_and_told_what_to_do(bent):
         reason = next(r for r in estimate.verdict.reasons if r.check == "curvature")
         assert estimate.verdict.word == "caution"
         assert "L by +" in reason.text
-        assert "--nonlinear" in reason.text
+        assert "ambid.identify_nonlinear" in reason.text
 
 
 def test_a_linear_bench_is_not_cautioned_for_the_magnet_of_its_rig(experiment):

@@ -258,7 +258,7 @@ def test_what_cannot_be_designed_is_refused(bench):
     ):
         with pytest.raises(AmbidError, match=said):
             ambid.design_experiment(replace(bench, **changed), **short)
-    for how, said in (({"criterion": "kx"}, "k_x"), ({"use": 2.0}, "--use"), ({"band": (1e-3, 2e-3)}, "no line")):
+    for how, said in (({"criterion": "kx"}, "k_x"), ({"use": 2.0}, "use"), ({"band": (1e-3, 2e-3)}, "no line")):
         with pytest.raises(AmbidError, match=said):
             ambid.design_experiment(bench, **short, **how)
     with pytest.raises(EstimationError, match="designed for"):

@@ -172,7 +172,7 @@ def test_knobs_keep_the_limits_on_all_drawn_plants(prototypes):
     alone = Family(plants=drawn).figures(lqg(plant, weights_of(ambid.preset("prototype")), rig.noise).law)
     assert alone["peak"] > 3.0  # LQG has no margins by itself
     tight = replace(goals, limits={"peak": 1.3, "settling": 9.0})
-    with pytest.raises(EstimationError, match=r"no LQG law meets the limits .*is the least. Give --limit peak="):
+    with pytest.raises(EstimationError, match=r"no LQG law meets the limits .*is the least. Give limits={'peak': "):
         design_lqg(drawn[:2], rig, tight, silent)
     with pytest.raises(EstimationError, match=r"gives no \[limits\]"):
         design_lqg(drawn, replace(rig, limits=None), goals, silent)

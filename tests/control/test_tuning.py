@@ -84,7 +84,7 @@ def test_a_limit_that_no_loop_meets_is_refused_with_the_one_to_move(bench):
     with pytest.raises(EstimationError, match="no PID meets the limits") as refused:
         tune_pid(plants[:2], rig, goals, silent)
     assert "with the others kept, peak" in str(refused.value)
-    moved = float(str(refused.value).partition("--limit peak=")[2].partition("dB")[0])
+    moved = float(str(refused.value).partition("limits={'peak': ")[2].partition("}")[0])
     goals = Goals.of(GOALS, {"noise": 0.3 * before.noise, "peak": 10.0 ** (moved / 20.0)}, before)
     assert tune_pid(plants[:2], rig, goals, silent).closed
 

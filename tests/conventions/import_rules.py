@@ -26,6 +26,7 @@ TIERS: tuple[tuple[str, ...], ...] = (
     ("physics", "signals"),
     ("record",),
     ("units",),
+    ("settings",),
     ("errors", "arrays", "compiled", "lazy"),
 )
 # The one inversion (ARCHITECTURE.md): methods of results and records ask, when called, for what shows or converts them.

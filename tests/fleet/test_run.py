@@ -192,8 +192,8 @@ def test_a_table_that_leaves_something_open_is_refused(folder, tmp_path, table, 
         ([], {"job": "identfy"}, "Did you mean 'identify'"),
         ([], {"settings": {"form_s": 1}}, "Did you mean 'from_s'"),
         ([], {"job": "fit"}, "fit needs structure"),
-        ([], {"limit_s": math.nan}, "--limit is nan"),
-        ([], {"workers": 0}, "--workers is 0"),
+        ([], {"limit_s": math.nan}, "limit_s is nan"),
+        ([], {"workers": 0}, "workers is 0"),
     ],
 )
 def test_what_cannot_run_is_refused_before_anything_does(folder, records, more, why):

@@ -144,7 +144,7 @@ def test_curvature_alone_does_not_keep_a_better_loop_from_being_loaded(cautions,
 
 
 def test_a_loop_is_tried_by_the_firmware_alone(tmp_path):
-    with SimulatedDevice(prototype()) as device, pytest.raises(AmbidError, match="omit --redesign"):
+    with SimulatedDevice(prototype()) as device, pytest.raises(AmbidError, match="omit redesign"):
         commission(device, prototype(), tmp_path, plan=replace(SHORT, redesign=True))
     assert not files(tmp_path)
 

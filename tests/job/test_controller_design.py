@@ -39,9 +39,11 @@ def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
         monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: change(rig.loop))
 
     given(lambda loop: replace(loop, kd=0.7 * loop.kd))
-    with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or --limit peak=") as told:
+    with pytest.raises(
+        EstimationError, match=r"none is offered. Give the goal peak alone, or limits={'peak': "
+    ) as told:
         design_controller(known, rig, plants=3, judges=3)
-    least = float(str(told.value).rpartition("peak=")[2].removesuffix("dB"))
+    least = float(str(told.value).rpartition("'peak': ")[2].removesuffix("}"))
     found = design_controller(known, rig, plants=3, judges=3, limits={"peak": least})
     assert found.after.worst.peak > found.before.worst.peak
     given(lambda loop: replace(loop, kd=0.0))
@@ -54,7 +56,7 @@ def test_a_rotors_loop_with_a_higher_peak_is_refused_too(monkeypatch):
     known = ambid.identify(ambid.simulate("rmit", duration=1.0, seed=1), rig)
     worse = replace(rig.loop, kd=0.7 * rig.loop.kd)
     monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: worse)
-    with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or --limit peak="):
+    with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or limits={'peak': "):
         design_controller(known, rig, plants=2, judges=2)
 
 

@@ -89,7 +89,7 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
         ({"structure": "narmx"}, "Did you mean 'narmax'"),
         ({"orders": {"degre": 2}}, "Did you mean 'degree'"),
         ({"seed": -1}, "seed"),
-        ({"validate_from_s": 1.0}, "--validate"),
+        ({"validate_from_s": 1.0}, "Give validate"),
         ({"output": "z"}, "z"),
         ({"from_s": 100.0}, "100"),
     ],

@@ -80,8 +80,8 @@ def test_gains_of_the_rig_are_applied(files, rig):
 @pytest.mark.parametrize(
     ("more", "said"),
     [
-        ({"modes": "auto"}, "--modes is for records in time"),
-        ({"method": "random"}, "--method is for records in time"),
+        ({"modes": "auto"}, "modes is for records in time"),
+        ({"method": "random"}, "method is for records in time"),
         ({"hold": "zoh"}, "a held input needs the rate"),
         ({"rate_hz": 500.0}, "shows less than half"),
         ({"layout": {"group": "a"}}, "layout 'group' of a frequency response"),

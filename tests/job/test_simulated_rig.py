@@ -123,6 +123,6 @@ def test_what_is_simulated_is_found_again(text, bench, how, names) -> None:
 
 
 def test_a_controllers_rig_is_simulated_at_its_rate_and_names_its_magnet():
-    with pytest.raises(RigError, match=r"no value for k_x, k_i, L; .* Simulate its \[magnet\] \(--nonlinear"):
+    with pytest.raises(RigError, match=r"no value for k_x, k_i, L; .* Simulate its \[magnet\] \(nonlinear=True"):
         ambid.simulate(PROTOTYPE_FILE, duration=0.1)
     assert ambid.simulate(PROTOTYPE_FILE, duration=0.1, nonlinear=True).rate_hz == 2000.0

@@ -97,7 +97,7 @@ def test_a_lost_row_is_empty_cells_in_csv_which_the_reader_refuses_naming_the_re
     values = np.arange(40.0).reshape(20, 2)
     values[8:10] = np.nan
     write_chunks(without_samples(record), 20, [values], tmp_path / "gap.csv", {})()
-    with pytest.raises(RecordError, match=r"row 10.*--gaps"):
+    with pytest.raises(RecordError, match=r"row 10.*gaps="):
         read_record(tmp_path / "gap.csv")
     assert read_record(tmp_path / "gap.csv", gaps="cut").n_samples == 10
     assert read_record(tmp_path / "gap.csv", gaps="interpolate").n_samples == 20

@@ -64,9 +64,12 @@ def test_what_is_certain_is_read_and_told(tmp_path, case):
 LARGE = (np.arange(20.0) + 1, np.arange(20.0) + 1)
 BOTH = text(["time [s];voltage [V]"], lambda x: f"{x:.0f},234", ";", LARGE)
 ASKED = {
-    "1,234": (BOTH, r"row 2: '1,234' may be 1.234 or 1234; .*--layout decimal=comma, or thousands=comma$"),
-    "two rows of text": (text([NAMES, ["seconds", "volts", "mm"]]), r"rows 1 and 2 .*units=row, or units=none"),
-    "a place in parentheses": (text([TEXTS]), r"row 1: \(left\) is no known unit.*--layout units=parentheses"),
+    "1,234": (BOTH, r"row 2: '1,234' may be 1.234 or 1234; .*layout={'decimal': 'comma'}, or layout={'thousands': "
+                    r"'comma'}$"),
+    "two rows of "
+    "text": (text([NAMES, ["seconds", "volts", "mm"]]), r"rows 1 and 2 .*layout={'units': 'row'}, or "
+                                                                    r"layout={'units': 'none'}"),
+    "a place in parentheses": (text([TEXTS]), r"row 1: \(left\) is no known unit.*layout={'units': 'parentheses'}"),
     "point among commas": (text(form=comma, mark=";", tail="0,020;1.5;3\n"), r"row 22: '1.5' is not a number"),
     "comma among points": (text(form="{:,.3f}".format, mark=";", tail="0,020;1;3\n"), r"row 22: '0,020' is not"),
     "decimal and separating commas": (text(form=comma), r"row 2: 6 cells where the header names 3"),
@@ -101,7 +104,7 @@ def test_the_layout_decides(tmp_path):
     micro = text([["time [s]", "voltage [µV]", "position [mm]"]])
     assert read(micro, "latin-1", encoding="latin-1")["voltage"].source_unit == "uV"
     assert read(text(form=comma, mark=";"), decimal=",", separator=";")["voltage"].values[3] == 1.5
-    with pytest.raises(RecordError, match=r"byte 0xb5 is not UTF-8 text.*--layout encoding=latin-1"):
+    with pytest.raises(RecordError, match=r"byte 0xb5 is not UTF-8 text.*layout={'encoding': 'latin-1'}"):
         path.write_bytes(micro.encode("latin-1")), read_record(path)
     for layout, words in (
         ({"decimal": "x"}, "one of ,, comma"),

@@ -65,7 +65,7 @@ def test_values_that_are_not_finite_obey_the_same_rules_as_csv(tmp_path):
         Record(rate_hz=10.0, start_s=1.0, channels=(Channel(name="v", unit="V", values=values),)), tmp_path / "r.h5"
     )
     assert np.isnan(read_hdf5(tmp_path / "r.h5")["v"][20])  # the format itself is lossless
-    with pytest.raises(RecordError, match=r"row 20, column 'v'.*--gaps"):
+    with pytest.raises(RecordError, match=r"row 20, column 'v'.*gaps="):
         read_record(tmp_path / "r.h5")
     np.testing.assert_allclose(read_record(tmp_path / "r.h5", gaps="interpolate")["v"], np.arange(50.0))
     cut = read_record(tmp_path / "r.h5", gaps="cut")
@@ -75,7 +75,7 @@ def test_values_that_are_not_finite_obey_the_same_rules_as_csv(tmp_path):
 
 def test_rate_that_contradicts_the_file(tmp_path):
     write_record(record(), tmp_path / "r.h5")
-    with pytest.raises(RecordError, match=r"--rate\) says 1000 Hz. Omit it"):
+    with pytest.raises(RecordError, match=r"rate_hz says 1000 Hz. Omit it"):
         read_record(tmp_path / "r.h5", rate_hz=1000.0)
 
 

@@ -60,7 +60,7 @@ def test_named_variables_become_channels(path):
 
 def test_rate_given_instead_of_time(path):
     assert read_record(path, variables={"voltage": ("u", "V")}, rate_hz=250.0).rate_hz == 250.0
-    with pytest.raises(RecordError, match="--rate"):
+    with pytest.raises(RecordError, match="give rate_hz"):
         read_record(path, variables={"voltage": ("u", "V")})
 
 

@@ -60,7 +60,7 @@ def test_without_time_the_rate_is_needed(tmp_path):
 
 
 def test_a_rate_that_the_time_column_denies_is_refused(tmp_path):
-    with pytest.raises(RecordError, match=r"2000 Hz but rate_hz .--rate. says 100 Hz"):
+    with pytest.raises(RecordError, match=r"2000 Hz but rate_hz says 100 Hz"):
         read_rows(written(tmp_path), rate_hz=100.0)
 
 

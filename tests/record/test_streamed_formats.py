@@ -71,7 +71,7 @@ def test_tdms_gives_channels_in_si_with_rate_and_date(tmp_path):
     assert record.provenance["taken_at"].startswith("2024-05-06T00:00:00")
     assert len(record.provenance["sha256"]) == 64
     assert said(record)["group"] == "Log"
-    with pytest.raises(RecordError, match=r"1000 Hz but rate_hz \(--rate\) says 500"):
+    with pytest.raises(RecordError, match=r"1000 Hz but rate_hz says 500"):
         read_record(path, rate_hz=500)
     with pytest.raises(RecordError, match=r"\.tdms files are read, not written"):
         write_record(record, path)
@@ -87,7 +87,7 @@ def test_daqmx_scales_are_applied(tmp_path):
 
 def test_groups_are_asked_back_and_chosen(tmp_path):
     path = tdms(tmp_path / "a.tdms", [("Fast", "u", U, WAVE), ("Slow", "u", U[:50], WAVE)])
-    with pytest.raises(RecordError, match=r"2 groups \(Fast/u; Slow/u\)\. Say which: --layout group='Fast'"):
+    with pytest.raises(RecordError, match=r"2 groups \(Fast/u; Slow/u\)\. Say which: layout={'group': 'Fast'}"):
         read_record(path)
     assert read_record(path, layout={"group": "Slow"}).n_samples == 50
     with pytest.raises(RecordError, match=r"no group 'Fats'.*Did you mean 'Fast'"):
@@ -117,7 +117,7 @@ def test_what_differs_or_contradicts_is_named(tmp_path, second, words):
 
 def test_no_rate_and_texts_are_told(tmp_path):
     path = tdms(tmp_path / "a.tdms", [("Log", "u", U, {}), ("Log", "note", np.array(["a"] * N), {})])
-    with pytest.raises(RecordError, match=r"no column 'time \[s\]'.*--rate"):
+    with pytest.raises(RecordError, match=r"no column 'time \[s\]'.*rate_hz"):
         read_record(path)
     record = read_record(path, rate_hz=200)
     assert (record.rate_hz, record.names, record["u"].unit, said(record)["left_out"]) == (200.0, ("u",), "?", ["note"])

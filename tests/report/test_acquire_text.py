@@ -64,7 +64,7 @@ def test_without_an_excitation_there_is_no_ratio():
 
 
 def test_lost_samples_say_how_to_read_the_record():
-    assert "3 samples lost, 0 frames damaged, 0 blocks overrun; read it with --gaps" in said(run=replace(RUN, lost=3))
+    assert "3 samples lost, 0 frames damaged, 0 blocks overrun; read it with gaps" in said(run=replace(RUN, lost=3))
 
 
 def test_what_is_poor_is_said_first():

@@ -44,7 +44,7 @@ def test_the_first_twenty_terms_with_ratio_and_spread(fit: NonlinearFit) -> None
     assert fit.model.theta.size > 20
     assert len(lines) == 22
     assert lines[0].split() == ["term", "coefficient", "±", "sd", "ERR"]
-    assert lines[-1] == f"… and {fit.model.theta.size - 20} more; --json has them all"
+    assert lines[-1] == f"… and {fit.model.theta.size - 20} more; save() has them all"
     k = fit.model.names.index("u(t-1)")
     row = next(x for x in lines if x.startswith("u(t-1) "))
     assert fit.sd is not None
@@ -63,7 +63,7 @@ def test_weights_beside_terms_are_counted_and_ratios_shown_where_there_are_any(f
     lines = term_lines(hybrid)
     assert lines[0].split() == ["term", "coefficient", "±", "sd"]
     assert [x.split()[0] for x in lines[1:5]] == names[:4]
-    assert lines[5:] == [f"and a network of {len(names) - 4} weights; --json has them"]
+    assert lines[5:] == [f"and a network of {len(names) - 4} weights; save() has them"]
 
 
 def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit) -> None:

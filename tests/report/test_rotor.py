@@ -180,7 +180,7 @@ def test_a_rig_of_a_rotor_is_refused_where_one_axis_is_meant() -> None:
         lambda: physics(ambid.fit(record(), structure="arx", orders="na=1,nb=1,nk=1", input="ax_voltage",
                                   output="ax_current", rig=rig(known=False)), rig(known=False)),
     ):  # fmt: skip
-        with pytest.raises(EstimationError, match="--rig of a rotor on many axes is for 'ambid identify'"):
+        with pytest.raises(EstimationError, match="rig of a rotor on many axes is for 'ambid identify'"):
             verb()
 
 

@@ -190,15 +190,15 @@ def test_one_dropped_period_is_spoken_of_as_one():
 def test_remedies_name_the_options_of_the_command():
     rng = np.random.default_rng(17)
     x = one_period(rng, np.arange(1, 160), N)
-    with pytest.raises(EstimationError, match="--method local"):
+    with pytest.raises(EstimationError, match="method='local'"):
         frf_periodic(x, x + 0.1 * rng.standard_normal(N), 1.0, period=N, lines=np.arange(1, 160))
-    with pytest.raises(EstimationError, match="--method local"):
+    with pytest.raises(EstimationError, match="method='local'"):
         frf_periodic([np.stack([x, -x], axis=1)] * 3, [x] * 3, 1.0, period=N)
-    with pytest.raises(EstimationError, match=r"local or the random method \(--method\)"):
+    with pytest.raises(EstimationError, match=r"local or the random method \(method\)"):
         find_period(rng.standard_normal(400))
     xs = [one_period(rng, np.arange(1, 160), N) for _ in range(3)]
     ys = [x + 0.1 * rng.standard_normal(N) for x in xs]
-    assert any("--reference" in w and "--open-loop" in w for w in frf_periodic(xs, ys, 1.0, period=N).warnings)
+    assert any("(reference)" in w and "open_loop=True" in w for w in frf_periodic(xs, ys, 1.0, period=N).warnings)
     flat = {"inputs": ["coil"], "outputs": ["gap"], "period": N}
     with pytest.raises(EstimationError, match="output 'gap' is constant"):
         frf_periodic(x, np.ones(N), 1.0, **flat)

@@ -161,8 +161,8 @@ def test_leakage_of_short_segments_is_told():
     assert sum(told(resonant, 128) for _ in range(10)) == 10
     u = rng.standard_normal(16384)
     short = frf_random(u, lfilter(*resonant, u), 1.0, segment=128).warnings
-    assert any("--method local" in w for w in short)
-    assert any("--reference" in w and "--open-loop" in w for w in short)
+    assert any("method='local'" in w for w in short)
+    assert any("(reference)" in w and "open_loop=True" in w for w in short)
     assert sum(told(resonant, 4096) for _ in range(10)) == 0
     assert sum(told((B, A), 512) for _ in range(10)) == 0
 

@@ -55,7 +55,7 @@ def test_csv_of_complex_values(tmp_path, columns, made, dialect):
     np.testing.assert_allclose(found.G[:, 0, 0], G[:, 0], rtol=1e-9)
     np.testing.assert_allclose(found.sd[:, 0, 0], 0.02 * np.abs(G[:, 0]), rtol=1e-9)
     if layout:
-        with pytest.raises(AmbidError, match=r"in dB of what.*--layout magnitude=m/A"):
+        with pytest.raises(AmbidError, match=r"in dB of what.*layout={'magnitude': 'm/A'}"):
             read_response(path)
 
 
@@ -91,10 +91,10 @@ REFUSED = {
     "more.uff": (GOOD.replace(b"       199", b"999999999"[:9].rjust(10)), "of 1999999998 numbers"),
     "real.uff": (uff([(4, 1, 7, F, np.abs(G[:, 0]), UNITS)]), "real; a frequency response has a phase"),
     "none.uff": (uff([(2, 1, 7, F, np.abs(G[:, 0]), UNITS)]), "holds no frequency response"),
-    "twice.uff": (GOOD + GOOD, r"7Z → 1Z occurs twice \(functions 1,2\).*--layout functions=1"),
+    "twice.uff": (GOOD + GOOD, r"7Z → 1Z occurs twice \(functions 1,2\).*layout={'functions': '1"),
     "other.uff": (GOOD + uff([(4, 2, 7, F + 1, G[:, 0], UNITS)]), "other frequencies than the first"),
     "kinds.uff": (GOOD + uff([(4, 2, 7, F, G[:, 0], ("mm", "V"))]), r"7Z is in \[A\] in one function and in \[V\]"),
-    "inches.uff": (units_164(7) + GOOD, "dataset 164 says units of system 7.*--layout units=labels"),
+    "inches.uff": (units_164(7) + GOOD, "dataset 164 says units of system 7.*layout={'units': 'labels'}"),
     "few.uff": (uff([(4, 1, 7, F[:5], G[:5, 0], UNITS)]), "5 lines over 0 Hz; at least 9"),
     "nan.csv": (HEAD + ROWS.replace(b"10,1,2", b"10,nan,2"), "line 5 is not finite"),
     "word.csv": (HEAD + ROWS.replace(b"10,1,2", b"10,open,2"), "row 6: '10,open,2'"),

@@ -62,7 +62,7 @@ def test_the_open_loop_of_a_coil_is_known_in_closed_form():
 def test_an_unstable_loop_is_refused_with_what_would_make_it_stable(loop, words):
     found = margins(loop)
     assert not found.stable
-    with pytest.raises(ModelError, match=rf"largest pole {found.largest_pole:.5g}; .*{words}.*--force"):
+    with pytest.raises(ModelError, match=rf"largest pole {found.largest_pole:.5g}; .*{words}.*force=True"):
         found.refuse("this plant", remedy="Design [loop]")
     assert found.words().startswith("unstable")
 

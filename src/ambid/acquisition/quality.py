@@ -19,6 +19,7 @@ from ambid.acquisition.program import period_ticks
 from ambid.arrays import Array
 from ambid.errors import counted
 from ambid.estimation.result import Reason
+from ambid.settings.caller import setting
 from ambid.tracking.blocks import Frame
 
 _DIFFERENCES = np.array([1.0, -3.0, 3.0, -1.0])
@@ -384,7 +385,7 @@ def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[Reason]:
             check="lost",
             text=f"{counted(report.lost, 'sample')} lost in {counted(report.gaps, 'gap')} ({share:.2%}): "
             + (
-                "they are missing in the replayed record. Read it with --gaps"
+                f"they are missing in the replayed record. Read it with {setting('gaps')}"
                 if replay
                 else "the line or the host is too slow. Lower daq.rate_hz, or free the machine"
             ),

@@ -27,6 +27,7 @@ from ambid.arrays import Array
 from ambid.errors import DeviceError
 from ambid.physics.linear_model import model
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 from ambid.tracking.blocks import Frame
 
 _FEWEST_PERIODS = 4.5  # four whole ones, whatever the period is rounded to
@@ -241,7 +242,9 @@ def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callab
         if not found.reasons:
             return found.amplitude_v
         reasons = found.reasons
-    raise DeviceError(f"{device.info.port}: no suitable amplitude was found: {'; '.join(reasons)}. Give --amplitude")
+    raise DeviceError(
+        f"{device.info.port}: no suitable amplitude was found: {'; '.join(reasons)}. Give {setting('amplitude')}"
+    )
 
 
 def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:

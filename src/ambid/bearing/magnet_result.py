@@ -352,7 +352,7 @@ def bearing_from_json(document: Mapping[str, Any], where: str) -> NonlinearBeari
         _check_consistent(estimate)
         return estimate
 
-    return read_whole(read, where, "estimate", "identify --nonlinear")
+    return read_whole(read, where, "estimate", "identify_nonlinear")
 
 
 def _check_consistent(e: NonlinearBearingEstimate) -> None:

@@ -34,6 +34,7 @@ from ambid.estimation.modes import Modal, Mode
 from ambid.estimation.result import Reason, Result
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.linear_model import model as physical_model
+from ambid.settings.caller import setting
 from ambid.signals.response import FrequencyResponse
 
 Complex = NDArray[np.complex128]
@@ -91,7 +92,8 @@ class Measured(Result):
             found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
         if not (self.references or self.open_loop):
             text = (
-                "without a reference, feedback biases the response. Give --reference, or --open-loop if there is none"
+                f"without a reference, feedback biases the response. Give {setting('reference')}, or "
+                f"{setting('open_loop', True)} if there is none"
             )
             found.append(Reason(check="feedback", text=text))
         if "assumed" in frf.details:

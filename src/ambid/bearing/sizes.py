@@ -18,6 +18,7 @@ from ambid.bearing.multistart import Signals
 from ambid.estimation.estimate import Check
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.sensor_errors import CHANNELS, unit_powers
+from ambid.settings.caller import setting
 
 _UNITS = dict(zip(CHANNELS, ("V", "A", "m", "s"), strict=True))
 _SIGNALS = {  # powers of gains of `CHANNELS`
@@ -145,7 +146,7 @@ def check_units(
             passed=False,
             values={**factors, "unusual": float(len(odd))},
             detail=f"{what}. All sizes are typical if {words}. Correct the unit in the record's header, or give "
-            + ("--rate" if slips[0].channel == "time" else f"channels.{slips[0].channel}.gain"),
+            + (setting("rate_hz") if slips[0].channel == "time" else f"channels.{slips[0].channel}.gain"),
         )
     return Check(
         passed=_inside(sizes, logs),

@@ -24,6 +24,7 @@ from ambid.blackbox.model import Offsets, TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.uncertainty import p_text
+from ambid.settings.caller import setting
 
 LIMIT = (
     "limit of the three blocks: the mass is normalised to 1, so that only ratios to the mass are found (N/A, N/m per "
@@ -152,7 +153,8 @@ def _warnings(data: IOData, theta: Array, covariance: Array, doubt: Mapping[str,
     out = []
     if not (data.open_loop or data.references):
         out.append(
-            "blocks is biased by feedback. Name the loop's reference (--reference), or give --open-loop if the record "
+            f"blocks is biased by feedback. Name the loop's reference ({setting('reference')}), or give "
+            f"{setting('open_loop', True)} if the record "
             "is open loop"
         )
     what = {"current": "TFa and TFb do not explain the current", "position": "TFc does not explain the position"}

@@ -11,6 +11,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import EstimationError, counted, nearest
 from ambid.record import Record
+from ambid.settings.caller import setting
 
 _LARGEST = 1e60  # squares of ratios of channels have to stay inside the range of floating-point numbers
 _SMALLEST = 1e-60
@@ -129,7 +130,7 @@ def io_data(
     excitation; `open_loop`: whether the record is open loop.
     """
     if not outputs:
-        raise EstimationError("no output was named; a model needs at least one. Give --output COLUMN")
+        raise EstimationError(f"no output was named; a model needs at least one. Give {setting('output', 'COLUMN')}")
     n = record.n_samples
 
     def columns(names: Sequence[str]) -> Array:
@@ -276,7 +277,9 @@ def check_length(who: str, data: IOData, rows: int, unknowns: int) -> None:
     `rows`: samples that are left after lags; `unknowns`: numbers to be estimated for one output.
     """
     if not data.n_inputs:
-        raise EstimationError(f"{who}: no input was named; it estimates the path from inputs to outputs. Give --input")
+        raise EstimationError(
+            f"{who}: no input was named; it estimates the path from inputs to outputs. Give {setting('input')}"
+        )
     if rows < 4 * unknowns or rows < 20:
         raise EstimationError(
             f"{who}: {data.n_samples} samples for {unknowns} unknowns; at least {max(20, 4 * unknowns)} rows are "

@@ -16,6 +16,7 @@ from ambid.blackbox.model import BlackBoxModel, Offsets
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import FittedModel
 from ambid.estimation.result import Linear, Reason
+from ambid.settings.caller import setting
 
 Feedback = Literal["consistent", "biased", "with noise model"]
 Kind = Literal["polynomial", "state space", "transfer function"]
@@ -252,7 +253,8 @@ def build_fit(
         found.insert(0, "the search did not converge: treat the values as a first guess")
     if structure(name).feedback == "biased" and data.n_inputs and not data.open_loop:
         found.append(
-            f"{name} is biased by feedback. Use bj, armax or pbsid, or give --open-loop if the record is open loop"
+            f"{name} is biased by feedback. Use bj, armax or pbsid, or give {setting('open_loop', True)} if the "
+            "record is open loop"
         )
     return BlackBoxFit(
         structure=name,

@@ -49,6 +49,7 @@ from ambid.blackbox.prediction import Numbers, Responses, companion, filter_stat
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.physics.linear_model import zero_order_hold
+from ambid.settings.caller import setting
 
 _ROUGH, _FINE = 6, 60  # steps spent on a start, and on the best of them
 _HALVINGS = 6
@@ -279,7 +280,9 @@ def transfer_orders(who: str, data: IOData, orders: Orders, more: int = 1) -> Tr
     check_order_names(who, orders, ("nb", "nf", "nk"), ("nb", "nf"))
     n_u = data.n_inputs
     if not n_u:
-        raise EstimationError(f"{who}: no input was named; it estimates the path from inputs to outputs. Give --input")
+        raise EstimationError(
+            f"{who}: no input was named; it estimates the path from inputs to outputs. Give {setting('input')}"
+        )
     nb, n = order_per_input(who, orders, "nb", 1, n_u), single_order(who, orders, "nf", 1)
     if max(nb) > n + more:
         raise EstimationError(

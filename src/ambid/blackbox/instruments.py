@@ -18,6 +18,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.kernels import state_scan
+from ambid.settings.caller import setting
 from ambid.signals.delay import lagged_triangle
 
 
@@ -212,7 +213,7 @@ def require_reference(who: str, data: IOData) -> None:
     if not data.references:
         raise EstimationError(
             f"{who}: no reference was named; its instruments come from the loop's external excitation, which is "
-            "free of noise. Give --reference COLUMN, or use bj, armax or pbsid, which need none"
+            f"free of noise. Give {setting('reference', 'COLUMN')}, or use bj, armax or pbsid, which need none"
         )
 
 

@@ -16,6 +16,7 @@ from ambid.arrays import Array, Complex
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
 from ambid.estimation.stable_poles import Tolerance, TrialPole, clusters, followed, trial_poles
+from ambid.settings.caller import setting
 
 DEGREE = 2  # of polynomials that stand for what is far away
 MOST_DAMPED = 0.15  # above, a resonance is no line: rigid and control modes are taken for what is far away
@@ -57,7 +58,7 @@ def spectra(data: IOData, band: tuple[float, float] | None) -> Spectra:
     if np.count_nonzero(keep) < _LEAST_LINES:
         raise EstimationError(
             f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; modes want {_LEAST_LINES}. "
-            "Use a longer record or a wider --band"
+            f"Use a longer record or a wider {setting('band')}"
         )
     U, Y, f = U[keep], Y[keep], f[keep]
     silent = [name for name, x in zip(data.inputs, U.T, strict=True) if not np.any(x)]

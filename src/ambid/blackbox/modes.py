@@ -27,6 +27,7 @@ from ambid.estimation.modes import Modal, Mode, mode_of, modes_checks, student
 from ambid.estimation.result import NORMAL_95
 from ambid.estimation.search import Rows, search
 from ambid.estimation.stable_poles import assurance
+from ambid.settings.caller import setting
 
 _REACH = 10.0  # of a window to either side, in half bandwidths of its mode
 _FEWEST = 24  # lines of a window to either side, at least
@@ -365,7 +366,7 @@ def find_modes(
         found = sorted(sorted(found, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
     limits = float(lines.omega[0] / (2 * np.pi)), float(lines.omega[-1] / (2 * np.pi))
     modes = tuple(_mode(c, data.outputs) for c in found)
-    checks = modes_checks(modes, count, limits, "Excite more, longer, or give --band")
+    checks = modes_checks(modes, count, limits, f"Excite more, longer, or give {setting('band')}")
     return Modal(
         status="converged" if found else "failed",
         method="maximum likelihood on the record's spectrum, transients included",

@@ -27,6 +27,7 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import Modal, Mode, mode_of, modes_checks, student
 from ambid.estimation.stable_poles import PoleCluster, Tolerance, TrialPole, clusters, followed, trial_poles
+from ambid.settings.caller import setting
 
 _NEAR = Tolerance(frequency=0.002, damping=0.5, least=0.004, shape=0.9)
 _BANDS, _SHARE = 8, 0.25  # at most so many bands, each so wide beside its frequency
@@ -96,7 +97,7 @@ def operational_modes(
     if np.count_nonzero(keep) < _LEAST_LINES:
         raise EstimationError(
             f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; operational modes want "
-            f"{_LEAST_LINES}. Use a longer record or a wider --band"
+            f"{_LEAST_LINES}. Use a longer record or a wider {setting('band')}"
         )
     Y, omega = Y[keep], 2 * np.pi * f[keep]
     size = np.sqrt(np.mean(np.abs(Y) ** 2, axis=0))
@@ -118,7 +119,7 @@ def operational_modes(
         found = sorted(best, key=lambda x: x.pole.imag)
     limits = float(f[keep][0]), float(f[keep][-1])
     modes = tuple(_mode(x, data.outputs) for x in found)
-    checks = modes_checks(modes, count, limits, "Record longer, or give --band")
+    checks = modes_checks(modes, count, limits, f"Record longer, or give {setting('band')}")
     return Modal(
         status="converged" if found else "failed",
         method="covariance-driven stochastic subspace, broadband excitation not measured",

@@ -38,6 +38,7 @@ from ambid.blackbox.polynomial_search import (
 from ambid.errors import EstimationError
 from ambid.estimation.linear import directions, one_thread
 from ambid.estimation.uncertainty import p_text
+from ambid.settings.caller import setting
 
 _LEAST_SEEN = 1e-14  # singular value, of scaled columns, that stands for a direction not seen at all
 _FAR = 10.0  # standard deviations of y: an offset beyond is put on the input
@@ -280,7 +281,7 @@ def not_at_rest(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: Scal
             found.append(
                 f"{f'output {o}: ' if len(fits) > 1 else ''}the record does not start at rest at zero (initial "
                 f"state and constant, estimated freely, are significant: {p_text(p)}): coefficients are biased. "
-                "Omit at_rest (--at-rest)"
+                f"Omit {setting('at_rest')}"
             )
     return found
 

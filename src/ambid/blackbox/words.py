@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import EstimationError, by_name
+from ambid.errors import EstimationError
+from ambid.settings.caller import by_name, setting
 
 if TYPE_CHECKING:
     from ambid.blackbox.data import Orders
@@ -18,10 +19,10 @@ Candidate = str | tuple[str, "Orders | str | None"]
 def orders_of(given: Mapping[str, Any] | str | None) -> Orders | None:
     """Return orders by name; None where all are to be chosen."""
     if not isinstance(given, str):
-        return given and by_name(given, "--orders")
+        return given and by_name(given, "orders")
     if given.strip() == "auto":
         return None
-    where, remedy = f"--orders {given!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
+    where, remedy = f"{setting('orders')} {given!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
     pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
     found: dict[str, int | str | tuple[int, ...]] = {}
     for name, value in pairs.items():
@@ -46,10 +47,10 @@ def candidates_of(given: Sequence[Candidate]) -> list[tuple[str, Orders | None]]
 def settings_of(given: Mapping[str, Any] | str | None) -> dict[str, Any]:
     """Return the orders of a nonlinear structure by name; what is ``auto`` is left to the method."""
     if given is None or not isinstance(given, str):
-        return dict(by_name(given, "--orders"))
+        return dict(by_name(given, "orders"))
     if given.strip() in ("auto", ""):
         return {}
-    where = f"--orders {given!r}"
+    where = f"{setting('orders')} {given!r}"
     pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
     return {name: _read_first(x, _whole_numbers, int, float) for name, x in pairs.items() if x != "auto"}
 
@@ -58,8 +59,8 @@ def fixed_of(given: Mapping[str, float] | Sequence[str] | str | None) -> dict[st
     """Return known coefficients by name, from ``a1=-1.5`` and so on."""
     if isinstance(given, Mapping):
         return dict(given)
-    said, remedy = "--fix {} is not NAME=NUMBER", "Give --fix a1=-1, for example"
-    pairs = _pairs(given.split(",") if isinstance(given, str) else given or (), "--fix", said, remedy)
+    said, remedy = f"{setting('fix')} {{}} is not NAME=NUMBER", f"Give {setting('fix', 'a1=-1')}, for example"
+    pairs = _pairs(given.split(",") if isinstance(given, str) else given or (), setting("fix"), said, remedy)
     found = {name: _read_first(value, float) for name, value in pairs.items()}
     for name, number in found.items():
         if isinstance(number, str):

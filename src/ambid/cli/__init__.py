@@ -98,8 +98,10 @@ def run(arguments: Sequence[str]) -> int:
     words, trace = [w for w in arguments if w != "--traceback"], "--traceback" in arguments
     try:
         from ambid.cli.app import run_verb
+        from ambid.settings.caller import speaking
 
-        code = run_verb(words)
+        with speaking("shell"):
+            code = run_verb(words)
         sys.stdout.flush()
         return code
     except KeyboardInterrupt:

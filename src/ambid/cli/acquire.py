@@ -101,8 +101,8 @@ def command(
     replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
     start_file = None if track in (None, "auto") else Path(str(track))
     outputs = Outputs(rig, start_file, replayed, arm, json=None if track else json, plot=plot, report=report)
-    outputs.claim(record, "-o", _ENDINGS, force=force)
-    outputs.claim(json_path(json) if track else None, "--json")
+    outputs.claim(record, "out", _ENDINGS, force=force)
+    outputs.claim(json_path(json) if track else None, "json")
     known, stop, behind = load_rig(rig), Stop(), None if bench is None else preset_of(bench) or bench
     settings: dict[str, Any] = {
         "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,

@@ -69,9 +69,7 @@ def command(
     from ambid.report.device_text import next_text, progress_line, step_text
     from ambid.rig import load_rig
 
-    opt.check_positive(
-        {"--seconds": seconds, "--track-seconds": track_seconds, "--amplitude": amplitude, "--widest": widest}
-    )
+    opt.check_positive({"seconds": seconds, "track_seconds": track_seconds, "amplitude": amplitude, "widest": widest})
     outputs = Outputs(rig, json=json, plot=plot, report=report)
     plan = Plan(
         record_s=seconds,

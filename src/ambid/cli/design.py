@@ -75,10 +75,10 @@ def experiment(
     known = None if source.lower().endswith(".json") else preset_of(source)
     of = None if known is not None else Path(source)
     with Outputs(of, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
-        outputs.claim(record, "-o", (".csv", ".csv.gz", ".h5", ".hdf5"), force=force)
+        outputs.claim(record, "out", (".csv", ".csv.gz", ".h5", ".hdf5"), force=force)
         found = design_experiment(
             known or str(source), rig, seconds=seconds, period=period, band=band_of(band), lines=lines,
-            criterion=criterion, target=opt.share_of(target, "--target"), use=use, slew=slew, spread=spread,
+            criterion=criterion, target=opt.share_of(target, "target"), use=use, slew=slew, spread=spread,
             rate_hz=rate, closed=None if loop is None else loop == "closed", seed=seed, tick=show,
         )  # fmt: skip
         outputs.give(found, show)
@@ -142,8 +142,8 @@ def controller(
     from ambid.job.files import LAW_ENDINGS
 
     with Outputs(estimate, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
-        outputs.claim(out, "-o", force=force)
-        outputs.claim(export, "--export", LAW_ENDINGS)
+        outputs.claim(out, "out", force=force)
+        outputs.claim(export, "export", LAW_ENDINGS)
         found = design_controller(
             estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
             spread=_sources(spread or ()), form=form, filters=filters,

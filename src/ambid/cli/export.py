@@ -37,7 +37,7 @@ def command(
     from ambid.job.files import EXPORT_ENDINGS
 
     with Outputs(result) as outputs:
-        outputs.claim(out, "-o", EXPORT_ENDINGS, force=force)
+        outputs.claim(out, "out", EXPORT_ENDINGS, force=force)
         found = load(result)
         if not isinstance(found, Linear):
             raise EstimationError(f"{result} holds no linear plant. Give an estimate, or the fit of a linear structure")

@@ -16,8 +16,9 @@ from ambid.cli.interrupts import Stop, interruptible, signals
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import EstimationError, refuse_given
+from ambid.errors import EstimationError
 from ambid.job.files import FIGURE_ENDINGS
+from ambid.settings.caller import refuse_given
 
 Part = tuple[float | None, float | None]
 
@@ -101,12 +102,12 @@ def command(
     nonlinear, part, second_part = structure in NONLINEAR_STRUCTURES, (from_s, to_s), (validate_from, validate_to)
     if nonlinear:
         refuse_given(
-            {"--stabilisation": stabilisation, "--sensitivity": sensitivity},
+            {"stabilisation": stabilisation, "sensitivity": sensitivity},
             f"{{}} is for linear structures; {structure} does not use it. Omit it",
         )
     stop = Stop()
     with Outputs(*records, second, rig, json=json, plot=plot, report=report) as outputs:
-        outputs.claim(stabilisation, "--stabilisation", FIGURE_ENDINGS)
+        outputs.claim(stabilisation, "stabilisation", FIGURE_ENDINGS)
         opt.refuse_twice(records)
         if nonlinear:
             _check_second(records, part, second, second_part)

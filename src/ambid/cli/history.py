@@ -11,9 +11,10 @@ from ambid.cli import options as opt
 from ambid.cli.options import option
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter
-from ambid.errors import counted, refuse_given
+from ambid.errors import counted
 from ambid.estimation.result import Result
 from ambid.job.files import METRICS_ENDINGS
+from ambid.settings.caller import refuse_given
 
 _USUAL = "usual"
 
@@ -60,13 +61,13 @@ def command(
     place = None if "://" in ledger else Path(ledger)
     file = None if alarms in (None, _USUAL) else Path(str(alarms))
     with Outputs(place, file, json=json, plot=plot, report=report) as outputs:
-        outputs.claim(metrics, "--metrics", METRICS_ENDINGS)
+        outputs.claim(metrics, "metrics", METRICS_ENDINGS)
         rules = BUILT_IN if file is None else read_rules(file)
         if alarms is None:
-            refuse_given({"--metrics": metrics, "--mqtt": mqtt}, "{} needs --alarms. Give it, or omit {}")
+            refuse_given({"metrics": metrics, "mqtt": mqtt}, "{} needs --alarms. Give it, or omit {}")
         if bearing is None and alarms is None:
             refuse_given(
-                {"--json": json, "--plot": plot, "--report": report, "--strict": strict},
+                {"json": json, "plot": plot, "report": report, "strict": strict},
                 "{} is for one bearing. Name it, or omit {}",
             )
         with open_ledger(ledger, write=False) as found:

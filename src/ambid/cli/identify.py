@@ -16,7 +16,8 @@ from ambid.cli.keeping import Bearing, LedgerPlace, TakenAt, keeping
 from ambid.cli.options import option, switch
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
-from ambid.errors import AmbidError, EstimationError, refuse_given
+from ambid.errors import AmbidError, EstimationError
+from ambid.settings.caller import refuse_given
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -121,15 +122,15 @@ def command(
     with keeping(ledger, [*records, *kept], rig, bearing=bearing, taken_at=taken_at, job="identify", **asked) as store:
         with Outputs(*records, *kept, rig, second, experiment, json=json, plot=plot, report=report) as outputs:
             opt.refuse_twice([*records, *kept])
-            outputs.claim(export, "--export", EXPORT_ENDINGS)
+            outputs.claim(export, "export", EXPORT_ENDINGS)
             if nonlinear:
                 if off_below is not None and not isfinite(off_below):
                     raise AmbidError(f"--off-below is {off_below}; it must be a voltage in V. Give a number")
-                refuse_given({"--speed": speed}, "{} is for rotors with a linear model. Omit {}")
-                refuse_given({"--experiment": experiment}, "{} is for the linear model. Omit {}")
+                refuse_given({"speed_rpm": speed}, "{} is for rotors with a linear model. Omit {}")
+                refuse_given({"experiment": experiment}, "{} is for the linear model. Omit {}")
             else:
                 refuse_given(
-                    {f"--{name.replace('_', '-')}": x for name, x in {"held": kept, **own}.items()},
+                    {"held": kept, **own},
                     "{} is for the nonlinear magnet. Give --nonlinear too, or omit {}",
                 )
             with signals(stop.take) if nonlinear else nullcontext(), progress("identify") as show:

@@ -49,7 +49,7 @@ def command(
     if preset is not None and plot is not None:
         raise AmbidError("--plot draws the columns of a record; --preset reads none. Omit it")
     with Outputs(record, plot=plot) as outputs:
-        outputs.claim(rig, "-o", force=force)
+        outputs.claim(rig, "out", force=force)
         text = (
             _of_preset(preset)
             if preset is not None

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import typer
 
 from ambid.cli.options import option
-from ambid.errors import refuse_given
+from ambid.settings.caller import refuse_given
 
 LedgerPlace = Annotated[
     str | None, option("--ledger FILE.db|URL", "Keep the result in this ledger: file of SQLite, or URL of PostgreSQL.")
@@ -43,7 +43,7 @@ def keeping(
     `taken_now`: the records are yet to be taken; `settings`: as the job's function has them, a file as a path.
     """
     if ledger is None:
-        refuse_given({"--bearing": bearing, "--taken-at": taken_at}, "{} is for --ledger. Give that too, or omit {}")
+        refuse_given({"bearing": bearing, "taken_at": taken_at}, "{} is for --ledger. Give that too, or omit {}")
         yield lambda _: None
         return
     from ambid.job.data import known_rig

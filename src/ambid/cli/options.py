@@ -9,8 +9,9 @@ from typing import Annotated, Any, Literal
 import typer
 
 from ambid.cli.completion import values_of
-from ambid.errors import AmbidError, check_band
-from ambid.errors import check_positive as check_positive
+from ambid.errors import AmbidError
+from ambid.settings.caller import check_band, setting
+from ambid.settings.caller import check_positive as check_positive
 
 
 def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> Any:
@@ -128,7 +129,7 @@ def share_of(text: str, name: str) -> float:
     try:
         return float(number) / (100.0 if percent else 1.0)
     except ValueError:
-        raise AmbidError(f"{name} is {text!r}; it must be a share such as 0.01 or 1%. Correct it") from None
+        raise AmbidError(f"{setting(name)} is {text!r}; it must be a share such as 0.01 or 1%. Correct it") from None
 
 
 def refuse_twice(records: Sequence[Path]) -> None:

@@ -42,9 +42,9 @@ class Outputs(Files):
         """Check that what is asked for can be written."""
         super().__init__(*inputs)
         self._json, self._plot, self._report, self._document = json, plot, report, ""
-        self.claim(json_path(json), "--json")
-        self.claim(plot, "--plot", FIGURE_ENDINGS)
-        self.claim(report, "--report", PAGE_ENDINGS)
+        self.claim(json_path(json), "json")
+        self.claim(plot, "plot", FIGURE_ENDINGS)
+        self.claim(report, "report", PAGE_ENDINGS)
 
     def replaced(self, path: Path) -> None:
         """Tell that a file is going to be replaced."""

@@ -64,7 +64,7 @@ def _recover(journal: Path, output: Path | None, outputs: Outputs, *, delete: bo
     if not journal.name:
         raise AmbidError(f"journal {str(journal)!r} is a folder; it must be a file. Name the file inside it")
     path = record_path(journal) if output is None else output
-    outputs.claim(path, "-o", force=True)
+    outputs.claim(path, "out", force=True)
     with JournalReader.open(journal) as reader, progress("recover"), outputs:
         there = recorded_already(reader, path) if path.exists() and not force else None
         made = there or recorded_from(reader, path, force=force)

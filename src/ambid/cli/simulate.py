@@ -11,7 +11,8 @@ import typer
 from ambid.cli.options import ForceLoop, argument, band_of, option, switch
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
-from ambid.errors import counted, refuse_given
+from ambid.errors import counted
+from ambid.settings.caller import refuse_given
 
 if TYPE_CHECKING:
     from ambid.physics.presets import Preset
@@ -103,19 +104,19 @@ def command(
     preset = preset_of(rig)
     closed, source = None if loop is None else loop == "closed", None if preset else Path(rig)
     if scenario is not None:
-        of_excitation = {"--excitation": excitation, "--band": band, "--nonlinear": nonlinear,
-                         "--position": position, "--periods": periods, "--axes": axes, "--settle": settle,
-                         "--excitation-only": excitation_only}  # fmt: skip
+        of_excitation = {"excitation": excitation, "band": band, "nonlinear": nonlinear, "position": position,
+                         "periods": periods, "axes": axes, "settle": settle,
+                         "excitation_only": excitation_only}  # fmt: skip
         refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         words = {"duration_s": duration, "rate_hz": rate, "amplitude": amplitude, "at_s": at, "size": size,
                  "closed": closed, "log_excitation": log_excitation, "force": force}  # fmt: skip
         _run_scenario(scenario, preset, rig, record, seed, words, force=force)
         return
-    refuse_given({"--at": at, "--size": size}, "{} is for --scenario. Omit {}")
+    refuse_given({"at": at, "size": size}, "{} is for --scenario. Omit {}")
     if not nonlinear:
-        refuse_given({"--position": position}, "{} is for --nonlinear. Omit {}")
+        refuse_given({"position": position}, "{} is for --nonlinear. Omit {}")
     with Outputs(source) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", _ENDINGS, force=force)
+        outputs.claim(record, "out", _ENDINGS, force=force)
         done, told = simulate_used(
             preset or Path(rig), duration=duration, rate_hz=rate,
             excitation=excitation, amplitude=amplitude, band=band_of(band), periods=periods, seed=seed,
@@ -159,7 +160,7 @@ def _run_scenario(
 
     what = scenario(name)
     with Outputs(None if preset else Path(rig)) as outputs, progress("simulate"):
-        outputs.claim(record, "-o", _ENDINGS[:2] if what.dropped else _ENDINGS, force=force)
+        outputs.claim(record, "out", _ENDINGS[:2] if what.dropped else _ENDINGS, force=force)
         done = simulate_scenario(what, preset or load_rig(Path(rig)), seed=seed, **words)
         told: Mapping[str, Any] = next(step.settings for step in done.record.history if step.name == "scenario")
         lines = (f"truth: {truth_words(done)}", f"scenario {what.name}: {_words(done, told)}")

@@ -20,10 +20,6 @@ if TYPE_CHECKING:
     from ambid.cli.live import Flag
     from ambid.recursive.lines import TrackHeader
 
-_NAMES = {
-    "every_s": "--every", "limit": "--limit", "memory": "--memory", "start": "--start", "start_s": "--start-seconds"
-}  # fmt: skip
-
 
 def command(
     record: opt.RecordFile,
@@ -102,7 +98,7 @@ def command(
         "start": start, "start_s": start_seconds, "every_s": every, "limit": limit, "memory": _memory(memory),
         "pace": pace, "flags": times, "rate_hz": rate,
     }  # fmt: skip
-    check_settings(how, _NAMES)
+    check_settings(how)
     settings: dict[str, Any] = {
         "input": inputs, "output": output, "reference": reference, "orders": orders, "open_loop": open_loop,
         "step": step,
@@ -114,7 +110,7 @@ def command(
     asked = {**how, **given, **told, "method": method, "from_s": from_s, "to_s": to_s}
     with keeping(ledger, [record], rig, bearing=bearing, taken_at=taken_at, job="track", **asked) as store:
         with Outputs(record, rig, start, plot=plot, report=report) as outputs:
-            outputs.claim(json_path(json), "--json")
+            outputs.claim(json_path(json), "json")
             bench = None if rig is None else load_rig(rig)
             follower = Follower(
                 json, keep=plot is not None or report is not None, quiet=quiet, real_time=pace == "real-time"

@@ -18,6 +18,8 @@ from urllib.parse import parse_qs
 from starlette.responses import PlainTextResponse, RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from ambid.settings.caller import flag
+
 COOKIE = "ambid_console"
 HEADER = b"x-ambid"
 MOST_BYTES = 1 << 16  # of the body of a request
@@ -106,7 +108,7 @@ class Guard:
                 return Response(_LOGIN, media_type="text/html")
             return _no(403, "open the link that 'ambid console' printed; each link opens one page. Start it again")
         if scope["method"] == "POST" and self._read_only and not scope["path"].startswith(_CHANGES_NOTHING):
-            return _no(403, "this console was started with --read-only. Start it without")
+            return _no(403, f"this console was started with {flag('read_only')}. Start it without")
         return None
 
     def _opened(self, token: str) -> Response:

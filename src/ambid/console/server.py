@@ -33,6 +33,7 @@ from ambid.console.folder import Folder
 from ambid.console.guard import Guard
 from ambid.console.runs import Run, Runs
 from ambid.errors import AmbidError
+from ambid.settings.caller import setting
 
 MOVING = ("live", "commission")
 """Jobs that may move the machine: one client at a time orders them."""
@@ -416,14 +417,15 @@ def serve(
     local = listen in ("127.0.0.1", "localhost", "::1")
     if not local and (tls is None or not password):
         raise AmbidError(
-            f"--listen {listen} lets others on the network in; it needs --certificate, --key and a password. Give them"
+            f"{setting('listen', listen)} lets others on the network in; it needs {setting('certificate')}, "
+            f"{setting('key')} and a password. Give them"
         )
     try:
         family = socket.AF_INET6 if ":" in listen else socket.AF_INET
         listening = socket.create_server((listen, port), family=family)
     except (OSError, OverflowError) as failure:
         why = getattr(failure, "strerror", None) or failure
-        raise AmbidError(f"--port {port} at {listen} cannot be had: {why}. Choose another one") from None
+        raise AmbidError(f"{setting('port', port)} at {listen} cannot be had: {why}. Choose another one") from None
     number = listening.getsockname()[1]
     shown = f"[{listen}]" if ":" in listen else listen
     names = {shown, "localhost", "127.0.0.1"} if local else {shown}
@@ -443,7 +445,9 @@ def serve(
         config.load()
     except OSError as failure:  # also one of TLS
         listening.close()
-        raise AmbidError(f"--certificate and --key cannot be used: {failure}. Give PEM files of one pair") from None
+        raise AmbidError(
+            f"{setting('certificate')} and {setting('key')} cannot be used: {failure}. Give PEM files of one pair"
+        ) from None
     server = uvicorn.Server(config)
     try:
         on_ready(f"{scheme}://{shown}:{number}/?token={guard.token}")

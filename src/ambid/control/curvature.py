@@ -26,6 +26,7 @@ from ambid.estimation.predictor import assemble
 from ambid.estimation.sensitivity import products, run
 from ambid.physics.linear_model import discretise
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 
 MOST = 1.5
 """Standard deviations by which curvature may move a number: its 95 % interval then holds it in two of three records."""
@@ -115,7 +116,10 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
     passed, said = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta)
     if not passed:
         said += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
-        said += f". Record with {advised(values):.2g} of the excitation or less, or identify with --nonlinear"
+        said += (
+            f". Record with {advised(values):.2g} of the excitation or less, or identify with "
+            f"{setting('identify_nonlinear')}"
+        )
     return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=said)
 
 

@@ -16,10 +16,11 @@ from ambid.control.closed import Plant
 from ambid.control.excited import ExcitedLoop, begin_at, from_rest
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import Limited, Lines, joint_design, spread_power
-from ambid.errors import EstimationError, check_positive, check_whole
+from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import beside_harmonics
+from ambid.settings.caller import check_positive, check_whole, setting
 from ambid.signals.excitations import schroeder_phases
 
 SCHEMA = "ambid.experiment/1"
@@ -183,13 +184,13 @@ class Experiment(Judged):
         if abs(rate_hz / self.rate_hz - 1.0) > _SAME_RATE:
             raise EstimationError(
                 f"the experiment is designed for {self.rate_hz:g} Hz, the bench samples at {rate_hz:g} Hz. Design it "
-                "with --rate, or correct the rate"
+                f"with {setting('rate_hz')}, or correct the rate"
             )
         if closed not in (None, self.closed):
             of, now = ("closed", "open") if self.closed else ("open", "closed")
             raise EstimationError(
                 f"the experiment is designed for the {of} loop, here the loop is {now}: it may pass limits. Design it "
-                f"with --loop {now}, or play it with the {of} loop"
+                f"with {setting('closed')} {now}, or play it with the {of} loop"
             )
         waves = np.column_stack(list(self.excitation.values()))
         return np.asarray(np.resize(waves, (samples, waves.shape[1])))

@@ -27,7 +27,7 @@ from ambid.control.design import Goals, closed_loop_of, examine, mean_over, nois
 from ambid.control.hinf import hinf
 from ambid.control.lqg import SampledPlant, Weights, lqg
 from ambid.control.reduction import reduced
-from ambid.control.tuning import option, said
+from ambid.control.tuning import raised, said
 from ambid.errors import EstimationError, ModelError, RigError
 from ambid.estimation.progress import Tick
 from ambid.physics.law import StateLaw
@@ -236,7 +236,7 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> s
     least = ratio * goals.limits[limit]
     return (
         f"no {name} law meets the limits ({asked}) on all plants; with the others kept, {said(limit, least)} is the "
-        f"least. Give --limit {option(limit, least)}, or raise another"
+        f"least. Give {raised(limit, least)}, or raise another"
     )
 
 

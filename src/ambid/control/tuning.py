@@ -45,6 +45,7 @@ from ambid.physics.linear_model import OneAxis
 from ambid.physics.loop import Loop, placed_loop
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 from ambid.simulation.plant import closed_loop_matrix
 
 _SHARP = 200.0  # exponent of the smooth maximum over the frequencies
@@ -415,8 +416,8 @@ def _between(
     asked = ", ".join(said(name, x) for name, x in goals.limits.items())
     least = worst.settling if math.isfinite(worst.settling) else 2.0 * goals.limits["settling"]
     raise EstimationError(
-        f"no PID meets the limits ({asked}) on all plants: force steps take longer to settle. Give --limit "
-        f"{option('settling', least)}, or raise another"
+        f"no PID meets the limits ({asked}) on all plants: force steps take longer to settle. Give "
+        f"{raised('settling', least)}, or raise another"
     )
 
 
@@ -484,10 +485,10 @@ def _refusal(goals: Goals, ways: Sequence[_Way]) -> str:
         return f"no PID meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
     gap, name, _ = min(ways, key=lambda w: w[0])
     least = goals.limits[name] * math.exp(gap)
-    moved = option(name, least)
+    moved = raised(name, least)
     return (
         f"no PID meets the limits ({asked}) on all plants; with the others kept, {said(name, least)} is the "
-        f"least. Give --limit {moved}, or raise another"
+        f"least. Give {moved}, or raise another"
     )
 
 
@@ -497,7 +498,7 @@ def said(name: str, x: float) -> str:
     return f"{name} {shown:.4g} {'dB' if name == 'peak' else FIGURES[name]}"
 
 
-def option(name: str, x: float) -> str:
-    """Write a limit as the option ``--limit`` takes it, a little more than it is."""
+def raised(name: str, x: float) -> str:
+    """Write the setting of a limit that is a little more than it is."""
     shown = 1.01 * (20.0 * math.log10(x) if name == "peak" else x)
-    return f"{name}={shown:.4g}{'dB' if name == 'peak' else FIGURES[name]}"
+    return setting("limits", f"{name}={shown:.4g}{'dB' if name == 'peak' else FIGURES[name]}")

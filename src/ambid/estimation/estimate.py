@@ -27,6 +27,7 @@ from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.estimation.global_search import describe_search
 from ambid.estimation.result import NORMAL_95, Linear, Predicting, Reason, Result, Simulating
 from ambid.physics.linear_model import LinearModel, Parameter, model
+from ambid.settings.caller import command, saved
 
 _ROUNDING = 1e-9  # samples
 _SEEN = 0.25  # relative standard deviation up to which data show a coefficient
@@ -324,23 +325,21 @@ def json_text(document: Mapping[str, Any]) -> str:
     return json.dumps(document, indent=1, allow_nan=False) + "\n"
 
 
-def check_schema(document: object, schema: str, where: str, what: str, verb: str) -> None:
+def check_schema(document: object, schema: str, where: str, what: str, job: str) -> None:
     """Refuse a document of another schema."""
     found = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
     if found != schema:
-        raise EstimationError(
-            f"{where} has schema {found!r}; {what} has {schema!r}. Give a file that 'ambid {verb} --json' wrote"
-        )
+        raise EstimationError(f"{where} has schema {found!r}; {what} has {schema!r}. Give {saved(job)}")
 
 
-def read_whole(read: Callable[[], T], where: str, what: str, verb: str) -> T:
+def read_whole(read: Callable[[], T], where: str, what: str, job: str) -> T:
     """Return what a reader makes of a document; whatever it stumbles over is one line that names the file."""
     try:
         return read()
     except (AmbidError, AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
         raise EstimationError(
             f"{where} is not a complete {what} ({type(error).__name__}: {error}). "
-            f"Write it again with 'ambid {verb} --json'"
+            f"Write it again with '{command(job, json=True)}'"
         ) from error
 
 

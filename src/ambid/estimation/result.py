@@ -125,7 +125,7 @@ class Result:
         _shown("write_page")(self, path, record)
 
     def save(self, path: str | Path) -> None:
-        """Write the result as ``--json`` does; `ambid.load` reads it back.
+        """Write the result as the command's option ``json`` does; `ambid.load` reads it back.
 
         Parameters
         ----------

@@ -14,6 +14,7 @@ from typing import Any
 
 from ambid.errors import AmbidError
 from ambid.fleet.pool import Done, attempt, one_thread_each
+from ambid.settings.caller import Language, language, setting, speaking
 
 ALLOWED_FAILURES = 2  # workers that a task may have killed before it is held to be poison
 _AHEAD = 3  # tasks on their way for each worker
@@ -60,11 +61,11 @@ def _answers(
     while True:
         room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
         while room > 0 and (task := next(tasks, None)) is not None:
-            future = client.submit(timed, job, task, limit_s, pure=False, retries=0)
+            future = client.submit(timed, job, task, limit_s, language(), pure=False, retries=0)
             on_their_way[future], room = (task, False), room - 1
         if not on_their_way and suspects:
             task = suspects.popleft()
-            on_their_way[client.submit(timed, job, task, limit_s, pure=False, retries=0)] = (task, True)
+            on_their_way[client.submit(timed, job, task, limit_s, language(), pure=False, retries=0)] = (task, True)
         if not on_their_way or stopped():
             return
         try:
@@ -95,15 +96,16 @@ def _answers(
                 suspects.append(task)
 
 
-def timed(job: Callable[[Any], Any], task: Any, limit_s: float) -> Done:
-    """Do a task in a worker of the cluster; one that takes too long ends the worker."""
+def timed(job: Callable[[Any], Any], task: Any, limit_s: float, caller: Language) -> Done:
+    """Do a task in a worker of the cluster; one that takes too long ends the worker; `caller`: who reads messages."""
     from os import _exit
 
     watch = Timer(limit_s, _exit, (1,))
     watch.daemon = True
     watch.start()
     try:
-        return attempt(job, task)
+        with speaking(caller):
+            return attempt(job, task)
     finally:
         watch.cancel()
 
@@ -128,7 +130,7 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
             except (OSError, ValueError) as failure:
                 said = str(failure).splitlines()[0]
                 raise AmbidError(
-                    f"--scheduler {scheduler} cannot be reached: {said}. Start it, or correct it"
+                    f"{setting('scheduler', scheduler)} cannot be reached: {said}. Start it, or correct it"
                 ) from None
             with client:
                 yield client

@@ -28,6 +28,7 @@ from typing import Any
 
 from ambid.compiled import THREADS
 from ambid.errors import AmbidError
+from ambid.settings.caller import Language, language, speaking
 from ambid.tracking.engine import ignoring_interrupts
 
 LIMIT_S = 600.0
@@ -186,7 +187,7 @@ class _Pool:
     def _start(self) -> None:
         context = get_context("spawn")
         ours, theirs = context.Pipe()
-        process = context.Process(target=_serve, args=(theirs, self._job), daemon=True)
+        process = context.Process(target=_serve, args=(theirs, self._job, language()), daemon=True)
         with ignoring_interrupts(), one_thread_each():
             process.start()
         theirs.close()
@@ -280,7 +281,7 @@ def one_thread_each() -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _serve(line: Connection, packed: bytes) -> None:
+def _serve(line: Connection, packed: bytes, caller: Language) -> None:
     """Do tasks in a process of its own, until nobody wants more; interrupts are the business of whoever started it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_leave_with_parent, daemon=True).start()
@@ -291,7 +292,7 @@ def _serve(line: Connection, packed: bytes) -> None:
     except Exception as failure:
         line.send(f"the job cannot be used in another process ({failure}). Put it into a module that can be imported")
         return
-    with suppress(EOFError, OSError):
+    with suppress(EOFError, OSError), speaking(caller):
         line.send(None)
         while True:
             for _, task in pickle.loads(line.recv_bytes()):

@@ -16,7 +16,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ambid.errors import AmbidError, check_positive, check_whole, nearest
+from ambid.errors import AmbidError, nearest
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, Done, cores, work
@@ -26,6 +26,7 @@ from ambid.ledger.entry import Entry, entry_of, key_of, rig_sha_of, settings_tex
 from ambid.ledger.fleet_run import FleetRow, FleetRun
 from ambid.ledger.store import Failure, Ledger, open_ledger
 from ambid.record import Source
+from ambid.settings.caller import check_positive, check_whole, setting
 
 if TYPE_CHECKING:
     import pandas
@@ -107,7 +108,9 @@ def function_of(job: Job) -> Callable[..., Any]:
     if not isinstance(job, str):
         return job
     if job not in JOBS:
-        raise AmbidError(f"--job {job} is unknown; jobs are {', '.join(JOBS)}.{nearest(job, JOBS)} Correct it")
+        raise AmbidError(
+            f"{setting('job', job)} is unknown; jobs are {', '.join(JOBS)}.{nearest(job, JOBS)} Correct it"
+        )
     found: Callable[..., Any] = getattr(import_module("ambid.job"), job)
     return found
 
@@ -125,7 +128,7 @@ def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> Jo
                 )
         lacks = [n for n in takes if n not in settings and known[n].default is inspect.Parameter.empty]
         if lacks:
-            raise AmbidError(f"{job} needs {lacks[0]}. Give --set {lacks[0]}=…")
+            raise AmbidError(f"{job} needs {lacks[0]}. Give {setting('set', f'{lacks[0]}=…')}")
     told = {n: f"{x} {sha_of(Path(x))}" if isinstance(x, (str, Path)) and Path(x).is_file() else x
             for n, x in settings.items()}  # fmt: skip
     if not isinstance(job, str):  # another function under the same name is another job; what it calls is not seen
@@ -285,8 +288,8 @@ def run_fleet(
     tick: Tick | None = None,
 ) -> FleetRun:
     """Do a job on many records, as `fleet` does; `again`: also those that failed before; `stopped`: ends it early."""
-    check_positive({"--limit": limit_s})
-    for name, n in (("--workers", workers), ("--dask local:N", dask)):
+    check_positive({"limit_s": limit_s})
+    for name, n in (("workers", workers), ("dask", dask)):
         if n is not None:
             check_whole({name: n}, 1, 1024)
     made = job_of(job, settings or {}, stored=ledger is not None)

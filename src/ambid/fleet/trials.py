@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from ambid.errors import AmbidError, check_whole
+from ambid.errors import AmbidError
 from ambid.estimation.progress import Tick, silent
 from ambid.estimation.result import Result
 from ambid.fleet.pool import LIMIT_S, work
@@ -17,6 +17,7 @@ from ambid.job.simulation import bench_of_source, simulate
 from ambid.ledger.entry import settings_text
 from ambid.physics.presets import Preset
 from ambid.rig import Rig, rig_of_preset
+from ambid.settings.caller import check_whole
 from ambid.simulation.rotor_bench import RotorBench
 from ambid.validation.coverage import Coverage, Trial
 
@@ -95,8 +96,8 @@ def monte_carlo(
     >>> found.counts["usable"], [row.name for row in found.rows]
     (2, ['k_x', 'k_i', 'R', 'L'])
     """
-    check_whole({"--runs": runs}, 1, 1_000_000)
-    check_whole({"--seed": seed}, 0)
+    check_whole({"runs": runs}, 1, 1_000_000)
+    check_whole({"seed": seed}, 0)
     source = bench_of_source(str(rig) if isinstance(rig, Path) else rig)
     truth = rig_of_preset(source) if isinstance(source, Preset) else source
     if truth.rotor is not None:  # whose drawing gives numbers of the rigid motion

@@ -16,16 +16,7 @@ from ambid.acquisition.session import acquire as record_course
 from ambid.acquisition.settings import controller_settings, default_daq_notes, law_trial, with_default_daq
 from ambid.acquisition.trials import Trial, band_for, fitting_amplitude
 from ambid.control.experiment import Experiment
-from ambid.errors import (
-    LARGEST,
-    AmbidError,
-    DeviceError,
-    check_band,
-    check_positive,
-    check_whole,
-    counted,
-    refuse_given,
-)
+from ambid.errors import AmbidError, DeviceError, counted
 from ambid.estimation.progress import Tick, silent
 from ambid.job.data import known_rig
 from ambid.job.results import experiment_of
@@ -33,6 +24,7 @@ from ambid.job.simulation import bench_of_source
 from ambid.physics.presets import Preset
 from ambid.record.sampling import MIN_SAMPLES
 from ambid.rig import Rig
+from ambid.settings.caller import LARGEST, check_band, check_positive, check_whole, refuse_given, setting
 
 _TRIAL_S = 2.0  # of each trial of an amplitude
 _SAME_RATE = 1e-3  # a rate from a time column is rounded
@@ -62,15 +54,15 @@ class Request:
         """Check it against port and rig, and complete it."""
         mode = self.mode or _usual_mode(port, rig, self.excitation)
         settle_s = (1.0 if mode == "levitate" else 0.0) if self.settle is None else self.settle
-        check_positive({"--seconds": self.seconds, "--amplitude": self.amplitude})
+        check_positive({"seconds": self.seconds, "amplitude": self.amplitude})
         if not 0 <= settle_s <= LARGEST:
-            raise AmbidError(f"--settle is {settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
-        check_whole({"--seed": self.seed})
+            raise AmbidError(f"{setting('settle')} is {settle_s:g}; it must be a number, 0 to {LARGEST:g}. Correct it")
+        check_whole({"seed": self.seed})
         check_band(self.band)
-        named = {"--amplitude": self.amplitude, "--band": self.band}
+        named = {"amplitude": self.amplitude, "band": self.band}
         _check_excitation(port, mode, self.excitation, named)
         if (experiment := experiment_of(self.excitation)) is not None:
-            refuse_given(named, "--excitation is an experiment, which takes no {}. Omit {}")
+            refuse_given(named, f"{setting('excitation')} is an experiment, which takes no {{}}. Omit {{}}")
             _ = experiment.program
         return Trial(
             name=str(self.excitation),
@@ -91,7 +83,8 @@ class Request:
         samples = max(1, round(trial.seconds * rate_hz))
         if samples < MIN_SAMPLES:
             raise AmbidError(
-                f"--seconds is {trial.seconds:g}: {counted(samples, 'sample')} at {rate_hz:g} Hz; a record needs "
+                f"{setting('seconds')} is {trial.seconds:g}: {counted(samples, 'sample')} at {rate_hz:g} Hz; a "
+                "record needs "
                 f"at least {MIN_SAMPLES}. Give {MIN_SAMPLES / rate_hz:.3g} or more"
             )
         if self.excitation is None:
@@ -207,7 +200,9 @@ def acquire(
     )  # fmt: skip
     wanted.trial(port, known)
     if (path.exists() or path.is_symlink()) and not force:
-        raise AmbidError(f"-o {path} already exists. Choose another name, or give --force")
+        raise AmbidError(
+            f"{setting('out')} {path} already exists. Choose another name, or give {setting('force', True)}"
+        )
     with ready(port, known, wanted, bench=bench, pace=pace, force=force, note=on_note, tick=tick) as (device, course):
         return record_course(
             device,
@@ -237,9 +232,14 @@ def ready(
     trial, say = wanted.trial(port, rig), tick or silent
     closes = trial.mode == "levitate" and not force
     if wanted.arm is not None and trial.mode != "levitate":
-        raise AmbidError(f"--arm tries a loop while the rotor levitates, and the mode is {trial.mode}. Omit --arm")
+        raise AmbidError(
+            f"{setting('arm')} tries a loop while the rotor levitates, and the mode is {trial.mode}. Omit "
+            f"{setting('arm')}"
+        )
     if wanted.arm is not None and port == "simulated":
-        raise AmbidError("--arm is tried by the firmware alone. Give --port emulated, or a serial port")
+        raise AmbidError(
+            f"{setting('arm')} is tried by the firmware alone. Give {setting('port', 'emulated')}, or a serial port"
+        )
     with opened(port, rig, bench=bench, pace=pace, seed=wanted.seed, closes=closes, note=note) as device:
         course = wanted.course(device, rig, trial, note=note, tick=say)
         if wanted.arm is not None:
@@ -299,12 +299,13 @@ def _usual_mode(port: str, rig: Rig, excitation: object) -> Mode:
 def _check_excitation(port: str, mode: Mode, name: object, given: Mapping[str, object]) -> None:
     """Refuse an excitation that cannot be played, and what is `given` of one where none is named."""
     if name is None:
-        refuse_given(given, "{} is for an excitation, and none was named. Give --excitation, or omit it")
+        refuse_given(given, f"{{}} is for an excitation, and none was named. Give {setting('excitation')}, or omit it")
     elif port.startswith("replay:"):
-        raise AmbidError("--excitation cannot act on a replayed record. Omit it")
+        raise AmbidError(f"{setting('excitation')} cannot act on a replayed record. Omit it")
     elif mode == "sample":
         raise AmbidError(
-            "--mode sample keeps the output off: nothing can be excited. Omit --excitation, or give --mode drive"
+            f"{setting('mode', 'sample')} keeps the output off: nothing can be excited. Omit "
+            f"{setting('excitation')}, or give {setting('mode', 'drive')}"
         )
 
 

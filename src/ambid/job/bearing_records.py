@@ -19,6 +19,7 @@ from ambid.job.data import Reading, Source, known_rig, load_bench, origin, overl
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.rig import Rig, RigMagnet
+from ambid.settings.caller import setting
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
@@ -194,7 +195,7 @@ def take_all(
         known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
         raise EstimationError(
             f"{second.record.name}, for validation, is sampled at {second.record.rate_hz:g} Hz, the records at "
-            f"{known}; the rates must agree. Resample it, or omit --validate"
+            f"{known}; the rates must agree. Resample it, or omit {setting('validate')}"
         )
     return check_together(taken, second), second
 
@@ -215,7 +216,7 @@ def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> 
         if second is not None and _overlap(one, second):
             raise EstimationError(
                 f"{second.record.name}, for validation, holds samples that the estimate is fitted to. Give another "
-                "record, or omit --validate"
+                f"record, or omit {setting('validate')}"
             )
     moving = max((float(t.record.y[:, 0].std()) for t in taken if not t.record.held), default=0.0)
     return tuple(_warn_moving(t, moving) for t in taken)
@@ -225,7 +226,7 @@ def _refuse_senseless(record: BearingRecord) -> None:
     if np.all(record.loose > 0.0):
         raise EstimationError(
             f"{record.name}: every voltage is at or below off_below, where the stage is off, so none would be "
-            "known. Correct --off-below or magnet.off_below (in V)"
+            f"known. Correct {setting('off_below')} or magnet.off_below (in V)"
         )
     channels = {"voltage": record.u, "position": record.y[:, 0], "current": record.y[:, 1]}
     if record.held:

@@ -40,6 +40,7 @@ from ambid.report.commission_figures import trace_picture
 from ambid.report.commission_page import Step
 from ambid.rig import Rig, rig_text
 from ambid.rig.load import SELECTED
+from ambid.settings.caller import setting
 from ambid.simulation.margins import LoopMargins
 from ambid.tracking.lines_file import TrackWriter
 
@@ -254,8 +255,9 @@ class _Guide:
             raise AmbidError("the rig has no [loop] with a gain: there is nothing to levitate with. Give [loop]")
         if plan.redesign and self._device.info.kind == "simulated":
             raise AmbidError(
-                f"{self._device.info.port} is simulated; only the firmware tries another loop. Take --port emulated "
-                "or a bench, or omit --redesign"
+                f"{self._device.info.port} is simulated; only the firmware tries another loop. Take "
+                f"{setting('port', 'emulated')} "
+                f"or a bench, or omit {setting('redesign')}"
             )
         for what, seconds in (
             ("a trial of the amplitude", plan.longest_trial_s(rate_hz)),
@@ -270,7 +272,8 @@ class _Guide:
         top = HIGHEST * rate_hz
         if plan.band_hz and plan.band_hz[1] > top and (plan.amplitude_v is None or plan.redesign):
             raise AmbidError(
-                f"--band goes up to {plan.band_hz[1]:g} Hz; an experiment is designed up to {top:g} Hz, {HIGHEST:g} of "
+                f"{setting('band')} goes up to {plan.band_hz[1]:g} Hz; an experiment is designed up to {top:g} Hz, "
+                f"{HIGHEST:g} of "
                 "the rate. Lower it"
             )
 

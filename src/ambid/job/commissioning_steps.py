@@ -53,6 +53,7 @@ from ambid.report.device_text import acquired_text
 from ambid.report.estimate_text import sensitivity_lines
 from ambid.report.numbers import quantity, sized
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 from ambid.simulation.margins import LoopMargins
 
 StepName = Literal[
@@ -433,7 +434,8 @@ def identification(
             reasons.append(f"{p.name} is not identifiable from this record: excite more, or fix what is known")
         elif wide > plan.widest:
             reasons.append(
-                f"{p.name} is known to ± {100 * wide:.2g} % only (limit {100 * plan.widest:g} %, --widest): record"
+                f"{p.name} is known to ± {100 * wide:.2g} % only (limit {100 * plan.widest:g} %, "
+                f"{setting('widest')}): record"
                 " longer, or excite more"
             )
     for name, check in estimate.checks.items():

@@ -40,7 +40,7 @@ from ambid.control.design import (
 from ambid.control.drawn import Draws, Spread, draw_plants, over_speeds
 from ambid.control.gain_sets import FORMS
 from ambid.control.verification import Trials, checks_of_verifications, verify_all
-from ambid.errors import EstimationError, by_name, check_whole, nearest
+from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, part_of, silent
@@ -52,6 +52,7 @@ from ambid.physics.loop import Interval, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import by_name, check_whole
 from ambid.simulation.margins import zone_of
 
 _ROUNDS = 3  # in which the limits are met on the plants that judge too
@@ -169,8 +170,8 @@ def design_controller(
         raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
-    check_whole({"--plants": plants, "--judges": judges, "--schedule": schedule}, 1)
-    check_whole({"--seed": seed, "--filters": filters})
+    check_whole({"plants": plants, "judges": judges, "schedule": schedule}, 1)
+    check_whole({"seed": seed, "filters": filters})
     design = _method(method, form, filters)
     speeds = _speeds(known, bench, speeds_rpm)
     if schedule > 1:
@@ -313,7 +314,7 @@ def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Exam
 
     The peak counts on plants that the present loop holds: one that is held for the first time is none that got worse.
     """
-    from ambid.control.tuning import option, said
+    from ambid.control.tuning import raised, said
 
     lost = [sum(not x.figures.stable for x in seen) for seen in (before, after)]
     if lost[1] > lost[0]:
@@ -327,7 +328,7 @@ def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Exam
         raise EstimationError(
             f"the best loop found has {said('peak', peak)} (zone {zone_of(peak)}) on the plants that judge, above the "
             f"limit of {said('peak', most)} (zone {zone_of(most)}), by default what the present loop has; none is "
-            f"offered. Give the goal peak alone, or --limit {option('peak', peak)}"
+            f"offered. Give the goal peak alone, or {raised('peak', peak)}"
         )
 
 

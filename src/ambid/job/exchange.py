@@ -19,13 +19,14 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.prediction import plant_form
 from ambid.control.law_files import comment_text, write_mat
-from ambid.errors import AmbidError, EstimationError, check_switch, nearest, path_of
+from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.job.files import EXPORT_ENDINGS, Files
 from ambid.job.results import rig_of
 from ambid.physics.linear_model import StateSpace, delayed, model
 from ambid.physics.loop import UNLIMITED
 from ambid.physics.shaft import Disc, Material, Shaft, Step
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import check_switch, path_of, setting
 
 SCRIPTS = ("control", "ross")
 """For which library a script can be."""
@@ -66,7 +67,9 @@ def write_plant(result: Any, path: Path, name: str, to: str | None = None, *, an
         )
     doubt = _doubt(result)
     if doubt and not anyway:
-        raise EstimationError(f"{doubt}; its plant is not exported. Identify it better, or give --anyway (anyway=True)")
+        raise EstimationError(
+            f"{doubt}; its plant is not exported. Identify it better, or give {setting('anyway', True)}"
+        )
     about = [*_about(result), *([f"NOT TO BE RELIED ON: {doubt}."] if doubt else [])]
     ross = ending == ".py" and (isinstance(result, RotorEstimate) if to is None else to == "ross")
     if ross and not isinstance(result, RotorEstimate):

@@ -32,7 +32,7 @@ from ambid.control.experiment import (
 )
 from ambid.control.information import Information, Innovation, reported
 from ambid.control.waves import Lines
-from ambid.errors import AmbidError, check_band, check_positive, check_share, check_switch, check_whole, nearest
+from ambid.errors import AmbidError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -48,6 +48,7 @@ from ambid.record import Channel, Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import LEAST_LINES, LEAST_PERIODS
+from ambid.settings.caller import check_band, check_positive, check_share, check_switch, check_whole, saved, setting
 from ambid.signals.excitations import schroeder_phases
 from ambid.simulation.plant import LinearPlant
 from ambid.simulation.rig_bench import Bench, loop_of_rig
@@ -178,19 +179,19 @@ def design_experiment(
     say, clock = tick or silent, Clock()
     check_positive(
         {
-            "--seconds": seconds,
-            "--period": period,
-            "--slew": slew,
-            "--rate": rate_hz,
-            "--target": target or 0,
-            "--use": use or 0,
+            "seconds": seconds,
+            "period": period,
+            "slew": slew,
+            "rate_hz": rate_hz,
+            "target": target or 0,
+            "use": use or 0,
         }
     )
     if use > 1.0:
-        raise AmbidError(f"--use is {use:g}; it must be at most 1. Lower it")
-    check_share({"--spread": spread})
-    check_whole({"--lines": lines}, 2, _MOST // 2)
-    check_whole({"--seed": seed})
+        raise AmbidError(f"{setting('use')} is {use:g}; it must be at most 1. Lower it")
+    check_share({"spread": spread})
+    check_whole({"lines": lines}, 2, _MOST // 2)
+    check_whole({"seed": seed})
     check_band(band)
     check_switch({"closed": closed})
     wanted = Wanted(
@@ -216,13 +217,13 @@ def _given(
     known = source if isinstance(source, (Estimate, RotorEstimate)) else None
     given = None if rig is None else known_rig(rig)
     if given is not None and known is None:
-        raise AmbidError("--rig is for an estimate; a rig is there already. Omit --rig")
+        raise AmbidError(f"{setting('rig')} is for an estimate; a rig is there already. Omit {setting('rig')}")
     if isinstance(source, RotorEstimate):
         return source, _rotor_of(source, given or rig_of(source, "the estimate"), rate_hz, closed)
     if not isinstance(source, (str, Path, Rig, Preset, Estimate)):
         raise AmbidError(
-            f"a {type(source).__name__} is no linear estimate, for which an experiment is designed. Give what 'ambid "
-            "identify --json' wrote, or a rig"
+            f"a {type(source).__name__} is no linear estimate, for which an experiment is designed. Give "
+            f"{saved('identify')}, or a rig"
         )
     of = bench_of_source(source)
     of = rig_of_preset(of) if isinstance(of, Preset) else of
@@ -288,7 +289,8 @@ def _designed(known: Known | None, bench: AnyBench, wanted: Wanted, say: Tick) -
     ):
         raise AmbidError(
             f"{min(wanted.lines, task.candidates().size)} lines in {task.periods} periods; a rotor is identified from "
-            f"{LEAST_LINES} lines and {LEAST_PERIODS} periods at least. Change --lines, --band, --period or --seconds"
+            f"{LEAST_LINES} lines and {LEAST_PERIODS} periods at least. Change {setting('lines')}, "
+            f"{setting('band')}, {setting('period')} or {setting('seconds')}"
         )
     say("design")
     found = design(task, tick=lambda: say("design"))
@@ -392,7 +394,7 @@ def _refuse_full(signals: tuple[str, ...], spare: Array, low: Array, high: Array
     if room[k] <= 0.0:
         raise AmbidError(
             f"{signals[k]} may move {min(-low[k], high[k]):.3g} from rest, noise needs {spare[k]:.3g} of it (4 sd), "
-            "so that nothing is left for an excitation. Extend the limit, correct [noise], or raise --use"
+            f"so that nothing is left for an excitation. Extend the limit, correct [noise], or raise {setting('use')}"
         )
 
 
@@ -401,7 +403,8 @@ def _refuse_criterion(criterion: str, names: tuple[str, ...]) -> None:
     names = tuple(n for n in names if reported(n) and not n.endswith(".delay"))
     if criterion not in ("all", "worst", *names):
         raise AmbidError(
-            f"--criterion {criterion!r}; it must be all, worst or an estimated parameter: {', '.join(names)}."
+            f"{setting('criterion')} {criterion!r}; it must be all, worst or an estimated parameter: "
+            f"{', '.join(names)}."
             f"{nearest(criterion, list(names))} Correct it"
         )
 
@@ -414,7 +417,7 @@ def _task(
     rate = bench.rate_hz
     assert bench.rig is not None
     seconds = wanted.seconds or _SECONDS
-    samples_of(seconds, rate, "--seconds")  # no longer than can be simulated
+    samples_of(seconds, rate, "seconds")  # no longer than can be simulated
     hold, period = 1, min(round(seconds * rate / _PERIODS), _LONGEST)
     if wanted.period_s is not None:
         period = round(wanted.period_s * rate)
@@ -425,11 +428,15 @@ def _task(
         hold = int(np.ceil(period / TABLE_LENGTH - 1e-9))
         period -= period % hold
     if not 4 <= period <= _MOST:
-        raise AmbidError(f"the period has {period} samples; it must be 4 to {_MOST}. Correct --period or --band")
+        raise AmbidError(
+            f"the period has {period} samples; it must be 4 to {_MOST}. Correct {setting('period')} or "
+            f"{setting('band')}"
+        )
     band, highest = wanted.band or (rate / period, rate / 5.0), HIGHEST * rate
     if band[1] > highest:
         raise AmbidError(
-            f"--band goes up to {band[1]:g} Hz; it may go to {highest:g} Hz, {HIGHEST:g} of the rate. Lower it"
+            f"{setting('band')} goes up to {band[1]:g} Hz; it may go to {highest:g} Hz, {HIGHEST:g} of the rate. "
+            "Lower it"
         )
     periods = max(1, round(seconds * rate / period))
     return Task(
@@ -496,8 +503,9 @@ def _lowered(task: Task, wanted: Wanted) -> tuple[str, ...]:
     """Say where the controller's table, which holds each element for some samples, cannot play the band."""
     asked, top = (0.0, 0.0) if wanted.band is None else wanted.band, task.band_hz[1]
     return () if asked[1] <= top else (
-        f"--band goes up to {asked[1]:g} Hz; the controller's table holds each of its elements for {task.hold} samples "
-        f"and plays up to {top:.4g} Hz. Shorten --period, or raise the lower end of the band",
+        f"{setting('band')} goes up to {asked[1]:g} Hz; the controller's table holds each of its elements for "
+        f"{task.hold} samples "
+        f"and plays up to {top:.4g} Hz. Shorten {setting('period')}, or raise the lower end of the band",
     )  # fmt: skip
 
 
@@ -595,13 +603,14 @@ def _checks(used: Array, expected: Mapping[str, Expected], unstable: int) -> dic
             passed=most <= _FULL, values={"use": most},
             detail=f"the nominal plant and {used.shape[0] - 1} drawn ones stay within the limits, from rest too"
             if most <= _FULL else
-            f"rounding to the controller's table takes a drawn plant to {100.0 * most:.1f} % of a limit. Lower --use",
+            f"rounding to the controller's table takes a drawn plant to {100.0 * most:.1f} % of a limit. Lower "
+            f"{setting('use')}",
         ),
         "loop": Check(
             passed=unstable == 0, values={"unstable": float(unstable)},
             detail="all drawn plants are stable, in their loop if there is one" if not unstable else
             f"{unstable} of {_PLANTS} drawn plants are unstable in this loop; limits are kept for the others alone. "
-            "Know the plant better (--spread, priors, an estimate)",
+            f"Know the plant better ({setting('spread')}, priors, an estimate)",
         ),
         "identifiable": Check(
             passed=not weak,
@@ -618,7 +627,10 @@ def _curvature(expected: Mapping[str, Expected], assumed: str) -> Check:
     size = {name: far * expected[name].sd for name, far in shift.items()}
     passed, said = judge_shift(shift, size, {name: expected[name].value for name in shift})
     if not passed:
-        said += f" ({assumed}). Play {advised(shift):.2g} of it or less (--use), or identify with --nonlinear"
+        said += (
+            f" ({assumed}). Play {advised(shift):.2g} of it or less ({setting('use')}), or identify with "
+            f"{setting('identify_nonlinear')}"
+        )
     return Check(passed=passed, values=shift, detail=said)
 
 

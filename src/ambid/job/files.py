@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Self
 
 from ambid.errors import AmbidError
+from ambid.settings.caller import setting
 
 FIGURE_ENDINGS = (".png", ".svg", ".pdf")
 PAGE_ENDINGS = (".html", ".htm", ".pdf")
@@ -25,7 +26,7 @@ _BEGINNINGS = {
     EXPORT_ENDINGS: (_MATRICES, b'"""The plant of ', b"/* The plant of "),
     LAW_ENDINGS: (_MATRICES, b'"""The law of ', b"/* The law of "), METRICS_ENDINGS: (b"# HELP ambid_",),
 }  # fmt: skip
-_STREAMED = ("--json",)  # options that take - for standard output
+_STREAMED = ("json",)  # settings that take - for standard output
 
 
 class Files:
@@ -43,45 +44,47 @@ class Files:
         self._claimed: list[Path] = []
         self._staged: dict[Path, Path] = {}
 
-    def claim(self, path: Path | None, option: str, suffixes: Sequence[str] = (), *, force: bool | None = None) -> None:
+    def claim(self, path: Path | None, name: str, suffixes: Sequence[str] = (), *, force: bool | None = None) -> None:
         """Check that a file can be written, before any work is done.
 
-        `path`: the file; None: the option was not given; `option`: the option that names it, for messages; `suffixes`:
-        endings that it may have; any if empty; `force`: what the verb's --force says, None where it has none. Without
-        it only figures, reports, results and simulated records are written over, and that is told.
+        `path`: the file; None: none was given; `name`: of the setting that names it, for messages; `suffixes`:
+        endings that it may have; any if empty; `force`: what the setting of that name says, None where there is none.
+        Without it only figures, reports, results and simulated records are written over, and that is told.
         """
         if path is None:
             return
         try:
-            self._check(path, option, suffixes)
+            self._check(path, name, suffixes)
             if path.is_file() and not force and not _made_here(path, _BEGINNINGS.get(tuple(suffixes), ())):
-                remedy = "Choose another name" + ("" if force is None else ", or give --force")
-                raise AmbidError(f"{option} {path} exists, and is not a result of ambid. {remedy}")
+                remedy = "Choose another name" + ("" if force is None else f", or give {setting('force', True)}")
+                raise AmbidError(f"{setting(name)} {path} exists, and is not a result of ambid. {remedy}")
         except (OSError, RuntimeError, ValueError) as failure:  # a name that no file can have, a link to itself
             words = getattr(failure, "strerror", None) or failure
-            raise AmbidError(f"{option} {path} cannot be used: {words}. Give another name") from None
+            raise AmbidError(f"{setting(name)} {path} cannot be used: {words}. Give another name") from None
         self._claimed.append(path)
 
-    def _check(self, path: Path, option: str, suffixes: Sequence[str]) -> None:
+    def _check(self, path: Path, name: str, suffixes: Sequence[str]) -> None:
         whole = path.resolve()
         folder = (whole if path.is_symlink() else path).parent
         if path.exists() and not path.is_file() and not path.is_dir():
-            remedy = "Use - for standard output" if option in _STREAMED else "Name one"
-            raise AmbidError(f"{option} {path} is a device or a pipe; it must be a file. {remedy}")
+            remedy = "Use - for standard output" if name in _STREAMED else "Name one"
+            raise AmbidError(f"{setting(name)} {path} is a device or a pipe; it must be a file. {remedy}")
         if path.is_dir():
-            raise AmbidError(f"{option} {path} is a folder; it must be a file. Name a file inside it")
+            raise AmbidError(f"{setting(name)} {path} is a folder; it must be a file. Name a file inside it")
         if suffixes and not path.name.lower().endswith(tuple(suffixes)):
-            raise AmbidError(f"{option} {path} must end in {' or '.join(suffixes)}. Rename it")
+            raise AmbidError(f"{setting(name)} {path} must end in {' or '.join(suffixes)}. Rename it")
         if not folder.is_dir():
-            raise AmbidError(f"{option} {path}: there is no folder {folder}. Make it first, or correct the path")
+            raise AmbidError(f"{setting(name)} {path}: there is no folder {folder}. Make it first, or correct the path")
         if not os.access(folder, os.W_OK):
-            raise AmbidError(f"{option} {path}: folder {folder} may not be written. Choose another folder")
+            raise AmbidError(f"{setting(name)} {path}: folder {folder} may not be written. Choose another folder")
         for other in self._inputs:
             if _same(path, other):
-                raise AmbidError(f"{option} {path} is also an input, which would be overwritten. Choose another file")
+                raise AmbidError(
+                    f"{setting(name)} {path} is also an input, which would be overwritten. Choose another file"
+                )
         for other in self._claimed:
             if _same(path, other):
-                raise AmbidError(f"{option} {path} is named by two options. Choose another file for one of them")
+                raise AmbidError(f"{setting(name)} {path} is named by two options. Choose another file for one of them")
 
     def stage(self, path: Path, write: Callable[[Path], object]) -> None:
         """Write a file under a name beside its own.

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Any, get_args
 from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure
 from ambid.blackbox.fit import structure as structure_named
 from ambid.blackbox.words import Candidate, candidates_of, fixed_of, orders_of, settings_of
-from ambid.errors import EstimationError, nearest, refuse_given
+from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent
 from ambid.job.data import Channels, Clock, Names, Source, check_same_bench, known_rig, sources_of
@@ -22,6 +22,7 @@ from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, nonlinear_structure
 from ambid.physics.linear_model import model
 from ambid.record import GapPolicy
 from ambid.rig import Rig
+from ambid.settings.caller import refuse_given, setting
 
 if TYPE_CHECKING:
     from ambid.bearing.physical import PhysicalFit
@@ -131,17 +132,20 @@ def fit(
     nonlinear, fixed = structure in NONLINEAR_STRUCTURES, fixed_of(fix)
     wanted: Any = settings_of(orders) if nonlinear else orders_of(orders)
     if nonlinear:
-        linear_only = {"--fix": fixed, "--reference": channels.references, "--at-rest": at_rest,
-                       "--criterion": criterion != "bic"}  # fmt: skip
+        linear_only = {"fix": fixed, "reference": channels.references, "at_rest": at_rest,
+                       "criterion": criterion != "bic"}  # fmt: skip
         refuse_given(linear_only, f"{{}} is for linear structures; {structure} does not use it. Omit it")
         _check_settings(structure, sources, wanted, seed or 0)
     else:
-        _check_linear(structure, sources, {"--seed": seed is not None})
+        _check_linear(structure, sources, {"seed": seed is not None})
         _check_criterion(criterion, wanted)
         taken = channels.inputs if channels.rig is None else channels.inputs or channels.rig.plant.inputs
         _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
     if validate is None and (validate_from_s, validate_to_s) != (None, None):
-        raise EstimationError("--validate-from and --validate-to need a second record. Give --validate, or omit them")
+        raise EstimationError(
+            f"{setting('validate_from_s')} and {setting('validate_to_s')} need a second record. Give "
+            f"{setting('validate')}, or omit them"
+        )
     clock, data = Clock(), list[Any]()
     for record in sources:
         (say if nonlinear else silent)("read")
@@ -229,8 +233,9 @@ def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:
     bench = known_rig(rig)
     if bench.rotor is not None:
         raise EstimationError(
-            "--rig of a rotor on many axes is for 'ambid identify'; a fit does not lead to its parameters. Omit --rig, "
-            "and name columns by --input and --output"
+            f"{setting('rig')} of a rotor on many axes is for 'ambid identify'; a fit does not lead to its "
+            f"parameters. Omit {setting('rig')}, "
+            f"and name columns by {setting('input')} and {setting('output')}"
         )
     plant = model(bench.model)
     return physical_parameters(found, plant, bench.parameters, delay=bench.channel(plant.inputs[0]).delay)
@@ -316,7 +321,7 @@ def _check_criterion(criterion: str, orders: Orders | None) -> None:
         raise EstimationError(f"criterion {criterion!r} is not one of {', '.join(known)}.{nearest(criterion, known)}")
     if orders is not None and criterion != "bic":
         raise EstimationError(
-            f"criterion {criterion} chooses orders, but orders are given. Omit one, or give --orders auto"
+            f"criterion {criterion} chooses orders, but orders are given. Omit one, or give {setting('orders', 'auto')}"
         )
 
 
@@ -325,15 +330,16 @@ def _check_use(
 ) -> None:
     if inputs and not of.inputs:
         raise EstimationError(
-            f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Omit --input"
+            f"structure {of.name} is a time series and takes no inputs; it got {', '.join(inputs)}. Omit "
+            f"{setting('input')}"
         )
     if not inputs and of.inputs is True and of.kind != "state space":
-        raise EstimationError(f"structure {of.name} needs an input. Give --input COLUMN, or use arma")
+        raise EstimationError(f"structure {of.name} needs an input. Give {setting('input', 'COLUMN')}, or use arma")
     if fixed and of.kind != "polynomial":
         raise EstimationError(f"structure {of.name} has no coefficients that can be fixed. Use a polynomial structure")
     if at_rest and not of.prediction_error:
         some = ", ".join(x.name for x in STRUCTURES.values() if x.prediction_error)
-        raise EstimationError(f"structure {of.name} cannot start at rest; {some} can. Omit --at-rest")
+        raise EstimationError(f"structure {of.name} cannot start at rest; {some} can. Omit {setting('at_rest')}")
 
 
 def _check_linear(name: str, records: Sequence[object], given: Mapping[str, object]) -> None:
@@ -346,7 +352,7 @@ def _check_linear(name: str, records: Sequence[object], given: Mapping[str, obje
     if len(records) > 1:
         several = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(f"structure {name} takes one record; {several} take several. Give one")
-    refuse_given(given, f"{{}} is for nonlinear structures; {name} has --orders. Omit it")
+    refuse_given(given, f"{{}} is for nonlinear structures; {name} has {setting('orders')}. Omit it")
 
 
 def _check_settings(name: str, records: Sequence[object], settings: Settings, seed: int) -> None:

@@ -6,7 +6,6 @@ import math
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any, Literal, TypedDict
 
 from ambid.blackbox.data import Orders
@@ -14,6 +13,7 @@ from ambid.errors import EstimationError, nearest
 from ambid.job.data import Names
 from ambid.recursive.lines import Event, Track, TrackHeader, TrackLine
 from ambid.report.track_figures import TrackHistory
+from ambid.settings.caller import setting
 from ambid.tracking.lines_file import Tally
 
 Flag = Literal["track", "hold", "accept", "revert"]
@@ -97,18 +97,18 @@ class EstimatorWords(TypedDict, total=False):
     step: float | None
 
 
-def check_settings(said: Mapping[str, Any], names: Mapping[str, str] = MappingProxyType({})) -> None:
-    """Refuse what `track` is told where it makes no sense or contradicts itself, in the `names` of the caller."""
+def check_settings(said: Mapping[str, Any]) -> None:
+    """Refuse what `track` is told where it makes no sense or contradicts itself."""
     for name in ("every_s", "limit", "start_s", "rate_hz"):
         if name in said and not (said[name] is None and name in ("start_s", "rate_hz")):
-            _positive(names.get(name, name), said[name])
+            _positive(setting(name), said[name])
     for name in ("from_s", "to_s"):
         x = said.get(name)
         if x is not None and math.isnan(_number(x)):
-            raise EstimationError(f"{name} is {_short(x)}; it must be a time in s. Correct it")
+            raise EstimationError(f"{setting(name)} is {_short(x)}; it must be a time in s. Correct it")
     memory = said.get("memory", "auto")
     if memory not in ("auto", "all"):
-        name = names.get("memory", "memory")
+        name = setting("memory")
         _positive(name, memory, other="'auto', 'all' or ")
         if not _SHORTEST_S <= _number(memory) <= _LONGEST_S:
             raise EstimationError(
@@ -117,11 +117,11 @@ def check_settings(said: Mapping[str, Any], names: Mapping[str, str] = MappingPr
             )
     pace = said.get("pace", _PACES[0])
     if pace not in _PACES:
-        raise EstimationError(f"pace is {pace!r}; known: {', '.join(_PACES)}. Correct it")
+        raise EstimationError(f"{setting('pace')} is {pace!r}; known: {', '.join(_PACES)}. Correct it")
     if said.get("start") is not None and said.get("start_s") is not None:
         raise EstimationError(
-            f"{names.get('start_s', 'start_s')} is for a start identified from the record, but "
-            f"{names.get('start', 'start')} gives one. Omit one of them"
+            f"{setting('start_s')} is for a start identified from the record, but "
+            f"{setting('start')} gives one. Omit one of them"
         )
     for flag in said.get("flags", ()):
         _check_flag(flag)

@@ -20,6 +20,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.job.data import Clock, Reading, Source, known_rig, load_bench, origin, rig_entry, signals_of, sources_of
 from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
+from ambid.settings.caller import saved, setting
 
 if TYPE_CHECKING:
     from ambid.bearing.magnet_result import NonlinearBearingEstimate
@@ -111,11 +112,11 @@ def identify(
         second = validated(found, (load_bench(validate, bench, **reading),))
         return replace(found, validation={**second, "checks": plain_json(second["checks"])})
     if speed_rpm is not None:
-        raise EstimationError("--speed is of a rotor's records; the rig has no [bearings.X]. Omit it")
+        raise EstimationError(f"{setting('speed_rpm')} is of a rotor's records; the rig has no [bearings.X]. Omit it")
     if len(sources) != 1:
         raise EstimationError(
             f"{len(sources)} records are given; the linear model takes one, since k_x, k_i and L differ from one "
-            "operating point to the next. Give --nonlinear for one model of all, or one record"
+            f"operating point to the next. Give {setting('identify_nonlinear')} for one model of all, or one record"
         )
     estimate = identify_axis(sources[0], bench, validate=validate, tick=tick, **reading)
     return replace(estimate, checks={**estimate.checks, **_reached(planned, estimate)})
@@ -128,7 +129,7 @@ def _planned(experiment: Experiment | str | Path) -> Experiment:
     found = experiment_of(experiment)
     if found is None:
         raise EstimationError(
-            f"--experiment {experiment} is no experiment. Give what 'ambid design experiment --json' wrote"
+            f"{setting('experiment', experiment)} is no experiment. Give {saved('design_experiment')}"
         )
     return found
 

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 from ambid.errors import AmbidError
 from ambid.ledger import Ledger, entry_of, open_ledger
 from ambid.ledger.entry import moment, sha_of
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from ambid.ledger import History
@@ -44,20 +45,23 @@ def bearing_of(rig: Rig | None, given: str | None) -> str:
     """Return the name of the bearing: what is given, else the rig's name."""
     name = given if given is not None else "" if rig is None else rig.name
     if not name.strip():
-        raise AmbidError("the ledger has to know which bearing this is. Give --bearing NAME, or a rig that has a name")
+        raise AmbidError(
+            f"the ledger has to know which bearing this is. Give {setting('bearing', 'NAME')}, or a rig that has a name"
+        )
     return name
 
 
 def time_of(given: str | None, record: Path) -> float | None:
-    """Return when a record was taken as ``--taken-at`` says it; None: as the record says itself, which CSV cannot."""
+    """Return when a record was taken as its setting says; None: as the record says itself, which CSV cannot."""
     if given == _FILE:
         return record.stat().st_mtime
     if given is not None:
         return moment(given)
     if record.name.lower().endswith((".csv", ".csv.gz")):
         raise AmbidError(
-            f"{record} does not say when it was taken, and the ledger has to know. Give --taken-at TIME, or "
-            "--taken-at file for the time of its file"
+            f"{record} does not say when it was taken, and the ledger has to know. Give "
+            f"{setting('taken_at', 'TIME')}, or "
+            f"{setting('taken_at', 'file')} for the time of its file"
         )
     return None
 

@@ -38,6 +38,7 @@ from ambid.record import GapPolicy, Record
 from ambid.rig import Rig
 from ambid.rotor.balance import Machine
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import saved, setting
 from ambid.simulation.margins import zone_of
 
 
@@ -101,8 +102,9 @@ def margins(
     if isinstance(record, Numbers) or (isinstance(record, str | Path) and Path(record).suffix == ".json"):
         if estimate is not None or reference is not None or any(x is not None for x in reading.values()):
             raise EstimationError(
-                "margins of an estimate alone take nothing but the rig; --estimate, --reference, --from, --to, --rate, "
-                "--gaps, --layout and units are of a record. Omit them, or give a record"
+                f"margins of an estimate alone take nothing but the rig; {setting('estimate')}, "
+                f"{setting('reference')}, {setting('from_s')}, {setting('to_s')}, {setting('rate_hz')}, "
+                f"{setting('gaps')}, {setting('layout')} and units are of a record. Omit them, or give a record"
             )
         known, bench = given(record, rig)
         bench = replace(bench, open_loop=False)  # so were its records; here its [loop] is closed
@@ -151,7 +153,7 @@ def _with_reference(bench: Record, rig: Rig, column: str) -> Record:
     """Return a record of one axis whose excitation is a column of its own."""
     if rig.rotor is not None:
         raise EstimationError(
-            "--reference is of one axis; of a rotor the rig names the reference of each axis. Give "
+            f"{setting('reference')} is of one axis; of a rotor the rig names the reference of each axis. Give "
             "[channels.<axis>_reference] and omit it"
         )
     others = [c for c in bench.channels if c.name not in ("reference", column)]
@@ -166,8 +168,8 @@ def given(estimate: Any, rig: Rig | str | Path | None) -> tuple[Numbers, Rig]:
     known = load(estimate) if isinstance(estimate, str | Path) else estimate
     if not isinstance(known, Estimate | RotorEstimate):
         raise EstimationError(
-            f"{name} is no linear estimate of a bearing or a rotor, and a loop is judged on a linear plant. Give what "
-            "'ambid identify --json' wrote, without --nonlinear"
+            f"{name} is no linear estimate of a bearing or a rotor, and a loop is judged on a linear plant. Give "
+            f"{saved('identify')}, without {setting('identify_nonlinear')}"
         )
     bench = known_rig(rig) if rig is not None else rig_of(known, name)
     if (bench.rotor is None) != isinstance(known, Estimate) or bench.model != known.model:

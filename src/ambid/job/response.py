@@ -22,7 +22,7 @@ from ambid.blackbox.model import Offsets
 from ambid.blackbox.modes import find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.blackbox.words import orders_of
-from ambid.errors import EstimationError, check_band
+from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import Modal, plant_modes
 from ambid.estimation.progress import Tick, silent
@@ -31,6 +31,7 @@ from ambid.job.results import load, rig_of
 from ambid.physics.linear_model import model
 from ambid.record import Channel, GapPolicy, Record
 from ambid.rig import Rig, bench_record
+from ambid.settings.caller import check_band, setting
 from ambid.signals.frf import Method, frequency_response, repeats
 from ambid.signals.response import FrequencyResponse, Hold
 from ambid.signals.response_files import is_response_file, read_response
@@ -130,21 +131,27 @@ def frf(
     bench, wanted = channels.rig, orders_of(orders)
     if bench is not None and bench.rotor is not None:
         raise EstimationError(
-            "--rig of a rotor on many axes is for 'ambid identify', not for a frequency response. Name columns by "
-            "--input and --output instead"
+            f"{setting('rig')} of a rotor on many axes is for 'ambid identify', not for a frequency response. Name "
+            "columns by "
+            f"{setting('input')} and {setting('output')} instead"
         )
     if orders is not None and wanted is None:
-        raise EstimationError("--orders auto: a transfer function needs its degree. Give nf=2, or --state-space auto")
+        raise EstimationError(
+            f"{setting('orders', 'auto')}: a transfer function needs its degree. Give nf=2, or "
+            f"{setting('state_space', 'auto')}"
+        )
     _check(wanted, state_space, feedthrough, domain, delay, bench)
     _check_modes(modes, estimate)
     known = None if estimate is None else _plant_of(estimate)
     if is_response_file(record):
         for word, given in (
-            ("--method", method != "auto"), ("--modes", modes is not None), ("--from", from_s is not None),
-            ("--to", to_s is not None), ("--gaps", gaps is not None), ("units=", units is not None),
+            ("method", method != "auto"), ("modes", modes is not None), ("from_s", from_s is not None),
+            ("to_s", to_s is not None), ("gaps", gaps is not None), ("units", units is not None),
         ):  # fmt: skip
             if given:
-                raise EstimationError(f"{word} is for records in time; {record} holds frequency responses. Omit it")
+                raise EstimationError(
+                    f"{setting(word)} is for records in time; {record} holds frequency responses. Omit it"
+                )
         say("measure")
         response, about = _from_file(Path(str(record)), channels, hold or "band-limited")
         response = response if band is None else response.between(*band)
@@ -155,9 +162,9 @@ def frf(
         )
     alone = bench is None and not channels.inputs
     if alone and modes is None:
-        raise EstimationError("no input was named; a response needs at least one. Give --input COLUMN")
+        raise EstimationError(f"no input was named; a response needs at least one. Give {setting('input', 'COLUMN')}")
     if alone and (orders is not None or state_space is not None):
-        raise EstimationError("a model was requested, and no input was named. Give --input COLUMN")
+        raise EstimationError(f"a model was requested, and no input was named. Give {setting('input', 'COLUMN')}")
     data = channels.read(record, (from_s, to_s))
     clock.lap("read")
     modal: Modal | None = None
@@ -271,22 +278,34 @@ def _check(
     """Refuse what contradicts itself before the record is read."""
     if orders is not None and state_space is not None:
         raise EstimationError(
-            "both a transfer function and a state space were requested. Give --orders or --state-space"
+            f"both a transfer function and a state space were requested. Give {setting('orders')} or "
+            f"{setting('state_space')}"
         )
     if state_space is not None and state_space != "auto" and (not isinstance(state_space, int) or state_space < 1):
         raise EstimationError(f"the state-space order is {state_space}; it must be at least 1, or 'auto'. Correct it")
     if orders is None and state_space is None and domain is not None:
-        raise EstimationError("--domain is for --orders and --state-space; neither was given. Omit it")
+        raise EstimationError(
+            f"{setting('domain')} is for {setting('orders')} and {setting('state_space')}; neither was given. Omit it"
+        )
     if feedthrough and state_space is None:
-        raise EstimationError("--feedthrough is for --state-space (--orders has it with nb = nf + 1). Omit it")
+        raise EstimationError(
+            f"{setting('feedthrough')} is for {setting('state_space')} ({setting('orders')} has it with nb = nf + "
+            "1). Omit it"
+        )
     if state_space is not None and delay == "auto":
         raise EstimationError(
-            "a state space needs a known delay, not 'auto'. Give --delay S; --orders or --rig can find it"
+            f"a state space needs a known delay, not 'auto'. Give {setting('delay', 'S')}; {setting('orders')} or "
+            f"{setting('rig')} can find it"
         )
     if delay is not None and orders is None and state_space is None and rig is None:
-        raise EstimationError("--delay is for a model; none was requested. Give --orders, --state-space or --rig too")
+        raise EstimationError(
+            f"{setting('delay')} is for a model; none was requested. Give {setting('orders')}, "
+            f"{setting('state_space')} or {setting('rig')} too"
+        )
     if isinstance(delay, float | int) and not (np.isfinite(delay) and delay >= 0):
-        raise EstimationError(f"the delay is {delay} s; it must be zero or positive, or 'auto'. Correct --delay")
+        raise EstimationError(
+            f"the delay is {delay} s; it must be zero or positive, or 'auto'. Correct {setting('delay')}"
+        )
 
 
 def _plant_of(estimate: Any) -> Any:
@@ -311,9 +330,13 @@ def _beside(modal: Modal, estimate: Any) -> Modal:
 
 def _check_modes(modes: object, estimate: object) -> None:
     if estimate is not None and modes is None:
-        raise EstimationError("--estimate is for --modes; none were requested. Give --modes auto too")
+        raise EstimationError(
+            f"{setting('estimate')} is for {setting('modes')}; none were requested. Give {setting('modes', 'auto')} too"
+        )
     if modes is not None and modes != "auto" and (isinstance(modes, bool) or not isinstance(modes, int) or modes < 1):
-        raise EstimationError(f"{modes!r} modes were requested; it must be at least 1, or 'auto'. Correct --modes")
+        raise EstimationError(
+            f"{modes!r} modes were requested; it must be at least 1, or 'auto'. Correct {setting('modes')}"
+        )
 
 
 def _measure(

@@ -12,7 +12,7 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_j
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.fit_file import fit_from_json
 from ambid.control.experiment import Experiment
-from ambid.errors import AmbidError, EstimationError, path_of
+from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
 from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
@@ -22,6 +22,7 @@ from ambid.record import GapPolicy, read_record
 from ambid.record.record import file_bytes, utf8_text
 from ambid.rig import Rig, read_bench, rig_from_text
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import path_of, saved, setting
 from ambid.tracking.lines_file import SCHEMA as TRACK
 from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
@@ -43,8 +44,8 @@ def load(path: str | Path) -> Any:
     Parameters
     ----------
     path : str or Path
-        What ``--json`` or `Result.save` wrote: an estimate, fit, track, frequency response, comparison, validation,
-        inspection or acquisition.
+        What `Result.save` or the command's option ``json`` wrote: an estimate, fit, track, frequency response,
+        comparison, validation, inspection or acquisition.
 
     Returns
     -------
@@ -74,9 +75,9 @@ def _text(path: Path, what: str) -> str:
     return utf8_text(file_bytes(path, EstimationError, what), path, EstimationError, what)
 
 
-def _object(text: str, path: Path, what: str, verb: str) -> Mapping[str, Any]:
-    """Parse the object that a result's file holds; `what` and `verb`: the result and who wrote it, for messages."""
-    advice = f"Give what 'ambid {verb} --json' wrote"
+def _object(text: str, path: Path, what: str, job: str) -> Mapping[str, Any]:
+    """Parse the object that a result's file holds; `what` and `job`: the result and what wrote it, for messages."""
+    advice = f"Give {saved(job)}"
     try:
         document = json.loads(text)
     except json.JSONDecodeError as failure:
@@ -105,12 +106,12 @@ def _fit(document: Mapping[str, Any], path: str) -> AnyFit:
     return nonlinear_fit_from_json(document, where) if nonlinear else fit_from_json(document, where)
 
 
-def _whole(module: str, name: str, verb: str) -> Callable[[Mapping[str, Any], str], Any]:
+def _whole(module: str, name: str, job: str) -> Callable[[Mapping[str, Any], str], Any]:
     """Return a reader of a result whose file has all its fields by name."""
 
     def read(document: Mapping[str, Any], path: str) -> Any:
         kind = getattr(import_module(f"ambid.{module}"), name)
-        return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), verb)
+        return read_whole(lambda: read_as(kind, document), f"{name.lower()} {path}", name.lower(), job)
 
     return read
 
@@ -132,17 +133,17 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     FIT_SCHEMA: _fit,
     "ambid.frf/1": _measured,
     "ambid.comparison/1": _comparison,
-    _EXPERIMENT: _whole("control.experiment", "Experiment", "design experiment"),
-    "ambid.design/1": _whole("control.design", "Design", "design controller"),
+    _EXPERIMENT: _whole("control.experiment", "Experiment", "design_experiment"),
+    "ambid.design/1": _whole("control.design", "Design", "design_controller"),
     "ambid.history/1": _whole("ledger.history", "History", "history"),
-    "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet simulate"),
-    "ambid.alarms/1": _whole("ledger.monitor", "Watched", "history --alarms"),
+    "ambid.coverage/1": _whole("validation.coverage", "Coverage", "fleet_simulate"),
+    "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
     "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),
-    "ambid.fleet/1": _whole("ledger.fleet_run", "FleetRun", "fleet run"),
+    "ambid.fleet/1": _whole("ledger.fleet_run", "FleetRun", "fleet_run"),
     "ambid.recovery/1": _whole("acquisition.recorder", "Recorded", "recover"),
 }
 
@@ -153,14 +154,11 @@ def experiment_of(excitation: object) -> Experiment | None:
         return excitation if isinstance(excitation, Experiment) else None
     if str(excitation).isalpha():
         return None
-    refusal = (
-        f"{str(excitation)!r} is no experiment. Give what 'ambid design experiment --json' wrote, or the name of an "
-        "excitation"
-    )
+    refusal = f"{str(excitation)!r} is no experiment. Give {saved('design_experiment')}, or the name of an excitation"
     path = Path(excitation)
     if path.suffix.lower() != ".json":
         raise AmbidError(refusal)
-    document = _object(_text(path, "experiment"), path, "experiment", "design experiment")
+    document = _object(_text(path, "experiment"), path, "experiment", "design_experiment")
     if document.get("schema") != _EXPERIMENT:
         raise AmbidError(refusal)
     found: Experiment = _READERS[_EXPERIMENT](document, str(path))
@@ -186,7 +184,7 @@ def data_of(
     """
     if isinstance(known, BlackBoxFit | NonlinearFit):
         if rig is not None:
-            raise EstimationError(f"{where} is a black-box fit, which has no rig. Omit --rig")
+            raise EstimationError(f"{where} is a black-box fit, which has no rig. Omit {setting('rig')}")
         channels = Channels(
             inputs=known.inputs, outputs=known.outputs, rate_hz=reading.get("rate_hz"), gaps=reading.get("gaps"),
             units=reading.get("units"), layout=reading.get("layout"),
@@ -318,8 +316,8 @@ def rig_of(estimate: AnyEstimate | RotorEstimate, where: str) -> Rig:
     """Return the rig that an estimate remembers; `where` is its name, for messages."""
     text, folder = estimate.rig.get("text"), estimate.rig.get("folder")
     if not isinstance(text, str) or not isinstance(folder, str):
-        raise EstimationError(f"{where} does not hold its rig. Give --rig")
+        raise EstimationError(f"{where} does not hold its rig. Give {setting('rig')}")
     try:
         return rig_from_text(text, Path(folder) / "rig.toml")
     except AmbidError as error:
-        raise EstimationError(f"{where}: its rig cannot be used: {error}. Give --rig") from None
+        raise EstimationError(f"{where}: its rig cannot be used: {error}. Give {setting('rig')}") from None

@@ -22,6 +22,7 @@ from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from ambid.arrays import Complex
@@ -306,7 +307,8 @@ def _check_speeds(taken: Sequence[RotorRecord], speeds: Sequence[float]) -> None
         if abs(speed) >= np.pi * one.bench.rate_hz:
             raise EstimationError(
                 f"{one.name}: a speed of {speed * 30.0 / np.pi:.4g} rpm is more than half of its sampling rate, "
-                f"{one.bench.rate_hz:g} Hz; it would not show. Correct --speed, or [speed] and its unit in the rig"
+                f"{one.bench.rate_hz:g} Hz; it would not show. Correct {setting('speed_rpm')}, or [speed] and its "
+                "unit in the rig"
             )
 
 

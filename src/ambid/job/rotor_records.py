@@ -14,6 +14,7 @@ from ambid.estimation.progress import Tick
 from ambid.job.data import Reading, Source, load_bench, overlap
 from ambid.record import Record
 from ambid.rig import Rig
+from ambid.settings.caller import setting
 
 _TURNING = ("angle", "speed", "tacho")
 _SAME_RATE = 1e-6
@@ -58,7 +59,10 @@ def read_records(
     turning = [r for r in taken if any(role in r.bench for role in _TURNING)]
     if not turning or len(turning) == len(taken) or speed_rpm is not None:
         return taken
-    said = "has no column of the angle or speed that other records have: it is taken to be at rest. Else give --speed"
+    said = (
+        "has no column of the angle or speed that other records have: it is taken to be at rest. Else give "
+        f"{setting('speed_rpm')}"
+    )
     return [r if r in turning else replace(r, speed=0.0, warnings=(f"{r.name} {said}",)) for r in taken]
 
 
@@ -68,12 +72,13 @@ def _speeds(speed_rpm: float | Sequence[float] | None, n: int) -> list[float | N
     given = [speed_rpm] if isinstance(speed_rpm, (int, float)) else list(speed_rpm)
     if len(given) != n:
         raise EstimationError(
-            f"{counted(n, 'record')} and {counted(len(given), 'speed')} are given. Give --speed once for each record, "
+            f"{counted(n, 'record')} and {counted(len(given), 'speed')} are given. Give {setting('speed_rpm')} once "
+            "for each record, "
             "in their order"
         )
     wrong = next((x for x in given if not isfinite(x)), None)
     if wrong is not None:
-        raise EstimationError(f"--speed is {wrong}; it must be a speed in rpm. Give a number")
+        raise EstimationError(f"{setting('speed_rpm')} is {wrong}; it must be a speed in rpm. Give a number")
     return [x * 2.0 * pi / 60.0 for x in given]
 
 

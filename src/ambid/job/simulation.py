@@ -12,17 +12,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.control.experiment import Experiment
-from ambid.errors import (
-    AmbidError,
-    EstimationError,
-    check_band,
-    check_number,
-    check_positive,
-    check_switch,
-    check_whole,
-    nearest,
-    refuse_given,
-)
+from ambid.errors import AmbidError, EstimationError, nearest
 from ambid.estimation.estimate import Estimate
 from ambid.job.results import experiment_of, load, rig_of
 from ambid.physics.linear_model import Parameter
@@ -30,6 +20,15 @@ from ambid.physics.loop import Loop
 from ambid.physics.presets import Preset, preset_of
 from ambid.record import Channel, Record
 from ambid.rig import Rig, RigMagnet, load_rig, rig_of_preset
+from ambid.settings.caller import (
+    check_band,
+    check_number,
+    check_positive,
+    check_switch,
+    check_whole,
+    refuse_given,
+    setting,
+)
 from ambid.signals import excitation as make_excitation
 from ambid.signals import excitation_of_axes
 from ambid.simulation.bench import Simulation
@@ -41,7 +40,6 @@ BenchSource = str | Path | Rig | Preset | Estimate | NonlinearBearingEstimate
 
 _LEAST_PERIODS = 4  # of a rotor's record: their scatter is its noise
 _REACH = 10.0  # of the rate over the highest line of a rotor's excitation
-_NO_LOG = "--log-excitation is for one axis; a rotor's record has <axis>_reference. Omit it"
 _FRACTION = 0.5  # of the limits that an amplitude chosen by the program uses
 
 
@@ -155,10 +153,10 @@ def simulate_used(
     force: bool = False,
 ) -> tuple[Simulation, Excited]:
     """Return what `simulate` does with what happened, and the excitation."""
-    check_positive({"--duration": duration, "--rate": rate_hz, "--amplitude": amplitude})
-    check_whole({"--seed": seed} | {n: x for n, x in (("--periods", periods), ("--settle", settle)) if x is not None})
+    check_positive({"duration": duration, "rate_hz": rate_hz, "amplitude": amplitude})
+    check_whole({"seed": seed} | {n: x for n, x in (("periods", periods), ("settle", settle)) if x is not None})
     check_band(band)
-    check_number({"--position": position})
+    check_number({"position": position})
     check_switch({"closed": closed})
     bench, experiment = _bench(source, rate_hz, closed, nonlinear, position), experiment_of(excitation)
     if duration is None:
@@ -167,33 +165,36 @@ def simulate_used(
     if not force:
         bench.refuse_unstable()
     if experiment is not None:
-        of_others = {"--amplitude": amplitude, "--band": band, "--periods": periods, "--axes": axes}
-        refuse_given(of_others, "--excitation is an experiment, which takes no {}. Omit {}")
+        of_others = {"amplitude": amplitude, "band": band, "periods": periods, "axes": axes}
+        refuse_given(of_others, f"{setting('excitation')} is an experiment, which takes no {{}}. Omit {{}}")
         moved = tuple(experiment.excitation)
         if moved != bench.model.inputs if isinstance(bench, RotorBench) else len(moved) > 1:
             has = ", ".join(bench.model.inputs) if isinstance(bench, RotorBench) else "one axis"
-            raise AmbidError(f"--excitation is an experiment of {', '.join(moved)}, the bench has {has}. Give another")
+            raise AmbidError(
+                f"{setting('excitation')} is an experiment of {', '.join(moved)}, the bench has {has}. Give another"
+            )
         if isinstance(bench, RotorBench):
             if log_excitation:
-                raise AmbidError(_NO_LOG)
+                raise AmbidError(_no_log())
             sets_in = experiment.period * (1 if settle is None else settle)
             waves = experiment.played(sets_in + n, bench.rate_hz, closed=bench.loop.closed)
             excited = Excited(
                 kind="experiment", peak=float(np.max(np.abs(waves))), unit=bench.model.units[moved[0]]
             )  # fmt: skip
             return bench.simulate(waves, seed=seed, settle=sets_in), excited
-        refuse_given({"--settle": settle}, "--excitation is an experiment, which takes no {}. Omit {}")
+        refuse_given({"settle": settle}, f"{setting('excitation')} is an experiment, which takes no {{}}. Omit {{}}")
         wave = experiment.played(n, bench.rate_hz, closed=bench.loop.closed)[:, 0]
         return _with_excitation(bench.simulate(wave, seed=seed), wave if log_excitation else None), Excited(
             kind="experiment", peak=float(np.max(np.abs(wave)))
         )
     if amplitude is None and bench.rig is not None and bench.rig.limits is None:
         raise AmbidError(
-            "no amplitude was given, and the rig has no limits to derive one from. Give --amplitude A in V"
+            f"no amplitude was given, and the rig has no limits to derive one from. Give {setting('amplitude', 'A')} "
+            "in V"
         )
     if isinstance(bench, RotorBench):
         if log_excitation:
-            raise AmbidError(_NO_LOG)
+            raise AmbidError(_no_log())
         kind, held = str(excitation or "zippered"), 1 if settle is None else settle
         shape, period = _of_axes(bench, kind, n, periods, axes, band, seed)
         trial = shape[: 2 * period]  # begins at rest: what it needs is no less than later
@@ -202,7 +203,7 @@ def simulate_used(
         done = bench.simulate(peak * np.vstack([before, shape]), seed=seed, settle=held * period)
         return done, Excited(kind=kind, peak=peak, unit=bench.model.units[bench.model.inputs[0]])
     if axes is not None or settle is not None:
-        raise AmbidError("--axes and --settle are for a rotor on many axes. Omit them")
+        raise AmbidError(f"{setting('axes')} and {setting('settle')} are for a rotor on many axes. Omit them")
     kind = str(excitation or "multisine")
     shape = _repeat(
         lambda part: make_excitation(kind, part, bench.rate_hz, amplitude=1.0, band=band, seed=seed), n, periods or 1
@@ -233,7 +234,9 @@ def _of_axes(
     known = bench.model.axes
     for axis in axes or ():
         if axis not in known:
-            raise AmbidError(f"--axes has {axis!r}; the rotor has {', '.join(known)}.{nearest(axis, known)} Correct it")
+            raise AmbidError(
+                f"{setting('axes')} has {axis!r}; the rotor has {', '.join(known)}.{nearest(axis, known)} Correct it"
+            )
     excited = [known.index(axis) for axis in axes or known]
     blocks = len(excited) if kind == "orthogonal" else 1
     if periods is None:
@@ -248,11 +251,15 @@ def _of_axes(
     return shape, period
 
 
+def _no_log() -> str:
+    return f"{setting('log_excitation')} is for one axis; a rotor's record has <axis>_reference. Omit it"
+
+
 def only_references(record: Record) -> Record:
     """Return the excitation of a rotor's record alone, to be played by its own controller."""
     kept = tuple(c for c in record.channels if c.name.endswith("_reference"))
     if not kept:
-        raise AmbidError("--excitation-only is for a rotor on many axes. Omit it")
+        raise AmbidError(f"{setting('excitation_only')} is for a rotor on many axes. Omit it")
     return replace(record, channels=kept)
 
 
@@ -286,7 +293,7 @@ def _bench(
     rate = source.rate_for(rate)
     if source.rotor is not None:
         if position is not None:
-            raise AmbidError("--position is for one axis. Omit it")
+            raise AmbidError(f"{setting('position')} is for one axis. Omit it")
         return RotorBench.of(source, rate, closed, nonlinear=nonlinear)
     return Bench.of(source, rate, closed, nonlinear=nonlinear)
 
@@ -315,12 +322,12 @@ def _rig_of_estimate(estimate: Estimate | NonlinearBearingEstimate) -> Rig:
     )  # fmt: skip
 
 
-def samples_of(duration: float, rate_hz: float, option: str = "--duration") -> int:
+def samples_of(duration: float, rate_hz: float, name: str = "duration") -> int:
     """Return the samples of a record, and refuse one that is none or does not fit into memory."""
     count = duration * rate_hz
     if not 1 <= count <= 1e8:
         raise AmbidError(
-            f"{option} {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
+            f"{setting(name)} {duration:g} s at {rate_hz:g} Hz is {count:g} samples; it must be 1 to 1e8. Correct one"
         )
     return round(count)
 
@@ -329,6 +336,7 @@ def _repeat(make: Callable[[int], Array], n: int, periods: int) -> Array:
     """Lay equal periods one behind the other."""
     if n % periods:
         raise AmbidError(
-            f"--periods {periods}: {n} samples do not divide into that many periods. Change --duration or --periods"
+            f"{setting('periods', periods)}: {n} samples do not divide into that many periods. Change "
+            f"{setting('duration')} or {setting('periods')}"
         )
     return np.tile(make(n // periods), periods)

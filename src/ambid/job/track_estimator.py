@@ -17,7 +17,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_order_names, io_data, order_per_input, single_order
 from ambid.blackbox.words import orders_of
-from ambid.errors import EstimationError, nearest, refuse_given
+from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, names_of
 from ambid.job.following import EstimatorWords, Following, Memory, tell
@@ -37,6 +37,7 @@ from ambid.recursive import (
 )
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine
 from ambid.rig import Rig, default_rig
+from ambid.settings.caller import refuse_given, setting
 
 REGRESSIONS = ("rls", "lms", "nlms", "iv")
 POLYNOMIALS = ("fir", "arx", "armax", "arma", "ararx", "ararmax", "oe", "bj")
@@ -78,19 +79,21 @@ def track_estimator(
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
     inputs, outputs, references = (names_of(settings.get(x)) for x in ("input", "output", "reference"))  # type: ignore[arg-type]
     orders = orders_of(settings.get("orders"))
-    refusal = f"--method {method} takes no {{}}. Omit it"
+    refusal = f"{setting('method', method)} takes no {{}}. Omit it"
     if method in JOINT:
-        columns = {"--input": inputs, "--output": outputs, "--reference": references, "--orders": orders}
+        columns = {"input": inputs, "output": outputs, "reference": references, "orders": orders}
         refuse_given(columns, refusal)
         made = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
-        refuse_given({"--rig": rig, "--start": start, "--start-seconds": start_s}, refusal)
+        refuse_given({"rig": rig, "start": start, "start_s": start_s}, refusal)
         whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"), layout=part.get("layout"))
         span = part.get("from_s"), part.get("to_s")
         used = whole if span == WHOLE else cut(whole, *span)
         data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
-            raise EstimationError(f"{method} tracks one output; {data.y.shape[1]} were named. Name one with --output")
+            raise EstimationError(
+                f"{method} tracks one output; {data.y.shape[1]} were named. Name one with {setting('output')}"
+            )
         made = _coefficients(method, data, orders, how.memory, settings.get("step"), used.start_s)
     label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
     return _follow(made, label, how)
@@ -104,15 +107,18 @@ def _coefficients(
     u, y, sizes = data.u, data.y, (np.ones(data.u.shape[1]), np.ones(1))
     estimator: Any
     if method in REGRESSIONS:
-        na, nb, nk = _arx_orders(f"--method {method}", data, orders)
+        na, nb, nk = _arx_orders(f"{setting('method', method)}", data, orders)
         u, y, sizes = _scale(method, data)
         estimator = _arx(method, (na, nb, nk), data, samples, step)
         label = f"arx na={na} nb={'/'.join(map(str, nb))} nk={'/'.join(map(str, nk))}"
     else:
         if step is not None or orders is None:
-            raise EstimationError(f"--method {method} needs --orders as numbers, and takes no --step. Correct that")
+            raise EstimationError(
+                f"{setting('method', method)} needs {setting('orders')} as numbers, and takes no {setting('step')}. "
+                "Correct that"
+            )
         if samples is not None and samples <= 1.0:
-            raise EstimationError(f"--memory {memory:g} s is not longer than one sample. Give a longer one")
+            raise EstimationError(f"{setting('memory')} {memory:g} s is not longer than one sample. Give a longer one")
         estimator = RecursivePolynomial(  # stores the first samples and fits them off-line
             method, orders, dt=data.dt, n_inputs=data.u.shape[1], open_loop=data.open_loop,
             forgetting=1.0 if samples is None else 1.0 - 1.0 / samples,
@@ -146,7 +152,7 @@ def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]
     if not all((size > 0).all() for size in sizes):
         raise EstimationError(
             f"{method}: a signal is constant in the first {first.stop * data.dt:.3g} s, which set its scale. Begin "
-            "where the signals move, with --from"
+            f"where the signals move, with {setting('from_s')}"
         )
     return (u - means[0]) / sizes[0], (y - means[1]) / sizes[1], sizes
 
@@ -156,7 +162,8 @@ def _arx_orders(who: str, data: IOData, orders: Orders | None) -> tuple[int, tup
     names = ("na", "nb", "nk")
     if orders is None or not data.inputs:
         raise EstimationError(
-            f"{who} needs --input, --output and --orders na=2,nb=2,nk=1 as numbers: none is chosen on-line. Give them"
+            f"{who} needs {setting('input')}, {setting('output')} and {setting('orders', 'na=2,nb=2,nk=1')} as "
+            "numbers: none is chosen on-line. Give them"
         )
     check_order_names(who, orders, names, names)
     nb, nk = (order_per_input(who, orders, name, least, data.n_inputs) for name, least in (("nb", 1), ("nk", 0)))
@@ -172,14 +179,17 @@ def _arx(
 ) -> RecursiveArx | RecursiveIvArx:
     na, nb, nk = orders
     if step is not None and method not in _STEP:
-        raise EstimationError(f"--method {method} takes no --step. Omit it")
+        raise EstimationError(f"{setting('method', method)} takes no {setting('step')}. Omit it")
     if memory is not None and method in _STEP:
-        raise EstimationError(f"--method {method} forgets by its --step and takes no --memory. Omit it")
+        raise EstimationError(
+            f"{setting('method', method)} forgets by its {setting('step')} and takes no {setting('memory')}. Omit it"
+        )
     if method == "iv":
         if len(nb) != 1 or not (data.references or data.open_loop):
             raise EstimationError(
-                "--method iv needs one input, and the loop's external excitation as instrument. Name it with "
-                "--reference, or give --open-loop if there is no feedback"
+                f"{setting('method')} iv needs one input, and the loop's external excitation as instrument. Name it "
+                "with "
+                f"{setting('reference')}, or give {setting('open_loop', True)} if there is no feedback"
             )
         instruments: Literal["reference", "auxiliary model"] = "reference" if data.references else "auxiliary model"
         return RecursiveIvArx(
@@ -198,8 +208,9 @@ def _bias(method: str, data: IOData, estimator: object) -> tuple[str, ...]:
     """Return what is doubtful before the first sample: bias under feedback, above all."""
     if method in ("rls", "lms", "nlms") and not data.open_loop:
         return (
-            f"{method} is biased by feedback and by coloured noise. Use armax, or iv with --reference, or give "
-            "--open-loop if there is no feedback",
+            f"{method} is biased by feedback and by coloured noise. Use armax, or iv with {setting('reference')}, or "
+            "give "
+            f"{setting('open_loop', True)} if there is no feedback",
         )
     return tuple(w for w in getattr(estimator, "warnings", ()) if "first window" not in w)
 

@@ -25,6 +25,7 @@ from ambid.rotor.likelihood import Experiment, Point, noise_weight
 from ambid.rotor.spectra import Excitation, find_excitation, period_spectra
 from ambid.rotor.synchronous import separate
 from ambid.rotor.unknowns import Unknowns
+from ambid.settings.caller import saved, setting
 from ambid.tracking.rotor_filter import Block, RotorFilter, State
 
 _START = 4  # periods from which a start is identified, where the record has three times as many
@@ -57,7 +58,8 @@ def track_rotor(
         if not _LEAST <= n < found.count:
             raise EstimationError(
                 f"the record has {found.count} whole periods of {found.period / bench.rate_hz:.4g} s, {n} of them for "
-                f"the start, which needs {_LEAST} and leaves some to track. Use a longer record, or give --start"
+                f"the start, which needs {_LEAST} and leaves some to track. Use a longer record, or give "
+                f"{setting('start')}"
             )
         estimate, first = identify_rotor([_periods(bench, found, 0, n)], rig, tick=say), n
     else:
@@ -157,7 +159,7 @@ def _given(start: object, rig: Rig, rate_hz: float, speed: float) -> RotorEstima
         start = load(start)
     if not isinstance(start, RotorEstimate):
         raise EstimationError(
-            "the start is no estimate of a rotor. Give what 'ambid identify --json' wrote for a rig with [bearings.X]"
+            f"the start is no estimate of a rotor. Give {saved('identify')} for a rig with [bearings.X]"
         )
     assert rig.rotor is not None
     model = rig.rotor.with_modes(start.n_modes).at_speed(speed)

@@ -20,6 +20,7 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
+from ambid.settings.caller import setting
 from ambid.tracking.blocks import Replay, blocks_of
 from ambid.tracking.guard import ABSURD
 from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
@@ -188,8 +189,8 @@ def start_of(
             numbers = _numbers(estimate, source)
         except (AttributeError, ArithmeticError, KeyError, TypeError, ValueError, IndexError) as error:
             raise EstimationError(
-                f"the start estimate is incomplete ({type(error).__name__}: {error}). Write it again with 'ambid "
-                "identify --json'"
+                f"the start estimate is incomplete ({type(error).__name__}: {error}). Write it again with "
+                f"'{command('identify', json=True)}'"
             ) from error
     failed = [c.detail for c in estimate.checks.values() if not c.passed and c.detail not in estimate.warnings]
     return Start(
@@ -262,7 +263,7 @@ def _read(path: object) -> Estimate:
     return read_linear_estimate(
         path,
         f"{path} holds a black-box fit or a nonlinear estimate; tracking starts from linear physical parameters."
-        " Give what 'ambid identify --json' wrote without --nonlinear",
+        f" Give {saved('identify')} without {setting('identify_nonlinear')}",
     )
 
 
@@ -280,7 +281,7 @@ def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
         if isinstance(x, bool) or not isinstance(x, (int, float)) or not math.isfinite(x):
             raise EstimationError(
                 f"the start estimate's operating_point.{role} is {x!r}; it must be a number. Write the estimate again"
-                " with 'ambid identify --json'"
+                f" with '{command('identify', json=True)}'"
             )
 
 

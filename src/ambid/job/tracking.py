@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.blackbox.data import Orders
-from ambid.errors import EstimationError, refuse_given
+from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, silent
@@ -34,6 +34,7 @@ from ambid.physics.linear_model import model
 from ambid.recursive.lines import Track, TrackHeader, TrackLine
 from ambid.rig import Rig, load_rig
 from ambid.rotor.estimate import RotorEstimate
+from ambid.settings.caller import refuse_given
 from ambid.tracking.blocks import Block, Frame, Stretch
 from ambid.tracking.engine import run
 from ambid.tracking.evidence import Samples
@@ -153,9 +154,9 @@ def track(
 
         refuse_given(
             {
-                "--method": method != "rpem" and method,
-                "--pace": how.pace != "fastest" and how.pace,
-                "--flag": how.flags,
+                "method": method != "rpem" and method,
+                "pace": how.pace != "fastest" and how.pace,
+                "flags": how.flags,
             },
             "{} is for one axis; a rotor is tracked from one period to the next. Omit it",
         )

@@ -16,6 +16,7 @@ from ambid.errors import AmbidError
 from ambid.estimation.estimate import EstimatedParameter, plain_json
 from ambid.recursive.lines import Track, is_vague
 from ambid.rig import Rig, rig_text
+from ambid.settings.caller import setting
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +134,7 @@ def entry_of(
     """
     name = " ".join(bearing.split())
     if not name:
-        raise AmbidError("the bearing has no name. Give --bearing NAME, or a name in the rig")
+        raise AmbidError(f"the bearing has no name. Give {setting('bearing', 'NAME')}, or a name in the rig")
     track = isinstance(result, Track)
     of = result.header if track else result
     about: Mapping[str, object] = getattr(of, "record", None) or (getattr(of, "records", None) or ({},))[0]
@@ -157,7 +158,7 @@ def _time_of(about: Mapping[str, object]) -> float:
     if not about.get("started"):
         raise AmbidError(
             f"{about.get('file') or 'the record'} does not say when it was taken, and the ledger has to know. Give "
-            "--taken-at TIME, or --taken-at file for the time of its file"
+            f"{setting('taken_at', 'TIME')}, or {setting('taken_at', 'file')} for the time of its file"
         )
     return moment(str(about["started"]), "the record's time")
 
@@ -221,13 +222,14 @@ def settings_text(job: str, **settings: object) -> str:
     return json.dumps({"job": job, **given}, sort_keys=True, default=str, separators=(",", ":"))
 
 
-def moment(text: str, option: str = "--taken-at") -> float:
+def moment(text: str, name: str = "taken_at") -> float:
     """Read a date, or a date and time, as ISO 8601 has it; without an offset it is UTC. Returns s since 1970, UTC."""
     try:
         found = datetime.fromisoformat(text)
     except ValueError:
         raise AmbidError(
-            f"{option} is {text!r:.40}; it must be a date and time such as 2026-03-01T14:30 (UTC, or with an offset). "
+            f"{setting(name)} is {text!r:.40}; it must be a date and time such as 2026-03-01T14:30 (UTC, or with an "
+            "offset). "
             "Correct it"
         ) from None
     return (found if found.tzinfo is not None else found.replace(tzinfo=UTC)).timestamp()

@@ -17,6 +17,7 @@ from ambid.errors import AmbidError, EstimationError, counted, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.ledger import schema
 from ambid.ledger.entry import Note
+from ambid.settings.caller import command
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -145,11 +146,9 @@ def history_of(c: Connection, bearing: str, shown: str) -> History:
     """Read the history of a bearing; `shown`: name of the ledger."""
     (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
     if not known:
+        listing = command("history", ledger=shown)
         names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
-        raise AmbidError(
-            f"ledger {shown} has no bearing {bearing!r}.{nearest(bearing, names)} 'ambid history --ledger {shown}' "
-            "lists them"
-        )
+        raise AmbidError(f"ledger {shown} has no bearing {bearing!r}.{nearest(bearing, names)} '{listing}' lists them")
     ((of, name, plant),) = known
     asked = ", ".join(KnownEstimate.__slots__)
     heads, events, rows = _rows(

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from ambid.errors import AmbidError
 from ambid.ledger import schema
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from sqlalchemy import Connection
@@ -29,12 +30,12 @@ def export(c: Connection, folder: Path) -> tuple[str, ...]:
         files = [folder / f"{name}.parquet" for name in _TABLES]
         for path in files:
             if path.exists() and _MADE not in (parquet.read_schema(path).metadata or {}):
-                raise AmbidError(f"--export {path} exists, and is not of a ledger. Choose another folder")
+                raise AmbidError(f"{setting('export', path)} exists, and is not of a ledger. Choose another folder")
         for name, path in zip(_TABLES, files, strict=True):
             _write(c, name, path)
     except (OSError, ValueError) as failure:
         words = getattr(failure, "strerror", None) or failure
-        raise AmbidError(f"--export {folder} cannot be written: {words}. Give another folder") from None
+        raise AmbidError(f"{setting('export', folder)} cannot be written: {words}. Give another folder") from None
     return tuple(path.name for path in files)
 
 

@@ -14,6 +14,7 @@ import numpy as np
 from ambid.errors import AmbidError, counted
 from ambid.ledger.history import History
 from ambid.ledger.monitor import Watched
+from ambid.settings.caller import setting
 
 PATIENCE_S = 10.0  # for which a broker may stay silent
 
@@ -36,7 +37,9 @@ def write_metrics(found: Watched, path: str | Path) -> None:
     try:
         from prometheus_client import CollectorRegistry, Gauge, generate_latest
     except ImportError:
-        raise AmbidError("prometheus-client is not installed, and --metrics needs it. Install ambid[metrics]") from None
+        raise AmbidError(
+            f"prometheus-client is not installed, and {setting('metrics')} needs it. Install ambid[metrics]"
+        ) from None
     kept = CollectorRegistry()
 
     def gauge(name: str, says: str, *labels: str) -> Any:
@@ -85,15 +88,19 @@ def publish(found: Watched, where: str) -> int:
         from paho.mqtt.client import Client, MQTTv5
         from paho.mqtt.enums import CallbackAPIVersion
     except ImportError:
-        raise AmbidError("paho-mqtt is not installed, and --mqtt needs it. Install ambid[mqtt]") from None
+        raise AmbidError(f"paho-mqtt is not installed, and {setting('mqtt')} needs it. Install ambid[mqtt]") from None
     if "@" in where:
-        raise AmbidError("--mqtt takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead")
+        raise AmbidError(
+            f"{setting('mqtt')} takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead"
+        )
     plain = where.removeprefix("mqtts://")
     address, _, topic = plain.removeprefix("mqtt://").partition("/")
     host, _, port = address.partition(":")
     secure = plain != where
     if not host or not topic.strip("/") or set(topic) & set("+#") or not (not port or port.isdigit()):
-        raise AmbidError(f"--mqtt is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it")
+        raise AmbidError(
+            f"{setting('mqtt')} is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it"
+        )
     said = Queue[str]()
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
     client.on_connect = lambda *given: said.put("" if not given[3].is_failure else str(given[3]))
@@ -106,7 +113,7 @@ def publish(found: Watched, where: str) -> int:
         client.loop_start()
         refused = said.get(timeout=PATIENCE_S)
         if refused:
-            raise AmbidError(f"--mqtt {where}: {refused}. Check user and password")
+            raise AmbidError(f"{setting('mqtt', where)}: {refused}. Check user and password")
         sent = [
             client.publish(f"{topic.strip('/')}/{_plain(h.bearing)}", _message(found, h), qos=1, retain=True)
             for h in found.used or ()
@@ -115,11 +122,13 @@ def publish(found: Watched, where: str) -> int:
             message.wait_for_publish(PATIENCE_S)
         lost = sum(not message.is_published() for message in sent)
         if lost:
-            raise AmbidError(f"--mqtt {where}: the broker did not confirm {counted(lost, 'message')}. Check it")
+            raise AmbidError(
+                f"{setting('mqtt', where)}: the broker did not confirm {counted(lost, 'message')}. Check it"
+            )
     except Empty:
-        raise AmbidError(f"--mqtt {where}: the broker was silent for {PATIENCE_S:.0f} s. Check it") from None
+        raise AmbidError(f"{setting('mqtt', where)}: the broker was silent for {PATIENCE_S:.0f} s. Check it") from None
     except (OSError, ValueError, RuntimeError) as failure:
-        raise AmbidError(f"--mqtt {where}: {failure}. Check broker, user and network") from None
+        raise AmbidError(f"{setting('mqtt', where)}: {failure}. Check broker, user and network") from None
     finally:
         client.disconnect()
         client.loop_stop()

@@ -22,6 +22,7 @@ from ambid.estimation.uncertainty import sandwich
 from ambid.nonlinear.fit import Attempt, NonlinearFit
 from ambid.nonlinear.lagged import LaggedFunction, LaggedModel, Mask, Rows
 from ambid.nonlinear.records import Parts, Scaled, cloud_of
+from ambid.settings.caller import setting
 
 _BLOCK = 4096
 _LEAST = 1e-7  # standard deviation of errors, scaled
@@ -473,7 +474,8 @@ def finish(
     if not noise and records[0].n_inputs and not all(x.open_loop for x in records):
         draft.warnings.append(
             f"{draft.structure} has no noise model: trained on {'simulation' if draft.free else 'one-step errors'}, it "
-            f"is biased by feedback unless its errors are white. {instead}, or give --open-loop if the records are "
+            f"is biased by feedback unless its errors are white. {instead}, or give {setting('open_loop', True)} if "
+            "the records are "
             "open loop"
         )
     robust = how == "sandwich" or (draft.free and how == "auto")

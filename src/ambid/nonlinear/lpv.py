@@ -41,6 +41,7 @@ from ambid.nonlinear.lpv_model import (
     regressors,
 )
 from ambid.nonlinear.records import Scaled, cloud_of, scaled_records
+from ambid.settings.caller import setting
 
 DIVERGED = "no finite one-step predictor was found; lower degree, order or error_order, or check the columns"
 UNSTABLE = (
@@ -615,13 +616,12 @@ def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[st
 
 
 def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
-    found = []
-    of = fitting.shape
+    found, of = list[str](), fitting.shape
     if of.columns and not (of.ar or of.ma) and not all(x.open_loop for x in records):
         what = "noise is white" if of.form == "output" else "equation errors are white"
         found.append(
             f"without an error model (error_order = 0) lpv is biased by feedback unless its {what}. Raise "
-            "error_order, or give --open-loop if the records are open loop"
+            f"error_order, or give {setting('open_loop', True)} if the records are open loop"
         )
     if not of.columns and records[0].n_inputs:
         found.append(

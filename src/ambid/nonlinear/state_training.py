@@ -22,6 +22,7 @@ from ambid.nonlinear.fit import Attempt, LearningCurve, NonlinearFit
 from ambid.nonlinear.lagged_problem import sandwich_at
 from ambid.nonlinear.records import Scaled, cloud_of
 from ambid.nonlinear.state_network import Layout, StateNetwork, StateProblem, largest_pole
+from ambid.settings.caller import setting
 
 _ROUNDS = 3  # of weighting: the errors' covariance is known only afterwards
 _SHARES = (0.0, 0.6, 0.85, 1.0)  # of the time that is over before each round
@@ -417,7 +418,8 @@ def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
     if records[0].n_inputs and not all(x.open_loop for x in records) and not state.layout.gain:
         way_out = "" if state.layout.sensor else "give noise = innovations, or "
         fitting.warnings.append(
-            f"trained on simulation errors, nn is biased by feedback: {way_out}give --open-loop if the records are "
+            f"trained on simulation errors, nn is biased by feedback: {way_out}give {setting('open_loop', True)} if "
+            "the records are "
             "open loop"
         )
     with fitting.stage("standard deviations"):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from ambid.errors import RecordError, UnitError
 from ambid.record.record import utf8_text
+from ambid.settings.caller import setting
 from ambid.units import parse_unit
 
 _WORDS = {
@@ -151,7 +152,7 @@ def _names_and_units(
             return above[-2], list(texts)
         raise RecordError(
             f"{path}: rows {above[-2] + 1} and {above[-1] + 1} may both hold the names. Say whether the second holds "
-            "units: --layout units=row, or units=none"
+            f"units: {setting('layout', 'units=row')}, or {setting('layout', 'units=none')}"
         )
     return above[-1], None
 
@@ -178,7 +179,7 @@ def _in_parentheses(
         doubtful = next(x for x in units if x is not None and not _is_unit(x))
         raise RecordError(
             f"{path}, row {header + 1}: ({doubtful}) is no known unit, others in parentheses are. Say whether "
-            "they are units: --layout units=parentheses, or units=none"
+            f"they are units: {setting('layout', 'units=parentheses')}, or {setting('layout', 'units=none')}"
         )
     return [x if m is None else m["name"] for x, m in zip(cells, found, strict=True)], units
 
@@ -213,7 +214,7 @@ def _plain_numbers(
                     raise RecordError(
                         f"{path}, row {k + 1}: {cell!r} is not a number with decimal {decimal!r}"
                         f"{f' and thousands {thousands!r}' if thousands else ''}, as others are. Correct it, or give "
-                        "--layout decimal=… thousands=…"
+                        f"{setting('layout', 'decimal=… thousands=…')}"
                     )
                 cells[j] = re.sub(group, "", cell).replace(decimal, ".")
         body.append(delimiter.join(cells) if lines[k].strip() else lines[k])
@@ -239,7 +240,10 @@ def _marks(
         if decimal == "," and thousands:
             break
     if doubt and decimal is None and thousands is None:
-        raise RecordError(f"{doubt}; no number of the file decides. Give --layout decimal=comma, or thousands=comma")
+        raise RecordError(
+            f"{doubt}; no number of the file decides. Give {setting('layout', 'decimal=comma')}, or "
+            f"{setting('layout', 'thousands=comma')}"
+        )
     return decimal or ".", thousands
 
 

@@ -30,6 +30,7 @@ from ambid.record.sampling import (
     seconds,
     uniform_record,
 )
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
 _REFUSED_IN_NAMES = set(',;\t\n[]"#')
@@ -297,7 +298,10 @@ def _faulty_cell(text: str, gaps: GapPolicy) -> str:
     if gaps != "error":
         return ""
     what = f"{text!r} is not a finite number" if text else "the value is missing"
-    return f"{what}; every cell must be one. Correct it, or give --gaps interpolate or --gaps cut"
+    return (
+        f"{what}; every cell must be one. Correct it, or give {setting('gaps', 'interpolate')} or "
+        f"{setting('gaps', 'cut')}"
+    )
 
 
 def _ragged(line: str, got: int, wanted: int, delimiter: str) -> str:

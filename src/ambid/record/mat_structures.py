@@ -21,6 +21,7 @@ from ambid.record.frames import label_of
 from ambid.record.record import Record
 from ambid.record.sampling import TIME_NAMES, GapPolicy
 from ambid.record.streams import Stream, chosen_group, record_of
+from ambid.settings.caller import setting
 from ambid.units import parse_unit
 
 _LONE = "signals"  # group of the structures that hold one signal each
@@ -108,7 +109,8 @@ def read_structures(
         if not np.array_equal(clocks[0].time, other.time) or clocks[0].time_unit != other.time_unit:  # type: ignore[arg-type]
             raise RecordError(
                 f"record {path}: {clocks[0].name!r} and {other.name!r} have different times ({_span(clocks[0])}, "
-                f"{_span(other)}); all must have the same. Choose some: --layout channels={clocks[0].name},…"
+                f"{_span(other)}); all must have the same. Choose some: "
+                f"{setting('layout', f'channels={clocks[0].name},…')}"
             )
     if clocks:
         time = np.asarray(clocks[0].time, dtype=np.float64)
@@ -130,15 +132,16 @@ def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
     if len(set(said.values())) > 1:
         listed = ", ".join(f"{field} says [{text}]" for field, text in said.items())
         raise RecordError(
-            f"record {path}: signal {signal.name!r} has several units ({listed}). Say which field to believe: --layout "
-            f"units={next(iter(said))}, or units=none"
+            f"record {path}: signal {signal.name!r} has several units ({listed}). Say which field to believe: "
+            f"{setting('layout', f'units={next(iter(said))}')}, or {setting('layout', 'units=none')}"
         )
     values, unit = signal.values, next(iter(said.values()), "")
     if signal.factor != (1.0, 0.0):
         if layout.get("values") not in ("si", "label"):
             raise RecordError(
                 f"record {path}: signal {signal.name!r} is in [{unit}] with a unit transformation (factor "
-                f"{signal.factor[0]:g}, offset {signal.factor[1]:g}). Say what values are in: --layout values=si, or"
+                f"{signal.factor[0]:g}, offset {signal.factor[1]:g}). Say what values are in: "
+                f"{setting('layout', 'values=si')}, or"
                 f" values=label for [{unit}]"
             )
         if layout["values"] == "si":

@@ -25,7 +25,8 @@ import numpy as np
 from numpy.lib.mixins import NDArrayOperatorsMixin
 
 from ambid.arrays import Array
-from ambid.errors import LARGEST, AmbidError, RecordError, nearest
+from ambid.errors import AmbidError, RecordError, nearest
+from ambid.settings.caller import LARGEST, setting
 
 if TYPE_CHECKING:
     import pandas
@@ -375,7 +376,7 @@ def check_rate(rate_hz: object) -> float:
         return float(rate_hz)
     raise RecordError(
         f"the sampling rate given is {rate_hz!r}; it must be a positive number of Hz, up to {LARGEST:g}. Correct "
-        "rate_hz (--rate)"
+        f"{setting('rate_hz')}"
     )
 
 
@@ -461,7 +462,7 @@ def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, wh
     except UnicodeDecodeError as failure:
         row = data.count(b"\n", 0, failure.start) + 1
         byte = data[failure.start]
-        told = ", or give --layout encoding=latin-1" if what == "record" else ""
+        told = f", or give {setting('layout', 'encoding=latin-1')}" if what == "record" else ""
         raise error(
             f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8{told}"
         ) from None

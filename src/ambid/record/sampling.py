@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import RecordError, UnitError, counted
 from ambid.record.record import Channel, Record, Step, check_rate
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN, nearest_unit, parse_unit
 
 GapPolicy = Literal["error", "interpolate", "cut"]
@@ -95,7 +96,9 @@ def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) 
 def agreed_rate(where: str, found_hz: float, rate_hz: float | None) -> float:
     """Return the rate that a source says in Hz, unless another one was given."""
     if rate_hz is not None and not abs(check_rate(rate_hz) / found_hz - 1) <= JITTER:
-        raise RecordError(f"{where} was sampled at {found_hz:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz. Omit it")
+        raise RecordError(
+            f"{where} was sampled at {found_hz:g} Hz but {setting('rate_hz')} says {rate_hz:g} Hz. Omit it"
+        )
     return found_hz
 
 
@@ -162,8 +165,8 @@ def refuse_gaps(table: Table) -> None:
     row, j = np.argwhere(~np.isfinite(table.values))[0]
     raise RecordError(
         f"{table.where}, row {table.first_row + row}, column {table.names[j]!r}: {table.values[row, j]} is not a"
-        " finite number; every value must be one. Correct it, or give --gaps interpolate or"
-        " --gaps cut"
+        f" finite number; every value must be one. Correct it, or give {setting('gaps', 'interpolate')} or"
+        f" {setting('gaps', 'cut')}"
     )
 
 
@@ -212,7 +215,7 @@ def _check_rate(table: Table, rate_hz: float | None) -> None:
     if table.time is None and rate_hz is None:
         raise RecordError(
             f"{table.where} has no column 'time [s]' (columns: {', '.join(table.names)}) and no rate is given."
-            " Add the column, or give rate_hz (--rate)"
+            f" Add the column, or give {setting('rate_hz')}"
         )
 
 
@@ -221,7 +224,7 @@ def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
     found = float(f"{found_hz:.10g}")  # stamps carry no more than 10 digits of a rate
     if rate_hz is not None and abs(rate_hz / found - 1) > JITTER:
         raise RecordError(
-            f"{table.where}: its time column says {found:g} Hz but rate_hz (--rate) says {rate_hz:g} Hz; they must "
+            f"{table.where}: its time column says {found:g} Hz but {setting('rate_hz')} says {rate_hz:g} Hz; they must "
             "agree. Give one of them only"
         )
     return found
@@ -266,7 +269,8 @@ def _check_uniform(time: Array, where: str, name: str, first_row: int | None) ->
             k,
             f"advances by {steps[k - 1] / period:.4g} samples instead of 1 within 1 %",
             "Uniform sampling is required: print time with more digits, resample before, treat drop-outs with"
-            " --gaps interpolate or --gaps cut, or remove the time column and give rate_hz (--rate)",
+            f" {setting('gaps', 'interpolate')} or {setting('gaps', 'cut')}, or remove the time column and give "
+            f"{setting('rate_hz')}",
         )
 
 
@@ -311,7 +315,7 @@ def _interpolated(table: Table, steps: list[Step]) -> Array:
             end = "first" if missing[0] else "last"
             raise RecordError(
                 f"{table.where}, column {name!r}: the {end} value is missing; interpolation needs one on both"
-                " sides. Remove the rows at that end, or use --gaps cut"
+                f" sides. Remove the rows at that end, or use {setting('gaps', 'cut')}"
             )
         at = np.arange(values.shape[0])
         filled[missing, j] = np.interp(at[missing], at[~missing], values[~missing, j])
@@ -341,13 +345,13 @@ def _with_skipped_rows(table: Table, steps: list[Step]) -> Array:
         k = int(np.argmax(wrong))
         raise RecordError(
             f"{table.where}, row {table.first_row + k + 1}: time jumps by {advance[k]:.4g} samples, not by a whole"
-            " number: samples cannot be inserted. Use --gaps cut, or resample before"
+            f" number: samples cannot be inserted. Use {setting('gaps', 'cut')}, or resample before"
         )
     n_new = int(whole[skips].sum()) - int(skips.sum())
     if n_new > time.size:
         raise RecordError(
             f"{table.where}: time skips {n_new} samples but only {time.size} were recorded; that is too much to"
-            " interpolate. Use --gaps cut"
+            f" interpolate. Use {setting('gaps', 'cut')}"
         )
     at = np.concatenate([[0], np.cumsum(np.where(skips, whole, 1))]).astype(np.int64)
     values = np.full((int(at[-1]) + 1, table.values.shape[1]), np.nan)

@@ -20,6 +20,7 @@ from ambid.errors import RecordError, UnitError, nearest
 from ambid.record.frames import numbers
 from ambid.record.record import Channel, Record, Step, readable
 from ambid.record.sampling import TIME_NAMES, GapPolicy, Table, agreed_rate, refuse_gaps, sample_uniformly, seconds
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN, Unit, parse_unit
 
 PIECE = 1 << 18  # samples that are read at once
@@ -83,7 +84,8 @@ def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | 
             for group, names in list(groups.items())[:8]
         )
         raise RecordError(
-            f"record {path} has {len(groups)} groups ({listed}). Say which: --layout group={next(iter(groups))!r}, or "
+            f"record {path} has {len(groups)} groups ({listed}). Say which: "
+            f"{setting('layout', f'group={next(iter(groups))!r}')}, or "
             "record.layout in the rig"
         )
     if wanted is not None and wanted not in groups:
@@ -108,8 +110,8 @@ def record_of(
         if len(set(of.values())) > 1:
             listed = ", ".join(f"{name} {text}" for name, text in list(of.items())[:8])
             raise RecordError(
-                f"record {path}: channels differ in {what} ({listed}); all must have the same. Choose some: --layout "
-                f"channels={streams[0].name},…"
+                f"record {path}: channels differ in {what} ({listed}); all must have the same. Choose some: "
+                f"{setting('layout', f'channels={streams[0].name},…')}"
             )
     n = streams[0].size
     refuse_claim(path, n, len(streams), path.stat().st_size)
@@ -177,7 +179,9 @@ def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) ->
     clocks = [s.name for s in found if s.time]
     if not found or len(clocks) > 1:
         what = f"two time columns ({', '.join(clocks)})" if clocks else "no channel of numbers"
-        raise RecordError(f"record {path} has {what}; it needs one time, and a channel. Choose: --layout channels=…")
+        raise RecordError(
+            f"record {path} has {what}; it needs one time, and a channel. Choose: {setting('layout', 'channels=…')}"
+        )
     return found
 
 

@@ -14,6 +14,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.physics.linear_model import model_names
+from ambid.settings.caller import setting
 
 _VAGUE = 0.25  # relative standard deviation above which data do not show a parameter
 
@@ -181,7 +182,10 @@ class Track(Result):
     def reasons(self) -> tuple[Reason, ...]:
         """What is wrong at its end: values that the data contradict are not to be used."""
         if not self.lines:
-            text = "the record ends before the first reporting interval. Use a longer one, or a shorter --every"
+            text = (
+                "the record ends before the first reporting interval. Use a longer one, or a shorter "
+                f"{setting('every_s')}"
+            )
             return (Reason(check="lines", text=text, grave=True),)
         last, header, found = self.lines[-1], self.header, list[Reason]()
         if not self.totals.samples:

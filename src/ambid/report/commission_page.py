@@ -11,16 +11,13 @@ from typing import TYPE_CHECKING
 from ambid.estimation.estimate import fields_json
 from ambid.report.drawing import single
 from ambid.report.page import Page, Section
+from ambid.settings.caller import command
 
 if TYPE_CHECKING:
     from ambid.report.commission_figures import Picture
     from ambid.report.page import Cell
 
 _NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
-_STILL = (
-    "Signals of this page stand still. The record's own page, in which they are zoomed down to the samples, is written "
-    "in this folder by: ambid identify record.h5 --rig rig.toml --report record.html"
-)
 _SEEN = frozenset({"pictures", "text"})  # of the page, not of the file
 
 
@@ -46,6 +43,14 @@ class Step:
         return {**fields_json(self, without=tuple(_SEEN)), "passed": self.passed}
 
 
+def _still() -> str:
+    own_page = command("identify", "record.h5", rig="rig.toml", report="record.html")
+    return (
+        "Signals of this page stand still. The record's own page, in which they are zoomed down to the samples, is "
+        f"written in this folder by: {own_page}"
+    )
+
+
 def commission_page(
     title: str,
     steps: Sequence[Step],
@@ -61,7 +66,7 @@ def commission_page(
     `names`: of all steps in their order; `more`: by step, sections that follow its own; `rig`: its text.
     """
     recorded = any(step.name == "record" for step in steps)
-    sections = [Section(title="Steps", tables=[_overview(steps, names)], note=_STILL if recorded else "")]
+    sections = [Section(title="Steps", tables=[_overview(steps, names)], note=_still() if recorded else "")]
     for step in steps:
         sections.append(_section(step, f"{names.index(step.name) + 1}. {step.name}"))
         sections += [

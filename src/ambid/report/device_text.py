@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from ambid.errors import counted
 from ambid.report.text import WIDTH, Paint, Style, columns, hanging, joined, plain
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from ambid.acquisition.device import Counters
@@ -18,28 +19,33 @@ if TYPE_CHECKING:
 
 _SHOWN = ("position", "current")  # roles whose signal-to-noise ratio is worth a place on the line
 _ORDERED = ("voltage", "excitation", "reference")  # what the controller orders is known, and has no noise
-_NEXT = {
-    "self-test": "correct what the self-test names; the output was never switched on",
-    "rest": "correct sensors, wiring or calibrations; the output was never switched on",
-    "polarity": "correct what is reversed, at the bench or in the rig; the rotor was not lifted",
-    "levitate": "correct the bench, or [loop], [daq.trip] and the calibrations of the rig",
-    "excite": "give a smaller --amplitude or another --band, or correct the bench",
-    "record": "remove what disturbed the record; {folder}/record.h5 holds what was recorded",
-    "identify": (
-        "record longer (--seconds), excite more (--amplitude) or in a wider --band, or correct the rig; the last line"
-        " here tries a corrected rig without the bench"
-    ),
-    "validate": (
-        "look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
-        "what changed between the two"
-    ),
-    "load": (
-        "the controller kept levitating with the loop before; look at {folder}/design.json, or commission without "
-        "--redesign"
-    ),
-    "track": "look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when",
-}
-"""What to do after a step that was not good enough."""
+
+
+def _next(step: str, folder: object) -> str:
+    """Say what to do after a step that was not good enough."""
+    return {
+        "self-test": "correct what the self-test names; the output was never switched on",
+        "rest": "correct sensors, wiring or calibrations; the output was never switched on",
+        "polarity": "correct what is reversed, at the bench or in the rig; the rotor was not lifted",
+        "levitate": "correct the bench, or [loop], [daq.trip] and the calibrations of the rig",
+        "excite": f"give a smaller {setting('amplitude')} or another {setting('band')}, or correct the bench",
+        "record": f"remove what disturbed the record; {folder}/record.h5 holds what was recorded",
+        "identify": (
+            f"record longer ({setting('seconds')}), excite more ({setting('amplitude')}) or in a wider "
+            f"{setting('band')}, or correct the rig; the last line here tries a corrected rig without the bench"
+        ),
+        "validate": (
+            f"look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
+            "what changed between the two"
+        ),
+        "load": (
+            f"the controller kept levitating with the loop before; look at {folder}/design.json, or commission without "
+            f"{setting('redesign')}"
+        ),
+        "track": (
+            f"look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when"
+        ),
+    }.get(step, "see the reason above")
 
 
 def progress_line(q: QualityReport, counters: Counters) -> str:
@@ -97,7 +103,7 @@ def _line_words(run: RunReport, counters: Counters) -> str:
         f"{counted(counters.overruns, 'block')} overrun"
     )
     if run.lost:
-        words += "; read it with --gaps"
+        words += f"; read it with {setting('gaps')}"
     busy = counters.controller.get("busy_us")
     if busy is not None:
         words += f"; longest controller tick {busy:.0f} us"
@@ -172,8 +178,7 @@ def next_text(
         said = [
             f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found,"
             f" {folder}/report.html shows it.",
-            f"Next: {_NEXT.get(step, 'see the reason above').format(folder=folder)}."
-            " Then commission again, into another folder.",
+            f"Next: {_next(step, folder)}. Then commission again, into another folder.",
         ]
     lines = [line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False)]
     return "\n".join([*lines, *([f"  {command}"] if command else [])])

@@ -37,6 +37,7 @@ from ambid.report.text import (
     warning_lines,
     wrapped,
 )
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 from ambid.validation.sensitivity import SensitivityAnalysis
 
@@ -140,7 +141,7 @@ def coefficient_lines(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[
         right = [*rows[half:], ("", "")][:half]
         table = [(*a, *b) for a, b in zip([head, *rows[:half]], [head, *right], strict=True)]
     rest = 0 if named else free.size - len(rows)
-    return [*columns(table), *([f"… and {rest} more; --json has them all"] if rest else [])]
+    return [*columns(table), *([f"… and {rest} more; {setting('json')} has them all"] if rest else [])]
 
 
 def pole_lines(fit: BlackBoxFit, *, paint: Paint = plain) -> list[str]:
@@ -181,9 +182,9 @@ def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
     if fit.sd is not None:
         known = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
     elif "uncertainty" in fit.settings:
-        known += " (--orders uncertainty=... gives them)"
-    size = fit.model.theta.size
-    lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{'' if shown else '; --json has them all'}"]
+        known += f" ({setting('orders', 'uncertainty=...')} gives them)"
+    size, rest = fit.model.theta.size, "" if shown else f"; {setting('json')} has them all"
+    lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{rest}"]
     effective = fit.details.get("effective_parameters")
     if isinstance(effective, (int, float)) and math.isfinite(effective) and round(effective, 1) < fit.n_estimated:
         lines.append(f"regularised to {effective:.3g} effective parameters")
@@ -215,8 +216,8 @@ def term_lines(fit: NonlinearFit) -> list[str]:
     if any(isinstance(x, (int, float)) for x in ratio.values()):
         shares = ["ERR", *(_percent(ratio.get(fit.model.names[k])) for k in named[:_TERMS])]
         rows = [(*r, x) for r, x in zip(rows, shares, strict=True)]
-    more = [f"… and {rest} more; --json has them all"] if rest else []
-    beside = [f"and a network of {weights} weights; --json has them"] if weights else []
+    more = [f"… and {rest} more; {setting('json')} has them all"] if rest else []
+    beside = [f"and a network of {weights} weights; {setting('json')} has them"] if weights else []
     return [*columns(rows, right=(2,)), *more, *beside]
 
 
@@ -292,7 +293,7 @@ def curve_lines(curves: Sequence[LearningCurve]) -> list[str]:
     between, half = len(lines) - _TRAININGS, _TRAININGS // 2
     if between <= 0:
         return lines
-    return [*lines[:half], f"… {between} more trainings; --json has them", *lines[-half:]]
+    return [*lines[:half], f"… {between} more trainings; {setting('json')} has them", *lines[-half:]]
 
 
 def curve_line(curve: LearningCurve) -> str:

@@ -11,6 +11,7 @@ from ambid.errors import counted
 from ambid.report.drawing import BOUND, MEASURED, Block, head, panel, said_panel, stacked
 from ambid.report.numbers import prefixed, sized
 from ambid.report.text import WIDTH, WORDS, Paint, columns, joined, plain, wrapped
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -53,7 +54,7 @@ def _failures(found: FleetRun, width: int, paint: Paint) -> list[str]:
         names = ", ".join(records[:_SHOWN]) + (f" and {len(records) - _SHOWN} more" if len(records) > _SHOWN else "")
         lines += wrapped([f"{len(records)} x {reason}", f"    {names}"], width, "    ")
     more = len(reasons) - _REASONS
-    return lines + ([f"and {counted(more, 'reason')} more; --json has them all"] if more > 0 else [])
+    return lines + ([f"and {counted(more, 'reason')} more; {setting('json')} has them all"] if more > 0 else [])
 
 
 def _values(found: FleetRun, name: str) -> tuple[list[int], list[float], list[float]]:

@@ -13,6 +13,7 @@ from ambid.ledger.history import History, Series
 from ambid.ledger.store import Failure, KnownBearing
 from ambid.report.numbers import quantity
 from ambid.report.text import WIDTH, Paint, columns, hanging, joined, plain
+from ambid.settings.caller import setting
 
 _SHOWN = 12  # events, and failures
 
@@ -44,7 +45,7 @@ def history_text(found: History, *, width: int = WIDTH, paint: Paint = plain) ->
         who = f"{e.parameter}: " if e.parameter else ""
         events += hanging(f"{day(e.at)}  {e.kind}  ", who + e.text, width, 4, first=len(e.kind) + 20)
     rest = len(found.events) - _SHOWN
-    more = [f"{counted(rest, 'earlier event')} in --json"] if rest > 0 else []
+    more = [f"{counted(rest, 'earlier event')} in {setting('json')}"] if rest > 0 else []
     return joined([head, columns(rows), [*([paint("events", "strong")] if events else []), *more, *events]])
 
 

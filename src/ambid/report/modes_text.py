@@ -20,6 +20,7 @@ from ambid.report.text import (
     title_line,
     warning_lines,
 )
+from ambid.settings.caller import setting
 
 _OUTPUTS = 8  # whose shape a terminal shows
 _FIELDS = {"frequency": "frequency_hz", "damping": "damping"}
@@ -82,7 +83,7 @@ def shape_lines(modes: Sequence[Mode], outputs: Sequence[str], width: int) -> li
         part = [(row[0], *row[1 + begin : 1 + begin + most]) for row in rows]
         lines += columns(part, right=right[: len(part[0]) - 1])
     rest = len(outputs) - len(names)
-    return [*lines, *([f"… and {rest} outputs more; --json has them all"] if rest > 0 else [])]
+    return [*lines, *([f"… and {rest} outputs more; {setting('json')} has them all"] if rest > 0 else [])]
 
 
 def _cell(x: complex) -> str:

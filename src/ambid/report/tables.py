@@ -10,6 +10,7 @@ import numpy as np
 from ambid.errors import counted
 from ambid.report.numbers import prefixed
 from ambid.report.text import WIDTH, Paint, columns, fraction, joined, plain, pure, wrapped
+from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
@@ -117,7 +118,7 @@ def sensitivity_text(found: SensitivityAnalysis, *, width: int = WIDTH, paint: P
         for x in found.influences[:_SHOWN]
     ]
     rest = len(found.influences) - _SHOWN
-    more = [f"… and {rest} more of less effect; --json has them all"] if rest > 0 else []
+    more = [f"… and {rest} more of less effect; {setting('json')} has them all"] if rest > 0 else []
     index = "infinite" if not np.isfinite(found.collinearity) else f"{found.collinearity:.3g}"
     pairs = "; ".join(f"{a} with {b} ({r:+.3f})" for a, b, r in found.pairs[:6]) or "none above 0.9"
     weakest = ", ".join(f"{name} {100 * part:+.3g} %" for name, part in found.weakest)

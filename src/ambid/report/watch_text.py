@@ -12,6 +12,7 @@ from ambid.report.drawing import BOUND, ORANGE, Block, head, panel, said_panel, 
 from ambid.report.history_figures import dates, draw_parameter
 from ambid.report.history_text import day, percent
 from ambid.report.text import WIDTH, Paint, columns, hanging, joined, plain
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -37,7 +38,7 @@ def watch_text(found: Watched, *, width: int = WIDTH, paint: Paint = plain) -> s
             head_lines,
             [paint("alarms", "strong"), *alarms] if alarms else ["no alarm"],
             [paint("what moved", "strong"), *columns(rows, right=())] if rows else [],
-            [f"{counted(rest, 'more')} in --json"] if rest > 0 else [],
+            [f"{counted(rest, 'more')} in {setting('json')}"] if rest > 0 else [],
             [f"{counted(still, 'parameter')} without a change"] if still else [],
         ]
     )

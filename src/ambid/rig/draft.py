@@ -9,6 +9,7 @@ from ambid.physics.linear_model import LinearModel, model
 from ambid.record.record import Channel, Record
 from ambid.rig.rig import OPTIONAL_ROLES, layout_line, role_units, toml_text
 from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
+from ambid.settings.caller import command, setting
 from ambid.units import UNKNOWN, parse_unit
 
 
@@ -36,7 +37,8 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
     plant = model("coil" if coil and (held or not ranked["position"]) else "one-axis")
     name = record.provenance.get("file", "a record")
     lines = [
-        f"# Guessed from {name}: check every line marked CHECK, then run: ambid identify {name} --rig <this file>",
+        f"# Guessed from {name}: check every line marked CHECK, then run: "
+        f"{command('identify', name, rig='<this file>')}",
         'schema = "ambid.rig/1"',
         f"name   = {toml_text(f'bench of {name}')}",
         f'model  = "{plant.name}"'
@@ -83,7 +85,8 @@ def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
     """Guess the rig of a rotor on many axes: two axes a bearing; without its planes, to be measured, it is refused."""
     name = record.provenance.get("file", "a record")
     lines = [
-        f"# Guessed from {name}: complete every line marked CHECK, then run: ambid identify {name} --rig <this file>",
+        f"# Guessed from {name}: complete every line marked CHECK, then run: "
+        f"{command('identify', name, rig='<this file>')}",
         'schema = "ambid.rig/1"', f"name   = {toml_text(f'bench of {name}')}", 'model  = "rotor"',
         *([] if _turning(record) else ['# speed = { value = 3000, unit = "rpm" }   # 0 unless given']), "",
         "# Two axes a bearing, planes x and y, bearings in their order along the shaft; axial = true for an axial one.",
@@ -157,7 +160,8 @@ def _parameter_lines(plant: LinearModel) -> list[str]:
 def _magnet_lines() -> list[str]:
     return [
         "",
-        "# [magnet]            # one magnet that carries the weight is checked against it; and for --nonlinear",
+        "# [magnet]            # one magnet that carries the weight is checked against it; and for "
+        f"{setting('identify_nonlinear')}",
         '# kind = "single"     # or "pair"; default: a pair where the current changes its sign',
         "# [magnet.parameters] # 'ambid models' lists them",
         '# g = { value = 9.81, unit = "m/s^2", role = "fixed" }',

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest, path_of
+from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
 from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
@@ -34,6 +34,7 @@ from ambid.rig.rig import (
 )
 from ambid.rig.rotor import modes_of, planes_of, rotor_of, speed_of, turning_of
 from ambid.rig.shaft import shaft_of
+from ambid.settings.caller import path_of
 from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:

@@ -21,6 +21,7 @@ from ambid.physics.shaft import Shaft
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
 from ambid.rig.shaft import shaft_lines
+from ambid.settings.caller import setting
 
 TRIP_SHARE = 0.9
 """Share of ``loop.limits.position`` in which the controller holds the rotor, unless ``[daq.trip]`` says otherwise."""
@@ -183,10 +184,10 @@ class RigMagnet:
             "eddy = false": () if self.eddy else ("a",),
         }
         for p in self.parameters:
-            for setting, names in excluded.items():
+            for entry, names in excluded.items():
                 if p.name in names:  # it would be passed over in silence
                     raise RigError(
-                        f"magnet.parameters.{p.name} is given, but magnet.{setting} leaves it out. Remove one,"
+                        f"magnet.parameters.{p.name} is given, but magnet.{entry} leaves it out. Remove one,"
                         " or correct it"
                     )
 
@@ -299,7 +300,8 @@ class Rig:
         """
         if (rate := self.rate_hz if rate_hz is None else rate_hz) is None:
             raise RigError(
-                f"rig {self.source or self.name} gives no rate; a simulation needs one. Give --rate HZ (rate_hz), or "
+                f"rig {self.source or self.name} gives no rate; a simulation needs one. Give "
+                f"{setting('rate_hz', 'HZ')}, or "
                 "record.rate_hz"
             )
         return rate

@@ -21,12 +21,13 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.settings.caller import setting
 from ambid.signals.periodic_response import find_period, frf_periodic
 from ambid.signals.response import (
-    FEEDBACK,
     FrequencyResponse,
     Hold,
     checked,
+    feedback_caution,
     labels,
     product_covariance,
     ratio,
@@ -143,7 +144,7 @@ def frf_local(
     warnings: tuple[str, ...]
     if r is None:
         G, covariance = fitted.Z, fitted.covariance
-        warnings = () if open_loop else (f"local method: {FEEDBACK}",)
+        warnings = () if open_loop else (f"local method: {feedback_caution()}",)
     else:
         G, covariance = ratio(fitted.Z, fitted.covariance, n_y, weight=fitted.weight)
         warnings = weak_inputs(fitted.Z, fitted.covariance, n_y)
@@ -366,7 +367,7 @@ def frf_random(
         )
     found, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
     if r is None:
-        warnings += () if open_loop else (f"{kind.upper()}: {FEEDBACK}",)
+        warnings += () if open_loop else (f"{kind.upper()}: {feedback_caution()}",)
         if kind == "hv" and noise_ratio is None:
             warnings += ("Hv assumes the same noise share of input and output at every line. Give noise_ratio",)
     length = round(rate_hz / spectra.frequency_hz[1])
@@ -429,7 +430,7 @@ def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
     worst = float(np.sqrt(np.max(share)))
     return (
         f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which "
-        "the variance does not include. Give longer segments, or use the local method (--method local)",
+        f"the variance does not include. Give longer segments, or use the local method ({setting('method', 'local')})",
     )
 
 

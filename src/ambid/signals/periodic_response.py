@@ -17,11 +17,12 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.settings.caller import setting
 from ambid.signals.response import (
-    FEEDBACK,
     FrequencyResponse,
     Hold,
     checked,
+    feedback_caution,
     labels,
     ratio_map,
     right_inverse,
@@ -64,7 +65,7 @@ def find_period(x: Array) -> int:
     if not low.size or d[low].min() > 0.3:
         raise EstimationError(
             f"no period found in {x.shape[0]} samples of the excitation; a period and a part of the next must be in "
-            "it. Give the period, or use the local or the random method (--method)"
+            f"it. Give the period, or use the local or the random method ({setting('method')})"
         )
     deepest = float(d[low].min())
     # A multiple of the period is as deep but for noise: the first that is not clearly shallower is the period.
@@ -397,7 +398,7 @@ def frf_periodic(
     found = over_realisations(spectra, excited, n_y, n_u)
     warnings = tuple(w for s in spectra for w in s.warnings) + doubts + found.warnings
     if found.noise is None and r is None and not open_loop:
-        warnings += (f"one period cannot reveal noise at the input: {FEEDBACK}",)
+        warnings += (f"one period cannot reveal noise at the input: {feedback_caution()}",)
     spacing = rate_hz / period
     details: dict[str, object] = {
         "period": period,
@@ -444,7 +445,8 @@ def _experiments(
     if len(found) % n_u or (n_r and n_r != n_u):
         raise EstimationError(
             f"{len(found)} experiments with {n_u} inputs and {n_r} references; each realisation takes {n_u} "
-            "experiments, and a reference for each input. Add experiments, or use the local method (--method local)"
+            "experiments, and a reference for each input. Add experiments, or use the local method "
+            f"({setting('method', 'local')})"
         )
     return found
 
@@ -473,7 +475,7 @@ def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int
     if used.shape[0] >= 3 and transient_ratio(used[:, :, :n_z]) > _TRANSIENT:
         warnings += (
             f"experiment {k + 1}: the first period differs from the others by more than noise: a transient, which "
-            "biases G and its variance. Cut it off (--from, or drop_periods)",
+            f"biases G and its variance. Cut it off ({setting('from_s')}, or drop_periods)",
         )
     Z = np.fft.rfft(used, axis=1)[:, 1 : (period + 1) // 2] / period
     mean = Z.mean(axis=0)
@@ -540,7 +542,7 @@ def _total(
     if known is None and found.noise is None:
         raise EstimationError(
             "one period of one realisation without free lines gives no variance. Measure more periods or "
-            "realisations, omit lines, or use the local method (--method local)"
+            f"realisations, omit lines, or use the local method ({setting('method', 'local')})"
         )
     if known is None and found.noise is not None:
         return (

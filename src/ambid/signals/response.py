@@ -11,6 +11,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.errors import EstimationError
+from ambid.settings.caller import setting
 
 Hold = Literal["zoh", "band-limited"]
 
@@ -195,10 +196,12 @@ class FrequencyResponse:
         return np.asarray(np.sqrt(np.maximum(variance, 0.0)).reshape(self.G.shape))
 
 
-FEEDBACK = (
-    "without a reference the response is biased towards -1/controller where feedback carries the noise to the "
-    "input; give the reference r (--reference), or open_loop=True (--open-loop) if there is no feedback"
-)
+def feedback_caution() -> str:
+    """Warn of the bias by feedback where no reference is given."""
+    return (
+        "without a reference the response is biased towards -1/controller where feedback carries the noise to the "
+        f"input; give the reference r ({setting('reference')}), or {setting('open_loop', True)} if there is no feedback"
+    )
 
 
 def checked(

@@ -19,6 +19,7 @@ from ambid.errors import RecordError, UnitError, nearest
 from ambid.record.csv_dialect import decoded, recognised
 from ambid.record.frames import label_of
 from ambid.record.record import check_rate, file_bytes, gunzipped, sha256_of
+from ambid.settings.caller import setting
 from ambid.signals.response import FrequencyResponse, Hold, ratio
 from ambid.units import UNKNOWN, Unit, parse_unit
 
@@ -69,7 +70,10 @@ def read_response(
                 f"{nearest(word, WORDS)} Correct or omit it"
             )
     if hold == "zoh" and rate_hz is None:
-        raise RecordError(f"{path}: a held input needs the rate of its converter. Give --rate, or --hold band-limited")
+        raise RecordError(
+            f"{path}: a held input needs the rate of its converter. Give {setting('rate_hz')}, or "
+            f"{setting('hold', 'band-limited')}"
+        )
     data = file_bytes(path)
     uff = path.name.lower().endswith(ENDINGS)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by its line
@@ -84,7 +88,8 @@ def read_response(
         for i in ask:
             if (o, i) not in table:
                 raise RecordError(
-                    f"{path} has no response {i} → {o}; it has {listed}. Choose by --input, --output and --reference"
+                    f"{path} has no response {i} → {o}; it has {listed}. Choose by {setting('input')}, "
+                    f"{setting('output')} and {setting('reference')}"
                 )
     averages = _averages(path, told)
     Z = np.stack([np.stack([table[o, i].values for i in ask], axis=1) for o in give], axis=1)
@@ -107,7 +112,9 @@ def read_response(
     coherent = [next((f.coherence for f in functions if f.output == o and f.coherence is not None), None) for o in give]
     rate = _RATE * float(first.frequency_hz[-1]) if rate_hz is None else check_rate(rate_hz)
     if first.frequency_hz[-1] >= 0.5 * rate:
-        raise RecordError(f"{path}: lines up to {first.frequency_hz[-1]:g} Hz; --rate {rate:g} Hz shows less than half")
+        raise RecordError(
+            f"{path}: lines up to {first.frequency_hz[-1]:g} Hz; {setting('rate_hz')} {rate:g} Hz shows less than half"
+        )
     if rate_hz is None:
         done.append(f"no rate: delays count in samples of {rate:.6g} Hz")
     if left:
@@ -171,13 +178,16 @@ def _checked(path: Path, functions: Sequence[Function], told: Mapping[str, str])
     if twice is not None:
         at = ",".join(str(k) for k, p in enumerate(pairs, 1) if p == twice)
         raise RecordError(
-            f"{path}: {twice[1]} → {twice[0]} occurs twice (functions {at}). Choose: --layout functions=1,…"
+            f"{path}: {twice[1]} → {twice[0]} occurs twice (functions {at}). Choose: "
+            f"{setting('layout', 'functions=1,…')}"
         )
     grid = chosen[0].frequency_hz
     for f in chosen:
         where = f"{path}: {f.input} → {f.output}"
         if f.frequency_hz.size != grid.size or not np.allclose(f.frequency_hz, grid, rtol=1e-6, atol=0):
-            raise RecordError(f"{where} has other frequencies than the first function. Choose: --layout functions=1,…")
+            raise RecordError(
+                f"{where} has other frequencies than the first function. Choose: {setting('layout', 'functions=1,…')}"
+            )
         for what, x in (("frequency", f.frequency_hz), ("value", f.values)):
             bad = np.flatnonzero(~(np.abs(x) < _MOST))
             if bad.size:
@@ -222,7 +232,7 @@ def _variance(functions: Sequence[Function], averages: int | None) -> tuple[Arra
             freedom = min(freedom, 2.0 * (_WINDOW - 3))
     if not assumed:
         return np.stack(columns, axis=1), freedom, ""
-    how = "; the file has coherence: --layout averages=N gives them" if unaveraged else ""
+    how = f"; the file has coherence: {setting('layout', 'averages=N')} gives them" if unaveraged else ""
     text = f"standard deviations of {', '.join(assumed)} are assumed, from the scatter of neighbouring lines{how}"
     return np.stack(columns, axis=1), freedom, text
 
@@ -329,7 +339,9 @@ def _of_columns(
             )
         if unit == "dB":
             if "magnitude" not in told:
-                raise RecordError(f"{path}: {pair} is in dB of what? Say the unit of 0 dB: --layout magnitude=m/A")
+                raise RecordError(
+                    f"{path}: {pair} is in dB of what? Say the unit of 0 dB: {setting('layout', 'magnitude=m/A')}"
+                )
             size, unit = 10 ** (size / 20), told["magnitude"]
         elif np.any(size < 0):
             raise RecordError(f"{path}: {pair} has a negative magnitude: is it in dB? Write 'magnitude [dB]'")
@@ -499,7 +511,7 @@ def _function(
             if system > 1 and told.get("units") != "labels":
                 raise RecordError(
                     f"{where} is labelled [{text}], and dataset 164 says units of system {system}, not SI. Say that "
-                    "the labels hold: --layout units=labels; or export in SI"
+                    f"the labels hold: {setting('layout', 'units=labels')}; or export in SI"
                 )
             try:
                 unit = parse_unit(text)

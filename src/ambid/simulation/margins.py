@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import ModelError
 from ambid.physics.loop import Interval, Loop
+from ambid.settings.caller import setting
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 
 Complex = NDArray[np.complex128]
@@ -151,7 +152,7 @@ class LoopMargins(OpenLoop):
             far = f"it is stable for {self.gain[0]:.2g} to {self.gain[1]:.2g} times its gains"
         raise ModelError(
             f"the loop is unstable on {where}: largest pole {self.largest_pole:.5g}; {far}. {remedy}, or go on with"
-            " --force"
+            f" {setting('force', True)}"
         )
 
 

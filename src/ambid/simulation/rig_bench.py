@@ -1,6 +1,6 @@
 """Simulation of a rig: its linear model about the operating point, or the nonlinear plant of its ``[magnet]``.
 
-Magnet, gravity, eddy pole, stage and offsets are those that ``ambid identify --nonlinear`` finds, under the same names.
+Magnet, gravity, eddy pole, stage and offsets are those that `ambid.identify_nonlinear` finds, under the same names.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ from ambid.physics.named_bench import Preset, RotorBody
 from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
 from ambid.physics.power_stage import IDEAL, PowerStage
 from ambid.record.record import Channel, Record, Step
+from ambid.settings.caller import setting
 from ambid.simulation.bench import Simulation, largest_amplitude, simulate
 from ambid.simulation.margins import loop_margins
 from ambid.simulation.plant import LinearPlant, Standing
@@ -397,7 +398,7 @@ def parts_of_rig(
         raise RigError(
             f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a linear simulation needs every parameter. "
             + (
-                "Simulate its [magnet] (--nonlinear, nonlinear=True), or give value = ..."
+                f"Simulate its [magnet] ({setting('nonlinear', True)}), or give value = ..."
                 if rig.magnet
                 else "Give value = ..."
             )

@@ -39,6 +39,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Shaft
 from ambid.record.record import Channel, Record, Step
 from ambid.rig.rig import Rig
+from ambid.settings.caller import setting
 from ambid.simulation.bench import Simulation, acting, largest_amplitude
 from ambid.simulation.plant import (
     LinearPlant,
@@ -261,7 +262,7 @@ class RotorBench:
             raise ModelError(
                 f"the loop is unstable on {self.rig.name!r} at {self.rate_hz:g} Hz with a delay of "
                 f"{self.loop.delay:.2g} samples: largest pole {self.largest_pole:.5g}. Correct [loop] or the "
-                "parameters, or go on with --force"
+                f"parameters, or go on with {setting('force', True)}"
             )
 
     def simulate(

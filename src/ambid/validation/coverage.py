@@ -12,6 +12,7 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95, Reason, Result
+from ambid.settings.caller import setting
 
 SCHEMA = "ambid.coverage/1"
 _FEW = 20  # runs below which nothing is judged
@@ -169,7 +170,7 @@ class Coverage(Result):
             text = f"{len(self.trials)} of {counted(self.asked, 'run')} were done"
             found.append(Reason(check="interrupted", text=text))
         if not rows or max(row.runs for row in rows) < _FEW:
-            text = f"fewer than {_FEW} runs say nothing of coverage. Raise --runs"
+            text = f"fewer than {_FEW} runs say nothing of coverage. Raise {setting('runs')}"
             return (*found, Reason(check="runs", text=text))
         alone = _SURE / (2 * len(rows))
         seldom = [r for r in rows if r.runs >= _FEW and binom.cdf(r.inside, r.runs, 0.95) < alone]

@@ -25,6 +25,7 @@ from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import criteria, p_text, skipped
 from ambid.nonlinear.fit import NonlinearFit, NonlinearModel, nonlinear_structure
+from ambid.settings.caller import setting
 from ambid.validation.residuals import (
     LEAST,
     MOST,
@@ -341,12 +342,16 @@ def _feedback_warnings(
         return []
     open_loop = all(x.open_loop for x in records)
     if open_loop and tests is not None and tests.feedback_seen and not tests.explained_by_inputs:
-        return ["--open-loop was given, but inputs depend on past residuals: there is feedback. Omit --open-loop"]
+        return [
+            f"{setting('open_loop')} was given, but inputs depend on past residuals: there is feedback. Omit "
+            f"{setting('open_loop')}"
+        ]
     said = any("biased" in x and "open loop" in x for x in fit.warnings)
     if open_loop or said or not subject.biased:
         return []
     return [
-        f"{subject.name} has no noise model and is biased by feedback. Use narmax with ne > 0, or give --open-loop "
+        f"{subject.name} has no noise model and is biased by feedback. Use narmax with ne > 0, or give "
+        f"{setting('open_loop', True)} "
         "if the records are open loop"
     ]
 
@@ -476,7 +481,7 @@ def _feedback_warning(subject: Subject, tests: ResidualTests, *, open_loop: bool
             return [f"{evidence}: feedback, which biases {subject.name}, or an incomplete model"]
         return [f"there is feedback: {evidence}. It biases {subject.name}; use bj, armax or pbsid"]
     if open_loop and not tests.explained_by_inputs:
-        return [f"--open-loop was given, but {evidence}: there is feedback. Omit --open-loop"]
+        return [f"{setting('open_loop')} was given, but {evidence}: there is feedback. Omit {setting('open_loop')}"]
     return []
 
 

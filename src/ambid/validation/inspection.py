@@ -12,6 +12,7 @@ from ambid.errors import AmbidError, RecordError, nearest
 from ambid.estimation.result import Reason, Result
 from ambid.record import Channel, Record
 from ambid.rig.roles import rank_roles
+from ambid.settings.caller import setting
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
 from ambid.units import UNKNOWN
 
@@ -21,7 +22,7 @@ _LONGEST = 100_000  # samples from which the order of excitation is told
 _REMEDIES: tuple[tuple[str, Callable[[Record, str], Any], str], ...] = (
     ("saturation", find_saturation, "Excite less, or widen the range"),
     ("drop-outs", find_dropouts, "Look at cable and sensor, or leave these samples out"),
-    ("outliers", find_outliers, "Look at the line; --gaps and --from leave samples out"),
+    ("outliers", find_outliers, "Look at the line; {gaps} and {from_s} leave samples out"),
 )
 
 
@@ -120,8 +121,9 @@ def _faults(record: Record, c: Channel, *, grave: bool) -> list[Reason]:
         except AmbidError:
             continue
         if seen.count:
+            advice = remedy.format(gaps=setting("gaps"), from_s=setting("from_s"))
             still = not np.ptp(c.values) > 0
-            found.append(Reason(check=check, text=f"{seen}. {remedy}", grave=still and grave))
+            found.append(Reason(check=check, text=f"{seen}. {advice}", grave=still and grave))
     return found
 
 

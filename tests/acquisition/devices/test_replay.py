@@ -110,7 +110,7 @@ def test_a_port_s_name_chooses_the_device(record):
 
 
 @pytest.mark.parametrize(
-    ("port", "remedy"), [("simulated", "--excitation-only"), ("replay:a.h5", "ambid track RECORD")]
+    ("port", "remedy"), [("simulated", "excitation_only=True"), ("replay:a.h5", r"ambid.track\('RECORD', rig=RIG")]
 )
 def test_a_rotor_is_told_what_to_do_without_such_a_controller(port, remedy):
     notes = []

@@ -35,14 +35,14 @@ def test_lost_samples_become_rows_of_nan_that_a_reader_has_to_treat(tmp_path):
     assert record.start_s == 3 * ROWS / RATE
     assert record.history[1].name == "gaps"
     assert record.history[1].settings == {"lost_samples": 4 * ROWS, "places": 2}
-    with pytest.raises(RecordError, match="--gaps interpolate or --gaps cut"):
+    with pytest.raises(RecordError, match="gaps='interpolate' or gaps='cut'"):
         read_record(tmp_path / "run.h5")
     assert read_record(tmp_path / "run.h5", gaps="cut").n_samples == 3 * ROWS
 
 
 def test_the_same_in_csv(tmp_path):
     recorded(tmp_path / "run.csv", [block(k) for k in (0, 1, 3)])
-    with pytest.raises(RecordError, match="--gaps"):
+    with pytest.raises(RecordError, match="give gaps="):
         read_record(tmp_path / "run.csv")
     assert read_record(tmp_path / "run.csv", gaps="interpolate").n_samples == 4 * ROWS
 

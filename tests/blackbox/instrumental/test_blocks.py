@@ -68,7 +68,7 @@ def test_a_controller_wants_the_reference():
         value, sd = table(found)
         scores.append((value - TRUTH) / sd)
     assert np.mean(np.abs(np.array(scores)) < 1.96) > 0.8
-    assert any("--reference" in w for w in blocks(io(*columns), {}).warnings)
+    assert any("(reference)" in w for w in blocks(io(*columns), {}).warnings)
 
 
 def test_a_magnet_that_pulls_away_has_an_unstable_block():

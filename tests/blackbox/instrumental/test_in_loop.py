@@ -117,7 +117,7 @@ def test_the_sampled_equivalent_and_its_derivative():
 )
 def test_without_a_reference(estimator, orders):
     d = _sprung(np.random.default_rng(1))
-    with pytest.raises(EstimationError, match="--reference"):
+    with pytest.raises(EstimationError, match="Give reference"):
         estimator(io_data(d.u, d.y, dt=DT), orders)
 
 

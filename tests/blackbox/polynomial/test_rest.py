@@ -91,7 +91,7 @@ def test_a_record_that_is_not_at_rest_is_warned_of(name: str) -> None:
     assert sum(denied(x) for x in told[::2]) == 0
     least = 3 if name == "arma" else 8  # noise alone begins not far from rest
     assert sum(denied(x) for x in told[1::2]) >= least
-    assert "--at-rest" in next(w for x in told[1::2] for w in x.warnings)
+    assert "Omit at_rest" in next(w for x in told[1::2] for w in x.warnings)
 
 
 def test_an_offset_is_warned_of() -> None:

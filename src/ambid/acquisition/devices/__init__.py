@@ -7,6 +7,7 @@ from ambid.acquisition.devices.played import Pace
 from ambid.errors import DeviceError
 from ambid.physics.presets import Preset
 from ambid.rig.rig import Rig
+from ambid.settings.caller import command
 
 REPLAY = "replay:"
 """What a port begins with that is a record."""
@@ -26,11 +27,12 @@ def open_device(
     of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
     """
     if rig.rotor is not None:
+        making = command("simulate", "RIG", excitation="zippered", excitation_only=True, out="FILE.csv")
         remedy = (
-            "Follow a record by 'ambid track RECORD --rig RIG'"
+            f"Follow a record by '{command('track', 'RECORD', rig='RIG')}'"
             if port.startswith(REPLAY)
-            else "Write the excitation by 'ambid simulate RIG --excitation zippered --excitation-only -o FILE.csv', "
-            "play it on the rotor's own controllers, and give their record to 'ambid identify' or 'ambid track'"
+            else f"Write the excitation by '{making}', play it on the rotor's own controllers, and "
+            "give their record to 'ambid identify' or 'ambid track'"
         )
         raise DeviceError(f"rig {rig.name!r} has {len(rig.rotor.axes)} axes; this controller drives one. {remedy}")
     if bench is not None and port not in ("emulated", "simulated"):

@@ -83,7 +83,7 @@ class Emulator:
         trajectory: bool = False,
     ) -> None:
         self._plant, self._firmware, self._program, self._script = plant, firmware, program, script
-        self._options = ["--pace", pace, "--lockstep", repr(float(lockstep_ms)), "--seed", str(seed)]
+        self._options = {"pace": pace, "lockstep": repr(float(lockstep_ms)), "seed": str(seed)}
         self._folder = folder
         self._temporary = folder is None
         self._trajectory = trajectory
@@ -124,11 +124,12 @@ class Emulator:
         folder = self._place()
         folder.mkdir(parents=True, exist_ok=True)
         plant = _as_file(self._plant, folder / "plant.txt")
-        command = [str(program), "--firmware", str(firmware), "--plant", str(plant), "--log", str(self.log_path)]
-        command += self._options
+        options = {"firmware": str(firmware), "plant": str(plant), "log": str(self.log_path)} | self._options
         if self._script is not None:
-            command += ["--script", str(_as_file(self._script, folder / "script.txt"))]
-        command += ["--trajectory", str(self.trajectory_path)] if self._trajectory else []
+            options["script"] = str(_as_file(self._script, folder / "script.txt"))
+        if self._trajectory:
+            options["trajectory"] = str(self.trajectory_path)
+        command = [str(program), *(word for name, x in options.items() for word in (f"--{name}", x))]
         atexit.register(self.close)
         with self._said_path().open("wb") as said:
             try:

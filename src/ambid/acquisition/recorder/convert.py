@@ -47,6 +47,7 @@ from ambid.estimation.result import Reason, Result
 from ambid.record.chunks import check_chunks, write_chunks
 from ambid.record.csv_format import head_lines
 from ambid.record.record import Channel, Record, Step
+from ambid.settings.caller import setting
 from ambid.tracking.blocks import Block
 from ambid.units import UNKNOWN, parse_unit
 
@@ -333,7 +334,7 @@ class Recorded(Result):
             said.append(Reason(check="journal", text=f"{text}. Keep it, and look at the disk"))
         if found.gap_samples:
             text = f"{counted(found.gap_samples, 'sample')} missing in {counted(found.gaps, 'place')}"
-            said.append(Reason(check="samples", text=f"{text}. Read the record with --gaps"))
+            said.append(Reason(check="samples", text=f"{text}. Read the record with {setting('gaps')}"))
         if found.misplaced:
             text = f"{counted(found.misplaced, 'sample')} left out whose number had occurred before. Keep the journal"
             said.append(Reason(check="order", text=text))
@@ -352,7 +353,7 @@ def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
     if not path.parent.is_dir():
         raise DeviceError(f"{path}: there is no folder {path.parent}. Make it first, or correct the path")
     if path.exists() and not force:
-        raise DeviceError(f"{path} already exists. Choose another name, remove it, or give --force")
+        raise DeviceError(f"{path} already exists. Choose another name, remove it, or give {setting('force', True)}")
     if ".csv" in path.name.lower():
         try:
             head_lines(_record(header, Survey(), {}))

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from ambid.acquisition.device import Column, DeviceEvent, DeviceInfo
 from ambid.errors import DeviceError, UnitError
 from ambid.estimation.estimate import fields_json, read_as
+from ambid.settings.caller import command
 from ambid.units import UNKNOWN, parse_unit
 
 SCHEMA = "ambid.journal/1"
@@ -454,5 +455,5 @@ def free_bytes(folder: Path) -> int:
 def _occupied(path: Path) -> str:
     return (
         f"{path} already exists: another recorder writes it, or one was ended before it could finish."
-        f" Wait for it, or: ambid recover {path} --delete"
+        f" Wait for it, or: {command('recover', path, delete=True)}"
     )
