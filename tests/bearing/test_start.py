@@ -46,7 +46,7 @@ def test_ordinary_least_squares_is_exact_without_noise():
     a, b = (rng.standard_normal(50) + 1j * rng.standard_normal(50) for _ in range(2))
     y = 2.5 * a - 0.3 * b
     one = np.ones(50)
-    got = Regressors([("a", one, a), ("b", one, b)], one, {}).regress(("", 0 * one, y))
+    got = Regressors([("a", one, a), ("b", one, b)], one, {}).regress(("", 0 * one, y))[0]
     np.testing.assert_allclose(got, [2.5, -0.3], rtol=1e-12)
 
 
@@ -57,7 +57,7 @@ def test_errors_in_variables_have_no_bias():
     one = np.ones(n)
 
     def regress(levels):
-        return Regressors([("x", one, clean + noise[1])], one, levels).regress(("y", one, 2.0 * clean + noise[0]))
+        return Regressors([("x", one, clean + noise[1])], one, levels).regress(("y", one, 2.0 * clean + noise[0]))[0]
 
     assert regress({})[0] == pytest.approx(2.0 / 1.25, rel=0.02)  # attenuated
     assert regress({"x": 0.5, "y": 0.5})[0] == pytest.approx(2.0, rel=0.02)

@@ -140,11 +140,14 @@ def _follow(
     assert fit is not None
     if trial and fit.status != "converged":
         return fit
+    without_gain = fit.vector if fit.problem.noise == "given" else None  # where a gain promises nothing, see `_search`
     if search_delay:
         fit = _with_fraction(fit, tick)
         if noise == "auto":
             fit = _without_disturbances(fit, tick)
-    return _with_gain(fit, tick, force=noise == "gain") if noise != "levels" else fit
+    if noise == "levels" or (noise == "auto" and fit.vector is without_gain):
+        return fit
+    return _with_gain(fit, tick, force=noise == "gain")
 
 
 def _search(candidate: Candidate, tick: Callable[[], None] | None, *, with_disturbances: bool) -> Fit:

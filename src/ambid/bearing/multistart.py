@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import compress
+from itertools import accumulate, compress
 from typing import Literal
 
 import numpy as np
@@ -60,6 +60,9 @@ def weak_form_values(
     SI; they are used, and returned unchanged. Yields the delay with all parameters of the model, SI.
     """
     damping = known.get("c", 0.0)
+    steps = np.diff(delays, prepend=0.0).tolist()  # mostly one sample: products cost less than exponentials
+    turns = {d: np.exp(-1j * m.omega * d / rate_hz) for d in set(steps)}
+    delayed = np.stack(list(accumulate((turns[d] for d in steps), np.multiply)), axis=1)
     rate = damping / known.get("m", np.inf) if damping else 0.0
     for part, errors_in_variables in _BANDS:
         lines = slice(_LOWEST_LINE, int(part * m.omega.size))
@@ -68,26 +71,25 @@ def weak_form_values(
             continue
         jw, corner, level = 1j * omega, omega[-1] / 3, noise if errors_in_variables else {}
         s = {role: tuple(v[lines] for v in values) for role, values in m.signals.items()}
-        lags = [np.exp(-jw * d / rate_hz) for d in delays]
-        electric: list[Array] = [np.zeros(0)] * len(lags)
+        electric = np.zeros((len(delays), 0))
         if model_name in ("one-axis", "coil"):
             i0, i1, _ = s["current"]
             terms: list[Term] = [("current", 1 + 0 * jw, i0), ("current", jw, i1)]
             if model_name == "one-axis":
                 terms.append(("position", jw, s["position"][1]))
             coil = Regressors(terms, 1.0 / np.abs(jw + corner), level)
-            electric = [coil.regress(("", 0 * jw, s["voltage"][0] * lag)) for lag in lags]
-        motion: list[Array] = []
+            electric = coil.regress(("", 0 * jw, s["voltage"][0][:, None] * delayed[lines]))
         if model_name in ("one-axis", "rotor"):
             x0, x1, x2 = s["position"]
-            for lag in lags if model_name == "rotor" else [1.0]:
+            motion = []
+            for lag in delayed[lines].T if model_name == "rotor" else [1.0]:
                 terms = [("position", -1 + 0 * jw, -x0), ("current", 1 + 0 * jw, s["current"][0] * lag)]
                 rotor = Regressors(terms, 1.0 / np.abs(jw + corner) ** 2, level)
-                motion.append(rotor.regress(("position", jw**2 + rate * jw, x2 + rate * x1)))
-            motion *= len(lags) // len(motion)
+                motion.append(rotor.regress(("position", jw**2 + rate * jw, x2 + rate * x1))[0])
+            motion *= len(delays) // len(motion)
         for j, d in enumerate(delays):
             found = {**dict(zip(("R", "L", "k_i"), electric[j], strict=False)), **known}
-            if motion:
+            if model_name != "coil":
                 stiffness, current = motion[j]
                 if "m" not in known:  # its sign may come out wrong where the motional voltage is lost in the noise
                     found["m"] = abs(found["k_i"] / current) if "k_i" in found and current != 0 else 1.0
@@ -115,33 +117,38 @@ class Regressors:
         self.spread = sum(((f.conj().T @ f).real for f in self.filters.values()), np.zeros((len(terms),) * 2))
 
     def regress(self, first: Term) -> Array:
-        """Regress one more term on these.
+        """Regress more terms on these, whose moments are columns, (n_lines,) or (n_lines, n_first).
 
         With noise levels, generalised total least squares: the combination of terms that is smallest against what the
-        noise alone would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares. Returns (n_terms,),
-        NaN where the noise description cannot be used.
+        noise alone would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares. Returns (n_first,
+        n_terms), NaN where the noise description cannot be used.
         """
-        b, n = _real(first[2] * self.weight), self.size.size
-        length = float(np.linalg.norm(b)) or 1.0
-        along = self.Q.T @ b / length
+        b, n = _real(first[2].reshape(self.weight.size, -1) * self.weight[:, None]), self.size.size
+        length = np.linalg.norm(b, axis=0)
+        length[length == 0.0] = 1.0
+        b /= length
+        along = self.Q.T @ b
         if not self.noise:
-            return np.asarray(np.linalg.lstsq(self.R, along, rcond=None)[0] / self.size * length)
-        short, spread = np.zeros((n + 1, n + 1)), np.zeros((n + 1, n + 1))
-        short[:n, :n], short[:n, n] = self.R, along
-        short[n, n] = np.linalg.norm(b / length - self.Q @ along)
-        spread[:n, :n] = self.spread
+            return np.asarray((np.linalg.lstsq(self.R, along, rcond=None)[0] / self.size[:, None] * length).T)
+        short, spread = np.zeros((2, length.size, n + 1, n + 1))
+        short[:, :n, :n], short[:, :n, n] = self.R, along.T
+        short[:, n, n] = np.linalg.norm(b - self.Q @ along, axis=0)
+        spread[:, :n, :n] = self.spread
         if first[0] in self.noise:
-            own = first[1] * self.weight * self.noise[first[0]] / length
-            spread[n, :n] = spread[:n, n] = (self.filters[first[0]].conj().T @ own).real
-            spread[n, n] = np.vdot(own, own).real
-        spread += 1e-12 * np.trace(spread) * np.eye(n + 1)
-        if not spread[n, n] > 0:
-            return np.full(n, np.nan)
+            own = first[1] * self.weight * self.noise[first[0]]
+            cross = (self.filters[first[0]].conj().T @ own).real / length[:, None]
+            spread[:, n, :n] = spread[:, :n, n] = cross
+            spread[:, n, n] = np.vdot(own, own).real / length**2
+        spread += 1e-12 * np.trace(spread, axis1=1, axis2=2)[:, None, None] * np.eye(n + 1)
+        if not np.all(spread[:, n, n] > 0):
+            return np.full((length.size, n), np.nan)
         # smallest generalised singular vector against the noise: exact columns get a tiny one
         factor = np.linalg.cholesky(spread)
-        _, _, vt = np.linalg.svd(np.linalg.solve(factor, short.T).T)
-        v = np.linalg.solve(factor.T, vt[-1]) / np.append(self.size, length)
-        return -v[:n] / v[n] if v[n] != 0 else np.full(n, np.nan)
+        last = np.linalg.svd(np.swapaxes(np.linalg.solve(factor, np.swapaxes(short, 1, 2)), 1, 2))[2][:, -1]
+        v = np.linalg.solve(np.swapaxes(factor, 1, 2), last[:, :, None])[:, :, 0]
+        v /= np.column_stack([np.tile(self.size, (length.size, 1)), length])
+        v[v[:, n] == 0.0] = np.nan
+        return np.asarray(-v[:, :n] / v[:, n:])
 
 
 def _real(x: Spectrum) -> Array:
@@ -163,17 +170,19 @@ def take_moments(signals: Mapping[str, Array], held: tuple[str, ...], rate_hz: f
     `signals`: role -> samples, shape (n_samples,), SI, deviations from the operating point.
     """
     n = len(next(iter(signals.values())))
-    period, length = 1.0 / rate_hz, n / rate_hz
-    t = np.arange(n) / n
-    w = (3 - 4 * np.cos(2 * np.pi * t) + np.cos(4 * np.pi * t)) / 8
-    w1 = (8 * np.pi * np.sin(2 * np.pi * t) - 4 * np.pi * np.sin(4 * np.pi * t)) / (8 * length)
-    w2 = (16 * np.pi**2 * np.cos(2 * np.pi * t) - 16 * np.pi**2 * np.cos(4 * np.pi * t)) / (8 * length**2)
-    omega = 2 * np.pi * np.fft.rfftfreq(n, period)
-    jw = 1j * omega
-    result = {}
+    period, turn = 1.0 / rate_hz, 2 * np.pi * rate_hz / n
+    omega = turn * np.arange(n // 2 + 1)
+    jw, result = 1j * omega, {}
+    hold = np.sinc(omega * period / (2 * np.pi)) * np.exp(-0.5j * omega * period)
     for role, x in signals.items():
-        m0, m1, m2 = np.fft.rfft(w * x), np.fft.rfft(w1 * x), np.fft.rfft(w2 * x)
-        value = m0 * np.sinc(omega * period / (2 * np.pi)) * np.exp(-0.5j * omega * period) if role in held else m0
+        # times cos(2 pi t) and sin(2 pi t), t over the record, a spectrum moves by one line, times twice that by two
+        lines = np.fft.rfft(x)
+        whole = np.concatenate([lines[2:0:-1].conj(), lines, lines[(n - 1) // 2 : (n - 1) // 2 - 2 : -1].conj()])
+        below, above, below2, above2 = whole[1:-3], whole[3:-1], whole[:-4], whole[4:]
+        m0 = (3 * lines - 2 * (below + above) + (below2 + above2) / 2) / 8
+        m1 = -0.25j * turn * ((below - above) - (below2 - above2) / 2)
+        m2 = 0.25 * turn**2 * ((below + above) - (below2 + above2))
+        value = m0 * hold if role in held else m0
         # integration by parts: int phi x' = -int phi' x with phi' = (w' - jw w) e, and again for x''
         result[role] = (value, jw * m0 - m1, m2 - 2 * jw * m1 - omega**2 * m0)
     return Moments(omega=np.asarray(omega, dtype=np.float64), signals=result)
@@ -186,7 +195,7 @@ FARTHEST = 24  # samples: the search goes no farther
 _LEVELS = (-4.0, -8.0, -1.5)  # log disturbance levels tried, relative to what the sensor noise of one sample hides
 _STEPS = 25  # of a search on the stretch that a candidate of a long record is for; usually it takes ten
 _REGRESSED = 1 << 17  # samples that start values are regressed from, and that a search begins on
-_STRETCH = 8192  # samples on which candidates are first compared
+_STRETCH = 4096  # samples on which candidates are first compared
 _SHORT = 4096  # samples on which racers are searched
 _KEPT = 6  # candidates scored on all that start values are regressed from
 _RACE = 3  # candidates searched a little way

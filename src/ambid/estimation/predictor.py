@@ -72,6 +72,9 @@ class PredictorProblem:
     joint_priors: Callable[[Array], tuple[Array, Array]] | None = None
 
     slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
+    taps: tuple[int, ...] = field(init=False)  # lags beyond `delay`, in samples, at which the input acts over one
+    # lags beyond `delay` at which the input enters one step of the recursion, which is `stride` samples long
+    lags: tuple[int, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         if self.skip < self.delay + 2 or self.y.shape[0] <= self.skip:
@@ -88,6 +91,9 @@ class PredictorProblem:
         }
         ends = list(accumulate(sizes.values(), initial=0))
         object.__setattr__(self, "slices", {name: slice(*ends[j : j + 2]) for j, name in enumerate(sizes)})
+        taps = (-1, 0, 1, 2) if self.fractional else (0, 1) if np.any(self.lag) else (0,)
+        object.__setattr__(self, "taps", taps)
+        object.__setattr__(self, "lags", tuple(range(taps[0] - (self.stride - 1), taps[-1] + 1)))
 
     @property
     def n_physical(self) -> int:
@@ -98,18 +104,6 @@ class PredictorProblem:
     def size(self) -> int:
         """Length of the vector."""
         return int(self.slices["initial"].stop)
-
-    @property
-    def taps(self) -> tuple[int, ...]:
-        """Lags beyond `delay`, in samples, at which the input acts over one sample."""
-        if self.fractional:
-            return (-1, 0, 1, 2)
-        return (0, 1) if np.any(self.lag) else (0,)
-
-    @property
-    def lags(self) -> tuple[int, ...]:
-        """Lags beyond `delay` at which the input enters one step of the recursion, which is `stride` samples long."""
-        return tuple(range(self.taps[0] - (self.stride - 1), self.taps[-1] + 1))
 
     @property
     def n_used(self) -> int:

@@ -154,7 +154,7 @@ def explained_by_past(
     (n, p), k = E.shape, Z.shape[1]
     if n < max(least * k, k + 2):
         return 0.0, 0.0, p * k
-    left = E - Z @ least_squares(Z, E)
+    left = triangle_of([np.hstack([Z, E])])[k:, k:]
     before, after = (np.linalg.slogdet(x.T @ x / n + _VANISHED * np.eye(p))[1] for x in (E, left))
     gained, by_chance = float(before - after), -p * log(1.0 - k / n)
     if not np.isfinite(gained):
