@@ -20,7 +20,7 @@ from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.record import Channel, Record, Source, read_rows
 from ambid.rig import Rig, bench_record
 from ambid.rig.rig import OPTIONAL_ROLES, RigChannel
-from ambid.settings.caller import setting
+from ambid.settings.caller import command, saved, setting
 from ambid.tracking.blocks import Replay, blocks_of
 from ambid.tracking.guard import ABSURD
 from ambid.tracking.numbers import Forcing, TrackedNumbers, forcing_of, tracked_numbers
