@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from ambid.signals import find_period, frf_local, frf_periodic
+from ambid.signals import find_period
+from ambid.signals.frf import frf_local
+from ambid.signals.periodic_response import frf_periodic
 from tests.measured import ABSENT, BENCHMARKS
 
 SILVERBOX = BENCHMARKS / "silverbox.csv"

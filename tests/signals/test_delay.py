@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.signals import find_delay, gaussian, prbs
+from ambid.signals import find_delay
+from ambid.signals.excitations import gaussian, prbs
 
 
 def coil(u: np.ndarray, delay: int, noise: np.ndarray, pole: float = 0.9) -> np.ndarray:

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import RecordError
-from ambid.signals import find_dropouts, find_outliers, find_saturation, prbs, resolution, steps
+from ambid.signals import find_dropouts, find_outliers, find_saturation, resolution
+from ambid.signals.excitations import prbs, steps
 
 RATE = 1000.0
 N = 10000

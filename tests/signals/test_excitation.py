@@ -6,18 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.signals import (
-    EXCITATIONS,
-    chirp,
-    crest_factor,
-    excitation,
-    gaussian,
-    multisine,
-    persistent_excitation,
-    prbs,
-    schroeder_phases,
-    steps,
-)
+from ambid.signals import EXCITATIONS, crest_factor, excitation, multisine, persistent_excitation
+from ambid.signals.excitations import chirp, gaussian, prbs, schroeder_phases, steps
 
 RATE = 1000.0
 

@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.errors import EstimationError
-from ambid.signals import chirp, frf_local, frf_random
+from ambid.signals.excitations import chirp
+from ambid.signals.frf import frf_local, frf_random
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, response
 
 POLE = np.exp((-0.01 + 1j) * 0.6)  # damping ratio 0.01

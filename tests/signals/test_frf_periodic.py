@@ -5,8 +5,8 @@ import pytest
 from scipy.signal import lfilter
 
 from ambid.errors import EstimationError
-from ambid.signals import find_period, frf_periodic, multisine
-from ambid.signals.periodic_response import excited_lines
+from ambid.signals import find_period, multisine
+from ambid.signals.periodic_response import excited_lines, frf_periodic
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, one_period, response, steady
 
 N = 512

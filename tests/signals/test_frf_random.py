@@ -5,7 +5,8 @@ import pytest
 from scipy.signal import csd, lfilter, welch
 
 from ambid.errors import EstimationError
-from ambid.signals import cross_spectra, frequency_response, frf_random
+from ambid.signals import cross_spectra, frequency_response
+from ambid.signals.frf import frf_random
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_loop, mimo_response, response
 
 

@@ -7,7 +7,8 @@ import pytest
 from scipy.signal import freqz, lfilter
 
 from ambid.errors import AmbidError, RecordError
-from ambid.signals import gaussian, multisine, power_spectrum, snr
+from ambid.signals import multisine, power_spectrum, snr
+from ambid.signals.excitations import gaussian
 
 RATE = 10000.0
 N = 20000

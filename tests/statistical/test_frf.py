@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from ambid.signals import frf_local, frf_periodic, frf_random
+from ambid.signals.frf import frf_local, frf_random
+from ambid.signals.periodic_response import frf_periodic
 from tests.signals.frf_benches import A, B, Loop, inside, mimo, mimo_response, one_period, response, steady
 from tests.tiers import runs as number
 

@@ -111,10 +111,6 @@ class Terms:
         inside = np.isin(self.terms, at)
         return bool(np.any(inside.sum(axis=1) > 1) or np.any(inside[self.place[:, 1] == 1]))
 
-    def _varies(self, at: Table) -> bool:
-        """Whether slopes by regressors at some places are not the same everywhere."""
-        return self._rational or any(rest for v in at for _, _, rest in self._holds.get(int(v), ()))
-
     def prepare(self, x: Array) -> tuple[Array, ...]:
         """As `Block.prepare`."""
         out = np.ones((self.n_theta, x.shape[0]))
@@ -154,7 +150,8 @@ class Terms:
         for o, both in enumerate(self._owned if np.any(live) else ()):
             for below, own in enumerate(both):
                 out[:, o, own] = T[:, own] * by_value[:, o, below, None]
-        by_x = np.zeros((n if self._varies(at) else 1, p, at.size))
+        varies = self._rational or any(rest for v in at for _, _, rest in self._holds.get(int(v), ()))
+        by_x = np.zeros((n if varies else 1, p, at.size))
         for j, v in enumerate(at):
             for k, times, rest in self._holds.get(int(v), ()):
                 o, below = self.place[k]
@@ -579,20 +576,16 @@ class LaggedFunction(ABC):
         from ambid.nonlinear.kernels import propagate
 
         E = rows.y - self.values(theta, rows)
-        propagate(E[:, :, None], self._noise_gain(theta, rows), *self._recurrence(x.noisy), 0)
+        gain = np.zeros((1, p, x.noisy.size))  # what past innovations take off errors
+        for block, own, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True):
+            if block.uses(x.noisy):
+                gain = gain - block.derivatives(own, r, np.zeros(block.n_theta, dtype=np.bool_), x.noisy)[1]
+        propagate(E[:, :, None], np.ascontiguousarray(gain), *self._recurrence(x.noisy), 0)
         far = np.flatnonzero(~np.all(np.abs(E) < _FAR, axis=1))
         if far.size:
             E[far[0] :] = np.nan
         z[lag:, p + x.n_inputs :] = E
         return rows.y - E, z
-
-    def _noise_gain(self, theta: Array, rows: Rows) -> Array:
-        """What past innovations take off errors, (n or 1, n_outputs, n_noisy), where they enter without bends."""
-        at, out = self.regressors.noisy, np.zeros((1, self.n_outputs, self.regressors.noisy.size))
-        for block, own, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True):
-            if block.uses(at):
-                out = out - block.derivatives(own, r, np.zeros(block.n_theta, dtype=np.bool_), at)[1]
-        return np.ascontiguousarray(out)
 
     def free_run(self, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
         """Return a run on own outputs from sample `lag` on, shape (n_samples, n_outputs), and all signals behind it.

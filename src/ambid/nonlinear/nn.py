@@ -120,7 +120,19 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         _check_magnitude(records, {k: v for k, v in chosen.items() if k in settings})
     s: dict[str, Any] = {"starts": 20, **chosen, **_MAGNITUDE} if unsigned else {**_SIGNED, **chosen}
     data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
-    s["form"] = _choose_form(str(s["form"]), records[0])
+    asked, first = str(s["form"]), records[0]
+    units = [first.units.get(x) for x in first.outputs]
+    fits = (
+        [first.units.get(x) for x in first.inputs] == ["V"]
+        and {"m", "A"} <= set(units) <= set(_UNITS)
+        and len(set(units)) == len(units)
+    )
+    if asked == "one-axis" and not fits:
+        raise EstimationError(
+            "nn: form one-axis needs one input in V and outputs in m and A (and m/s); here "
+            f"{', '.join(f'{x} [{first.units.get(x)}]' for x in (*first.inputs, *first.outputs))}. Choose form free"
+        )
+    s["form"] = "one-axis" if fits and asked != "free" else "free"
     fitting = Fitting(structure="nn", records=records, settings=s, seed=seed, whole=data, data=data)
     reason = NO_START
     try:
@@ -144,22 +156,6 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         m = state.layout.matrices(state.theta)
         fitting.details["continuous"] = matrices_json(state.layout, m.A, m.B, sampled=True)
     return finish(fitting, reason, part_of(tick, *_SPREAD))
-
-
-def _choose_form(asked: str, first: IOData) -> str:
-    """``one-axis`` where the units are those of thesis eq. 4.8, or it was asked for."""
-    units = [first.units.get(x) for x in first.outputs]
-    fits = (
-        [first.units.get(x) for x in first.inputs] == ["V"]
-        and {"m", "A"} <= set(units) <= set(_UNITS)
-        and len(set(units)) == len(units)
-    )
-    if asked == "one-axis" and not fits:
-        raise EstimationError(
-            "nn: form one-axis needs one input in V and outputs in m and A (and m/s); here "
-            f"{', '.join(f'{x} [{first.units.get(x)}]' for x in (*first.inputs, *first.outputs))}. Choose form free"
-        )
-    return "one-axis" if fits and asked != "free" else "free"
 
 
 def _heads(fitting: Fitting) -> tuple[int, ...]:

@@ -180,7 +180,8 @@ class Layout:
         n, m, units = self.n, self.n_inputs, range(self.neurons)
         out = []
         for r, c in self.entries:
-            out.append(f"a{r + 1}{c + 1}" if c < n else f"c{r + 1}" if c == n + m else self._input_name(r, c - n))
+            of_input = f"b{r + 1}" if m == 1 else f"b{r + 1}{c - n + 1}"
+            out.append(f"a{r + 1}{c + 1}" if c < n else f"c{r + 1}" if c == n + m else of_input)
         if self.gain:
             out += [f"k{i + 1}{j + 1}" for i in range(n) for j in range(self.p)]
         if self.sensor:
@@ -190,9 +191,6 @@ class Layout:
         if not self.sensor:
             out += [f"unit {k + 1}: 1" for k in units]
         return (*out, *(f"x{r + 1}: unit {k + 1}" for r in self.rows for k in units))
-
-    def _input_name(self, row: int, column: int) -> str:
-        return f"b{row + 1}" if self.n_inputs == 1 else f"b{row + 1}{column + 1}"
 
     def widen(self, theta: Array, **changes: Any) -> tuple[Layout, Array]:
         """Return the layout with another ``gain`` or number of ``neurons``, and its weights; new ones are zero."""

@@ -153,16 +153,13 @@ def _csv_texts(record: Record, chunks: Iterable[Array]) -> Iterator[bytes]:
     at = 0
     for values in chunks:
         time = record.start_s + np.arange(at, at + len(values)) / record.rate_hz
-        yield _lines([_row(t, row) for t, row in zip(time.tolist(), values.tolist(), strict=True)])
+        rows = zip(time.tolist(), values.tolist(), strict=True)
+        yield _lines([",".join((repr(t), *("" if x != x else repr(x) for x in row))) for t, row in rows])
         at += len(values)
 
 
 def _lines(lines: list[str]) -> bytes:
     return ("\n".join(lines) + "\n").encode()
-
-
-def _row(time: float, row: list[float]) -> str:
-    return ",".join((repr(time), *("" if x != x else repr(x) for x in row)))
 
 
 def _check_csv(path: Path, wanted: int) -> None:

@@ -75,7 +75,8 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
 
     `lines`: of the file. Raises where it could be read in two ways.
     """
-    told, begin = words_of(layout, path), _first(lines, 0)
+    told = words_of(layout, path)
+    begin = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
     table = None if begin is None else _table(lines, begin, told.get("separator"))
     if begin is None or table is None:
         return None
@@ -103,10 +104,6 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
         row=at, delimiter=delimiter, cells=tuple(cells), units=None if units is None else tuple(units),
         comments=tuple(comments), lines=body, settings=settings,
     )  # fmt: skip
-
-
-def _first(lines: Sequence[str], start: int) -> int | None:
-    return next((k for k in range(start, len(lines)) if lines[k].strip() and not lines[k].startswith("#")), None)
 
 
 def _cells(line: str, delimiter: str) -> list[str]:

@@ -17,7 +17,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import RecordError
-from ambid.record.csv_dialect import Dialect, decoded, recognised
+from ambid.record.csv_dialect import decoded, recognised
 from ambid.record.record import Record, file_bytes, gunzipped, sha256_of
 from ambid.record.sampling import (
     MIN_SAMPLES,
@@ -82,7 +82,12 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
         if dialect is None:
             header = find_header(lines, path)
         else:
-            header, lines, found = _header_of(dialect, path), dialect.lines, dialect.settings
+            names, units = _names_and_units(dialect.cells, dialect.row, path)
+            header = Header(
+                row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments,
+                unit_texts=units if dialect.units is None else dialect.units,
+            )  # fmt: skip
+            lines, found = dialect.lines, dialect.settings
         values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     else:
         header, values = plain
@@ -163,7 +168,15 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
         raise RecordError(f"{path} has no header row. Write one row of 'name [unit]', then the numbers")
     line = lines[row - 1]
     comments = [text.lstrip("#").strip() for text in lines[: row - 1] if text.startswith("#")]
-    delimiter = _delimiter(line, row, path)
+    outside = re.sub(r"\[[^\[\]]*\]", "[]", line)
+    found = [d for d in (",", ";", "\t") if d in outside]
+    if len(found) > 1:
+        raise RecordError(
+            f"{path}, row {row}: the header holds both {found[0]!r} and {found[1]!r}; one delimiter only. Use commas"
+        )
+    if not found and outside.count("[]") > 1:
+        raise RecordError(f"{path}, row {row}: the columns are not separated by commas. Write 'time [s],voltage [V],…'")
+    delimiter = found[0] if found else ","
     cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
     if all(np.isfinite(_number(cell)) for cell in cells):
         raise RecordError(
@@ -172,14 +185,6 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
         )
     names, units = _names_and_units(cells, row, path)
     return Header(row=row, delimiter=delimiter, names=names, unit_texts=units, comments=tuple(comments))
-
-
-def _header_of(found: Dialect, path: Path) -> Header:
-    names, units = _names_and_units(found.cells, found.row, path)
-    return Header(
-        row=found.row, delimiter=found.delimiter, names=names, comments=found.comments,
-        unit_texts=units if found.units is None else found.units,
-    )  # fmt: skip
 
 
 def _names_and_units(cells: Sequence[str], row: int, path: Path) -> tuple[tuple[str, ...], tuple[str | None, ...]]:
@@ -197,19 +202,6 @@ def _names_and_units(cells: Sequence[str], row: int, path: Path) -> tuple[tuple[
         names.append(name)
         units.append(match["unit"].strip() if match else None)
     return tuple(names), tuple(units)
-
-
-def _delimiter(line: str, row: int, path: Path) -> str:
-    """Tell what separates the columns, from the header row outside its units."""
-    outside = re.sub(r"\[[^\[\]]*\]", "[]", line)
-    found = [d for d in (",", ";", "\t") if d in outside]
-    if len(found) > 1:
-        raise RecordError(
-            f"{path}, row {row}: the header holds both {found[0]!r} and {found[1]!r}; one delimiter only. Use commas"
-        )
-    if not found and outside.count("[]") > 1:
-        raise RecordError(f"{path}, row {row}: the columns are not separated by commas. Write 'time [s],voltage [V],…'")
-    return found[0] if found else ","
 
 
 def read_plain(data: bytes, path: Path) -> tuple[Header, Array] | None:

@@ -85,7 +85,7 @@ def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mappi
 def to_dataframe(record: Record) -> Any:
     """Return a record as a pandas DataFrame."""
     pandas = imported("pandas", "a DataFrame")
-    columns = {_label(c): c.values for c in record.channels}
+    columns = {(c.name if c.unit == UNKNOWN else f"{c.name} [{c.unit}]"): c.values for c in record.channels}
     return pandas.DataFrame(columns, index=pandas.Index(record.time_s, name="time [s]"))
 
 
@@ -115,10 +115,6 @@ def label_of(label: str) -> tuple[str, str | None]:
     """Return name and unit of a column that is called ``name [unit]``."""
     match = _LABEL.fullmatch(label.strip())
     return (match["name"].strip(), match["unit"].strip()) if match else (label.strip(), None)
-
-
-def _label(channel: Channel) -> str:
-    return channel.name if channel.unit == UNKNOWN else f"{channel.name} [{channel.unit}]"
 
 
 def _class_of(x: object) -> tuple[str, str]:

@@ -209,7 +209,15 @@ def read_hdf5(path: str | Path) -> Record:
         raise RecordError(f"record {path} is not an HDF5 file, or is damaged. Copy it again, or name its real format")
     try:
         with h5py.File(path, "r") as file:
-            _check_schema(file, path)
+            schema = file.attrs.get("schema")
+            if schema is None:
+                inside = ", ".join(sorted(file)[:5]) or "nothing"
+                raise RecordError(
+                    f"record {path} is HDF5 but not of ambid (no schema attribute; it holds {inside})."
+                    " Export it as CSV, or write it with ambid"
+                )
+            if schema != SCHEMA:
+                raise RecordError(f"record {path} has schema {schema!r}; this program reads {SCHEMA!r}. Write it again")
             datasets = [file["channels"][str(k)] for k in range(len(file["channels"]))]
             for dataset in datasets:
                 refuse_claim(path, dataset.size, dataset.dtype.itemsize, len(data))
@@ -232,19 +240,6 @@ def read_hdf5(path: str | Path) -> Record:
     return Record(
         rate_hz=rate_hz, start_s=start_s, channels=channels, history=history, provenance=MappingProxyType(provenance)
     )
-
-
-def _check_schema(file: Any, path: Path) -> None:
-    """Refuse HDF5 files of other programs and versions."""
-    schema = file.attrs.get("schema")
-    if schema is None:
-        inside = ", ".join(sorted(file)[:5]) or "nothing"
-        raise RecordError(
-            f"record {path} is HDF5 but not of ambid (no schema attribute; it holds {inside})."
-            " Export it as CSV, or write it with ambid"
-        )
-    if schema != SCHEMA:
-        raise RecordError(f"record {path} has schema {schema!r}; this program reads {SCHEMA!r}. Write it again")
 
 
 def _channel(dataset: Any) -> Channel:

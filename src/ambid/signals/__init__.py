@@ -14,40 +14,21 @@ if TYPE_CHECKING:
     from ambid.signals.conditioning import replace_samples as replace_samples
     from ambid.signals.conditioning import resample as resample
     from ambid.signals.conditioning import scale as scale
-    from ambid.signals.delay import Delay as Delay
-    from ambid.signals.delay import PersistentExcitation as PersistentExcitation
     from ambid.signals.delay import find_delay as find_delay
     from ambid.signals.delay import persistent_excitation as persistent_excitation
     from ambid.signals.excitations import AXES_EXCITATIONS as AXES_EXCITATIONS
     from ambid.signals.excitations import EXCITATIONS as EXCITATIONS
-    from ambid.signals.excitations import chirp as chirp
     from ambid.signals.excitations import crest_factor as crest_factor
     from ambid.signals.excitations import excitation as excitation
     from ambid.signals.excitations import excitation_of_axes as excitation_of_axes
-    from ambid.signals.excitations import gaussian as gaussian
     from ambid.signals.excitations import multisine as multisine
-    from ambid.signals.excitations import prbs as prbs
-    from ambid.signals.excitations import schroeder_phases as schroeder_phases
-    from ambid.signals.excitations import steps as steps
-    from ambid.signals.faults import Dropouts as Dropouts
-    from ambid.signals.faults import Limit as Limit
-    from ambid.signals.faults import Outliers as Outliers
-    from ambid.signals.faults import Resolution as Resolution
-    from ambid.signals.faults import Saturation as Saturation
     from ambid.signals.faults import find_dropouts as find_dropouts
     from ambid.signals.faults import find_outliers as find_outliers
     from ambid.signals.faults import find_saturation as find_saturation
     from ambid.signals.faults import resolution as resolution
     from ambid.signals.frf import frequency_response as frequency_response
-    from ambid.signals.frf import frf_local as frf_local
-    from ambid.signals.frf import frf_random as frf_random
-    from ambid.signals.periodic_response import Distortions as Distortions
     from ambid.signals.periodic_response import find_period as find_period
-    from ambid.signals.periodic_response import frf_periodic as frf_periodic
     from ambid.signals.response import FrequencyResponse as FrequencyResponse
-    from ambid.signals.spectra import CrossSpectra as CrossSpectra
-    from ambid.signals.spectra import PowerSpectrum as PowerSpectrum
-    from ambid.signals.spectra import Snr as Snr
     from ambid.signals.spectra import cross_spectra as cross_spectra
     from ambid.signals.spectra import power_spectrum as power_spectrum
     from ambid.signals.spectra import snr as snr

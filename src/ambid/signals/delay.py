@@ -91,31 +91,17 @@ _RELATIVE = 0.2  # of the largest coefficient: under it a lag is the foot of a f
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Delay:
-    """Pure delay of an output behind an input.
+    """Pure delay of an output behind an input."""
 
-    Attributes
-    ----------
-    samples : int or None
-        Delay in samples; None if no lag is significant.
-    confidence : float
-        Probability, 0 to 1, that the first significant lag lies above the threshold and all earlier ones under it,
-        given the coefficients and their standard deviations; it does not know of model error.
-    lags : ndarray of int, shape (n_lags,)
-        Candidate delays in samples.
-    coefficients : ndarray, shape (n_lags,), output unit per input unit
-        Weight of the input in the one-step predictor for each candidate.
-    z : ndarray, shape (n_lags,), dimensionless
-        Coefficients over their standard deviations.
-    threshold : float
-        Size that a coefficient has to exceed, output unit per input unit.
-    """
-
-    samples: int | None
+    samples: int | None  # delay in samples; None if no lag is significant
+    # probability, 0 to 1, that the first significant lag lies above the threshold and all earlier ones under it,
+    # given the coefficients and their standard deviations; it does not know of model error
     confidence: float
-    lags: np.ndarray
+    lags: np.ndarray  # (n_lags,): Candidate delays in samples
+    # (n_lags,), output unit per input unit: Weight of the input in the one-step predictor for each candidate
     coefficients: Array
-    z: Array
-    threshold: float
+    z: Array  # (n_lags,), dimensionless: Coefficients over their standard deviations
+    threshold: float  # size that a coefficient has to exceed, output unit per input unit
 
     def __str__(self) -> str:
         if self.samples is None:
@@ -215,21 +201,12 @@ def _confidence(b: Array, sd: Array, threshold: float, first: int) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PersistentExcitation:
-    """Persistent excitation of a signal.
+    """Persistent excitation of a signal."""
 
-    Attributes
-    ----------
-    order : int
-        Largest order, up to `asked`, at which the signal is persistently exciting; 0 for a constant signal.
-    asked : int
-        Order looked at.
-    smallest, largest : float
-        Singular values of the Hankel matrix of order `asked`, of the signal scaled to mean 0 and rms 1 and divided by
-        the square root of the number of rows: both are 1 for white noise.
-    """
-
-    order: int
-    asked: int
+    order: int  # largest order, up to `asked`, at which the signal is persistently exciting; 0 for a constant signal
+    asked: int  # order looked at
+    # singular values of the Hankel matrix of order `asked`, of the signal scaled to mean 0 and rms 1 and divided by
+    # the square root of the number of rows: both are 1 for white noise
     smallest: float
     largest: float
 

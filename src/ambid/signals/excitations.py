@@ -68,33 +68,7 @@ def steps(
     levels: Sequence[float] = (0.0, 1.0, 0.0, -1.0),
     amplitude_is: AmplitudeIs = "peak",
 ) -> Array:
-    """Return steps that run through `levels`, holding each for `hold_s`, over and over.
-
-    Parameters
-    ----------
-    n_samples : int
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-    amplitude : float
-        Largest absolute value, or rms over the signal, in the unit of the result.
-    hold_s : float
-        Time in s for which a level is held, at least one sample; rounded to whole samples.
-    levels : sequence of float
-        Relative heights.
-    amplitude_is : {"peak", "rms"}
-        What `amplitude` means.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `amplitude`
-        The steps.
-
-    Raises
-    ------
-    AmbidError
-        If a setting is out of range, or no step falls into the signal.
-    """
+    """Return steps that run through `levels`, holding each for `hold_s`, over and over."""
     checked(n_samples, rate_hz)
     hold = round(hold_s * rate_hz)
     if hold < 1:
@@ -122,31 +96,6 @@ def chirp(
     """Return a sine whose frequency runs once through the band, starting at phase 0.
 
     Linear: φ = 2π (f0 t + (f1 - f0) t²/(2 T)); logarithmic: φ = 2π f0 T/ln(f1/f0) ((f1/f0)^(t/T) - 1).
-
-    Parameters
-    ----------
-    n_samples : int
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-    amplitude : float
-        Largest absolute value, or rms, in the unit of the result.
-    band : (float, float)
-        First and last frequency in Hz; the first must be over 0 for a logarithmic sweep.
-    sweep : {"linear", "log"}
-        Frequency linear in time, or its logarithm.
-    amplitude_is : {"peak", "rms"}
-        What `amplitude` means.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `amplitude`
-        The chirp.
-
-    Raises
-    ------
-    AmbidError
-        If a setting is out of range.
     """
     checked(n_samples, rate_hz)
     low, high = checked_band(band, rate_hz)
@@ -177,33 +126,6 @@ def prbs(
     A shift register of `bits` bits gives a period of 2^bits - 1 clock ticks; its mean is amplitude/(2^bits - 1) and
     its periodic autocorrelation has two values only (Ljung 1999, sec. 13.3). The spectrum falls to half at 0.44/tick
     and to nothing at 1/tick.
-
-    Parameters
-    ----------
-    n_samples : int
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-    amplitude : float
-        Both peak and rms, which are equal here, in the unit of the result.
-    bits : int, optional
-        Length of the register, 2 to 31; by default the shortest (at least 4) whose period is as long as the signal.
-    hold : int
-        Samples of a clock tick.
-    seed : int or numpy.random.Generator
-        Chooses where in its period the sequence starts.
-    amplitude_is : {"peak", "rms"}
-        Accepted for uniformity.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `amplitude`
-        The sequence.
-
-    Raises
-    ------
-    AmbidError
-        If a setting is out of range.
     """
     from scipy.signal import max_len_seq
 
@@ -231,33 +153,7 @@ def gaussian(
     seed: int | np.random.Generator = 0,
     amplitude_is: AmplitudeIs = "rms",
 ) -> Array:
-    """Return Gaussian noise, white or confined to a band.
-
-    Parameters
-    ----------
-    n_samples : int
-        Samples.
-    rate_hz : float
-        Sampling rate in Hz.
-    amplitude : float
-        Rms of these samples (default), or largest absolute value, in the unit of the result.
-    band : (float, float), optional
-        Band in Hz, cut out exactly in the discrete Fourier transform of the whole signal; white by default.
-    seed : int or numpy.random.Generator
-        Source of the noise.
-    amplitude_is : {"rms", "peak"}
-        What `amplitude` means.
-
-    Returns
-    -------
-    ndarray, shape (n_samples,), unit of `amplitude`
-        The noise.
-
-    Raises
-    ------
-    AmbidError
-        If a setting is out of range, or no frequency of the signal falls into the band.
-    """
+    """Return Gaussian noise, white or confined to a band."""
     checked(n_samples, rate_hz)
     x = np.random.default_rng(seed).standard_normal(n_samples)
     if band is not None:
@@ -353,18 +249,7 @@ def multisine(
 
 
 def schroeder_phases(size: Array) -> Array:
-    """Return Schroeder's phases for lines of the given amplitudes (equally spaced in frequency).
-
-    Parameters
-    ----------
-    size : ndarray, shape (n_lines,), any unit
-        Amplitudes of the lines, in order of frequency.
-
-    Returns
-    -------
-    ndarray, shape (n_lines,), rad
-        φ_k = -2π Σ_{j<k} (k - j) p_j with p_j = size_j²/Σ size² (Schroeder 1970).
-    """
+    """Return Schroeder's phases for lines of the given amplitudes (equally spaced in frequency)."""
     share = size**2 / np.sum(size**2)
     # Σ_{j<k} (k - j) p_j is the running sum of the running sum of p, one line late.
     twice = np.cumsum(np.cumsum(share))
@@ -600,7 +485,9 @@ def excitation(
     seed : int or numpy.random.Generator
         Source of randomness; the same seed gives the same samples. Steps and chirp have none.
     **options : object
-        Further settings of that excitation.
+        Further settings of that excitation. All: ``amplitude_is`` ("peak" or "rms"). Steps: ``hold_s``, ``levels``.
+        Chirp: ``sweep`` ("linear" or "log"). Prbs: ``bits`` of the register, 2 to 31, and ``hold``, samples of a tick.
+        Multisines: those of `multisine`.
 
     Returns
     -------
@@ -616,7 +503,9 @@ def excitation(
         raise AmbidError(f"excitation {name!r} is over the axes of a rotor; this bench has one axis. Give multisine")
     _refuse_unknown(name, tuple(EXCITATIONS))
     checked(n_samples, rate_hz)
-    known = _options(name)
+    function = prbs if name == "prbs" else EXCITATIONS[name]
+    taken = {"n_samples", "rate_hz", "amplitude", "band", "seed"} | ({"phases"} if name == "schroeder" else set())
+    known = [p for p in signature(function).parameters if p not in taken]
     for option in options:
         if option not in known:
             near = get_close_matches(option, known, n=1, cutoff=0.4)
@@ -641,10 +530,3 @@ def _refuse_unknown(name: str, known: Sequence[str]) -> None:
         near = get_close_matches(name, known, n=1, cutoff=0.4)
         hint = f"Did you mean {near[0]!r}?" if near else "Give one of these"
         raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(known)}. {hint}")
-
-
-def _options(name: str) -> list[str]:
-    """Names of the options of an excitation beside those that `excitation` itself takes."""
-    function = prbs if name == "prbs" else EXCITATIONS[name]
-    taken = {"n_samples", "rate_hz", "amplitude", "band", "seed"} | ({"phases"} if name == "schroeder" else set())
-    return [p for p in signature(function).parameters if p not in taken]

@@ -19,27 +19,13 @@ _ZERO_JUMP = 8.0  # robust sd of the sample-to-sample change that a fall to zero
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dropouts:
-    """Stretches in which a channel stood still or fell to zero.
+    """Stretches in which a channel stood still or fell to zero."""
 
-    Attributes
-    ----------
-    channel : str
-        Channel looked at.
-    spans : tuple of (int, int)
-        First sample and number of samples of each stretch.
-    n_samples : int
-        Samples of the channel.
-    first_s : float or None
-        Time of the first one in s.
-    shortest : int
-        Number of equal samples in a row from which on quantisation and chance no longer explain them.
-    """
-
-    channel: str
-    spans: tuple[tuple[int, int], ...]
-    n_samples: int
-    first_s: float | None
-    shortest: int
+    channel: str  # channel looked at
+    spans: tuple[tuple[int, int], ...]  # first sample and number of samples of each stretch
+    n_samples: int  # samples of the channel
+    first_s: float | None  # time of the first one in s
+    shortest: int  # number of equal samples in a row from which on quantisation and chance no longer explain them
 
     @property
     def count(self) -> int:
@@ -171,24 +157,12 @@ _MAD_TO_SD = 1.4826  # of a Gaussian
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Outliers:
-    """Samples that neither their past nor their future predicts.
+    """Samples that neither their past nor their future predicts."""
 
-    Attributes
-    ----------
-    channel : str
-        Channel looked at.
-    indices : ndarray of int, shape (count,)
-        The samples.
-    first_s : float or None
-        Time of the first one in s.
-    largest_sd : float
-        Largest prediction error among them, in robust standard deviations of the innovations.
-    """
-
-    channel: str
-    indices: NDArray[np.intp]
-    first_s: float | None
-    largest_sd: float
+    channel: str  # channel looked at
+    indices: NDArray[np.intp]  # (count,): The samples
+    first_s: float | None  # time of the first one in s
+    largest_sd: float  # largest prediction error among them, in robust standard deviations of the innovations
 
     @property
     def count(self) -> int:
@@ -303,11 +277,6 @@ def _errors(x: Array, clean: Array, weights: Array, spread: float) -> Array:
     """Errors of the one-step predictions of x from the clean past, in local robust sd."""
     padded = np.concatenate((np.full(_ORDER, clean[0]), clean[:-1]))
     error = x - (np.convolve(padded, weights[:_ORDER], mode="valid") + weights[-1])
-    return np.asarray(error / _local_scale(error, spread))
-
-
-def _local_scale(error: Array, spread: float) -> Array:
-    """Robust sd of errors around each sample: the largest of its own and the two neighbouring blocks."""
     n_blocks = max(1, error.size // _BLOCK)
     length, longer = divmod(error.size, n_blocks)  # the first blocks are longer by one sample
     cut, size = longer * (length + 1), np.abs(error)
@@ -323,7 +292,7 @@ def _local_scale(error: Array, spread: float) -> Array:
     lengths[:longer] += 1
     # The floor keeps round-off of a noise-free record from being its own measure.
     scale: Array = np.repeat(np.maximum(_MAD_TO_SD * widest, 1e-6 * spread), lengths)
-    return scale
+    return np.asarray(error / scale)
 
 
 def _stand_out(x: Array, forward: Array, backward: Array, threshold: float) -> Array:
@@ -345,46 +314,24 @@ _NEIGHBOURS = 10  # levels beside the limit that tell how many samples a level h
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Limit:
-    """One limit at which samples pile up.
+    """One limit at which samples pile up."""
 
-    Attributes
-    ----------
-    value : float
-        The limit in the channel's unit.
-    count, longest : int
-        Samples at it, and those of the longest run.
-    first_index : int
-        First sample at it.
-    """
-
-    value: float
-    count: int
+    value: float  # the limit in the channel's unit
+    count: int  # samples at it, and those of the longest run
     longest: int
-    first_index: int
+    first_index: int  # first sample at it
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Saturation:
-    """Saturation of a channel.
+    """Saturation of a channel."""
 
-    Attributes
-    ----------
-    channel, unit : str
-        Channel looked at and its unit.
-    lower, upper : Limit or None
-        The limits that were reached.
-    n_samples : int
-        Samples of the channel.
-    first_s : float or None
-        Time of the first saturated sample in s.
-    """
-
-    channel: str
+    channel: str  # channel looked at and its unit
     unit: str
-    lower: Limit | None
+    lower: Limit | None  # the limits that were reached
     upper: Limit | None
-    n_samples: int
-    first_s: float | None
+    n_samples: int  # samples of the channel
+    first_s: float | None  # time of the first saturated sample in s
 
     @property
     def count(self) -> int:
@@ -493,30 +440,15 @@ def _held(x: Array, dwell: float) -> bool:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Resolution:
-    """Quantisation of a channel.
+    """Quantisation of a channel."""
 
-    Attributes
-    ----------
-    channel : str
-        Channel looked at.
-    unit : str
-        Its unit.
-    step : float
-        Typical smallest spacing of neighbouring levels, in `unit`; 0 for a channel with one level.
-    n_levels : int
-        Number of different values.
-    n_samples : int
-        Number of samples.
-    uniform : float
-        Part of the spacings that are whole multiples of `step` within 5 %; near 1 for a linear converter, less behind
-        a calibration curve.
-    """
-
-    channel: str
-    unit: str
-    step: float
-    n_levels: int
-    n_samples: int
+    channel: str  # channel looked at
+    unit: str  # its unit
+    step: float  # typical smallest spacing of neighbouring levels, in `unit`; 0 for a channel with one level
+    n_levels: int  # number of different values
+    n_samples: int  # number of samples
+    # part of the spacings that are whole multiples of `step` within 5 %; near 1 for a linear converter, less behind
+    # a calibration curve
     uniform: float
 
     @property

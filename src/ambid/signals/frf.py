@@ -93,52 +93,35 @@ def frf_local(
 
     The resolution is that of the record, rate/n_samples; a resonance should be wider than the window. Errors of
     neighbouring lines are correlated over the window (`lines_per_independent`).
-
-    Parameters
-    ----------
-    u : ndarray, shape (n_samples, n_u), any units
-        Inputs, with a rough spectrum (noise, PRBS, multisine): a smooth one is not separated from leakage.
-    y : ndarray, shape (n_samples, n_y), any units
-        Outputs.
-    rate_hz : float
-        Sampling rate in Hz.
-    r : ndarray, shape (n_samples, n_r), optional
-        References: outer excitation of the loop, independent of the noise, at least as many as inputs.
-    free : int, optional
-        Least lines of a window beyond its unknowns: more gives a better variance and a wider window. By default 8, or
-        4 more than there are signals.
-    band : (float, float), optional
-        Band in Hz in which the estimate is wanted.
-    open_loop : bool
-        Whether the record is known to be open loop.
-    hold : {"zoh", "band-limited"}
-        What the input does between samples; kept with the result.
-    leave_out : bool
-        Whether lines at which the excitation does not tell G from leakage are left out, and told, instead of refused.
-    inputs, outputs : sequence of str, optional
-        Names.
-    units : Mapping[str, str], optional
-        SI unit by name.
-
-    Returns
-    -------
-    FrequencyResponse
-        At every line of the record in the band, 0 and half the rate left out, and with `leave_out` those not told.
-
-    Raises
-    ------
-    EstimationError
-        If the record is shorter than a window, or the excitation does not tell G from leakage.
     """
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     n, n_y, n_u = u.shape[0], y.shape[1], u.shape[1]
     x, z = (u, y) if r is None else (r, np.concatenate([y, u], axis=1))
     X, Z = (np.fft.rfft(s, axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for s in (x, z))
-    plan = _plan(X, Z, free)
+    free = max(8, Z.shape[1] + 4) if free is None else free
+    if free < Z.shape[1]:
+        raise EstimationError(
+            f"local polynomials with {free} lines beyond the unknowns and {Z.shape[1]} signals; there must be at least "
+            "as many lines as signals. Give more"
+        )
+    unknowns = (_DEGREE + 1) * (X.shape[1] + 1)
+    power = np.abs(X) ** 2
+    loud = power > _LOUD * power.max(axis=0)
+    gaps = [np.diff(np.flatnonzero(column)) for column in loud.T]
+    # lines between those that excite the sparsest input: a zippered multisine leaves most out
+    apart = max((int(np.percentile(g, 90)) for g in gaps if g.size), default=1)
+    half = max(unknowns + free, (_DEGREE + 2) * apart) // 2
+    if X.shape[0] < 2 * half + 1:
+        raise EstimationError(f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record")
+    plan = _Plan(half=half, unknowns=unknowns)
     frequency = np.arange(1, X.shape[0] + 1) * (rate_hz / n)
     wanted = _in_band(frequency, band)
     fitted = _fitted(X, Z, wanted, plan)
-    told = _refuse_smooth(fitted.condition, frequency[wanted], leave_out=leave_out)
+    told = fitted.condition < _WORST
+    if not (told.all() or (leave_out and told.any())):
+        raise EstimationError(
+            f"{_smooth(~told, frequency[wanted])}. Give a band without them, or excite with noise or a multisine"
+        )
     left = () if told.all() else (_smooth(~told, frequency[wanted]) + "; they are left out",)
     wanted, fitted = wanted[told], fitted.at(told)
     warnings: tuple[str, ...]
@@ -170,28 +153,6 @@ def frf_local(
             }
         ),
     )
-
-
-def _plan(X: Complex, Z: Complex, free: int | None) -> _Plan:
-    free = max(8, Z.shape[1] + 4) if free is None else free
-    if free < Z.shape[1]:
-        raise EstimationError(
-            f"local polynomials with {free} lines beyond the unknowns and {Z.shape[1]} signals; there must be at least "
-            "as many lines as signals. Give more"
-        )
-    unknowns = (_DEGREE + 1) * (X.shape[1] + 1)
-    half = max(unknowns + free, (_DEGREE + 2) * _apart(X)) // 2
-    if X.shape[0] < 2 * half + 1:
-        raise EstimationError(f"{X.shape[0]} lines in the record, {2 * half + 1} in a window. Use a longer record")
-    return _Plan(half=half, unknowns=unknowns)
-
-
-def _apart(X: Complex) -> int:
-    """Return how many lines lie between those that excite the sparsest input: a zippered multisine leaves most out."""
-    power = np.abs(X) ** 2
-    loud = power > _LOUD * power.max(axis=0)
-    gaps = [np.diff(np.flatnonzero(column)) for column in loud.T]
-    return max((int(np.percentile(g, 90)) for g in gaps if g.size), default=1)
 
 
 def _in_band(frequency: Array, band: tuple[float, float] | None) -> np.ndarray:
@@ -274,16 +235,6 @@ def _solved(columns: Complex, Z: Complex, n_x: int) -> tuple[Complex, Complex, A
     return L, Z - Q @ (Qh @ Z), np.where(singular, np.inf, condition)
 
 
-def _refuse_smooth(condition: Array, frequency: Array, *, leave_out: bool) -> np.ndarray:
-    """Return which lines the excitation tells from leakage; refuse others, where they are not to be left out."""
-    told = condition < _WORST
-    if not (told.all() or (leave_out and told.any())):
-        raise EstimationError(
-            f"{_smooth(~told, frequency)}. Give a band without them, or excite with noise or a multisine"
-        )
-    return told
-
-
 def _smooth(bad: np.ndarray, frequency: Array) -> str:
     return (
         f"at {int(bad.sum())} of {bad.size} lines, {frequency[bad][0]:g} to {frequency[bad][-1]:g} Hz, the "
@@ -316,47 +267,16 @@ def frf_random(
 
     Its variance is (1 - γ²)/γ² |G|²/n with one input and n independent averages (Bendat and Piersol 2010, sec. 9.2),
     with n reduced for overlap (Welch 1967), and its several-input form S_vv ⊗ S_uu⁻ᵀ/n.
-
-    Parameters
-    ----------
-    u : ndarray, shape (n_samples, n_u), any units
-        Inputs.
-    y : ndarray, shape (n_samples, n_y), any units
-        Outputs.
-    rate_hz : float
-        Sampling rate in Hz.
-    r : ndarray, shape (n_samples, n_r), optional
-        References: outer excitation of the loop, independent of the noise, at least as many as inputs.
-    kind : {"h1", "h2", "hv"}
-        Where the noise is, without a reference: outputs, inputs (as many outputs as inputs), or both.
-    segment : int, optional
-        Samples of a segment; by default an eighth of the record. It should hold several time constants.
-    noise_ratio : float, optional
-        For "hv": variance of the input noise over that of the output noise. By default the noise is taken to be the
-        same share of both signals at every line.
-    open_loop : bool
-        Whether the record is known to be open loop.
-    hold : {"zoh", "band-limited"}
-        What the input does between samples; kept with the result.
-    inputs, outputs : sequence of str, optional
-        Names.
-    units : Mapping[str, str], optional
-        SI unit by name.
-
-    Returns
-    -------
-    FrequencyResponse
-        At the lines of a segment, the two next to 0 and to half the rate left out.
-
-    Raises
-    ------
-    EstimationError
-        If there are too few segments, options contradict each other, or inputs cannot be distinguished.
-    RecordError
-        If the segment does not fit the record.
     """
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
-    _options_agree(kind, noise_ratio, r is not None)
+    if kind not in ("h1", "h2", "hv"):
+        raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
+    if r is not None and kind != "h1":
+        raise EstimationError(f"kind {kind!r} with a reference, which replaces it. Omit one of the two")
+    if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
+        raise EstimationError(
+            f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
+        )
     z = np.concatenate([y, u] if r is None else [y, u, r], axis=1)
     spectra = cross_spectra(z, rate_hz, segment=segment)
     n_y, n_u, n_x = y.shape[1], u.shape[1], (u if r is None else r).shape[1]
@@ -389,19 +309,14 @@ def frf_random(
         degrees_of_freedom=2.0 * (spectra.n_effective - n_x),
         lines_per_independent=spectra.lines_per_independent,
         warnings=warnings,
-        details=MappingProxyType(_details(spectra, rate_hz)),
+        details=MappingProxyType(
+            {
+                "segments": spectra.n_segments,
+                "effective_averages": spectra.n_effective,
+                "segment_samples": round(rate_hz / spectra.frequency_hz[1]),
+            }
+        ),
     )
-
-
-def _options_agree(kind: str, noise_ratio: float | None, reference: bool) -> None:
-    if kind not in ("h1", "h2", "hv"):
-        raise EstimationError(f"kind {kind!r} of averaged response; it must be 'h1', 'h2' or 'hv'. Give one of them")
-    if reference and kind != "h1":
-        raise EstimationError(f"kind {kind!r} with a reference, which replaces it. Omit one of the two")
-    if noise_ratio is not None and (kind != "hv" or not noise_ratio > 0.0):
-        raise EstimationError(
-            f"noise_ratio {noise_ratio} with kind {kind!r}; it must be positive, for 'hv'. Correct it"
-        )
 
 
 def _found(
@@ -409,7 +324,14 @@ def _found(
 ) -> tuple[_Found, tuple[str, ...]]:
     S, n = spectra.density[_EDGE:-_EDGE], spectra.n_effective
     if S.shape[1] > n_y + n_u:
-        return _with_reference(S, n_y, n_u, n)
+        n_z = n_y + n_u
+        S_rr = S[:, n_z:, n_z:]
+        _told_apart(S_rr)
+        Z, covariance, noise = _regressed(S[:, :n_z, :n_z], S[:, :n_z, n_z:], S_rr, n)
+        G, C = ratio(Z, covariance, n_y, weight=S_rr)
+        coherence = _explained(noise, S, n_y, n, S_rr.shape[1])
+        found = (G, C, coherence, "joint input-output with the reference (Welch)")
+        return found, weak_inputs(Z, covariance, n_y)
     return _by_kind(S, n_y, n_u, kind, n, noise_ratio), ()
 
 
@@ -432,17 +354,6 @@ def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
         f"segments half as long give another response, by up to {worst:.1f} standard deviations: leakage, which "
         f"the variance does not include. Give longer segments, or use the local method ({setting('method', 'local')})",
     )
-
-
-def _with_reference(S: Complex, n_y: int, n_u: int, n: float) -> tuple[_Found, tuple[str, ...]]:
-    n_z = n_y + n_u
-    S_rr = S[:, n_z:, n_z:]
-    _told_apart(S_rr)
-    Z, covariance, noise = _regressed(S[:, :n_z, :n_z], S[:, :n_z, n_z:], S_rr, n)
-    G, C = ratio(Z, covariance, n_y, weight=S_rr)
-    coherence = _explained(noise, S, n_y, n, S_rr.shape[1])
-    found = (G, C, coherence, "joint input-output with the reference (Welch)")
-    return found, weak_inputs(Z, covariance, n_y)
 
 
 def _by_kind(S: Complex, n_y: int, n_u: int, kind: str, n: float, noise_ratio: float | None) -> _Found:
@@ -532,14 +443,6 @@ def _told_apart(S: Complex) -> None:
         )
 
 
-def _details(spectra: CrossSpectra, rate_hz: float) -> dict[str, object]:
-    return {
-        "segments": spectra.n_segments,
-        "effective_averages": spectra.n_effective,
-        "segment_samples": round(rate_hz / spectra.frequency_hz[1]),
-    }
-
-
 Method = Literal["auto", "periodic", "random", "local"]
 
 
@@ -566,7 +469,12 @@ def frequency_response(
         "auto" takes `frf_periodic` for several experiments, a given period, or an excitation (r, or u without it) of
         one input that repeats at least twice; else `frf_local`. What was taken is in the result's `method`.
     **options
-        Passed on to the method; all know `open_loop`, `hold`, `inputs`, `outputs` and `units`.
+        Passed on to the method. All know `open_loop` (the record is known to be open loop), `hold` ("zoh" or
+        "band-limited", what the input does between samples), and `inputs`, `outputs`, `units` (names, and SI unit by
+        name). Local: `free` (least lines of a window beyond its unknowns), `band` in Hz, `leave_out` (lines at which
+        the excitation does not tell G from leakage are left out instead of refused). Random: `kind` ("h1", "h2", "hv":
+        where the noise is), `segment` in samples, `noise_ratio` (for "hv", of input over output noise). Periodic:
+        `period` in samples, `lines` that are excited, `drop_periods` (a number, or "auto") that hold a transient.
 
     Returns
     -------

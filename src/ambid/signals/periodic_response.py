@@ -154,32 +154,15 @@ class Distortions:
     """Output levels at detection lines, each the rms of the sine at that line (mean over experiments).
 
     Levels hold noise too; compare them with the noise beside them.
-
-    Attributes
-    ----------
-    even_hz : ndarray, shape (n_even,), Hz
-        Even lines without excitation, between the lowest and the highest excited line.
-    even : ndarray, shape (n_even, n_y), output units
-        Level there.
-    even_noise : ndarray, shape (n_even, n_y), or None
-        Part of it that differs between periods; None with one period.
-    odd_hz : ndarray, shape (n_odd,), Hz
-        Odd lines without excitation.
-    odd : ndarray, shape (n_odd, n_y), output units
-        Level there.
-    odd_noise : ndarray, shape (n_odd, n_y), or None
-        Part of it that differs between periods.
-    signal : ndarray, shape (n_f, n_y), output units
-        Level at the excited lines.
     """
 
-    even_hz: Array
-    even: Array
-    even_noise: Array | None
-    odd_hz: Array
-    odd: Array
-    odd_noise: Array | None
-    signal: Array
+    even_hz: Array  # (n_even,), Hz: Even lines without excitation, between the lowest and the highest excited line
+    even: Array  # (n_even, n_y), output units: Level there
+    even_noise: Array | None  # (n_even, n_y), or None: Part of it that differs between periods; None with one period
+    odd_hz: Array  # (n_odd,), Hz: Odd lines without excitation
+    odd: Array  # (n_odd, n_y), output units: Level there
+    odd_noise: Array | None  # (n_odd, n_y), or None: Part of it that differs between periods
+    signal: Array  # (n_f, n_y), output units: Level at the excited lines
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -353,41 +336,6 @@ def frf_periodic(
     With n_u inputs, n_u successive experiments (with inputs that are linearly independent at every line, e.g.
     orthogonal multisines) make a realisation, in which G = Y U⁻¹. Realisations are averaged; with a reference r, the
     responses of [Y; U] to it are averaged first, so that noise and distortion at the input do not bias G.
-
-    Parameters
-    ----------
-    u, y : ndarray, shape (n_samples, n_u) and (n_samples, n_y), or a sequence of them
-        Inputs and outputs, one array per experiment. What leads before the last whole number of periods is not used.
-    rate_hz : float
-        Sampling rate in Hz.
-    r : ndarray, shape (n_samples, n_u), or a sequence of them, optional
-        Reference: what excited the experiment.
-    period : int, optional
-        Period in samples; by default found from r or u.
-    lines : sequence of int, optional
-        Excited multiples of rate/period; by default found from r or u.
-    drop_periods : int or "auto"
-        Leading periods not used, for the transient; "auto" drops those that differ significantly, and says so.
-    open_loop : bool
-        Whether the record is known to be open loop; otherwise single periods, which do not show the noise that
-        feedback carries to the input, give a warning.
-    hold : {"zoh", "band-limited"}
-        What the input does between samples; kept with the result.
-    inputs, outputs : sequence of str, optional
-        Names.
-    units : Mapping[str, str], optional
-        SI unit by name.
-
-    Returns
-    -------
-    FrequencyResponse
-        At the excited lines. Its total variance is that over the realisations; with one realisation the noise plus
-        the distortion at detection lines, where there are any. ``details["distortions"]`` holds the levels.
-
-    Raises
-    ------
-    EstimationError
-        If experiments do not fit together, or neither periods nor realisations nor free lines give a variance.
     """
     experiments = _experiments(u, y, r, rate_hz, inputs, outputs)
     n_u, n_y = experiments[0][0].shape[1], experiments[0][1].shape[1]

@@ -19,24 +19,12 @@ _CHUNK = 64  # segments transformed at a time: memory does not grow with the rec
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PowerSpectrum:
-    """One-sided power spectral density.
+    """One-sided power spectral density."""
 
-    Attributes
-    ----------
-    frequency_hz : ndarray, shape (n_frequencies,), Hz
-        Frequencies from 0 to half the rate.
-    density : ndarray, shape (n_frequencies,), signal unit squared per Hz
-        Its integral over frequency is the variance.
-    n_segments : int
-        Half-overlapping segments that were averaged.
-    n_effective : float
-        Independent segments that would give the same variance; fewer, since neighbours share samples.
-    """
-
-    frequency_hz: Array
-    density: Array
-    n_segments: int
-    n_effective: float
+    frequency_hz: Array  # (n_frequencies,), Hz: Frequencies from 0 to half the rate
+    density: Array  # (n_frequencies,), signal unit squared per Hz: Its integral over frequency is the variance
+    n_segments: int  # half-overlapping segments that were averaged
+    n_effective: float  # independent segments that would give the same variance; fewer, since neighbours share samples
 
     @property
     def sd(self) -> Array:
@@ -47,21 +35,6 @@ class PowerSpectrum:
         """Return the bounds of the density: 2 n_effective·estimate/truth is χ² with 2 n_effective degrees of freedom.
 
         It holds inside the band; at 0 and at half the rate the density has half the degrees of freedom.
-
-        Parameters
-        ----------
-        level : float
-            Probability, 0 to 1.
-
-        Returns
-        -------
-        low, high : ndarray, shape (n_frequencies,), unit of the density
-            Bounds (Welch 1967; Bendat and Piersol 2010, sec. 8.5).
-
-        Raises
-        ------
-        RecordError
-            If the level is not between 0 and 1.
         """
         from scipy.special import gammaincinv
 
@@ -74,26 +47,15 @@ class PowerSpectrum:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class CrossSpectra:
-    """One-sided spectral density matrix of several signals.
+    """One-sided spectral density matrix of several signals."""
 
-    Attributes
-    ----------
-    frequency_hz : ndarray, shape (n_frequencies,), Hz
-        Frequencies from 0 to half the rate.
-    density : complex ndarray, shape (n_frequencies, n_signals, n_signals), product of units per Hz
-        E[Z Zᴴ], so that entry (i, j) is signal i times the conjugate of signal j. Its integral is the covariance.
-    n_segments : int
-        Segments averaged.
-    n_effective : float
-        Independent segments that would give the same variance (Welch 1967).
-    lines_per_independent : float
-        Neighbouring lines share noise through the window: Σ over lags of the squared correlation.
-    """
-
-    frequency_hz: Array
+    frequency_hz: Array  # (n_frequencies,), Hz: Frequencies from 0 to half the rate
+    # (n_frequencies, n_signals, n_signals), product of units per Hz: E[Z Zᴴ], so that entry (i, j) is signal i
+    # times the conjugate of signal j. Its integral is the covariance
     density: NDArray[np.complex128]
-    n_segments: int
-    n_effective: float
+    n_segments: int  # segments averaged
+    n_effective: float  # independent segments that would give the same variance (Welch 1967)
+    # neighbouring lines share noise through the window: Σ over lags of the squared correlation
     lines_per_independent: float
 
 
@@ -166,11 +128,16 @@ def cross_spectra(z: Array, rate_hz: float, *, segment: int | None = None) -> Cr
     density[0] *= 0.5
     if length % 2 == 0:
         density[-1] *= 0.5
+    power = np.sum(w**2)
+    total = 1.0
+    for q in range(1, min(count, -(-w.size // step))):
+        rho = float(np.sum(w[q * step :] * w[: w.size - q * step]) / power)
+        total += 2.0 * (1.0 - q / count) * rho**2
     return CrossSpectra(
         frequency_hz=np.asarray(np.fft.rfftfreq(length, 1.0 / rate_hz), dtype=np.float64),
         density=density,
         n_segments=count,
-        n_effective=_effective(w, step, count),
+        n_effective=(count / total),
         lines_per_independent=_line_overlap(w),
     )
 
@@ -183,16 +150,6 @@ def _segment(n_samples: int, segment: int | None) -> int:
     return segment
 
 
-def _effective(w: Array, step: int, count: int) -> float:
-    """Return K/(1 + 2 Σ_q (1 - q/K) ρ_q²), ρ_q = Σ w(t) w(t + q step)/Σ w² (Welch 1967)."""
-    power = np.sum(w**2)
-    total = 1.0
-    for q in range(1, min(count, -(-w.size // step))):
-        rho = float(np.sum(w[q * step :] * w[: w.size - q * step]) / power)
-        total += 2.0 * (1.0 - q / count) * rho**2
-    return count / total
-
-
 def _line_overlap(w: Array) -> float:
     """Return Σ_q |ρ(q)|² over lags of lines, ρ(q) = Σ w² e^{-2πj q t/n}/Σ w²: 1 for a box, 35/18 for Hann."""
     rho = np.fft.fft(w**2) / np.sum(w**2)
@@ -201,26 +158,14 @@ def _line_overlap(w: Array) -> float:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Snr:
-    """Signal-to-noise ratio of a channel.
+    """Signal-to-noise ratio of a channel."""
 
-    Attributes
-    ----------
-    channel, unit : str
-        Channel and its unit.
-    db : float
-        10·log10(σ²_signal/σ²_noise); inf without noise, -inf without signal.
-    signal_sd, noise_sd : float
-        Standard deviations in `unit`. The mean counts as neither.
-    method : str
-        How the noise was told from the signal, in words.
-    """
-
-    channel: str
+    channel: str  # channel and its unit
     unit: str
-    db: float
-    signal_sd: float
+    db: float  # 10·log10(σ²_signal/σ²_noise); inf without noise, -inf without signal
+    signal_sd: float  # standard deviations in `unit`. The mean counts as neither
     noise_sd: float
-    method: str
+    method: str  # how the noise was told from the signal, in words
 
     def __str__(self) -> str:
         return f"{self.channel}: SNR {self.db:.1f} dB, noise {self.noise_sd:.3g} {self.unit} rms ({self.method})"

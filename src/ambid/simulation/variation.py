@@ -361,7 +361,11 @@ class Tables:
         nodes = np.minimum(begin + numbers * stride, end).astype(np.float64)
         at = cells // _NODE - numbers[0]
         weight = (middles - nodes[at]) / (nodes[at + 1] - nodes[at])
-        exact = self._exact(self._parameters(nodes, before=nodes > begin))
+        stack = self._stacked(self._parameters(nodes, before=nodes > begin))
+        n, inside = len(self._of.states), slice(0, len(self._of.states))
+        full = exponentials(stack, self._halvings)
+        now = full if self._fraction == 0.0 else exponentials(stack * (1.0 - self._fraction), self._halvings)
+        exact = full[:, inside, :n], now[:, inside, n], full[:, inside, n] - now[:, inside, n], full[:, inside, n + 1 :]
         a, b, late, e = (m[at] + weight.reshape(-1, *[1] * (m.ndim - 1)) * (m[at + 1] - m[at]) for m in exact)
         return middles, (a, b, late, e), np.minimum(ends, stop).tolist()
 
@@ -373,14 +377,6 @@ class Tables:
             values = {name: np.where(before, ahead[name], v) for name, v in values.items()}
         rows = zip(*(v.tolist() for v in values.values()), strict=True) if values else [()] * samples.size
         return [{**self._fixed, **dict(zip(values, row, strict=True))} for row in rows]
-
-    def _exact(self, thetas: list[dict[str, float]]) -> Matrices:
-        """Discretise many at once: exp([[A, B, E], [0, 0, 0]] T) holds all three (Van Loan 1978)."""
-        stack = self._stacked(thetas)
-        n, inside = len(self._of.states), slice(0, len(self._of.states))
-        full = exponentials(stack, self._halvings)
-        now = full if self._fraction == 0.0 else exponentials(stack * (1.0 - self._fraction), self._halvings)
-        return full[:, inside, :n], now[:, inside, n], full[:, inside, n] - now[:, inside, n], full[:, inside, n + 1 :]
 
     def _stacked(self, thetas: list[dict[str, float]]) -> Array:
         spaces = [self._of.matrices(theta) for theta in thetas]
