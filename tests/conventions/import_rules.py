@@ -34,7 +34,7 @@ ASKED = {
     ("ambid.estimation.result", "ambid.job.presentation"),
     ("ambid.estimation.result", "ambid.job.prediction"),
     ("ambid.record.record", "ambid.record.frames"),
-    ("ambid.record.record", "ambid.report.record_figures"),
+    ("ambid.record.record", "ambid.report.record"),
 }
 RANK = {room: rank for rank, tier in enumerate(TIERS) for room in tier}
 

@@ -68,7 +68,7 @@ def test_probabilities_are_printed_in_one_way():
             if isinstance(node, ast.JoinedStr):
                 before = [str(part.value) for part in node.values[:-1] if isinstance(part, ast.Constant)]
                 wrong = any(SHOWN_AS_PROBABILITY.search(text) for text in before)
-                assert not wrong or path.name in ("uncertainty.py", "fit_text.py"), (
+                assert not wrong or path.name in ("uncertainty.py", "response.py"), (
                     f"{shown(path)}:{node.lineno}: p_text"
                 )
 

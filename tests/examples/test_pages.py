@@ -287,7 +287,6 @@ def test_the_page_on_nonlinear_models_runs_and_shows_what_comes_out(tmp_path, mo
 def test_the_page_on_the_nonlinear_magnet_runs_and_shows_what_comes_out(tmp_path, monkeypatch):
     """Its records, its rig and its Python, which does what its command does."""
     from ambid.cli.app import run_verb
-    from ambid.report.estimate_text import estimate_text
 
     monkeypatch.chdir(tmp_path)
     page = ROOT / "docs" / "nonlinear_bearing.md"
@@ -301,7 +300,7 @@ def test_the_page_on_the_nonlinear_magnet_runs_and_shows_what_comes_out(tmp_path
     assert again.dumps() == estimate.dumps()
     assert estimate.passed
     rows = re.compile(r"^(k|s|L_leak) +([\d.]+) ± ([\d.]+) \S+", re.MULTILINE)
-    shown, found = (rows.findall(text) for text in (page.read_text(encoding="utf-8"), estimate_text(estimate)))
+    shown, found = (rows.findall(text) for text in (page.read_text(encoding="utf-8"), estimate.summary()))
     assert [x[0] for x in shown] == [x[0] for x in found] == ["k", "s", "L_leak"]
     for (_, value, sd), (_, now, sd_now) in zip(shown, found, strict=True):
         assert abs(float(value) - float(now)) < 0.2 * float(sd)

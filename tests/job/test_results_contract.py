@@ -82,7 +82,7 @@ def again(request, results, tmp_path):
 
 
 def test_the_register_knows_every_kind(results):
-    assert {type(r).__name__ for r in results.values()} <= set(presentation._VIEWS)
+    assert {type(r).__name__ for r in results.values()} <= set(presentation._KINDS)
     assert all(isinstance(r, Result) for r in results.values())
 
 

@@ -5,7 +5,7 @@ import pytest
 from ambid.job import identify, signals_of
 from ambid.physics.linear_model import model
 from ambid.physics.presets import preset
-from ambid.report.figures import Evidence
+from ambid.report.estimate_figures import Evidence
 from ambid.rig import default_rig
 from ambid.signals import excitation
 from ambid.simulation import simulate_preset

@@ -12,8 +12,9 @@ from ambid.acquisition.session import Acquired, RunReport
 from ambid.estimation.result import Reason
 from ambid.job.commissioning_steps import STEPS
 from ambid.job.presentation import text as show
-from ambid.report.commission_page import Step
-from ambid.report.device_text import next_text, progress_line, step_text
+from ambid.report.commission import Step, next_text, step_section
+from ambid.report.device import progress_line
+from ambid.report.document import sections_text
 
 COLUMN = ColumnQuality(
     name="gap", role="position", unit="1", mean=512.0, sd=20.0, rms=512.0, least=400.0, most=600.0, saturated=0.0,
@@ -90,7 +91,8 @@ def test_the_line_of_progress_tells_the_rate_as_it_comes(measured, words):
 
 
 def test_a_step_shows_findings_cautions_and_reasons():
-    text = step_text(Step(name="rest", findings=("found",), cautions=("beware",), reasons=("broken",)), "2/9")
+    step = Step(name="rest", findings=("found",), cautions=("beware",), reasons=("broken",))
+    text = sections_text([step_section(step, "2/9")])
     assert "2/9 rest" in text
     assert [line.strip() for line in text.splitlines()[1:]] == ["found", "note: beware", "stopped: broken"]
 

@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.job.presentation import text as estimate_text
-from ambid.report.estimate_page import estimate_page
-from ambid.report.estimate_text import curve_rows
-from ambid.report.figures import bearing_evidence, figures, overview
+from ambid.report.estimate import curve_rows, estimate_document
+from ambid.report.estimate_figures import bearing_evidence, figures, overview
 from ambid.report.page import page_html
 from tests.bearing.magnet.estimates import by_hand, seen
 
@@ -79,7 +78,7 @@ def test_every_record_is_drawn(evidence, estimate, drawn):
     assert set(drawn) == {"force", "curves", "map", "records", "correlations"}
     titles = [a.get_title(loc="left") for a in drawn["records"].axes]
     assert [t for t in titles if t and "%" not in t] == list(estimate.noise)
-    first, held = evidence.traces[0], evidence.traces[2]
+    first, held = evidence.records[0], evidence.records[2]
     assert first.time_s[0] > 2.0
     assert np.all(np.isfinite(first.predicted))
     assert np.all(np.isnan(held.predicted[:, 0]))
@@ -109,7 +108,7 @@ def test_the_page_holds_all_and_escapes_names(evidence, estimate):
     renamed = {bad if n == "one.csv" else n: levels for n, levels in estimate.noise.items()}
     fits = {bad if n == "one.csv" else n: f for n, f in estimate.fit.items()}
     e = replace(estimate, noise=renamed, fit=fits)
-    page = page_html(estimate_page(replace(evidence, estimate=e)), e.verdict, made="2001-02-03")
+    page = page_html(estimate_document(e, lambda: replace(evidence, estimate=e)), e.verdict, made="2001-02-03")
     assert "&lt;b&gt;one.csv" in page
     assert bad not in page
     assert page.count("<svg ") + page.count("<img ") == 5  # a cloud of samples is smaller as pixels

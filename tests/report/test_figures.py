@@ -12,9 +12,9 @@ from matplotlib.transforms import Bbox
 from ambid.errors import AmbidError
 from ambid.estimation.estimate import Check, Delay
 from ambid.report.drawing import save, single
-from ambid.report.figures import figures, measured_beside, overview, responses, unsampled, validation_figure
+from ambid.report.estimate_figures import figures, measured_beside, overview, responses, unsampled, validation_figure
 from ambid.report.response_panels import Pole, poles_panel
-from ambid.report.signal_panels import autocorrelation, whiteness_panel
+from ambid.report.signals import autocorrelation, whiteness_panel
 from ambid.validation.second_result import Validation
 
 

@@ -7,8 +7,10 @@ import pytest
 
 from ambid.bearing.measured import Measured, model_responses
 from ambid.job import frf
-from ambid.report.fit_text import frf_text, pair_lines, response_unit, warnings_of
-from ambid.report.response_figures import frf_figure
+from ambid.job.presentation import text as frf_text
+from ambid.report.document import part_lines
+from ambid.report.numbers import response_unit
+from ambid.report.response import frf_figure, pair_parts, warnings_of
 from ambid.rig import default_rig
 from ambid.signals.response import FrequencyResponse
 from tests.job.loops import loop_record, odd_record
@@ -29,6 +31,10 @@ def drawn(n=40, noise=None, **changes):
 @pytest.fixture(scope="module")
 def both():
     return frf(loop_record(), reference="excitation", rig=default_rig(), orders={"nf": 4})
+
+
+def pair_lines(measured):
+    return [line for part in pair_parts(measured) for line in part_lines(part, 80)]
 
 
 def test_pairs_are_told_by_their_medians():

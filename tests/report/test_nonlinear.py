@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from ambid.job.presentation import text as fit_text
 from ambid.nonlinear.fit import LearningCurve, NonlinearFit
 from ambid.nonlinear.narmax import narmax
-from ambid.report.fit_figures import bars_of, fit_overview, traces_of
-from ambid.report.fit_text import (
+from ambid.report.document import part_lines
+from ambid.report.fit import (
     curve_line,
     curve_lines,
-    fit_text,
-    named_lines,
-    schedule_lines,
+    named_parts,
+    schedule_parts,
     setting_text,
-    term_lines,
+    term_parts,
 )
+from ambid.report.fit_figures import bars_of, fit_overview, traces_of
 from ambid.validation.fits import judge
 from tests.validation.nonlinear.plants import Static, io, squared, static_fit
 
@@ -32,6 +33,10 @@ class Renamed:
     theta: NDArray[np.float64]
 
 
+def lines_of(parts, fit):
+    return [line for part in parts(fit) for line in part_lines(part, 80)]
+
+
 @pytest.fixture(scope="module")
 def fit() -> NonlinearFit:
     data = squared(500, 1)
@@ -39,7 +44,7 @@ def fit() -> NonlinearFit:
 
 
 def test_the_first_twenty_terms_with_ratio_and_spread(fit: NonlinearFit) -> None:
-    lines = term_lines(fit)
+    lines = lines_of(term_parts, fit)
     assert fit.model is not None
     assert fit.model.theta.size > 20
     assert len(lines) == 22
@@ -49,7 +54,7 @@ def test_the_first_twenty_terms_with_ratio_and_spread(fit: NonlinearFit) -> None
     row = next(x for x in lines if x.startswith("u(t-1) "))
     assert fit.sd is not None
     assert abs(float(row.split()[1]) - fit.model.theta[k]) < 0.5 * fit.sd[k]
-    assert "±" not in "".join(term_lines(replace(fit, covariance=None)))
+    assert "±" not in "".join(lines_of(term_parts, replace(fit, covariance=None)))
 
 
 def test_weights_beside_terms_are_counted_and_ratios_shown_where_there_are_any(fit: NonlinearFit) -> None:
@@ -60,7 +65,7 @@ def test_weights_beside_terms_are_counted_and_ratios_shown_where_there_are_any(f
         model=Renamed(names=tuple(names), theta=fit.model.theta),
         details={"terms": {"y": [{"term": x} for x in names[:4]]}},
     )
-    lines = term_lines(hybrid)
+    lines = lines_of(term_parts, hybrid)
     assert lines[0].split() == ["term", "coefficient", "±", "sd"]
     assert [x.split()[0] for x in lines[1:5]] == names[:4]
     assert lines[5:] == [f"and a network of {len(names) - 4} weights; save() has them"]
@@ -70,12 +75,12 @@ def test_numbers_with_a_meaning_are_listed_and_weights_are_not(fit: NonlinearFit
     few = replace(
         fit, model=Renamed(names=("a21", "b3"), theta=np.array([1939.0, 8.5])), covariance=np.diag([121.0, 0])
     )
-    assert [x.split() for x in named_lines(few)] == [
+    assert [x.split() for x in lines_of(named_parts, few)] == [
         ["parameter", "coefficient", "±", "sd"],
         ["a21", "1939", "±", "11"],
     ]
-    assert named_lines(replace(few, model=Renamed(names=("a21", "unit 1: u"), theta=np.ones(2)))) == []
-    assert named_lines(replace(fit, details={})) == []
+    assert lines_of(named_parts, replace(few, model=Renamed(names=("a21", "unit 1: u"), theta=np.ones(2)))) == []
+    assert lines_of(named_parts, replace(fit, details={})) == []
     assert bars_of(few) is not None
     assert bars_of(replace(few, model=Renamed(names=("a21", "y: unit 1"), theta=np.ones(2)))) is None
 
@@ -90,7 +95,7 @@ def test_a_schedule_is_shown_at_its_ends_and_in_the_middle(fit: NonlinearFit) ->
         for p, g, s in ((1.0, 2.0, 0.1), (1.5, 2.5, 0.1), (2.0, 3.0, None))
     ]
     schedule = {"signal": "level", "low": 1.0, "high": 2.0, "time_constant_s": 0.5, "unit": "m"}
-    lines = schedule_lines(replace(fit, details={"schedule": schedule, "frozen": table}))
+    lines = lines_of(schedule_parts, replace(fit, details={"schedule": schedule, "frozen": table}))
     assert lines[0] == "schedule: the output, low-passed (0.5 s), 1 to 2 m in training"
     assert [x.split()[0] for x in lines[2:]] == ["1", "1.5", "2"]
     assert "-3.00 ± 0.10 ± j 4.00 ± 0.20, -20.0 ± 1.0" in lines[2]

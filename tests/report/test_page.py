@@ -13,13 +13,12 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ambid.report.book import page_pdf
-from ambid.report.estimate_page import estimate_page
-from ambid.report.figures import responses
-from ambid.report.page import Page, Section, page_html
+from ambid.report.document import Document, Preformatted, Section, grid, page_sections
+from ambid.report.estimate import estimate_document
+from ambid.report.estimate_figures import responses
+from ambid.report.page import page_html, page_pdf
 from ambid.report.picture import _needed, picture
-from ambid.report.signal_panels import Traces
-from ambid.report.strips import EVERY_SAMPLE, strips_of
+from ambid.report.signals import EVERY_SAMPLE, Traces, strips_of
 
 PLANTED = "</script><script>document.title = 'planted'</script><img src=x onerror=\"document.title = 'planted'\">"
 BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -27,7 +26,7 @@ BROWSER = shutil.which("chromium") or shutil.which("chromium-browser") or shutil
 
 @pytest.fixture(scope="module")
 def page(unstable):
-    return estimate_page(unstable)
+    return estimate_document(unstable.estimate, lambda: unstable)
 
 
 @pytest.fixture(scope="module")
@@ -148,8 +147,8 @@ def test_the_page_is_small(text):
 
 
 def test_the_pdf_has_the_same_sections(page, unstable):
-    drawn = [x for x in page.sections if x.figure is not None]
-    few = replace(page, sections=[*(x for x in page.sections if x.figure is None), *drawn[-2:]])
+    drawn = [x for x in page_sections(page) if x.figure is not None]
+    few = replace(page, drawings=lambda: drawn[-2:])
     made = [page_pdf(few, unstable.estimate.verdict, made="2001-01-01") for _ in range(2)]
     assert made[0] == made[1]
     assert made[0].startswith(b"%PDF")
@@ -165,8 +164,12 @@ def test_a_browser_draws_the_signals_and_runs_nothing_that_names_hold(unstable, 
         found.subplots().plot([0, 1], label=PLANTED)
         return found
 
-    section = Section(title=PLANTED, figure=figure, signals=[strips_of(traces)], text=PLANTED, tables=[[[PLANTED]]])
-    page = Page(title="sound", subtitle=PLANTED, sections=[section, replace(section, signals=())])
+    parts = [Preformatted(text=PLANTED), grid([[PLANTED], [PLANTED]])]
+    section = Section(title=PLANTED, figure=figure, signals=[strips_of(traces)], parts=parts)
+    sections = [section, replace(section, signals=())]
+    page = Document(
+        title="sound", subtitle=PLANTED, sections=sections, figure=figure, frame=parts[1].frame, drawings=tuple
+    )
     text = page_html(page, unstable.estimate.verdict)
     for name, more in (("page", ""), ("foreign", "<script>document.title = 'planted'</script>")):
         (tmp_path / f"{name}.html").write_text(text.replace("</body>", f"{more}</body>"), encoding="utf-8")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.record import Channel, Record
-from ambid.report.record_figures import record_figure
+from ambid.report.record import record_figure
 
 STEP, NOISE, RATE = 0.01, 0.02, 1000.0
 

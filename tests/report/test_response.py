@@ -7,7 +7,7 @@ import pytest
 
 from ambid.estimation.estimate import Estimate
 from ambid.physics.linear_model import model
-from ambid.report.figures import poles, responses
+from ambid.report.estimate_figures import poles, responses
 
 
 def moved(estimate: Estimate, values) -> Estimate:

@@ -11,11 +11,13 @@ import pytest
 import ambid
 from ambid.errors import EstimationError, RigError
 from ambid.job.fits import physics
+from ambid.job.presentation import document_of
 from ambid.job.rotor import replays_of
+from ambid.report.document import page_sections
 from ambid.report.drawing import single
+from ambid.report.rotor import rotor_document
 from ambid.report.rotor_figures import RotorEvidence, measured_pairs, response_of, rotor_overview, rotor_poles
-from ambid.report.rotor_page import rotor_page
-from ambid.report.strips import record_strips
+from ambid.report.signals import record_strips
 from ambid.rig import draft_rig, rig_from_text
 from tests.report.rotor_record import estimate, record, rig
 
@@ -107,11 +109,11 @@ def test_figure_and_page_of_a_rotor_show_its_record() -> None:
     (residual,) = (a for a in figure.axes if a.get_title(loc="left").startswith("ay_position: "))
     measured = next(line for line in residual.lines if line.get_label() == "residual")
     assert len(measured.get_xdata()) == evidence().runs[0].left.shape[0]
-    page = rotor_page(evidence())
-    assert [s.title for s in page.sections][:3] == ["Rotor", "Bearings", "Checks"]
-    assert {"Response in plane x", "Coils", "Residuals", "Poles", "Noise", "Rig"} <= {s.title for s in page.sections}
+    sections = page_sections(rotor_document(e, None, evidence))
+    assert [s.title for s in sections][:3] == ["Rotor", "Bearings", "Checks"]
+    assert {"Response in plane x", "Coils", "Residuals", "Poles", "Noise", "Rig"} <= {s.title for s in sections}
     assert e.to_dataframe().loc["ax.k_i", "value"] == e["ax.k_i"].value
-    assert all(s.figure is not None for s in page.sections if s.title in ("Coils", "Residuals", "Poles"))
+    assert all(s.figure is not None for s in sections if s.title in ("Coils", "Residuals", "Poles"))
 
 
 def test_the_page_of_a_rotor_holds_its_signals_as_extremes_and_a_stretch_in_full(tmp_path: Path) -> None:
@@ -169,7 +171,7 @@ def test_a_second_record_given_with_the_first_is_judged_beside_it(tmp_path: Path
     e = ambid.identify(record(), rig(known=False), validate=record(2))
     assert e.validation is not None
     assert "on the second record (15000 samples)" in e.summary()
-    assert "On the second record" in [s.title for s in rotor_page(RotorEvidence(estimate=e)).sections]
+    assert "On the second record" in [s.title for s in page_sections(document_of(e))]
     e.save(tmp_path / "e.json")
     assert ambid.load(tmp_path / "e.json").summary() == e.summary()
 

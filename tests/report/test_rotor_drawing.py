@@ -9,8 +9,8 @@ import pytest
 from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics import campbell
 from ambid.report.drawing import Block, single
+from ambid.report.rotor import mode_rows
 from ambid.report.rotor_drawing import campbell_panel, shapes_block
-from ambid.report.rotor_text import mode_rows
 from tests.physics.test_shaft import RPM, TWO_SLEEVES
 
 PLANES = {"A.z": 0.10, "A.z_sensor": 0.13, "B.z": 0.65, "B.z_sensor": 0.62}

@@ -7,9 +7,10 @@ import pytest
 
 from ambid.estimation.estimate import Check
 from ambid.job.presentation import text as estimate_text
-from ambid.report.estimate_page import estimate_page
+from ambid.report.estimate import estimate_document
 from ambid.report.page import page_html
-from ambid.report.text import check_lines, columns, verdict
+from ambid.report.parameters import ParameterRow
+from ambid.report.text import check_lines, columns
 
 
 def line_of(text, name):
@@ -27,8 +28,8 @@ def test_a_parameter_that_is_not_shown_is_never_called_identified(unstable):
 
 def test_priors_say_how_much_came_from_the_data(unstable):
     p = replace(unstable.estimate.parameter("R"), role="prior", data_share=0.873)
-    assert verdict(p) == "prior, 87 % data"
-    assert verdict(replace(p, identifiable=False)) == "prior, not identifiable, 87 % data"
+    assert ParameterRow(parameter=p).judged[0] == "prior, 87 % data"
+    assert ParameterRow(parameter=replace(p, identifiable=False)).judged[0] == "prior, not identifiable, 87 % data"
 
 
 def test_too_wide_a_table_loses_its_si_column_only(unstable):
@@ -110,7 +111,7 @@ def judged(unstable):
 
 @pytest.fixture(scope="module")
 def page(judged):
-    return page_html(estimate_page(judged), judged.estimate.verdict, made="2001-01-01")
+    return page_html(estimate_document(judged.estimate, lambda: judged), judged.estimate.verdict, made="2001-01-01")
 
 
 def test_the_report_holds_everything_and_needs_nothing_else(page, judged):

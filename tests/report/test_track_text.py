@@ -9,8 +9,13 @@ from dataclasses import replace
 import pytest
 
 from ambid.recursive.lines import Event, Latency, Track, TrackedValue, TrackLine
-from ambid.report.track_text import change_words, speed_words, track_text, value_words
+from ambid.report.document import sections_text
+from ambid.report.track import change_words, speed_words, track_sections, value_words
 from tests.tracking.tracks import header, track_of
+
+
+def track_text(track, events=(), width=80):
+    return sections_text(track_sections(track, events), width=width)
 
 
 @pytest.fixture(scope="module")

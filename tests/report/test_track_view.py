@@ -10,7 +10,7 @@ import pytest
 from rich.console import Console
 
 from ambid.recursive.lines import Event
-from ambid.report.track_text import interval_bar, live_view, sparkline
+from ambid.report.track import interval_bar, live_view, sparkline
 from ambid.tracking.lines_file import LiveState
 from tests.tracking.tracks import track_of
 

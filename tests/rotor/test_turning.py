@@ -8,8 +8,9 @@ import pytest
 
 import ambid
 from ambid.physics.linear_model import Parameter
+from ambid.report.document import sections_text
 from ambid.report.drawing import WIDE, stacked
-from ambid.report.orbit_panels import balance_block, orbit_blocks, synchronous_lines
+from ambid.report.rotor_drawing import balance_block, orbit_blocks, synchronous_sections
 from ambid.rig.rig import RigChannel, RigModes
 from tests.rotor.test_synchronous import planes_of, spinning, without
 from tests.rotor_benches import needs_simulator, rig_of
@@ -58,7 +59,7 @@ def test_the_unbalance_is_found_with_the_identified_plant():
 
 def test_what_turns_is_told_and_drawn(tmp_path):
     e, bench, _, _, _ = identified()
-    lines = synchronous_lines(e, 80)
+    lines = sections_text(synchronous_sections(e)).splitlines()
     assert max(map(len, lines)) <= 80
     (static,) = (line.split() for line in lines if line.startswith("  unbalance, static"))
     assert float(static[2]) == pytest.approx(1e6 * bench.unbalance, rel=0.01)

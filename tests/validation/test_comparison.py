@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.report.tables import comparison_text
 from ambid.validation.comparison import compare
 from ambid.validation.orders import folds, hold_out
 from tests.validation.blackbox.fits import io, polynomial, run
@@ -45,7 +44,7 @@ def test_orders_are_chosen_where_none_are_given():
 
 
 def test_the_table_fits_the_terminal_and_names_every_structure():
-    shown = comparison_text(compare(record(4), [RIGHT, ("fir", {"nb": 2, "nk": 1}), ("cliv", None)]))
+    shown = compare(record(4), [RIGHT, ("fir", {"nb": 2, "nk": 1}), ("cliv", None)]).summary()
     assert max(map(len, shown.splitlines())) <= 80
     for word in ("arx", "fir", "cliv was not fitted", "na=2 nb=2 nk=1", "BIC", "last 30 %"):
         assert word in shown

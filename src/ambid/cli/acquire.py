@@ -94,7 +94,7 @@ def command(
     """
     from ambid.job.acquiring import Request, acquire, ready
     from ambid.physics.presets import preset_of
-    from ambid.report.device_text import progress_line
+    from ambid.report.device import progress_line
     from ambid.rig import load_rig
 
     between = opt.band_of(band)

@@ -23,7 +23,7 @@ from ambid.errors import AmbidError
 if TYPE_CHECKING:
     from ambid.acquisition.session import Progress
     from ambid.job.commissioning_steps import StepName
-    from ambid.report.commission_page import Step
+    from ambid.report.commission import Step
 
 
 def command(
@@ -66,7 +66,9 @@ def command(
     from ambid.job.commissioning import check_folder
     from ambid.job.commissioning_steps import Plan
     from ambid.physics.presets import preset_of
-    from ambid.report.device_text import next_text, progress_line, step_text
+    from ambid.report.commission import next_text, step_section
+    from ambid.report.device import progress_line
+    from ambid.report.document import sections_text
     from ambid.rig import load_rig
 
     opt.check_positive({"seconds": seconds, "track_seconds": track_seconds, "amplitude": amplitude, "widest": widest})
@@ -109,7 +111,8 @@ def command(
         def tell(step: Step) -> None:
             last.append(step)
             watch.clear()
-            typer.echo(step_text(step, f"{len(last)}/{len(plan.steps)}", paint=paint), err=json == "-")
+            section = step_section(step, f"{len(last)}/{len(plan.steps)}")
+            typer.echo(sections_text([section], paint=paint), err=json == "-")
 
         def agreed(name: StepName) -> bool:
             del name

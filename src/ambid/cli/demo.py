@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from importlib.resources import as_file, files
 from importlib.resources.abc import Traversable
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from ambid.estimation.estimate import Estimate
-    from ambid.report.text import Paint
+    from ambid.report.document import Table
 
 # Truth of the thesis's simulation rig (table 4.1, corrected) and what its own identification found there (eq. 4.11).
 _THESIS = {
@@ -31,8 +31,9 @@ def command() -> None:
     """
     from ambid.job.identification import identify_axis
     from ambid.physics.presets import preset
-    from ambid.report.estimate_text import delay_lines, header_lines, output_rows
-    from ambid.report.text import check_lines, columns, verdict_lines
+    from ambid.report.document import Checks, Lines, Section, sections_text
+    from ambid.report.estimate import delay_lines, header, output_table
+    from ambid.report.text import verdict_lines
     from ambid.rig import load_rig
 
     with (
@@ -43,42 +44,62 @@ def command() -> None:
         estimate = identify_axis(record, load_rig(rig), tick=tick)
     paint = painter()
     truth = preset(PRESET).parameters
-    typer.echo("\n".join([*verdict_lines(estimate.verdict, paint=paint), ""]))
-    typer.echo(f"{header_lines(estimate, paint=paint)[0]}\nsimulated in closed loop; no parameter was given\n")
-    typer.echo("\n".join(truth_lines(estimate, truth, paint)))
-    typer.echo("\n" + "\n".join([*delay_lines(estimate), "", *columns(output_rows(estimate))]))
-    typer.echo("\n" + "\n".join(check_lines(estimate.checks, paint=paint)))
     whole = sum(estimate.timing_s.values())
-    typer.echo(f"\ntime: {whole:.2g} s from file to checked estimate (the thesis* reports about 5 s)")
-
-
-def truth_lines(found: Estimate, truth: Mapping[str, float], paint: Paint) -> list[str]:
-    """Write estimated parameters beside their truth.
-
-    `found`: its fixed parameters are left out; `truth`: SI; `paint`: adds colour. Returns a table, and a
-    line on how many truths lie inside their 99.9 % intervals.
-    """
-    from ambid.report.numbers import quantity
-    from ambid.report.text import columns, verdict
-
-    rows = [("", "estimate ± sd", "truth", "error", "in sd", "thesis*", "verdict")]
-    inside = []
-    for p in (p for p in found.parameters if p.role != "fixed"):
-        true, (was, got) = truth[p.name], _THESIS[p.name]
-        z = (p.value - true) / p.sd
-        inside.append(abs(z) < _INSIDE)
-        q = quantity(p.value, p.sd, p.unit)
-        scale, decimals = p.value / float(q.value), len(q.value.partition(".")[2])
-        shown = f"{true / scale:.{decimals}f} {q.unit}"
-        errors = (_percent(p.value - true, true, 2), f"{z:+.1f}", _percent(got - was, was, 1))
-        rows.append((p.name, q.text, shown, *errors, verdict(p, found.verdict)))
-    mark = paint("✓", "good") if all(inside) else paint("✗", "bad")
-    return [
-        *columns(rows, right=(3, 4, 5)),
-        "* error in eq. 4.11 of the thesis that ambid builds on, 'Physical parameters",
-        "  identification for a prototype of Active Magnetic Bearing system', simulated",
-        f"{mark} {sum(inside)} of {len(inside)} true values lie in their 99.9 % intervals",
+    inside = [abs(row.z) < _INSIDE for row in truth_rows(estimate, truth)]
+    mark = ("✓", "good") if all(inside) else ("✗", "bad")
+    sections = [
+        Section(parts=[*header(estimate), Lines(lines=["simulated in closed loop; no parameter was given"])]),
+        Section(
+            parts=[
+                truth_table(estimate, truth),
+                Lines(
+                    lines=[
+                        "* error in eq. 4.11 of the thesis that ambid builds on, 'Physical parameters",
+                        "  identification for a prototype of Active Magnetic Bearing system', simulated",
+                        [mark, f" {sum(inside)} of {len(inside)} true values lie in their 99.9 % intervals"],
+                    ],
+                    wrap=False,
+                ),
+            ]
+        ),
+        Section(parts=[Lines(lines=delay_lines(estimate))]),
+        Section(parts=[output_table(estimate)]),
+        Section(parts=[Checks(checks=estimate.checks)]),
+        Section(
+            parts=[Lines(lines=[f"time: {whole:.2g} s from file to checked estimate (the thesis* reports about 5 s)"])]
+        ),
     ]
+    typer.echo("\n".join([*verdict_lines(estimate.verdict, paint=paint), "", sections_text(sections, paint=paint)]))
+
+
+def truth_rows(estimate: Estimate, truth: Mapping[str, float]) -> list[Any]:
+    """Return the parameters that were estimated beside their truth, SI."""
+    from ambid.report.parameters import TrueRow
+
+    return [
+        TrueRow(parameter=p, verdict=estimate.verdict, truth=truth[p.name])
+        for p in estimate.parameters
+        if p.role != "fixed"
+    ]
+
+
+def truth_table(estimate: Estimate, truth: Mapping[str, float]) -> Table:
+    """Return the table of parameters with truth and errors, and the errors of the thesis."""
+    from ambid.report.document import Column, Table
+    from ambid.report.parameters import varied
+
+    def theirs(row: Any) -> str:
+        was, got = _THESIS[row.parameter.name]
+        return _percent(got - was, was, 1)
+
+    more = [
+        Column(label="truth", cell=lambda row: row.true_text),
+        Column(label="error", cell=lambda row: _percent(row.parameter.value - row.truth, row.truth, 2), right=True),
+        Column(label="in sd", cell=lambda row: f"{row.z:+.1f}", right=True),
+        Column(label="thesis*", cell=theirs, right=True),
+    ]
+    labels = {"value ± sd": "estimate ± sd", "95 % interval": None, "in SI": None}
+    return Table(columns=varied(labels, {"value ± sd": more}), rows=truth_rows(estimate, truth))
 
 
 def _percent(error: float, of: float, decimals: int) -> str:

@@ -56,7 +56,7 @@ def command(
     from ambid.ledger import open_ledger, read_rules, watch
     from ambid.ledger.monitor import BUILT_IN
     from ambid.ledger.telling import publish, write_metrics
-    from ambid.report.history_text import bearings_text
+    from ambid.report.history import bearings_text
 
     place = None if "://" in ledger else Path(ledger)
     file = None if alarms in (None, _USUAL) else Path(str(alarms))

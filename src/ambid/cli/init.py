@@ -92,7 +92,7 @@ def _of_record(
     for role, found in ranked.items():
         typer.echo(f"{role}: {f'{found[0].channel.name}, because {found[0].why}' if found else 'none found'}", err=True)
     if plot is not None:
-        from ambid.report.role_figures import roles_figure  # much is loaded for it
+        from ambid.report.record import roles_figure  # much is loaded for it
 
         outputs.draw(plot, lambda: roles_figure(read, ranked), lambda _: None)
     return draft_rig(read, ranked)

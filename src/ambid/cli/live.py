@@ -227,7 +227,7 @@ class Follower:
 
     def _view(self, keys: bool, ascii_only: bool) -> Group | None:
         """Draw what is shown now; None before the first line. Called by the drawing thread."""
-        from ambid.report.track_text import live_view
+        from ambid.report.track import live_view
 
         state = self.state
         if state is None or state.line is None:

@@ -128,7 +128,7 @@ class Worker:
 
     def give(self, result: Any, name: str, record: object = None, *, drawn: str = "") -> None:
         """Write a result and its report beside each other, and tell them; `drawn`: what its figure shows."""
-        from ambid.job.presentation import text, view
+        from ambid.job.presentation import drawing, text
 
         self._tell_progress("report", None)
         report = self.folder / f"{name}.html"
@@ -139,12 +139,9 @@ class Worker:
         result.report(report, record)
         verdict, pictures = result.verdict, list[Mapping[str, str]]()
         if drawn:
-            from ambid.report.drawing import WIDE
             from ambid.report.picture import image
 
-            pictures = [
-                {"title": name, "caption": drawn, "image": image(view(result).figure(result, None, WIDE), name)}
-            ]
+            pictures = [{"title": name, "caption": drawn, "image": image(drawing(result), name)}]
         self.feed.tell(
             "result",
             {"name": name, "verdict": verdict.word, "reasons": [r.text for r in verdict.reasons],

@@ -6,8 +6,9 @@ Results stand low, texts and figures high. A method of a result asks for what sh
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, fields
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -53,6 +54,41 @@ class Verdict:
         ordered = tuple(sorted(reasons, key=lambda r: not r.grave))
         grave = any(r.grave for r in ordered)
         return cls(word="unusable" if grave else "caution" if ordered else "usable", reasons=ordered)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordEntry:
+    """What a result remembers of a record, as its document has it by name."""
+
+    file: str = ""
+    sha256: str = ""
+    samples: int = 0
+    rate_hz: float = math.nan
+    start_s: float = 0.0
+    speed: float = 0.0  # rad/s
+    periods: int = 0
+    period_s: float = math.nan
+    history: tuple[str, ...] = ()  # what was done to it
+
+    @classmethod
+    def of(cls, record: Mapping[str, object]) -> RecordEntry:
+        """Read an entry; what it does not have is left at its default."""
+        return cls(**{f.name: _ENTRIES[str(f.type)](record[f.name]) for f in fields(cls) if record.get(f.name)})
+
+    @property
+    def name(self) -> str:
+        """Its file, or "record"."""
+        return self.file or "record"
+
+    @property
+    def seconds(self) -> float:
+        """Its length, s."""
+        return self.samples / self.rate_hz
+
+
+_ENTRIES: Mapping[str, Callable[[Any], Any]] = {
+    "str": str, "int": int, "float": float, "tuple[str, ...]": lambda steps: tuple(map(str, steps)),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

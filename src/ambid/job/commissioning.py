@@ -36,8 +36,7 @@ from ambid.job.track_live import track_live
 from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.recursive.lines import Track
-from ambid.report.commission_figures import trace_picture
-from ambid.report.commission_page import Step
+from ambid.report.commission import Step, trace_picture
 from ambid.rig import Rig, rig_text
 from ambid.rig.load import SELECTED
 from ambid.settings.caller import setting

@@ -37,8 +37,9 @@ from ambid.control.experiment import Experiment
 from ambid.control.margins import Margins
 from ambid.estimation.estimate import Estimate
 from ambid.job.track_live import LiveTrack
-from ambid.report.commission_figures import (
+from ambid.report.commission import (
     Picture,
+    Step,
     design_picture,
     margins_picture,
     measured_picture,
@@ -47,10 +48,10 @@ from ambid.report.commission_figures import (
     trace_picture,
     trials_picture,
 )
-from ambid.report.commission_page import Step
-from ambid.report.design_text import NAMES, said
-from ambid.report.device_text import acquired_text
-from ambid.report.estimate_text import sensitivity_lines
+from ambid.report.design import NAMES, figure_text
+from ambid.report.device import acquired_sections
+from ambid.report.document import sections_text
+from ambid.report.estimate import sensitivity_lines
 from ambid.report.numbers import quantity, sized
 from ambid.rig import Rig
 from ambid.settings.caller import setting
@@ -398,7 +399,7 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
         if column.role in ("position", "current") and column.sd == 0.0
     ]
     cautions = [str(t) for t in done.troubles if not done.not_stored] + [f"{name}: {v}" for v in done.quality.verdict]
-    text = acquired_text(done)
+    text = sections_text(acquired_sections(done))
     return Step(
         name="record", findings=tuple(findings), reasons=tuple(reasons), cautions=tuple(cautions), text=text,
         pictures=pictures,
@@ -459,7 +460,9 @@ def redesign(design: Design, estimate: Estimate) -> Step:
     curved = all(r.check == "curvature" for r in estimate.verdict.reasons)
     against = [r for r in design.verdict.reasons if not (curved and r.check == "estimate")]
     of = [(name, getattr(design.before.worst, name), getattr(design.after.worst, name)) for name in FIGURES]
-    findings = [f"{NAMES[name]} {said(name, was)} → {said(name, now)}, predicted worst" for name, was, now in of]
+    findings = [
+        f"{NAMES[name]} {figure_text(name, was)} → {figure_text(name, now)}, predicted worst" for name, was, now in of
+    ]
     stays = [f"the present loop stays: {r.check}: {r.text}" for r in against if not design.passed]
     numbers = {"better": float(not stays), "peak": design.after.figures.peak, "peak_before": design.before.figures.peak}
     return Step(

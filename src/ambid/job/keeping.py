@@ -72,7 +72,7 @@ def keep(
 ) -> str:  # fmt: skip
     """Put a result into a ledger, and say so; nothing is added where the same one is there."""
     from ambid.job.presentation import document
-    from ambid.report.history_text import day
+    from ambid.report.history import day
 
     made = entry_of(
         result, bearing=bearing, sha=sha_of(*records), rig=rig, settings=settings, job=job, taken_at=taken_at,

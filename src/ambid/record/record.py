@@ -289,7 +289,7 @@ class Record:
         matplotlib.figure.Figure
         """
         title = f"{self.provenance.get('file', 'record')}: {self.duration_s:.4g} s at {self.rate_hz:.6g} Hz"
-        draw = import_module("ambid.report.record_figures").record_figure
+        draw = import_module("ambid.report.record").record_figure
         return draw(self, title)  # type: ignore[no-any-return]
 
     def _repr_html_(self) -> str:

@@ -4,7 +4,8 @@ predictions with bands, correlations, learning curves.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle
 from typing import TYPE_CHECKING
@@ -20,6 +21,7 @@ from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, innovation
 from ambid.errors import counted
 from ambid.estimation.result import NORMAL_95
 from ambid.nonlinear.fit import NonlinearFit
+from ambid.report.document import Part
 from ambid.report.drawing import (
     BAND,
     BOUND,
@@ -34,11 +36,11 @@ from ambid.report.drawing import (
     said_panel,
     stacked,
 )
-from ambid.report.figures import AHEAD
-from ambid.report.fit_text import is_weight, pole_lines, term_ratios
+from ambid.report.estimate_figures import AHEAD
 from ambid.report.numbers import prefixed
+from ambid.report.parameters import pole_table
 from ambid.report.response_panels import bode_panel, frequency_grid, poles_panel, roots
-from ambid.report.signal_panels import (
+from ambid.report.signals import (
     Traces,
     records_panel,
     residuals_panel,
@@ -63,6 +65,8 @@ _MOST = 20
 _RECORDS = 6  # that are drawn
 _ROWS = 13  # of coefficients below each other
 _LEAST_P = 1e-12  # p-value that is drawn as the smallest
+_POLES = 12  # that a terminal shows
+_WEIGHT = re.compile(r"\bunit \d|\bhidden\b|: bias\b")  # of a network: says nothing by itself
 _LEAD = 500  # samples in which derivatives that are recursions settle
 
 
@@ -255,7 +259,7 @@ def _poles(fit: BlackBoxFit) -> Block:
     delayed = ", without the delay" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
     return poles_panel(
         roots(poles, of_poles, 1e3),
-        "\n".join(pole_lines(fit)),
+        pole_parts(fit),
         f"poles and zeros{hidden}{delayed}",
         zeros=roots(zeros[near], of_zeros, reach),
         discrete=fit.model.dt is not None,
@@ -415,3 +419,29 @@ def _draw_band(fit: NonlinearFit, data: IOData, where: str) -> Block:
     views = ((np.zeros_like(predicted), f"{where}, where errors are largest"), (predicted, "measured less predicted"))
     columns = [[panel(draw, j, *v, height=2.1) for j in range(data.n_outputs)] for v in views]
     return Block(columns=columns, widths=(3, 2), title="predictions with their bands")
+
+
+def is_weight(name: str) -> bool:
+    """Return whether a parameter is a weight of a network's unit, which says nothing by itself."""
+    return _WEIGHT.search(name) is not None
+
+
+def pole_parts(fit: BlackBoxFit) -> list[Part]:
+    """Return the first poles of a fit."""
+    poles = fit.model.poles()
+    spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
+    covariances = [None] * poles.size if spread is None else list(spread)
+    shown = [k for k in range(poles.size) if poles[k].imag >= 0][:_POLES]
+    return pole_table([(complex(poles[k]), covariances[k]) for k in shown], None if fit.model.dt is None else fit.dt)
+
+
+def term_ratios(fit: NonlinearFit) -> dict[str, object]:
+    """Return the error reduction ratio of each chosen term by the name of its parameter, None where it has none."""
+    terms, several = fit.details.get("terms"), len(fit.outputs) > 1
+    if not isinstance(terms, Mapping):
+        return {}
+    return {
+        (f"y{o + 1}: " if several else "") + str(t["term"]): t.get("err")
+        for o, output in enumerate(fit.outputs)
+        for t in terms.get(output, ())
+    }

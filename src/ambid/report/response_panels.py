@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.bearing.measured import ModelResponse
 from ambid.estimation.result import NORMAL_95
+from ambid.report.document import Part, part_lines
 from ambid.report.drawing import (
     BAND,
     BOUND,
@@ -233,13 +234,13 @@ def pole_region(axes: Axes, pole: Pole, color: str) -> None:
 
 def poles_panel(
     poles: Sequence[Pole],
-    text: str,
+    table: Sequence[Part],
     title: str,
     *,
     zeros: Sequence[Pole] = (),
     discrete: bool = False,
 ) -> Block:
-    """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a text of numbers.
+    """Draw poles and zeros with their 95 % regions and the border of stability, close views, and a table of numbers.
 
     Poles that lie too close to be separated on the scale of all of them are drawn again, larger.
     """
@@ -262,7 +263,7 @@ def poles_panel(
         head(axes, f"close view of {len(crowd)} of them")
 
     def words(axes: Axes) -> None:
-        room, lines = 4.9, text.splitlines()
+        room, lines = 4.9, table_lines
         if crowd:
             room, lines = 3.5, [x for line in lines for x in textwrap.wrap(line, 58, subsequent_indent="    ")]
         longest = max(map(len, lines), default=1)
@@ -273,8 +274,9 @@ def poles_panel(
             transform=axes.transAxes, clip_on=False,
         )  # fmt: skip
 
+    table_lines = [line for part in table for line in part_lines(part, 10**6)]
     crowd = _crowd([p.value for p in (*poles, *zeros)])
-    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=0.8 + 0.2 * len(text.splitlines()))]]
+    columns = [[Panel(draw=every, height=3.0)], [Panel(draw=words, height=0.8 + 0.2 * len(table_lines))]]
     if crowd:
         columns.insert(1, [Panel(draw=close, height=3.0)])
     return Block(columns=columns, widths=(4, 3, 4) if crowd else (1, 1), shared=False)

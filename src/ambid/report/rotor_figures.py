@@ -28,7 +28,7 @@ from ambid.report.drawing import (
     stacked,
 )
 from ambid.report.numbers import prefixed, response_unit
-from ambid.report.orbit_panels import balance_block, orbit_blocks
+from ambid.report.parameters import pole_table
 from ambid.report.response_panels import (
     Pole,
     correlations_panel,
@@ -39,8 +39,7 @@ from ambid.report.response_panels import (
     poles_panel,
     roots,
 )
-from ambid.report.rotor_drawing import campbell_panel, shapes_block
-from ambid.report.text import pole_table
+from ambid.report.rotor_drawing import balance_block, campbell_panel, orbit_blocks, shapes_block
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.replay import RotorReplay, at_speed, point_of, slopes
 from ambid.rotor.response import Sampled
@@ -290,8 +289,8 @@ def rotor_poles(estimate: RotorEstimate) -> list[Pole]:
 
 def _poles(e: RotorEstimate) -> Block:
     found = rotor_poles(e)
-    text = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
-    return poles_panel(found, "\n".join(text), "poles of the identified rotor in its magnets, open loop")
+    table = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
+    return poles_panel(found, table, "poles of the identified rotor in its magnets, open loop")
 
 
 def _correlations(e: RotorEstimate) -> Block:

@@ -6,21 +6,21 @@ from __future__ import annotations
 import math
 import textwrap
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any, Literal, cast
+from typing import Literal, cast
 
-import numpy as np
-
-from ambid.arrays import Array
 from ambid.errors import counted
-from ambid.estimation.estimate import Check, Delay, EstimatedParameter, OutputFit
-from ambid.estimation.result import Verdict
-from ambid.report.numbers import Quantity, quantity, sized
+from ambid.estimation.estimate import Check, Delay
+from ambid.estimation.result import RecordEntry, Verdict
+from ambid.report.numbers import quantity, sized
 
 Style = Literal["good", "doubt", "bad", "dim", "strong"]
 Paint = Callable[[str, Style], str]
+Cell = str | tuple[str, str]
+"""A text; or a text and its style, empty for words among numbers."""
+Line = str | Sequence[Cell]
+"""A text, or its parts."""
 
 WIDTH = 80
-USABLE = Verdict(word="usable", reasons=())
 
 
 def plain(text: str, style: Style) -> str:
@@ -39,28 +39,43 @@ def wrapped(lines: Sequence[str], width: int, indent: str = "") -> list[str]:
     return [part for line in lines for part in textwrap.wrap(line, width, subsequent_indent=indent)]
 
 
-def columns(rows: Sequence[Sequence[str]], *, right: Sequence[int] = ()) -> list[str]:
+def parts_of(line: Line) -> list[Cell]:
+    """Return the parts of a line."""
+    return [line] if isinstance(line, str) else list(line)
+
+
+def text_of(parts: Sequence[Cell]) -> str:
+    """Return parts of a line without their styles."""
+    return "".join(x if isinstance(x, str) else x[0] for x in parts)
+
+
+def painted(parts: Sequence[Cell], paint: Paint) -> str:
+    """Return parts of a line, each in its style."""
+    return "".join(x if isinstance(x, str) else paint(x[0], cast("Style", x[1])) if x[1] else x[0] for x in parts)
+
+
+def columns(rows: Sequence[Sequence[Cell]], *, right: Sequence[int] = (), paint: Paint = plain) -> list[str]:
     """Return rows of cells, all of one length, as lines in columns two spaces apart; `right` are aligned right."""
-    widths = [max(len(row[j]) for row in rows) for j in range(len(rows[0]))]
-    cells = [
-        [cell.rjust(w) if j in right else cell.ljust(w) for j, (cell, w) in enumerate(zip(row, widths, strict=True))]
-        for row in rows
-    ]
-    return ["  ".join(row).rstrip() for row in cells]
+    widths = [max(len(text_of([cell])) for cell in column) for column in zip(*rows, strict=True)]
+    lines = []
+    for row in rows:
+        cells = []
+        for j, (cell, width) in enumerate(zip(row, widths, strict=True)):
+            room = " " * (width - len(text_of([cell])))
+            cells.append(room + painted([cell], paint) if j in right else painted([cell], paint) + room)
+        lines.append("  ".join(cells).rstrip())
+    return lines
 
 
-def title_line(name: object, what: str, samples: int, rate_hz: float, status: str, paint: Paint = plain) -> str:
+def title_line(record: RecordEntry, what: str, status: str = "converged") -> Line:
     """State what was made of how long a record, and whether the search converged."""
-    return (
-        f"{paint(str(name or 'record'), 'strong')}: {what}, {counted(samples, 'sample')} at {rate_hz:g} Hz "
-        f"({samples / rate_hz:.4g} s){status_words(status, paint)}"
-    )
+    about = f": {what}, {counted(record.samples, 'sample')} at {record.rate_hz:g} Hz ({record.seconds:.4g} s)"
+    return [(record.name, "strong"), about, *status_words(status)]
 
 
-def record_line(found: Any, what: str, paint: Paint = plain) -> str:
-    """State what was made of the record that a result remembers, and whether the search converged."""
-    of = found.record
-    return title_line(of.get("file"), what, int(str(of["samples"])), float(str(of["rate_hz"])), found.status, paint)
+def names_words(names: Sequence[str]) -> str:
+    """Name one record, or say how many there are."""
+    return names[0] if len(names) == 1 else f"{len(names)} records"
 
 
 SPREAD = "± is one standard deviation; intervals and bands are 95 %"
@@ -82,87 +97,9 @@ def verdict_lines(found: Verdict, *, width: int = WIDTH, paint: Paint = plain) -
     return lines
 
 
-def status_words(status: str, paint: Paint = plain) -> str:
+def status_words(status: str) -> list[Cell]:
     """Name a status other than converged."""
-    return "" if status == "converged" else paint(f" – {status}", "bad")
-
-
-def parameter_lines(
-    parameters: Sequence[EstimatedParameter],
-    *,
-    width: int = WIDTH,
-    paint: Paint = plain,
-    found: Verdict = USABLE,
-) -> list[str]:
-    """Return the table of parameters; where the verdict on all of them is not good, none is called identified.
-
-    Where the terminal is too narrow the column of SI values is left out.
-    """
-    rows = parameter_rows(parameters, found)
-    head = ("", "value ± sd", "95 % interval", "in SI", "verdict")
-    return verdict_table(head, rows, right=2, spare=3, width=width, paint=paint)
-
-
-def parameter_rows(
-    parameters: Sequence[EstimatedParameter], found: Verdict = USABLE
-) -> list[tuple[str, str, str, str, str, Style]]:
-    """Return name, value, interval, value in SI and verdict of each parameter, and how the verdict is painted."""
-    rows: list[tuple[str, str, str, str, str, Style]] = []
-    for p in parameters:
-        q = quantity(p.value, p.sd, p.unit, ci95=p.ci95)
-        words = verdict(p, found)
-        good = p.identifiable and word_for_all(found) == "usable"
-        style: Style = (
-            "dim" if p.role == "fixed" else "good" if good else WORDS[found.word][1] if found.reasons else "bad"
-        )
-        rows.append((p.name, q.text, interval_words(q), q.si, words, style))
-    return rows
-
-
-def interval_words(q: Quantity) -> str:
-    """Write the interval of a quantity; empty where it has none."""
-    return f"{q.low} … {q.high}" if q.low else ""
-
-
-def verdict_table(
-    head: tuple[str, ...],
-    rows: Sequence[tuple[str, ...]],
-    *,
-    right: int,
-    spare: int,
-    width: int,
-    paint: Paint,
-) -> list[str]:
-    """Return a table whose rows end with a verdict and its style, the column `right` aligned right.
-
-    The column `spare` is left out where the terminal is too narrow.
-    """
-    table = [head, *(row[:-1] for row in rows)]
-    lines = columns(table, right=(right,))
-    if max(map(len, lines)) > width:
-        lines = columns([row[:spare] + row[spare + 1 :] for row in table], right=(right - (spare < right),))
-    ends = [(row[-2], cast("Style", row[-1])) for row in rows]
-    body = zip(lines[1:], ends, strict=True)
-    return [lines[0], *(line.removesuffix(x) + paint(x, style) if x else line for line, (x, style) in body)]
-
-
-def verdict(p: EstimatedParameter, found: Verdict = USABLE) -> str:
-    """Say in a word or two where a parameter's value comes from, such as ``"prior, 87 % data"``."""
-    if p.role == "fixed":
-        return "fixed"
-    word = word_for_all(found)
-    if word != "usable":
-        return WORDS[word][0]
-    if p.role == "prior":
-        share = "" if p.data_share is None else f", {100 * p.data_share:.0f} % data"
-        return f"prior{share}" if p.identifiable else f"prior, not identifiable{share}"
-    return "identified" if p.identifiable else "not identifiable"
-
-
-def word_for_all(found: Verdict) -> str:
-    """The verdict on every parameter: what the record does not show concerns some of them alone."""
-    alone = all(r.check == "identifiable" for r in found.reasons)
-    return "usable" if alone and found.word == "caution" else found.word
+    return [] if status == "converged" else [(f" – {status}", "bad")]
 
 
 def delay_line(what: str, d: Delay, rate_hz: float) -> str:
@@ -194,55 +131,9 @@ def coefficient_text(value: float, sd: float | None) -> str:
     return f"({pure(value / scale, sd / scale)})e{exponent}"
 
 
-def pole_table(
-    poles: Sequence[tuple[complex, Array | None]],
-    dt: float | None = None,
-    *,
-    times: bool = False,
-    paint: Paint = plain,
-) -> list[str]:
-    """Write poles, each with its covariance or None, with frequency, damping and standard deviation.
-
-    `dt` is the sampling interval in s of discrete ones, `times` adds time constants; of each pair one is given.
-    """
-    rows = [(f"poles [{'z' if dt else 'rad/s'}]", "frequency", "damping", "")]
-    for p, covariance in poles:
-        sd = np.zeros(2) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
-        text = pure(p.real, float(sd[0])) + (f" ± j({pure(p.imag, float(sd[1]))})" if p.imag else "")
-        if p == 0:
-            rows.append((text, "", "", "delay" if dt else "integrator"))
-            continue
-        s = complex(np.log(p) / dt) if dt else p
-        unstable = abs(p) > 1 if dt else p.real > 0
-        frequency = sized(abs(s) / (2 * np.pi), "Hz") if abs(s) else "0 Hz"
-        damping = f"{-s.real / abs(s):.3g}" if abs(s) else ""
-        words = "unstable" if unstable else ""
-        if times and s.real and not s.imag:
-            words += f"{', ' if words else ''}time constant {sized(1 / abs(s.real), 's')}"
-        rows.append((text, frequency, damping, paint(words, "bad") if unstable else words))
-    return columns(rows) if poles else []
-
-
-def fit_rows(fits: Mapping[str, OutputFit], units: Mapping[str, str], no_simulation: str) -> list[tuple[str, ...]]:
-    """Return a table of the fit of each output; `no_simulation` says why there may be no simulation."""
-    rows: list[tuple[str, ...]] = [("fit", "one step", "simulation", "innovations")]
-    for output, f in fits.items():
-        free = no_simulation if f.simulation is None else fraction(f.simulation)
-        rows.append((output, fraction(f.one_step), free, f"{sized(f.innovation_sd, units[output])} rms"))
-    return rows
-
-
 def fraction(x: float | None) -> str:
     """Write a fit, or a dash where there is none."""
     return "–" if x is None else f"{x:.4f}"
-
-
-def criteria_lines(criteria: Mapping[str, float], n_estimated: int, width: int) -> list[str]:
-    """Write the information criteria of a fit."""
-    if not criteria:
-        return []
-    text = ", ".join(f"{name} {value:.6g}" for name, value in criteria.items())
-    return textwrap.wrap(f"criteria: {text}; {n_estimated} parameters estimated", width)
 
 
 def check_lines(
@@ -256,14 +147,6 @@ def check_lines(
         detail = check.detail if check.passed or not above else "see the verdict"
         lines += hanging(f"{mark} {name.ljust(wide)}  ", detail, width, wide + 4)
     return lines
-
-
-def checks_of(validation: Mapping[str, Any]) -> dict[str, Check]:
-    """Return the checks that a validation holds as JSON."""
-    return {
-        name: Check(passed=bool(c["passed"]), detail=str(c["detail"]), p=c.get("p"))
-        for name, c in validation["checks"].items()
-    }
 
 
 def hanging(head: str, text: str, width: int, indent: int, first: int | None = None) -> list[str]:
@@ -285,20 +168,3 @@ def other_warnings(checks: Mapping[str, Check], warnings: Sequence[str]) -> list
     """Return the warnings that say more than the detail of a failed check, which stands with the checks."""
     said = {c.detail for c in checks.values()}
     return [warning for warning in warnings if warning not in said]
-
-
-def ending(found: Any, *, width: int = WIDTH, paint: Paint = plain) -> list[list[str]]:
-    """Return what a result ends with: its checks, the warnings that say more than they do, and how long it took."""
-    return [
-        check_lines(found.checks, width=width, paint=paint, above=True),
-        warning_lines(other_warnings(found.checks, found.warnings), width=width, paint=paint),
-        timing_lines(found.timing_s, width=width, paint=paint),
-    ]
-
-
-def timing_lines(timing_s: Mapping[str, float], *, width: int = 10 * WIDTH, paint: Paint = plain) -> list[str]:
-    """Say how long each stage took, and all together."""
-    if not timing_s:
-        return []
-    parts = ", ".join(f"{name} {seconds:.2g} s" for name, seconds in timing_s.items())
-    return [paint(line, "dim") for line in textwrap.wrap(f"{parts}; {sum(timing_s.values()):.2g} s in all", width)]

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ambid.errors import AmbidError, counted
+from ambid.estimation.result import RecordEntry
 from ambid.record import Record
+from ambid.report.document import Document, Lines, Section, grid, numbers_of
 from ambid.report.drawing import (
     BOUND,
     GREEN,
@@ -25,16 +28,23 @@ from ambid.report.drawing import (
     stacked,
 )
 from ambid.report.numbers import prefixed, sized
+from ambid.report.text import Line
+from ambid.rig.roles import Candidate
 from ambid.signals.faults import find_dropouts, find_outliers, find_saturation, resolution
-from ambid.signals.spectra import power_spectrum, snr
+from ambid.signals.spectra import cross_spectra, power_spectrum, snr
 from ambid.units import UNKNOWN
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
+    from ambid.validation.inspection import ChannelLook, Inspection
+
+
 _MOST = 8  # channels that are drawn
+
 _CLOSE = 200  # samples of a close view
+
 _ROW = 1.6  # inches
 
 
@@ -55,6 +65,45 @@ def record_figure(record: Record | None, title: str, looks: Sequence[Any] = (), 
         columns = [[panel(view, record, name, height=_ROW) for name in shown] for view in views]
         block = Block(columns=columns, widths=(4, 3, 3))
     return stacked(f"{title}{hidden}", [block], width)
+
+
+def inspection_document(inspection: Inspection, used: Record | None) -> Document:
+    """Describe what a record holds."""
+    i, name = inspection, RecordEntry.of(inspection.record).name
+    return Document(
+        title=f"{name}, {i.record['samples']} samples at {i.record['rate_hz']:g} Hz", sections=inspection_sections(i),
+        figure=partial(record_figure, used, f"{name}: channels", i.channels),
+        frame=lambda: ("name", numbers_of(i.channels)),
+    )  # fmt: skip
+
+
+def inspection_sections(inspection: Inspection) -> list[Section]:
+    """Say what a record holds: its channels, the columns for each role, its history."""
+    i, record = inspection, RecordEntry.of(inspection.record)
+    head: Line = [
+        (record.name, "strong"),
+        f": {counted(record.samples, 'sample')} at {record.rate_hz:.6g} Hz, {record.seconds:.6g} s from "
+        f"{record.start_s:g} s",
+    ]
+    rows: list[tuple[str, ...]] = [("channel", "unit", "min", "max", "mean", "sd", "step", "SNR")]
+    rows += [_row(c) for c in i.channels]
+    mark: list[Line] = [] if i.faults else [[("✓", "good"), " no saturation, drop-outs or outliers"]]
+    likely: list[Line] = []
+    for role, names in i.roles.items():
+        likely += names and [[(f"{role}: likely", "strong"), f" {names[0]}"], *(f"  or {x}" for x in names[1:])]
+    history = [f"history: {'; '.join(record.history)}"] if record.history else []
+    return [
+        Section(parts=[Lines(lines=[head], indent=2)]),
+        Section(title="Channels", parts=[grid(rows, right=range(2, 8))]),
+        *(Section(parts=[Lines(lines=lines, indent=2)]) for lines in ([*mark, *i.notes], likely, history)),
+    ]
+
+
+def _row(c: ChannelLook) -> tuple[str, ...]:
+    size = max(abs(c.least), abs(c.most))
+    scale, unit = (1.0, c.source_unit) if c.unit in (UNKNOWN, "1") else prefixed(size, c.unit)
+    numbers = [f"{v / scale:.5g}" for v in (c.least, c.most, c.mean, c.sd)]
+    return c.name, f"[{unit}]", *numbers, "–" if c.step is None else f"{c.step / scale:.3g}", c.snr
 
 
 def _scale(record: Record, name: str) -> tuple[float, str]:
@@ -149,3 +198,44 @@ def _range(axes: Axes, c: Any) -> None:
     axes.errorbar(c.mean / scale, 0, xerr=c.sd / scale, fmt="o", color=PREDICTED, capsize=4, label="mean ± sd")
     axes.set_yticks([])
     axes.set_xlabel(f"{c.name} [{unit}]")
+
+
+_SEGMENT = 512  # samples: smooth curves rather than fine ones
+
+_COLORS = {"voltage": BOUND, "current": PREDICTED, "position": GREEN}
+
+
+def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], width: float = WIDE) -> Figure:
+    """Return a row for each candidate: its signal, and its coherence with the columns chosen for the other roles."""
+    rows = [(x, x is found[0]) for found in ranked.values() for x in found]
+    chosen = {role: found[0].channel.name for role, found in ranked.items() if found}
+    names = list(dict.fromkeys([x.channel.name for x, _ in rows]))
+    signals = np.column_stack([record[name] for name in names]) if names else None
+    spectra = None if signals is None else cross_spectra(signals, record.rate_hz, segment=min(len(signals), _SEGMENT))
+    t = record.start_s + np.arange(record.n_samples) / record.rate_hz
+
+    def signal(axes: Axes, x: Candidate, first: bool) -> None:
+        values, unit = x.channel.values, x.channel.unit
+        scale, unit = (1.0, unit) if unit in (UNKNOWN, "1") else prefixed(float(np.max(np.abs(values))), unit)
+        curve(axes, t, values / scale, PREDICTED if first else MEASURED, "chosen" if first else "other candidates")
+        axes.set_ylabel(f"[{unit}]")
+        axes.set_xlabel("time [s]")
+        head(axes, f"{x.role}: {x.channel.name}, score {x.score:.2f}{' (chosen)' if first else ''}")
+
+    def coherence(axes: Axes, x: Candidate) -> None:
+        for role, name in chosen.items():
+            if spectra is not None and name != x.channel.name and role != x.role:
+                j, k = names.index(x.channel.name), names.index(name)
+                power = spectra.density[1:, j, j].real * spectra.density[1:, k, k].real
+                share = np.abs(spectra.density[1:, j, k]) ** 2 / np.where(power > 0, power, np.inf)
+                axes.semilogx(spectra.frequency_hz[1:], share, color=_COLORS[role], lw=1.0, label=f"with {name}")
+        axes.set_ylim(0.0, 1.05)
+        axes.set_ylabel("coherence")
+        axes.set_xlabel("frequency [Hz]")
+
+    columns = [
+        [panel(signal, x, first, height=1.6) for x, first in rows],
+        [panel(coherence, x, height=1.6) for x, _ in rows],
+    ]
+    title = f"{record.provenance.get('file', 'record')}: which column is which"
+    return stacked(title, [Block(columns=columns, widths=(3, 2))] if rows else [], width)

@@ -3,31 +3,26 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any
 
 from ambid.errors import counted
+from ambid.estimation.estimate import EstimatedParameter
 from ambid.estimation.result import NORMAL_95, Verdict
 from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.report.document import Column, Document, Frame, Lines, Part, Section, Table, grid
 from ambid.report.numbers import quantity, sized
-from ambid.report.text import (
-    USABLE,
-    WIDTH,
-    WORDS,
-    Paint,
-    columns,
-    hanging,
-    interval_words,
-    joined,
-    plain,
-    verdict_table,
-    word_for_all,
-)
+from ambid.report.parameters import ParameterRow, varied, word_for_all
+from ambid.report.text import WORDS, Cell, Line
+from ambid.report.track_figures import TrackHistory
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.console import Group
-    from rich.table import Table
+    from rich.table import Table as Grid
 
+    from ambid.report.track_figures import Truth
     from ambid.tracking.lines_file import LiveState
 
 STATE_STYLES = {"tracking": "bold green", "changed": "bold red", "hold": "bold cyan", "frozen": "bold yellow"}
@@ -41,73 +36,114 @@ _DECISIONS = 6
 LATE_S = 0.2  # a lag beyond which is shown in red, s
 
 
-def track_text(track: Track, *, events: Sequence[Event] = (), width: int = WIDTH, paint: Paint = plain) -> str:
-    """Write what a track came to, below its verdict; colour does not change the layout.
+def track_document(
+    track: Track, *, events: Sequence[Event] = (), history: TrackHistory | None = None,
+    truth: Callable[[Mapping[str, str]], Truth | None] | None = None,
+) -> Document:  # fmt: skip
+    """Describe a track; `history`: its lines as numbers, where they are at hand, `truth`: by the units of its names."""
+
+    def lines() -> TrackHistory:
+        return history or TrackHistory.of(track)
+
+    def drawn(width: float) -> Figure:
+        from ambid.report.track_figures import track_figure
+
+        shown = lines()
+        units = {name: shown.header.units.get(name, "") for name in shown.names}
+        return track_figure(shown, truth=None if truth is None else truth(units), width=width)
+
+    def frame() -> Frame:
+        shown = TrackHistory.of(track)
+        columns: dict[str, Any] = {"t": shown.t, "state": [x.state for x in track.lines], "error": shown.error}
+        for name in shown.names:
+            columns |= dict(zip((name, f"{name} sd"), shown.values(name)[:2], strict=True))
+        return "t", columns
+
+    name = str(track.header.record.get("file") or "record")
+    names = track.lines[-1].parameters if track.lines else ()
+    return Document(
+        title=f"{name}, track of {track.totals.seconds_of_record:.4g} s", sections=track_sections(track, events),
+        figure=drawn, frame=frame,
+        numbers=[(n, quantity(track[n].value, track[n].sd, track[n].unit).text) for n in names],
+    )  # fmt: skip
+
+
+def track_sections(track: Track, events: Sequence[Event] = ()) -> list[Section]:
+    """Say what a track came to.
 
     `events`: decisions that are told in their order, beside the changes of the whole.
     """
     header, totals = track.header, track.totals
+    name = str(header.record.get("file") or "record")
+    about = f": model {header.model}, {header.method}, {totals.seconds_of_record:.4g} s at {header.rate_hz:g} Hz"
+    stopped: list[Cell] = [] if totals.complete else [(" – stopped before its end", "bad")]
+    head = Section(parts=[Lines(lines=[[(name, "strong"), about, *stopped]], wrap=False)])
     if not track.lines:
-        return header_line(header, totals, paint)
+        return [head]
     last = track.lines[-1]
     error = "unknown" if math.isnan(last.error) else f"{last.error:.3g}"
-    return joined(
-        [
-            [header_line(header, totals, paint)],
-            parameter_lines(header, last, width=width, paint=paint, found=track.verdict),
-            extra_lines(header, last),
-            [f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"],
-            event_lines(events or totals.changes, width=width, paint=paint),
-            closing_lines(totals, paint),
-        ]
-    )
+    state = f"state at the end: {last.state}; model error {error}, limit {header.limit:g}"
+    extra = [(name, value_words(v, header.units.get(name, ""))[0]) for name, v in last.extra.items()]
+    return [
+        head,
+        Section(title="Parameters", parts=[track_table(header, last, track.verdict)]),
+        Section(parts=[grid([("", ""), *extra], bare=True)] if extra else []),
+        Section(parts=[Lines(lines=[state], wrap=False)]),
+        Section(title="Events", parts=event_parts(events or totals.changes)),
+        Section(parts=closing_parts(totals)),
+    ]
 
 
-def header_line(header: TrackHeader, summary: TrackSummary, paint: Paint = plain) -> str:
-    """Say what was tracked, how, and how far.
+@dataclass(frozen=True, kw_only=True)
+class TrackedRow(ParameterRow):
+    """A tracked parameter as the table of parameters sees it."""
 
-    `paint`: adds colour. Returns one line.
-    """
-    name = str(header.record.get("file") or "record")
-    stopped = "" if summary.complete else paint(" – stopped before its end", "bad")
-    return (
-        f"{paint(name, 'strong')}: model {header.model}, {header.method}, {summary.seconds_of_record:.4g} s"
-        f" at {header.rate_hz:g} Hz{stopped}"
-    )
+    tracked: TrackedValue
+    start: TrackedValue | None
+
+    @property
+    def text(self) -> str:
+        """Value ± standard deviation, as far as they are known."""
+        return value_words(self.tracked, self.parameter.unit)[0]
+
+    @property
+    def interval(self) -> str:
+        """The 95 % interval; empty where there is none."""
+        return value_words(self.tracked, self.parameter.unit)[1]
+
+    @property
+    def judged(self) -> Cell:
+        """Whether the value follows the record."""
+        if self.tracked.stale:
+            return "STALE", "bad"
+        word = word_for_all(self.verdict)
+        return ("tracked", "good") if word == "usable" else WORDS[word]
 
 
-def parameter_lines(
-    header: TrackHeader, last: TrackLine, *, found: Verdict = USABLE, width: int = WIDTH, paint: Paint = plain
-) -> list[str]:
-    """Write the table of the parameters at the end of a track; `found` is the verdict on all of them.
-
-    `width`: columns of the terminal; where they are too few, the interval is left out; `paint`: adds colour. Returns a
-    header and a line for each parameter.
-    """
-    word = word_for_all(found)
-    usual = ("tracked", "good") if word == "usable" else WORDS[word]
-    rows: list[tuple[str, ...]] = []
+def track_table(header: TrackHeader, last: TrackLine, verdict: Verdict) -> Table:
+    """Return the parameters at the end of a track; `verdict`: on all of them."""
+    rows = []
     for name, v in last.parameters.items():
-        value, interval = value_words(v, header.units.get(name, ""))
-        change = change_words(v, header.start.get(name))
-        rows.append((name, value, interval, change, *(("STALE", "bad") if v.stale else usual)))
-    head = ("", "value ± sd", "95 % interval", "from start", "verdict")
-    return verdict_table(head, rows, right=3, spare=2, width=width, paint=paint)
+        p = EstimatedParameter(
+            name=name, unit=header.units.get(name, ""), value=v.value, sd=v.sd, role="free", identifiable=not v.stale,
+            ci95=(v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd),
+        )  # fmt: skip
+        rows.append(TrackedRow(parameter=p, verdict=verdict, tracked=v, start=header.start.get(name)))
+    change = Column(label="from start", cell=lambda row: change_words(row.tracked, row.start), right=True)
+    columns = varied({"in SI": None}, {"95 % interval": [change]})
+    place = next(k for k, column in enumerate(columns) if column.label == "95 % interval")
+    columns[place] = replace(columns[place], right=False, spare=True)
+    return Table(columns=columns, rows=rows)
 
 
 def value_words(v: TrackedValue, unit: str) -> tuple[str, str]:
-    """Write a tracked value and its interval.
-
-    `unit`: SI unit. Returns `value, interval`: ``"4.002 ± 0.016 kg"`` and ``"3.971 … 4.033"``; the interval is empty
-    where there is none.
-    """
+    """Write a tracked value and its interval, which is empty where there is none."""
     if not math.isfinite(v.value):
         return "unknown", ""
     if not math.isfinite(v.sd):
         return f"{sized(v.value, unit, 5)} ± ?", ""
-    ci95 = (v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd)
-    q = quantity(v.value, v.sd, unit, ci95=ci95)
-    return q.text, interval_words(q)
+    q = quantity(v.value, v.sd, unit, ci95=(v.value - NORMAL_95 * v.sd, v.value + NORMAL_95 * v.sd))
+    return q.text, f"{q.low} … {q.high}" if q.low else ""
 
 
 def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
@@ -122,44 +158,29 @@ def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
     return text.replace("-0.00", "+0.00")
 
 
-def extra_lines(header: TrackHeader, last: TrackLine) -> list[str]:
-    """Write what is tracked beside the parameters."""
-    rows = [(name, value_words(v, header.units.get(name, ""))[0]) for name, v in last.extra.items()]
-    return columns(rows) if rows else []
-
-
-def event_lines(events: Sequence[Event], *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
-    """Write events, one after the other: when, what, why.
-
-    `width`: columns of the terminal; longer reasons go on under themselves; `paint`: adds colour. Returns at most the
-    last twenty, and how many came before.
-    """
+def event_parts(events: Sequence[Event]) -> list[Part]:
+    """Return the last twenty events, one after the other: when, what, why; and how many came before."""
     shown = events[-_MOST:]
-    lines = [f"{len(events) - len(shown)} earlier events are omitted"] if len(shown) < len(events) else []
+    earlier = [f"{len(events) - len(shown)} earlier events are omitted"] if len(shown) < len(events) else []
+    told: list[Line] = []
     for e in shown:
         who = f" {e.parameter}" if e.parameter else ""
-        head = f"{e.t:10.3f} s  "
-        what = f"{e.kind}{who}: "
-        painted = head + paint(what, "bad" if e.kind in _BAD else "strong")
-        lines += hanging(painted, e.why, width, len(head), len(head) + len(what))
-    return lines
+        told.append([f"{e.t:10.3f} s  ", (f"{e.kind}{who}: ", "bad" if e.kind in _BAD else "strong"), e.why])
+    return [Lines(lines=earlier), Lines(lines=told, hang=True, indent=14)]
 
 
-def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
-    """Write counts, throughput and latency.
-
-    `paint`: adds colour.
-    """
+def closing_parts(summary: TrackSummary) -> list[Part]:
+    """Return counts, throughput and latency."""
     places = summary.counts.get("rejected", 0)
     rejected = counted(summary.rejected_samples, "sample") + " rejected"
     if places:
         rejected += f" in {counted(places, 'place')}"
-    lines = [f"{counted(summary.updates, 'update')}, {counted(len(summary.changes), 'change')}, {rejected}"]
+    lines: list[Line] = [f"{counted(summary.updates, 'update')}, {counted(len(summary.changes), 'change')}, {rejected}"]
     if summary.counts:
         lines.append(f"events: {', '.join(f'{n} {kind}' for kind, n in summary.counts.items())}")
     speed = speed_words(summary.samples, summary.seconds_of_record, summary.computing_s)
     if speed:
-        lines.append(paint(f"{summary.computing_s:.2g} s of computing: {speed}", "dim"))
+        lines.append([(f"{summary.computing_s:.2g} s of computing: {speed}", "dim")])
     latency = summary.latency
     if latency is not None and math.isfinite(latency.median):
         lost = f"; {counted(latency.overruns, 'block')} LOST" if latency.overruns else ""
@@ -169,8 +190,8 @@ def closing_lines(summary: TrackSummary, paint: Paint = plain) -> list[str]:
             f"lag from sample to decision: median {median}, 99 % {p99}, largest {largest}{start}; "
             f"{latency.late} late{lost}"
         )
-        lines.append(paint(words, "bad" if lost else "dim"))
-    return lines
+        lines.append([(words, "bad" if lost else "dim")])
+    return [Lines(lines=lines, wrap=False)]
 
 
 def speed_words(samples: int, seconds_of_record: float, computing_s: float) -> str:
@@ -229,11 +250,11 @@ def _head(state: LiveState, line: TrackLine, behind_s: float | None, ascii_only:
     return parts
 
 
-def _parameters(state: LiveState, line: TrackLine, ascii_only: bool) -> Table:
-    from rich.table import Table
+def _parameters(state: LiveState, line: TrackLine, ascii_only: bool) -> Grid:
+    from rich.table import Table as Grid
     from rich.text import Text
 
-    table = Table.grid(padding=(0, 2, 0, 0))
+    table = Grid.grid(padding=(0, 2, 0, 0))
     for column in range(5):
         table.add_column(justify="right" if column == 2 else "left", no_wrap=True)
     table.add_row("", "value ± sd", "from start", "95 % interval", "", style="dim")

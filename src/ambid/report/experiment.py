@@ -1,19 +1,90 @@
-"""Panels of a designed experiment: lines, one period of what moves beside its limits, what records will show."""
+"""A designed experiment as tables for the terminal: what it moves, and what a record of it will show."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ambid.control.experiment import Experiment
+from ambid.report.document import Document, Lines, Section, Table, ending, grid, numbers_of
 from ambid.report.drawing import BOUND, CYCLE, MEASURED, ORANGE, Block, curve, head, log_axis, panel, stacked
-from ambid.report.numbers import prefixed
+from ambid.report.numbers import prefixed, quantity, sized
 from ambid.simulation.rotor_bench import kind_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+
+_NONE = "–"
+
+_CRITERIA = {"all": "all parameters", "worst": "the worst parameter"}
+
+
+def experiment_document(experiment: Experiment, _: Any) -> Document:
+    """Describe a designed experiment."""
+    x, title = experiment, title_of(experiment)
+    return Document(
+        title=title, sections=experiment_sections(x), figure=partial(experiment_figure, x, title),
+        frame=lambda: ("name", {"name": list(x.expected), **numbers_of(list(x.expected.values()))}),
+    )  # fmt: skip
+
+
+def experiment_sections(experiment: Experiment) -> list[Section]:
+    """Say what was designed."""
+    x = experiment
+    first, last = (sized(float(f), "Hz") for f in (x.frequency_hz[0], x.frequency_hz[-1]))
+    lines = [
+        f"{x.frequency_hz.size} lines, {first} to {last}, period {x.period} samples at {x.rate_hz:g} Hz",
+        f"record of {sized(x.seconds, 's')}, {x.periods} periods; limits kept for {x.drawn} drawn plants",
+    ]
+    if x.table is not None:
+        lines.append(
+            f"table for the controller: {len(x.table.elements)} elements of {x.table.hold} ticks, "
+            f"amplitude {sized(x.table.amplitude, 'V')}"
+        )
+    flat = "flat: standard deviation with a flat multisine of the same band and use of the limits"
+    return [
+        Section(heading=[(title_of(x), "strong")], parts=[Lines(lines=lines)]),
+        Section(heading=[("what the record will show", "strong")], parts=[expected_table(x), Lines(lines=[flat])]),
+        Section(
+            heading=[("deviations from rest, four standard deviations of noise kept free", "strong")],
+            parts=[_signals(x)],
+        ),
+        *ending(x),
+    ]
+
+
+def title_of(found: Experiment) -> str:
+    """Return what was designed, in a few words."""
+    loop = "closed" if found.closed else "open"
+    return f"experiment for {_CRITERIA.get(found.criterion, found.criterion)} of model {found.model}, {loop} loop"
+
+
+def expected_table(x: Experiment) -> Table:
+    """Return what a record of an experiment will show, by parameter."""
+    rows: list[tuple[str, ...]] = [
+        ("", "designed for", "relative", "flat", "curvature", f"{100.0 * x.target:.3g} % after")
+    ]
+    for name, e in x.expected.items():
+        needed = _NONE if e.seconds is None or not e.identifiable else sized(e.seconds, "s")
+        value = quantity(e.value, e.sd, e.unit).text.removesuffix(" 1")
+        moved = _NONE if e.shift is None else f"{e.shift:+.1f} sd"
+        rows.append((name, value, f"{100.0 * e.relative_sd:.2g} %", f"{e.flat_sd / e.sd:.2g} times", moved, needed))
+    return grid(rows)
+
+
+def _signals(x: Experiment) -> Table:
+    rows: list[tuple[str, ...]] = [("", "peak", "limits", "in use", "drawn plants")]
+    for name, s in x.signals.items():
+        if s.low is None and s.high is None:
+            continue
+        ends = " … ".join("any" if e is None else sized(e, s.unit) for e in (s.low, s.high))
+        most = f"{100.0 * max(s.steady, s.from_rest):.0f} %"
+        rows.append((name, sized(s.peak, s.unit), ends, most, f"{100.0 * s.drawn:.0f} %"))
+    return grid(rows)
 
 
 def experiment_figure(found: Experiment, title: str, width: float) -> Figure:

@@ -35,11 +35,11 @@ from ambid.report.drawing import (
     single,
     stacked,
 )
-from ambid.report.estimate_text import names_words
 from ambid.report.numbers import prefixed, sized
+from ambid.report.parameters import pole_table
 from ambid.report.response_panels import Pole, bode_panel, correlations_panel, frequency_grid, poles_panel, roots
-from ambid.report.signal_panels import Traces, records_panel, residuals_panel, signals_panel, whiteness_panel
-from ambid.report.text import pole_table
+from ambid.report.signals import Traces, records_panel, residuals_panel, signals_panel, whiteness_panel
+from ambid.report.text import names_words
 from ambid.signals.frf import frf_local
 from ambid.signals.response import FrequencyResponse
 from ambid.signals.spectra import power_spectrum
@@ -97,6 +97,11 @@ class Evidence:
             input_units=tuple(plant.units[role] for role in plant.inputs),
         )
 
+    @property
+    def records(self) -> Sequence[Traces]:
+        """What a page shows down to the samples."""
+        return () if self.run is None else (self.traces,)
+
     def traces_ahead(self) -> Traces:
         """Return what `traces` does, with predictions several samples ahead."""
         run, traces = self.run, self.traces
@@ -128,7 +133,7 @@ class BearingEvidence:
     """What the figures of a nonlinear bearing show beside it."""
 
     estimate: NonlinearBearingEstimate
-    traces: tuple[Traces, ...]  # one for each of its records, position and current; without any no record is drawn
+    records: tuple[Traces, ...]  # one for each of its records, position and current; without any no record is drawn
 
     @property
     def title(self) -> str:
@@ -142,7 +147,7 @@ class BearingEvidence:
             "force": _force(self),
             "curves": _curves(e),
             "map": _map(self),
-            **({"records": records_panel(self.traces)} if self.traces else {}),
+            **({"records": records_panel(self.records)} if self.records else {}),
             "correlations": correlations_panel(e.covariance_names, e.covariance, e.values),
         }
 
@@ -166,7 +171,7 @@ def bearing_evidence(
                 sd=run.sd,
             )
         )
-    return BearingEvidence(estimate=estimate, traces=tuple(traces))
+    return BearingEvidence(estimate=estimate, records=tuple(traces))
 
 
 def overview(evidence: Evidence | BearingEvidence, width: float = WIDE) -> Figure:
@@ -329,8 +334,8 @@ def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
 
 def _poles(estimate: Estimate) -> Block:
     found = poles(estimate)
-    text = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
-    return poles_panel(found, "\n".join(text), "poles of the identified plant")
+    table = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
+    return poles_panel(found, table, "poles of the identified plant")
 
 
 # --- a nonlinear bearing --------------------------------------------------------------------------------------------
@@ -389,7 +394,7 @@ def _force(evidence: BearingEvidence) -> Block:
         drawn = axes.contour(x / scale, i, values, levels=10, cmap="viridis", linewidths=1.2)
         axes.clabel(drawn, fontsize=7, fmt="%g")
         axes.contourf(x / scale, i, ~inside, levels=[0.5, 1.5], colors=["#ededed"], zorder=0)
-        for color, t in zip(CYCLE, evidence.traces, strict=False):
+        for color, t in zip(CYCLE, evidence.records, strict=False):
             free = t.measured[np.isfinite(t.predicted[:, 0])]
             points = free[:: max(1, free.shape[0] // _CLOUD)]
             axes.plot(points[:, 0] / scale, points[:, 1], ".", color=color, markersize=1.5, alpha=0.35, zorder=0.5)
@@ -418,7 +423,7 @@ def _map(evidence: BearingEvidence) -> Block:
     scale, unit = prefixed(float(np.max(np.abs(e.coil_hull[:, 0]))), "m")
 
     def where(axes: Axes) -> None:
-        for color, t in zip(cycle(CYCLE), evidence.traces, strict=False):
+        for color, t in zip(cycle(CYCLE), evidence.records, strict=False):
             every = max(1, t.measured.shape[0] // _CLOUD)
             used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
             mark = "." if np.any(np.isfinite(t.predicted[:, 0])) else "|"

@@ -1,11 +1,14 @@
-"""What the steps of a commissioning saw, drawn: rest, pulses, lift-off, trials of the amplitude, records, margins."""
+"""A commissioning for people: its steps, each with what it found and saw; the same page where it ended early."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING
+import textwrap
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -13,23 +16,149 @@ from ambid.acquisition.trials import Pulse
 from ambid.arrays import Array
 from ambid.control.design import Design
 from ambid.control.margins import Margins
-from ambid.report.design_figures import loops_block
-from ambid.report.drawing import BAND, BOUND, MEASURED, ORANGE, PREDICTED, Block, curve, head, log_axis, panel
-from ambid.report.margins_figures import sensitivity_panel, zone_lines
+from ambid.estimation.estimate import fields_json
+from ambid.report.design import loops_block
+from ambid.report.document import Document, Lines, Preformatted, Section, Table, grid
+from ambid.report.drawing import (
+    BAND,
+    BOUND,
+    MEASURED,
+    ORANGE,
+    PREDICTED,
+    Block,
+    curve,
+    head,
+    log_axis,
+    panel,
+    single,
+    stacked,
+)
+from ambid.report.margins import sensitivity_panel, zone_lines
 from ambid.report.numbers import prefixed, sized
+from ambid.report.text import WIDTH, Cell, Line
+from ambid.settings.caller import command, setting
 from ambid.signals.spectra import power_spectrum
 from ambid.simulation.margins import ZONES, LoopMargins
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+
+_NO_NUMBERS: Mapping[str, float] = MappingProxyType({})
+
+
+_SEEN = frozenset({"pictures", "text"})  # of the page, not of the file
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """One step, done."""
+
+    name: str
+    findings: tuple[str, ...] = ()  # what was measured, one line each
+    reasons: tuple[str, ...] = ()  # why it is not good enough, and what to do, one line each; empty: it is
+    cautions: tuple[str, ...] = ()  # what a reader should know although the step is good enough
+    numbers: Mapping[str, float] = field(default_factory=lambda: _NO_NUMBERS)  # the same as numbers, SI
+    pictures: tuple[Picture, ...] = ()  # what it saw
+    text: str = ""  # more of it, as on a terminal
+
+    @property
+    def passed(self) -> bool:
+        """Whether commissioning may go on."""
+        return not self.reasons
+
+    def as_json(self) -> dict[str, object]:
+        """Return its fields and whether it ``passed``, without what is only for the page; what is not known is None."""
+        return {**fields_json(self, without=tuple(_SEEN)), "passed": self.passed}
+
+
+def _still() -> str:
+    own_page = command("identify", "record.h5", rig="rig.toml", report="record.html")
+    return (
+        "Signals of this page stand still. The record's own page, in which they are zoomed down to the samples, is "
+        f"written in this folder by: {own_page}"
+    )
+
+
+def commission_document(
+    commissioned: Any, device: str, rig: str, more: Mapping[str, Callable[[], Sequence[Section]]]
+) -> Document:
+    """Describe a commissioning, also one that ended early.
+
+    `device`: which and where, `rig`: its text; `more`: by step, sections of the page that follow its own.
+    """
+    c, title = commissioned, f"Commissioning: {commissioned.rig.name}"
+    count = len(c.names)
+
+    told = [part for k, step in enumerate(c.steps, 1) for part in step_section(step, f"{k}/{count}").parts]
+
+    def pages() -> list[Section]:
+        recorded = any(step.name == "record" for step in c.steps)
+        sections = [Section(title="Steps", parts=[_overview(c.steps, c.names)], note=_still() if recorded else "")]
+        for step in c.steps:
+            sections.append(_section(step, f"{c.names.index(step.name) + 1}. {step.name}"))
+            sections += [
+                Section(title=p.title, caption=p.caption, figure=partial(single, p.block)) for p in step.pictures[1:]
+            ]
+            sections += more[step.name]() if step.name in more else ()
+        return [*sections, *([Section(title="Rig", parts=[Preformatted(text=rig)], folded=True)] if rig else [])]
+
+    return Document(
+        title=title, subtitle=device,
+        sections=[Section(parts=told, page=False)],
+        figure=lambda width: stacked(title, [p.block for step in c.steps for p in step.pictures], width),
+        frame=lambda: ("step", {"step": [s.name for s in c.steps], "passed": [s.passed for s in c.steps]}),
+        drawings=pages,
+        provenance=[("rig", str(c.rig.source or c.rig.name)), ("device", device), ("folder", str(c.folder))],
+    )  # fmt: skip
+
+
+def _overview(steps: Sequence[Step], names: Sequence[str]) -> Table:
+    """One row for each step, those that were not reached too."""
+    rows: list[Sequence[Cell]] = [("", "outcome", "")]
+    done = {step.name: step for step in steps}
+    for k, name in enumerate(names, 1):
+        step = done.get(name)
+        if step is None:
+            rows.append((f"{k}. {name}", ("not reached", "dim"), ""))
+        elif step.passed:
+            words: Cell = ("passed", "good") if not step.cautions else ("passed, see the note", "doubt")
+            rows.append((f"{k}. {name}", words, (step.findings[-1] if step.findings else "", "")))
+        else:
+            rows.append((f"{k}. {name}", ("stopped", "bad"), (step.reasons[0], "")))
+    return grid(rows)
+
+
+def _section(step: Step, title: str) -> Section:
+    """What a step found, why it stopped, and its first picture."""
+    rows: list[Sequence[Cell]] = [("", "what stands against it")]
+    rows += [("stopped", (text, "bad")) for text in step.reasons]
+    rows += [("note", (text, "doubt")) for text in step.cautions]
+    picture = step.pictures[0] if step.pictures else None
+    return Section(
+        title=f"{'✓' if step.passed else '✗'} {title}",
+        parts=[
+            Lines(lines=[text for text in step.findings if text]),
+            *([grid(rows)] if len(rows) > 1 else []),
+            *([Preformatted(text=step.text)] if step.text else []),
+        ],
+        figure=None if picture is None else partial(single, picture.block),
+        note="" if picture is None else picture.caption,
+    )
+
+
 Bounds = Mapping[str, tuple[float, float]]  # trips by role, SI
 
 UNITS = {"position": "m", "current": "A", "voltage": "V"}
+
 _MOST = 20_000  # samples of a trace that are kept
+
 _PULSES = 4  # beside each other
+
 _BEGIN_S = 0.25  # of lift-off that is drawn closer
+
 _ROW = 1.5  # inches
+
 _DB = (-20.0, 16.0)
 
 
@@ -223,3 +352,70 @@ def _sensitivity(axes: Axes, loops: Mapping[str, LoopMargins]) -> None:
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("sensitivity [dB]")
     head(axes, f"largest {20.0 * math.log10(peak):.1f} dB at {hz:.3g} Hz", good=peak < ZONES[-1][0])
+
+
+def step_section(step: Step, place: str) -> Section:
+    """Return a step that was done; `place` says which of how many it is, such as ``"2/9"``."""
+    mark = ("✗", "bad") if step.reasons else ("✓", "good")
+    lines: list[Line] = [["  ", x] for x in step.findings if x]
+    cautions: list[Line] = [["  ", f"note: {c}"] for c in step.cautions]
+    reasons: list[Line] = [["  ", f"stopped: {r}"] for r in step.reasons]
+    return Section(
+        parts=[
+            Lines(lines=[[mark, f" {place} ", (step.name, "strong")]], wrap=False),
+            Lines(lines=lines, hang=True, indent=4),
+            Lines(lines=cautions, hang=True, indent=4, style="dim"),
+            Lines(lines=reasons, hang=True, indent=4, style="bad"),
+        ]
+    )
+
+
+def next_text(
+    passed: bool, step: str, number: int, of: int, folder: str, *, command: str = "", width: int = WIDTH
+) -> str:
+    """Say where a commissioning ended, and what to do next.
+
+    `passed`: whether it came to its end; `step`: the last one; `number`, `of`: which of how many it is; `folder`: where
+    the files are; `command`: what is said to be run next, on a line of its own; `width`: columns of the terminal.
+    Returns lines without the last line's end.
+    """
+    if passed:
+        said = [
+            f"commissioned; {folder} holds rig, records, estimate, report and track.",
+            f"Next: read {folder}/report.html; follow the bench while it runs:",
+        ]
+    else:
+        said = [
+            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found,"
+            f" {folder}/report.html shows it.",
+            f"Next: {_next(step, folder)}. Then commission again, into another folder.",
+        ]
+    lines = [line for text in said for line in textwrap.wrap(text, width, break_on_hyphens=False)]
+    return "\n".join([*lines, *([f"  {command}"] if command else [])])
+
+
+def _next(step: str, folder: object) -> str:
+    """Say what to do after a step that was not good enough."""
+    return {
+        "self-test": "correct what the self-test names; the output was never switched on",
+        "rest": "correct sensors, wiring or calibrations; the output was never switched on",
+        "polarity": "correct what is reversed, at the bench or in the rig; the rotor was not lifted",
+        "levitate": "correct the bench, or [loop], [daq.trip] and the calibrations of the rig",
+        "excite": f"give a smaller {setting('amplitude')} or another {setting('band')}, or correct the bench",
+        "record": f"remove what disturbed the record; {folder}/record.h5 holds what was recorded",
+        "identify": (
+            f"record longer ({setting('seconds')}), excite more ({setting('amplitude')}) or in a wider "
+            f"{setting('band')}, or correct the rig; the last line here tries a corrected rig without the bench"
+        ),
+        "validate": (
+            f"look at {folder}/estimate.json: the model does not hold for the second record; excite less, or look for "
+            "what changed between the two"
+        ),
+        "load": (
+            f"the controller kept levitating with the loop before; look at {folder}/design.json, or commission without "
+            f"{setting('redesign')}"
+        ),
+        "track": (
+            f"look for what changed after the record: load, temperature, supply; {folder}/track.jsonl shows when"
+        ),
+    }.get(step, "see the reason above")

@@ -1,0 +1,182 @@
+"""The table of parameters, declared once: of estimates, rotors, tracks and the demo."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.estimate import EstimatedParameter, OutputFit
+from ambid.estimation.result import Verdict
+from ambid.report.document import Column, Part, Table, grid
+from ambid.report.numbers import Quantity, quantity, sized
+from ambid.report.text import WORDS, Cell, fraction, pure
+
+USABLE = Verdict(word="usable", reasons=())
+
+
+@dataclass(frozen=True, kw_only=True)
+class ParameterRow:
+    """A parameter as its table sees it; where the verdict on all of them is not good, none is called identified."""
+
+    parameter: EstimatedParameter
+    verdict: Verdict = USABLE
+    meaning: str = ""
+
+    @cached_property
+    def quantity(self) -> Quantity:
+        """The value, its standard deviation and interval, ready for print."""
+        p = self.parameter
+        return quantity(p.value, p.sd, p.unit, ci95=p.ci95)
+
+    @property
+    def text(self) -> str:
+        """Value ± standard deviation."""
+        return self.quantity.text
+
+    @property
+    def interval(self) -> str:
+        """The 95 % interval; empty where there is none."""
+        q = self.quantity
+        return f"{q.low} … {q.high}" if q.low else ""
+
+    @property
+    def judged(self) -> Cell:
+        """Where the value comes from in a word or two, such as ``"prior, 87 % data"``."""
+        p, word = self.parameter, word_for_all(self.verdict)
+        if p.role == "fixed":
+            return "fixed", "dim"
+        doubt = WORDS[self.verdict.word][1] if self.verdict.reasons else "bad"
+        if word != "usable":
+            return WORDS[word][0], doubt
+        words = "identified" if p.identifiable else "not identifiable"
+        if p.role == "prior":
+            share = "" if p.data_share is None else f", {100 * p.data_share:.0f} % data"
+            words = f"prior{share}" if p.identifiable else f"prior, not identifiable{share}"
+        return words, "good" if p.identifiable else doubt
+
+
+@dataclass(frozen=True, kw_only=True)
+class TrueRow(ParameterRow):
+    """A parameter beside its truth, SI."""
+
+    truth: float
+
+    @property
+    def z(self) -> float:
+        """The error in standard deviations."""
+        return (self.parameter.value - self.truth) / self.parameter.sd
+
+    @property
+    def true_text(self) -> str:
+        """The truth, with the digits of the value."""
+        q = self.quantity
+        scale, decimals = self.parameter.value / float(q.value), len(q.value.partition(".")[2])
+        return f"{self.truth / scale:.{decimals}f} {q.unit}"
+
+
+def word_for_all(verdict: Verdict) -> str:
+    """Return the verdict on every parameter: what the record does not show concerns some of them alone."""
+    alone = all(r.check == "identifiable" for r in verdict.reasons)
+    return "usable" if alone and verdict.word == "caution" else verdict.word
+
+
+PARAMETERS: Sequence[Column] = (
+    Column(cell=lambda row: row.parameter.name, frame={"name": lambda row: row.parameter.name}),
+    Column(label="meaning", cell=lambda row: (row.meaning, ""), page=True, sparse=True),
+    Column(
+        label="value ± sd",
+        cell=lambda row: row.text,
+        frame={
+            "value": lambda row: row.parameter.value,
+            "sd": lambda row: row.parameter.sd,
+            "unit": lambda row: row.parameter.unit,
+            "role": lambda row: row.parameter.role,
+            "identifiable": lambda row: row.parameter.identifiable,
+        },
+    ),
+    Column(
+        label="95 % interval",
+        cell=lambda row: row.interval,
+        right=True,
+        frame={
+            "ci95_low": lambda row: row.parameter.ci95[0],
+            "ci95_high": lambda row: row.parameter.ci95[1],
+        },
+    ),
+    Column(label="in SI", cell=lambda row: row.quantity.si, spare=True),
+    Column(label="verdict", cell=lambda row: row.judged),
+)
+"""Columns of every table of parameters: one that is added here appears wherever parameters are shown."""
+
+
+def parameter_table(
+    parameters: Sequence[EstimatedParameter],
+    verdict: Verdict = USABLE,
+    meanings: Mapping[str, str] | None = None,
+    *,
+    label: str = "",
+) -> Table:
+    """Return parameters as a table; `label`: of the column of names."""
+    rows = [ParameterRow(parameter=p, verdict=verdict, meaning=(meanings or {}).get(p.name, "")) for p in parameters]
+    return Table(columns=[replace(PARAMETERS[0], label=label), *PARAMETERS[1:]], rows=rows)
+
+
+def varied(labels: Mapping[str, str | None], more: Mapping[str, Sequence[Column]]) -> list[Column]:
+    """Return the columns of parameters, some renamed or, as None, left out, with `more` behind those of a label."""
+    columns = list[Column]()
+    for column in PARAMETERS:
+        label = str(column.label)
+        if labels.get(label, label) is not None:
+            columns.append(replace(column, label=labels.get(label, label) or ""))
+        columns += more.get(label, ())
+    return columns
+
+
+def short_numbers(parameters: Sequence[EstimatedParameter]) -> list[tuple[str, str]]:
+    """Return name and value ± standard deviation of parameters, but fixed ones."""
+    return [(p.name, quantity(p.value, p.sd, p.unit).text.removesuffix(" 1")) for p in parameters if p.role != "fixed"]
+
+
+def fit_table(fits: Mapping[str, OutputFit], units: Mapping[str, str], no_simulation: str) -> Table:
+    """Return a table of the fit of each output; `no_simulation` says why there may be no simulation."""
+    return Table(
+        columns=[
+            Column(label="fit", cell=lambda row: row[0]),
+            Column(label="one step", cell=lambda row: fraction(row[1].one_step)),
+            Column(
+                label="simulation",
+                cell=lambda row: no_simulation if row[1].simulation is None else fraction(row[1].simulation),
+            ),
+            Column(label="innovations", cell=lambda row: f"{sized(row[1].innovation_sd, units[row[0]])} rms"),
+        ],
+        rows=list(fits.items()),
+    )
+
+
+def pole_table(
+    poles: Sequence[tuple[complex, Array | None]], dt: float | None = None, *, times: bool = False
+) -> list[Part]:
+    """Return poles, each with its covariance or None, with frequency, damping and standard deviation.
+
+    `dt` is the sampling interval in s of discrete ones, `times` adds time constants; of each pair one is given.
+    """
+    rows: list[Sequence[Cell]] = [(f"poles [{'z' if dt else 'rad/s'}]", "frequency", "damping", "")]
+    for p, covariance in poles:
+        sd = np.zeros(2) if covariance is None else np.sqrt(np.maximum(np.diag(covariance), 0.0))
+        text = pure(p.real, float(sd[0])) + (f" ± j({pure(p.imag, float(sd[1]))})" if p.imag else "")
+        if p == 0:
+            rows.append((text, "", "", "delay" if dt else "integrator"))
+            continue
+        s = complex(np.log(p) / dt) if dt else p
+        unstable = abs(p) > 1 if dt else p.real > 0
+        frequency = sized(abs(s) / (2 * np.pi), "Hz") if abs(s) else "0 Hz"
+        damping = f"{-s.real / abs(s):.3g}" if abs(s) else ""
+        words = ["unstable"] if unstable else []
+        if times and s.real and not s.imag:
+            words.append(f"time constant {sized(1 / abs(s.real), 's')}")
+        rows.append((text, frequency, damping, (", ".join(words), "bad" if unstable else "")))
+    return [grid(rows)] if poles else []
