@@ -142,7 +142,7 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
     "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
-    "ambid.acquisition/1": _whole("acquisition.recording", "Acquired", "acquire"),
+    "ambid.acquisition/1": _whole("acquisition.session", "Acquired", "acquire"),
     "ambid.fleet/1": _whole("ledger.fleet_run", "FleetRun", "fleet_run"),
     "ambid.recovery/1": _whole("acquisition.recorder", "Recorded", "recover"),
 }
