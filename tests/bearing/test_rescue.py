@@ -18,7 +18,7 @@ from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, estimate_from_json
 from ambid.estimation.global_search import describe_search
-from ambid.estimation.likelihood import Fit
+from ambid.estimation.likelihood import Fit, unexplained
 from ambid.job import identify
 from ambid.record import Channel, Record
 from ambid.rig import load_rig
@@ -100,7 +100,7 @@ def test_a_wrong_minimum_shows_in_its_errors_and_is_left() -> None:
     late = run("thesis", 1500, 1, delay=20.0)
     ps = parameters(late, fixed=("c",))
     before = greybox(late.model, late.signals, ps, evaluations=0)
-    assert rescue.unexplained(before) > 0.9
+    assert unexplained(before) > 0.9
     assert max(abs(before.problem.parameters(before.vector)[k] / late.truth[k] - 1.0) for k in ("m", "k_i", "L")) > 1.0
     fit = greybox(late.model, late.signals, ps, evaluations=700)
     assert fit.status == "converged"

@@ -15,11 +15,11 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.lag import lag_of, without_lag
-from ambid.bearing.multistart import Candidate, Delay, Signals, busiest, starts
-from ambid.bearing.rescue import reason
+from ambid.bearing.multistart import Candidate, Delay, Signals, starts
 from ambid.bearing.sizes import check_units, possible
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import Fit
+from ambid.estimation.likelihood import Fit, failure
+from ambid.estimation.predictor import busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.physics.linear_model import LinearModel, Parameter
 from ambid.rig.roles import Coil, coil_of
@@ -253,7 +253,7 @@ def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate
         fit = follow(found)
     except (EstimationError, np.linalg.LinAlgError):
         return None
-    return fit if reason(fit) == "" else None
+    return fit if failure(fit) == "" else None
 
 
 def _can_be(fit: Fit) -> bool:

@@ -12,8 +12,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.multistart import Signals, Spectrum, busiest, take_moments
+from ambid.bearing.multistart import Signals, Spectrum, take_moments
 from ambid.estimation.estimate import Check
+from ambid.estimation.predictor import busiest
 from ambid.physics.linear_model import LinearModel
 
 _LOOKED = 16384  # samples

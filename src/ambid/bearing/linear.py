@@ -19,9 +19,9 @@ from ambid.arrays import Array
 from ambid.bearing.columns import POOR, refuse_mistaken, refuse_silent
 from ambid.bearing.lag import late
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
-from ambid.bearing.rescue import EVALUATIONS, Rescue, reason, rescue
+from ambid.bearing.rescue import EVALUATIONS, Rescue, rescue
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import Fit, extend, promise_of, score_statistic, search, workspace_near
+from ambid.estimation.likelihood import Fit, extend, failure, promise_of, score_statistic, search, workspace_near
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, assemble, stable
 from ambid.estimation.sensitivity import Workspace
@@ -100,9 +100,9 @@ def _greybox(
     refuse_silent(model, signals)
     try:
         candidates = starts(model, signals, parameters, delay, tick=tick)
-    except EstimationError as failure:
+    except EstimationError as error:
         refuse_mistaken(model, signals, parameters, delay, np.inf, tried)
-        fit = rescue(None, str(failure), model, signals, parameters, delay, how, follow, tick)
+        fit = rescue(None, str(error), model, signals, parameters, delay, how, follow, tick)
         if fit is None:
             raise
         return fit
@@ -110,7 +110,7 @@ def _greybox(
     refuse_mistaken(model, signals, parameters, delay, as_is, tried)
     start_s = perf_counter() - begun
     fit = follow(candidates)
-    why = reason(fit) if how.evaluations else ""
+    why = failure(fit) if how.evaluations else ""
     if as_is < POOR and (why or fit.problem.parameters(fit.vector).get("R", 1.0) <= 0.0):
         as_is = fit.criterion / fit.problem.n_used if fit.status != "failed" else np.inf
         refuse_mistaken(model, signals, parameters, delay, as_is, tried, searched=True)

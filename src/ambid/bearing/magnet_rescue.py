@@ -10,10 +10,11 @@ import numpy as np
 from ambid.arrays import Array
 from ambid.bearing.magnet_likelihood import BearingFit, criterion, search
 from ambid.bearing.magnet_problem import BearingProblem, BearingRecord
-from ambid.bearing.rescue import PAST
-from ambid.estimation.global_search import NOT_CONVERGED, STAGE, BestByDelay, global_search, predictable, rescued
+from ambid.estimation.global_search import STAGE, BestByDelay, global_search, rescued
+from ambid.estimation.likelihood import PAST
 from ambid.estimation.predictor import noise_floor
 from ambid.estimation.progress import Tick, silent
+from ambid.estimation.search import NOT_CONVERGED, predictable
 from ambid.estimation.uncertainty import explained_by_past
 
 _ITERATIONS = 15  # iterations from each place found

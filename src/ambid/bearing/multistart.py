@@ -24,7 +24,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError
 from ambid.estimation.likelihood import evaluate, search, with_linear_part
 from ambid.estimation.linear import column_sizes, triangle_of
-from ambid.estimation.predictor import PredictorProblem, Scales, all_scales, assemble_all, noise_floor
+from ambid.estimation.predictor import PredictorProblem, Scales, all_scales, assemble_all, busiest, noise_floor
 from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel, Parameter
 
@@ -387,19 +387,6 @@ def _possible(
         finite = all(np.isfinite(v) for v in values.values())
         if finite and len(values) == len(model.parameters) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0:
             yield values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}
-
-
-def busiest(u: Array, length: int) -> slice:
-    """Return the stretch of at most `length` samples in which the inputs move most.
-
-    `u`: (n_samples, n_inputs).
-    """
-    n = u.shape[0]
-    if n <= length:
-        return slice(0, n)
-    power = np.cumsum(np.concatenate([[0.0], np.sum((u / np.std(u, axis=0)) ** 2, axis=1)]))
-    first = int(np.argmax(power[length:] - power[:-length]))
-    return slice(first, first + length)
 
 
 def candidate_problem(

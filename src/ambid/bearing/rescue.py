@@ -25,54 +25,23 @@ from ambid.bearing.multistart import (
     Delay,
     Signals,
     at_first_sample,
-    busiest,
     candidate_problem,
     fixed_values,
     race,
 )
-from ambid.estimation.global_search import NOT_CONVERGED, BestByDelay, global_search, predictable, rescued
+from ambid.estimation.global_search import BestByDelay, global_search, rescued
 from ambid.estimation.likelihood import Fit, evaluate, search
-from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
+from ambid.estimation.predictor import PredictorProblem, Scales, busiest, noise_floor
 from ambid.estimation.progress import Tick, silent
-from ambid.estimation.sensitivity import Workspace, innovations
-from ambid.estimation.uncertainty import explained_by_past
+from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel, Parameter
 
 EVALUATIONS = 1200  # of the likelihood, unless the caller says otherwise: 1 to 2 s, and as much for local searches
-PAST = 10  # samples of innovations that it looks at
-_INPUTS = FARTHEST + 4  # and of inputs: a delay that was missed shows there
-_LOOKED = 2048  # samples that it looks at
 _BETTER = 0.5  # of the criterion, its numbers paid for (BIC), by which a fit must be better
 _STRETCH = 2048  # samples on which the global search compares
 _QUIET = (-9.0, 2.0)  # log disturbance level, relative to what sensor noise hides within a sample
 _SMALL, _LARGE = 1e-3, 30.0  # R over |u|/|i|
 _TRIED = 16  # places that are searched from: the best, and the best of each delay, as each has minima of its own
-
-
-def reason(fit: Fit) -> str:
-    """Return why a fit counts as failed.
-
-    Returns empty where it did not.
-    """
-    if fit.status != "converged":
-        return NOT_CONVERGED
-    return predictable(unexplained(fit))
-
-
-def unexplained(fit: Fit) -> float:
-    """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains.
-
-    About 0 where a search ended well: a linear model of high order predicts no better. Corrected for chance.
-
-    Returns at most 1; 1 where there is no predictor.
-    """
-    work = None if fit.work is None else fit.work.of(fit.problem)
-    e = None if fit.status == "failed" else innovations(fit.problem, fit.vector, work)
-    if e is None:
-        return 1.0
-    u = fit.problem.u[fit.problem.skip :]
-    at = busiest(u, _LOOKED)
-    return explained_by_past([(e[at], ((e[at], PAST), (u[at], _INPUTS)))])[0]
 
 
 def rescue(

@@ -18,8 +18,6 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.search import PhysicalFit
 
 STAGE = "global search"
-NOT_CONVERGED = "no search converged"
-_PREDICTABLE = 0.5  # part of the residuals' variance that a regression may explain before a fit counts as failed
 _MUTATION = (0.5, 1.0)  # factor of the difference vectors, drawn anew for each generation
 _RECOMBINATION = 0.9  # numbers of a physical model hang together: most of them change at once
 _MEMBERS = 8  # of the population, for each number
@@ -104,15 +102,6 @@ class BestByDelay:
     def vectors(self) -> list[Array]:
         """Return them, best first."""
         return [np.array(z) for _, z in sorted(self._best.values())]
-
-
-def predictable(part: float) -> str:
-    """Return why a fit counts as failed of whose residuals a regression on the past predicts a part; empty if not."""
-    return (
-        f"a linear regression on past data predicts {100 * part:.0f} % of the residual variance"
-        if part > _PREDICTABLE
-        else ""
-    )
 
 
 def rescued(

@@ -17,15 +17,19 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.linear import directions, triangle_of
-from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, predictor_gain
-from ambid.estimation.search import PhysicalFit
+from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest, predictor_gain
+from ambid.estimation.search import NOT_CONVERGED, PhysicalFit, predictable
 from ambid.estimation.search import search as descend
 from ambid.estimation.sensitivity import Workspace, innovations, linearise, run
+from ambid.estimation.uncertainty import explained_by_past
 
 NOISE_PRIOR_SD = 5.0  # of a log noise level: keeps a level that the data do not see from running to minus infinity
 _STEPS = 200
 _SETTLED = 0.01  # Newton step of every physical parameter, in standard deviations, below which a search has converged
 _FLAT = 0.001  # fall of the criterion in one step below which a search has converged; a needless number earns one
+PAST = 10  # samples of innovations that a regression looks at, which tells whether a fit has failed
+_INPUTS = 28  # and of inputs: a delay that was missed shows there
+_LOOKED = 2048  # samples that it looks at
 _POOR = 0.1  # share of the squares that offsets and initial state would take off, above which they are set first
 
 
@@ -346,3 +350,22 @@ def _predictor(fit: Fit) -> Predictor:
     if predictor is None:
         raise ValueError("the fit has no predictor; it has failed")
     return predictor
+
+
+def failure(fit: Fit) -> str:
+    """Return why a fit counts as failed, empty where it did not."""
+    return predictable(unexplained(fit)) if fit.status == "converged" else NOT_CONVERGED
+
+
+def unexplained(fit: Fit) -> float:
+    """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains.
+
+    About 0 where a search ended well: a linear model of high order predicts no better; 1 without a predictor.
+    """
+    work = None if fit.work is None else fit.work.of(fit.problem)
+    e = None if fit.status == "failed" else innovations(fit.problem, fit.vector, work)
+    if e is None:
+        return 1.0
+    u = fit.problem.u[fit.problem.skip :]
+    at = busiest(u, _LOOKED)
+    return explained_by_past([(e[at], ((e[at], PAST), (u[at], _INPUTS)))])[0]

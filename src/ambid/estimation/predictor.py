@@ -153,6 +153,19 @@ def noise_floor(y: Array) -> Array:
     return np.asarray(np.maximum(floor, 1e-9 * np.std(y, axis=0)))
 
 
+def busiest(u: Array, length: int) -> slice:
+    """Return the stretch of at most `length` samples in which the inputs move most.
+
+    `u`: (n_samples, n_inputs).
+    """
+    n = u.shape[0]
+    if n <= length:
+        return slice(0, n)
+    power = np.cumsum(np.concatenate([[0.0], np.sum((u / np.std(u, axis=0)) ** 2, axis=1)]))
+    first = int(np.argmax(power[length:] - power[:-length]))
+    return slice(first, first + length)
+
+
 def scales_for(
     model: LinearModel, values: Mapping[str, float], inputs: Array, outputs: Array, rate_hz: float
 ) -> Scales:

@@ -23,6 +23,8 @@ from ambid.estimation.progress import Tick, guessed
 
 Status = Literal["converged", "stalled", "failed"]
 
+NOT_CONVERGED = "no search converged"
+_PREDICTABLE = 0.5  # part of the residuals' variance that a regression may explain before a fit counts as failed
 _USUAL = 10.0  # iterations, roughly, of a search
 _MOST_DAMPED = 1e9
 _NOTHING = 1e-12  # radius of the trust region below which no step is left
@@ -97,6 +99,15 @@ class PhysicalFit:
     evaluations: int
     # what a global search did where the ordinary starts failed, see `ambid.estimation.global_search.rescued`
     global_search: Mapping[str, object] | None = None
+
+
+def predictable(part: float) -> str:
+    """Return why a fit counts as failed of whose residuals a regression on the past predicts a part; empty if not."""
+    return (
+        f"a linear regression on past data predicts {100 * part:.0f} % of the residual variance"
+        if part > _PREDICTABLE
+        else ""
+    )
 
 
 def search(

@@ -153,9 +153,9 @@ def identify_axis(
 ) -> Estimate:
     """Identify one axis, as `identify` does."""
     from ambid.bearing.linear import greybox
-    from ambid.job.closed_loop import loop_and_peaks
 
-    say, clock = tick or silent, Clock()
+    say: Tick = tick or (lambda *_: None)
+    clock = Clock()
     bench, plant = load_bench(record, rig, **reading), rig.plant
     clock.lap("read")
     say("identify")
@@ -172,8 +172,11 @@ def identify_axis(
     say("check")
     with one_thread():
         estimate = judge(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
-        _, sensitivity, said = loop_and_peaks(estimate, rig, bench, None)
-        estimate = replace(estimate, sensitivity=sensitivity, warnings=(*estimate.warnings, *said))
+        if "reference" in bench or (rig.loop is not None and not rig.open_loop):
+            from ambid.job.closed_loop import loop_and_peaks
+
+            _, sensitivity, warnings = loop_and_peaks(estimate, rig, bench, None)
+            estimate = replace(estimate, sensitivity=sensitivity, warnings=(*estimate.warnings, *warnings))
     clock.lap("checks")
     if validate is not None:
         from ambid.validation.second_record import validation
@@ -192,11 +195,9 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     """
     from ambid.bearing.lag import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
-    from ambid.control.curvature import curvature_check
     from ambid.estimation.likelihood import simulation_error
     from ambid.estimation.sensitivity import innovations
     from ambid.validation import physical
-    from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
     from ambid.validation.residuals import fit_of
 
     problem = fit.problem
@@ -217,13 +218,19 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
         checks["in_time"] = check_lag(signals)
-        loop = loop_agrees(rig, problem.parameters(fit.vector), bench.rate_hz)
-        checks |= {} if loop is None else {"loop_agrees": loop}
-        if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
+        if rig.loop is not None or rig.magnet is not None:
+            from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
+
             theta = problem.parameters(fit.vector)
-            checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
-        curved = curvature_check(fit, e, rig, means, known.standard_deviations(robust=robust))
-        checks |= {} if curved is None else {"curvature": curved}
+            loop = loop_agrees(rig, theta, bench.rate_hz)
+            checks |= {} if loop is None else {"loop_agrees": loop}
+            if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
+                checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
+        if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
+            from ambid.control.curvature import curvature_check
+
+            curved = curvature_check(fit, e, rig, means, known.standard_deviations(robust=robust))
+            checks |= {} if curved is None else {"curvature": curved}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
