@@ -10,8 +10,7 @@ import numpy as np
 import scipy_baseline
 import scipy_simulation
 from ambid.bearing.linear import greybox
-from ambid.estimation.likelihood import search
-from ambid.estimation.sensitivity import Workspace, linearise, residual_blocks
+from ambid.estimation.likelihood import Workspace, linearise, residual_blocks, search
 from ambid.job import identify
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Noise

@@ -9,8 +9,8 @@ import pytest
 from ambid.bearing.linear import Signals, carry, greybox
 from ambid.bearing.uncertainty import uncertainty
 from ambid.errors import EstimationError
+from ambid.estimation.likelihood import innovations
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import innovations
 from ambid.physics.linear_model import Parameter, model
 from tests.bearing.benches import parameters, problem_of, run
 

@@ -13,9 +13,8 @@ from ambid.control.experiment import reached
 from ambid.control.information import Information, Innovation, informed_lines, power_design
 from ambid.control.waves import BROADBAND, Limited, joint_design
 from ambid.errors import AmbidError, EstimationError
-from ambid.estimation.likelihood import weight_of
+from ambid.estimation.likelihood import linearise, weight_of
 from ambid.estimation.predictor import PredictorProblem, scales_for
-from ambid.estimation.sensitivity import linearise
 from ambid.physics.linear_model import Parameter, model
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.presets import preset

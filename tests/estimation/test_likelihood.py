@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from ambid.estimation import likelihood
-from ambid.estimation.likelihood import evaluate, prior_rows, score_statistic, search, weight_of
+from ambid.estimation.likelihood import evaluate, innovations, linearise, prior_rows, score_statistic, search, weight_of
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import innovations, linearise
 from tests.bearing.benches import problem_of, run, stationary_gain
 from tests.estimation import reference
 from tests.estimation.reference import complex_step

@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.estimation.likelihood import expected_prediction_sd, prediction_error, search, simulation_error
+from ambid.estimation.likelihood import expected_prediction_sd, innovations, prediction_error, search, simulation_error
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import innovations
 from ambid.validation.residuals import fit_of
 from tests.bearing.benches import problem_of, run
 from tests.estimation.reference import sampled

@@ -5,10 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.estimation import sensitivity
-from ambid.estimation.likelihood import weight_of
+from ambid.estimation import likelihood
+from ambid.estimation.likelihood import (
+    Workspace,
+    innovations,
+    linearise,
+    null_space,
+    reduce_rows,
+    residual_blocks,
+    weight_of,
+)
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import Workspace, innovations, linearise, null_space, reduce_rows, residual_blocks
 from tests.bearing.benches import problem_of, run, stationary_gain
 from tests.estimation import reference
 from tests.estimation.reference import complex_step
@@ -145,7 +152,7 @@ def test_blocks_change_nothing(name, monkeypatch):
     problem, vector = case(name, "levels", n=700)
     weight = some_weight(len(problem.model.outputs))
     whole = rows_of(problem, vector, weight)
-    monkeypatch.setattr(sensitivity, "_BLOCK", 64)
+    monkeypatch.setattr(likelihood, "_BLOCK", 64)
     parts = rows_of(problem, vector, weight)
     for one, other in zip(whole, parts, strict=True):
         np.testing.assert_allclose(other, one, rtol=1e-9, atol=1e-10 * np.abs(one).max())

@@ -58,7 +58,7 @@ def test_the_predictor_finds_the_machine_within_its_intervals(once: tuple[Any, R
 
 def test_slopes_of_the_innovations_are_exact(once: tuple[Any, Record]) -> None:
     """Every number of the vector, the delays of two inputs and the level of every noise among them."""
-    from ambid.estimation.sensitivity import Workspace, innovations, linearise
+    from ambid.estimation.likelihood import Workspace, innovations, linearise
 
     bench, record = once
     rig = free_rig(bench)

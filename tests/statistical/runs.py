@@ -8,10 +8,9 @@ import numpy as np
 
 from ambid.bearing.linear import greybox
 from ambid.bearing.uncertainty import uncertainty
-from ambid.estimation.likelihood import weight_of
+from ambid.estimation.likelihood import innovations, linearise, weight_of
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import innovations, linearise
 from ambid.validation.physical import innovation_products, innovation_tests
 from tests.bearing.benches import parameters, problem_of, run
 

@@ -6,9 +6,8 @@ from functools import cache
 
 import numpy as np
 
-from ambid.estimation.likelihood import weight_of
+from ambid.estimation.likelihood import Workspace, innovations, residual_blocks, weight_of
 from ambid.estimation.predictor import PredictorProblem, Scales
-from ambid.estimation.sensitivity import Workspace, innovations, residual_blocks
 from ambid.physics.linear_model import LinearModel, model
 from ambid.physics.loop import Noise
 from ambid.physics.sensor_errors import SensorGains

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.estimation.sensitivity import linearise as off_line
+from ambid.estimation.likelihood import linearise as off_line
 from ambid.tracking.evidence import EvidenceStream, Samples, linearise
 from ambid.tracking.numbers import tracked_numbers
 from tests.tracking.starts import bearing, bearing_start, columns

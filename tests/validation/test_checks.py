@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from ambid.bearing.uncertainty import uncertainty
-from ambid.estimation.likelihood import search, sparse_gain
-from ambid.estimation.sensitivity import innovations
+from ambid.estimation.likelihood import innovations, search, sparse_gain
 from ambid.physics.linear_model import model
 from ambid.record import Channel, Record
 from ambid.validation.physical import (

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest
 
-from ambid.estimation.likelihood import search
-from ambid.estimation.sensitivity import innovations
+from ambid.estimation.likelihood import innovations, search
 from ambid.validation.physical import innovation_products, innovation_tests
 from tests.bearing.benches import problem_of, run
 from tests.validation.wrong import WithoutMotionalVoltage

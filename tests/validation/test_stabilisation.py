@@ -7,7 +7,7 @@ import pytest
 
 from ambid.blackbox.prediction import run_states
 from ambid.errors import EstimationError
-from ambid.estimation.stable_poles import assurance
+from ambid.estimation.modes import assurance
 from ambid.report.response import stabilisation_figure
 from ambid.validation.stabilisation import stabilisation
 from tests.validation.blackbox.fits import DT, io

@@ -21,10 +21,18 @@ from ambid.bearing.lag import late
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, rescue
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import Fit, extend, failure, promise_of, score_statistic, search, workspace_near
+from ambid.estimation.likelihood import (
+    Fit,
+    Workspace,
+    extend,
+    failure,
+    promise_of,
+    score_statistic,
+    search,
+    workspace_near,
+)
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, assemble, stable
-from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel, Parameter
 
 

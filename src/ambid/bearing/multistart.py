@@ -22,10 +22,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import evaluate, search, with_linear_part
+from ambid.estimation.likelihood import Workspace, evaluate, search, with_linear_part
 from ambid.estimation.linear import column_sizes, triangle_of
 from ambid.estimation.predictor import PredictorProblem, Scales, all_scales, assemble_all, busiest, noise_floor
-from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel, Parameter
 
 Spectrum = NDArray[np.complexfloating]

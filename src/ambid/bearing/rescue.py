@@ -30,10 +30,9 @@ from ambid.bearing.multistart import (
     race,
 )
 from ambid.estimation.global_search import BestByDelay, global_search, rescued
-from ambid.estimation.likelihood import Fit, evaluate, search
+from ambid.estimation.likelihood import Fit, Workspace, evaluate, search
 from ambid.estimation.predictor import PredictorProblem, Scales, busiest, noise_floor
 from ambid.estimation.progress import Tick, silent
-from ambid.estimation.sensitivity import Workspace
 from ambid.physics.linear_model import LinearModel, Parameter
 
 EVALUATIONS = 1200  # of the likelihood, unless the caller says otherwise: 1 to 2 s, and as much for local searches

@@ -16,10 +16,18 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.estimation.estimate import Check, Continuous, Delay, Estimate, EstimatedParameter, NoiseModel, OutputFit
-from ambid.estimation.likelihood import Fit, evaluate, prior_rows, weight_of, workspace_near
+from ambid.estimation.likelihood import (
+    Fit,
+    Workspace,
+    evaluate,
+    linearise,
+    prior_rows,
+    products,
+    weight_of,
+    workspace_near,
+)
 from ambid.estimation.linear import directions
 from ambid.estimation.predictor import Predictor, assemble, stable
-from ambid.estimation.sensitivity import Workspace, linearise, products
 from ambid.estimation.uncertainty import WEAK, natural_sizes, weakest_direction
 from ambid.physics.linear_model import Parameter
 

@@ -15,7 +15,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.blackbox.data import IOData
 from ambid.errors import EstimationError
-from ambid.estimation.stable_poles import Tolerance, TrialPole, clusters, followed, trial_poles
+from ambid.estimation.modes import Tolerance, TrialPole, clusters, followed, trial_poles
 from ambid.settings.caller import setting
 
 DEGREE = 2  # of polynomials that stand for what is far away

@@ -23,10 +23,9 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.mode_starts import DEGREE, MOST_DAMPED, Spectra, conjugate, principal, spectra, starting_poles
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import Modal, Mode, mode_of, modes_checks, student
+from ambid.estimation.modes import Modal, Mode, assurance, mode_of, modes_checks, student
 from ambid.estimation.result import NORMAL_95
 from ambid.estimation.search import Rows, search
-from ambid.estimation.stable_poles import assurance
 from ambid.settings.caller import setting
 
 _REACH = 10.0  # of a window to either side, in half bandwidths of its mode

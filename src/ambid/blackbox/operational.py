@@ -25,8 +25,19 @@ from ambid.blackbox.mode_starts import MOST_DAMPED, excited_band, overlapping_ba
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import Modal, Mode, mode_of, modes_checks, student
-from ambid.estimation.stable_poles import PoleCluster, Tolerance, TrialPole, clusters, followed, trial_poles
+from ambid.estimation.modes import (
+    Modal,
+    Mode,
+    PoleCluster,
+    Tolerance,
+    TrialPole,
+    clusters,
+    followed,
+    mode_of,
+    modes_checks,
+    student,
+    trial_poles,
+)
 from ambid.settings.caller import setting
 
 _NEAR = Tolerance(frequency=0.002, damping=0.5, least=0.004, shape=0.9)

@@ -23,7 +23,7 @@ from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
 from ambid.errors import EstimationError
-from ambid.estimation.sensitivity import run
+from ambid.estimation.likelihood import run
 from ambid.physics.linear_model import zero_order_hold
 
 Numbers = Any  # arrays of real numbers, or of complex ones for complex steps

@@ -21,9 +21,8 @@ from ambid.control.experiment import Task
 from ambid.control.information import Information
 from ambid.control.waves import Lines
 from ambid.estimation.estimate import Check
-from ambid.estimation.likelihood import Fit, weight_of, workspace_near
+from ambid.estimation.likelihood import Fit, products, run, weight_of, workspace_near
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import products, run
 from ambid.physics.linear_model import discretise
 from ambid.rig import Rig
 from ambid.settings.caller import setting

@@ -195,8 +195,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     """
     from ambid.bearing.lag import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
-    from ambid.estimation.likelihood import simulation_error
-    from ambid.estimation.sensitivity import innovations
+    from ambid.estimation.likelihood import innovations, simulation_error
     from ambid.validation import physical
     from ambid.validation.residuals import fit_of
 

@@ -14,9 +14,8 @@ from ambid.arrays import Array
 from ambid.bearing.measured import Measured, ModelResponse, model_responses
 from ambid.blackbox.fit import BlackBoxFit, any_structure
 from ambid.blackbox.model import TransferModel
-from ambid.estimation.modes import EstimatedNumber, Modal, Mode
+from ambid.estimation.modes import EstimatedNumber, Modal, Mode, PoleCluster, TrialPole
 from ambid.estimation.result import NORMAL_95, RecordEntry
-from ambid.estimation.stable_poles import PoleCluster, TrialPole
 from ambid.report.document import (
     Checks,
     Column,

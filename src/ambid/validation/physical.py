@@ -24,9 +24,18 @@ from ambid.bearing.multistart import MAX_DELAY
 from ambid.bearing.uncertainty import STRETCHES, Uncertainty, experiment_hint
 from ambid.errors import counted
 from ambid.estimation.estimate import Check
-from ambid.estimation.likelihood import Fit, extend, free_one, search, sparse_gain, weight_of, workspace_near
+from ambid.estimation.likelihood import (
+    Fit,
+    Products,
+    extend,
+    free_one,
+    products,
+    search,
+    sparse_gain,
+    weight_of,
+    workspace_near,
+)
 from ambid.estimation.linear import column_sizes, directions
-from ambid.estimation.sensitivity import Products, products
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record

@@ -6,8 +6,8 @@ import numpy as np
 
 from ambid.bearing.uncertainty import noise_levels
 from ambid.estimation.estimate import OutputFit
+from ambid.estimation.likelihood import innovations
 from ambid.estimation.predictor import assemble
-from ambid.estimation.sensitivity import innovations
 from ambid.rotor.conclusion import Evidence
 from ambid.rotor.prediction import PredictorFit
 from ambid.validation.physical import innovation_products, innovation_tests

@@ -14,6 +14,8 @@ from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.likelihood import (
     Fit,
     expected_prediction_sd,
+    innovations,
+    linearise,
     prediction_error,
     search,
     simulation_error,
@@ -21,7 +23,6 @@ from ambid.estimation.likelihood import (
 )
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
-from ambid.estimation.sensitivity import innovations, linearise
 from ambid.physics.linear_model import model
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check

@@ -12,7 +12,7 @@ from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.subspace import subspace_models
 from ambid.errors import EstimationError, nearest
-from ambid.estimation.stable_poles import PoleCluster, Tolerance, TrialPole, clusters, followed, trial_poles
+from ambid.estimation.modes import PoleCluster, Tolerance, TrialPole, clusters, followed, trial_poles
 
 Method = Literal["n4sid", "moesp", "cva", "pbsid"]
 
