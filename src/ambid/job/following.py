@@ -53,14 +53,14 @@ class Following:
 
 def tell(header: TrackHeader, lines: Iterable[TrackLine], how: Following) -> Track:
     """Return the track of lines that come one by one, each told as `how` says."""
-    kept = list[TrackLine]()
-    tally, take, begun = Tally(header), how.collect(kept), time.perf_counter()
+    collected = list[TrackLine]()
+    tally, take, begun = Tally(header), how.collect(collected), time.perf_counter()
     if how.on_header is not None:
         how.on_header(header)
     for line in lines:
         tally.add(line)
         take(line)
-    return Track(header=header, lines=tuple(kept), totals=tally.summary(computing_s=time.perf_counter() - begun))
+    return Track(header=header, lines=tuple(collected), totals=tally.summary(computing_s=time.perf_counter() - begun))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -83,20 +83,20 @@ def track_estimator(
     if method in JOINT:
         columns = {"input": inputs, "output": outputs, "reference": references, "orders": orders}
         refuse_given(columns, refusal)
-        made = _joint(method, record, rig, start, start_s, how.memory, part)
+        job = _joint(method, record, rig, start, start_s, how.memory, part)
     else:
         refuse_given({"rig": rig, "start": start, "start_s": start_s}, refusal)
         whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"), layout=part.get("layout"))
         span = part.get("from_s"), part.get("to_s")
-        used = whole if span == WHOLE else cut(whole, *span)
-        data = io_data(used, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
+        part_record = whole if span == WHOLE else cut(whole, *span)
+        data = io_data(part_record, inputs, outputs, references=references, open_loop=settings.get("open_loop", False))
         if data.y.shape[1] != 1:
             raise EstimationError(
                 f"{method} tracks one output; {data.y.shape[1]} were named. Name one with {setting('output')}"
             )
-        made = _coefficients(method, data, orders, how.memory, settings.get("step"), used.start_s)
+        job = _coefficients(method, data, orders, how.memory, settings.get("step"), part_record.start_s)
     label = f"{method}, memory {how.memory if isinstance(how.memory, str) else f'{how.memory:g} s'}"
-    return _follow(made, label, how)
+    return _follow(job, label, how)
 
 
 def _coefficients(
@@ -227,19 +227,19 @@ def _joint(
     """Physical parameters in one filter with the plant's states; with a memory they walk as much as they are unsure."""
     source = rows_of(record, rig, **part)
     begin = start_of(source, rig or default_rig(), given=start, start_s=start_s, rig_speaks=rig is not None)
-    estimate, rate, of = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
+    estimate, rate, plant = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
     free = estimate.covariance_names
     sd = dict(zip(free, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
     rates = {} if isinstance(memory, str) else {name: sd[name] / np.sqrt(memory) for name in free}
-    made = (JointEkf if method == "ekf" else JointUkf).from_estimate(estimate, rate, rates=rates)
-    known = {p.name: p.unit for p in of.parameters}
-    offsets = {f"{name}_offset": "N" if name == "force" else "V" for name in of.disturbances}
+    joint = (JointEkf if method == "ekf" else JointUkf).from_estimate(estimate, rate, rates=rates)
+    units = {p.name: p.unit for p in plant.parameters}
+    offsets = {f"{name}_offset": "N" if name == "force" else "V" for name in plant.disturbances}
     bench, first = source.record, begin.first
     return _Run(
-        estimator=made, rate_hz=rate, t0=source.t0 + first / rate, scale=np.ones(len(made.names)), model=of.name,
-        inputs=np.column_stack([bench[x].values for x in of.inputs])[first:],
-        outputs=np.column_stack([bench[x].values for x in of.outputs])[first:],
-        units={k: known.get(k) or offsets[k] for k in made.names},
+        estimator=joint, rate_hz=rate, t0=source.t0 + first / rate, scale=np.ones(len(joint.names)), model=plant.name,
+        inputs=np.column_stack([bench[x].values for x in plant.inputs])[first:],
+        outputs=np.column_stack([bench[x].values for x in plant.outputs])[first:],
+        units={k: units.get(k) or offsets[k] for k in joint.names},
         origin={**source.origin, "samples": bench.n_samples - first},
         start={k: TrackedValue(value=estimate.values[k], sd=sd[k]) for k in free}, warnings=begin.warnings,
     )  # fmt: skip
@@ -263,8 +263,8 @@ def _line(run: _Run, part: slice) -> TrackLine:
     errors = estimator.update(run.inputs[part], run.outputs[part])
     t = run.t0 + min(part.stop, run.outputs.shape[0]) / run.rate_hz
     sd = np.sqrt(np.diag(estimator.covariance)) * run.scale
-    used = np.isfinite(errors).any()
-    known = getattr(estimator, "started", True)
+    informed = np.isfinite(errors).any()
+    started = getattr(estimator, "started", True)
     events: tuple[Event, ...] = ()
     rejected = estimator.n_rejected - before
     if rejected:
@@ -274,12 +274,12 @@ def _line(run: _Run, part: slice) -> TrackLine:
         t=t,
         parameters={
             name: TrackedValue(
-                value=float(value) if known else np.nan, sd=float(s) if known else np.nan, stale=not used
+                value=float(value) if started else np.nan, sd=float(s) if started else np.nan, stale=not informed
             )
             for name, value, s in zip(estimator.names, estimator.estimate * run.scale, sd, strict=True)
         },
         error=_error(estimator, errors),
-        state="tracking" if used else "frozen",
+        state="tracking" if informed else "frozen",
         events=events,
     )
 

@@ -99,7 +99,7 @@ def track_live(
         runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
             lead = _Lead(_frames(ring, ring_tap.fresh), runner, wanted_s, view, device.info.port)
-            begin = start_of(lead.source, rig, given=start, start_s=lead_s, rig_speaks=True)
+            begin = start_of(lead.source, rig, start=start, start_s=lead_s, rig_speaks=True)
             track = follow(lead.frames(begin.first, on_lag), lead.source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
 

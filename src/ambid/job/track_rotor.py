@@ -47,43 +47,46 @@ def track_rotor(
 ) -> Track:
     """Follow the numbers of a rotor that age; options as of `ambid.track`."""
     bench = load_bench(record, rig, **part)
-    model, found = rig.rotor, _excitation(bench, rig)
+    model, excitation = rig.rotor, _excitation(bench, rig)
     assert model is not None
     still = separate(bench, model)
     speed = still.speed
     say("start")
     if start is None:
-        n = _START if start_s is None else round(start_s * bench.rate_hz / found.period)
-        n = min(n, found.count // 3) if start_s is None else n
-        if not _LEAST <= n < found.count:
+        n = _START if start_s is None else round(start_s * bench.rate_hz / excitation.period)
+        n = min(n, excitation.count // 3) if start_s is None else n
+        if not _LEAST <= n < excitation.count:
             raise EstimationError(
-                f"the record has {found.count} whole periods of {found.period / bench.rate_hz:.4g} s, {n} of them for "
-                f"the start, which needs {_LEAST} and leaves some to track. Use a longer record, or give "
+                f"the record has {excitation.count} whole periods of {excitation.period / bench.rate_hz:.4g} s, {n} of "
+                f"them for the start, which needs {_LEAST} and leaves some to track. Use a longer record, or give "
                 f"{setting('start')}"
             )
-        estimate, first = identify_rotor([_periods(bench, found, 0, n)], rig, tick=say), n
+        estimate, first = identify_rotor([_periods(bench, excitation, 0, n)], rig, tick=say), n
     else:
-        estimate, first, n = _given(start, rig, bench.rate_hz, speed), 0, min(_START, found.count)
-    spectra = period_spectra(still.record, model, found, speed)
-    head = period_spectra(_periods(still.record, found, 0, n), model, replace(found, first=0, count=n), speed)
+        estimate, first, n = _given(start, rig, bench.rate_hz, speed), 0, min(_START, excitation.count)
+    spectra = period_spectra(still.record, model, excitation, speed)
+    head = period_spectra(_periods(still.record, excitation, 0, n), model, replace(excitation, first=0, count=n), speed)
     whole = Experiment(spectra=replace(spectra, between=head.between), speed=speed)
     with one_thread():
-        follower, size = _filter(estimate, rig, bench, whole, n, how), _size(how, bench, found.period)
+        follower, size = _filter(estimate, rig, bench, whole, n, how), _size(how, bench, excitation.period)
         header = TrackHeader(
             rate_hz=bench.rate_hz, limit=how.limit, method=f"periods, memory {how.memory}", model="rotor",
-            every_s=size * found.period / bench.rate_hz, units=_units(follower), start=_values(follower, stale=False),
-            record={**origin(bench), "samples": (found.count - first) * found.period},
+            every_s=size * excitation.period / bench.rate_hz, units=_units(follower),
+            start=_values(follower, stale=False),
+            record={**origin(bench), "samples": (excitation.count - first) * excitation.period},
             warnings=tuple(r.text for r in estimate.verdict.reasons) if start is None else (),
         )  # fmt: skip
         say("track")
-        return tell(header, _lines(follower, whole, found, first, size), how)
+        return tell(header, _lines(follower, whole, excitation, first, size), how)
 
 
-def _lines(follower: RotorFilter, whole: Experiment, found: Excitation, first: int, size: int) -> Iterator[TrackLine]:
-    for k in range(first, found.count - size + 1, size):
+def _lines(
+    follower: RotorFilter, whole: Experiment, excitation: Excitation, first: int, size: int
+) -> Iterator[TrackLine]:
+    for k in range(first, excitation.count - size + 1, size):
         spectra = replace(whole.spectra, U=whole.spectra.U[k : k + size], Y=whole.spectra.Y[k : k + size])
-        at = found.first + k * found.period
-        block = Block(experiment=replace(whole, spectra=spectra), first=at, last=at + size * found.period)
+        at = excitation.first + k * excitation.period
+        block = Block(experiment=replace(whole, spectra=spectra), first=at, last=at + size * excitation.period)
         step = follower.take(block)
         yield TrackLine(
             t=follower.t0 + block.last / follower.rate_hz, parameters=_values(follower, stale=not step.used),
@@ -101,10 +104,10 @@ def _filter(estimate: RotorEstimate, rig: Rig, bench: Record, whole: Experiment,
     at = Point(theta=theta, delays=np.array([_late(estimate, role) for role in model.inputs]))
     chosen = tuple(n for n in estimate.covariance_names if n not in roles)
     lengths = {p.name for p in model.parameters if p.unit == "m"}
-    shown = {n for n in chosen if n.startswith("mode") and ".z" in n}
+    damping = {n for n in chosen if n.startswith("mode") and ".z" in n}
     span = model.span(theta)
     scales = {
-        n: span if n in lengths else max(abs(x), 0.1) if n in shown or n.startswith("gyro") else x or 1.0
+        n: span if n in lengths else max(abs(x), 0.1) if n in damping or n.startswith("gyro") else x or 1.0
         for n, x in theta.items()
     }  # fmt: skip
     unknowns = Unknowns(model=model, known=(), scales=scales, held_modes=True, chosen=chosen)
@@ -116,8 +119,8 @@ def _filter(estimate: RotorEstimate, rig: Rig, bench: Record, whole: Experiment,
     top = 2.0 * np.pi * float(whole.spectra.frequency_hz.max())
     within = {f"mode{r}" for r in range(1, model.n_modes + 1) if theta[f"mode{r}.omega"] <= top}
     ages = [
-        what in _AGE or (what in _OF_MODES and of in within)
-        for of, _, what in (x.partition(".") for x in unknowns.names)
+        what in _AGE or (what in _OF_MODES and part in within)
+        for part, _, what in (x.partition(".") for x in unknowns.names)
     ]
     memory = {"auto": None, "all": np.inf}.get(how.memory) if isinstance(how.memory, str) else how.memory / block_s
     return RotorFilter(
@@ -131,22 +134,22 @@ def _excitation(bench: Record, rig: Rig) -> Excitation:
     """Return the excitation of a whole record, whose response may change on the way."""
     model = rig.rotor
     assert model is not None
-    found = find_excitation(bench, model)
-    if found is None:
+    excitation = find_excitation(bench, model)
+    if excitation is None:
         raise EstimationError(
             "the record is not periodic or has less than two whole periods; a rotor is tracked from one period to the "
             "next. Excite with a multisine of whole periods"
         )
-    head = _periods(bench, Excitation(period=found.period, first=0, count=0), 0, _START)
+    head = _periods(bench, Excitation(period=excitation.period, first=0, count=0), 0, _START)
     begun = find_excitation(head, model)  # where a first transient is over; a later change is none
     first = 0 if begun is None else begun.first
-    return Excitation(period=found.period, first=first, count=(bench.n_samples - first) // found.period)
+    return Excitation(period=excitation.period, first=first, count=(bench.n_samples - first) // excitation.period)
 
 
-def _periods(bench: Record, found: Excitation, first: int, count: int) -> Record:
+def _periods(bench: Record, excitation: Excitation, first: int, count: int) -> Record:
     """Return some periods of a record."""
-    a = found.first + first * found.period
-    part = slice(a, a + count * found.period)
+    a = excitation.first + first * excitation.period
+    part = slice(a, a + count * excitation.period)
     channels = tuple(replace(c, values=c.values[part]) for c in bench.channels)
     return replace(bench, channels=channels, start_s=bench.start_s + a / bench.rate_hz)
 
@@ -188,9 +191,9 @@ def _size(how: Following, bench: Record, period: int) -> int:
 
 def _shown(name: str) -> tuple[str, str | None, float]:
     """Return how a number is called in a track, its unit where it is not the model's, and what turns it into that."""
-    of, _, what = name.partition(".")
-    called, unit, factor = _OF_MODES.get(what, (what, None, 1.0)) if of.startswith("mode") else (what, None, 1.0)
-    return f"{of}.{called}", unit, factor
+    part, _, what = name.partition(".")
+    called, unit, factor = _OF_MODES.get(what, (what, None, 1.0)) if part.startswith("mode") else (what, None, 1.0)
+    return f"{part}.{called}", unit, factor
 
 
 def _told(event: Event) -> Event:
@@ -203,12 +206,12 @@ def _told(event: Event) -> Event:
 
 
 def _values(follower: RotorFilter, *, stale: bool) -> dict[str, TrackedValue]:
-    theta, sd, found = follower.point.theta, follower.sd(), dict[str, TrackedValue]()
+    theta, sd, values = follower.point.theta, follower.sd(), dict[str, TrackedValue]()
     for name, ages in zip(follower.unknowns.names, follower.ages, strict=True):
         if ages:
             called, _, factor = _shown(name)
-            found[called] = TrackedValue(value=factor * theta[name], sd=factor * sd[name], stale=stale)
-    return found
+            values[called] = TrackedValue(value=factor * theta[name], sd=factor * sd[name], stale=stale)
+    return values
 
 
 def _units(follower: RotorFilter) -> dict[str, str]:

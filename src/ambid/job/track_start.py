@@ -54,8 +54,8 @@ class BenchRows:
     @property
     def origin(self) -> dict[str, object]:
         """Where the record came from."""
-        said = self.record.provenance
-        return {"file": said.get("file"), "sha256": said.get("sha256"), **began(self.record)}
+        provenance = self.record.provenance
+        return {"file": provenance.get("file"), "sha256": provenance.get("sha256"), **began(self.record)}
 
     def clean_part(self, n: int, *, begin_anywhere: bool) -> tuple[Record, int]:
         """Return the first clean stretch, and the number of the sample after it.
@@ -89,21 +89,21 @@ class BenchRows:
         return part, int(numbers[at]) + length
 
 
-def rows_of(record: Source, known: Rig | None, **reading: Unpack[Reading]) -> BenchRows:
+def rows_of(record: Source, stated: Rig | None, **reading: Unpack[Reading]) -> BenchRows:
     """Read the rows of a record through a rig; without one, columns are named like the roles, also of a turning rotor.
 
     `record`: a table or file, or a record.
     """
-    rig, rate_hz = known_rig(known), reading.get("rate_hz")
+    rig, rate_hz = known_rig(stated), reading.get("rate_hz")
     if isinstance(record, Record) or (isinstance(record, (str, Path)) and not str(record).lower().endswith(_ROWS)):
         bench, stamps = load_bench(record, rig, **reading), None
     else:
         rate = rate_hz if rate_hz is not None else rig.record.rate_hz
-        told = {**rig.record.layout, **(reading.get("layout") or {})}
-        rows = read_rows(record, rate_hz=rate, units=reading.get("units"), layout=told)
+        layout = {**rig.record.layout, **(reading.get("layout") or {})}
+        rows = read_rows(record, rate_hz=rate, units=reading.get("units"), layout=layout)
         from_s, to_s = reading.get("from_s"), reading.get("to_s")
         bench, stamps = _part(
-            bench_record(rows.record, _with_rotation(rig, rows.record) if known is None else rig), rows.time_s,
+            bench_record(rows.record, _with_rotation(rig, rows.record) if stated is None else rig), rows.time_s,
             rig.record.from_s if from_s is None else from_s, rig.record.to_s if to_s is None else to_s,
         )  # fmt: skip
     plant = model(rig.model)
@@ -129,19 +129,19 @@ def _part(bench: Record, time_s: Array | None, from_s: float | None, to_s: float
     if from_s is None and to_s is None:
         return bench, time_s
     stamps = bench.time_s if time_s is None else time_s
-    known = np.flatnonzero(np.isfinite(stamps))
-    last = known[np.maximum(np.searchsorted(known, np.arange(stamps.size), side="right") - 1, 0)]
+    stamped = np.flatnonzero(np.isfinite(stamps))
+    last = stamped[np.maximum(np.searchsorted(stamped, np.arange(stamps.size), side="right") - 1, 0)]
     t = stamps[last]
-    kept = (t >= (-np.inf if from_s is None else from_s)) & (t < (np.inf if to_s is None else to_s))
-    if not kept.any():
+    inside = (t >= (-np.inf if from_s is None else from_s)) & (t < (np.inf if to_s is None else to_s))
+    if not inside.any():
         raise RecordError(
             f"the record spans {np.nanmin(stamps):g} to {np.nanmax(stamps):g} s and has nothing between "
             f"{from_s if from_s is not None else 'its start'} and {to_s if to_s is not None else 'its end'} s. "
             "Give times inside it"
         )
-    channels = tuple(replace(c, values=c.values[kept]) for c in bench.channels)
-    first = float(t[kept][0])
-    return replace(bench, channels=channels, start_s=first), None if time_s is None else time_s[kept]
+    channels = tuple(replace(c, values=c.values[inside]) for c in bench.channels)
+    first = float(t[inside][0])
+    return replace(bench, channels=channels, start_s=first), None if time_s is None else time_s[inside]
 
 
 def _stream(bench: Record, plant: LinearModel, forcing: Forcing | None) -> Record:
@@ -167,21 +167,21 @@ def start_of(
     source: BenchRows,
     rig: Rig,
     *,
-    given: Estimate | str | Path | None,
+    start: Estimate | str | Path | None,
     start_s: float | None,
     rig_speaks: bool,
 ) -> Start:
     """Take the estimate to begin with, or make one.
 
-    `given`: an estimate or its file; None: identify the beginning of the record; `start_s`: length of that beginning,
+    `start`: an estimate or its file; None: identify the beginning of the record; `start_s`: length of that beginning,
     s.
     """
     warnings: list[str] = []
-    if given is None:
+    if start is None:
         estimate, first = _identify_beginning(source, rig, start_s)
         numbers = _numbers(estimate, source)
     else:
-        estimate, first = given if isinstance(given, Estimate) else _read(given), 0
+        estimate, first = start if isinstance(start, Estimate) else _read(start), 0
         try:
             _check_fit(estimate, source, rig)
             if rig_speaks:
@@ -225,17 +225,17 @@ def credible_limits(source: BenchRows, estimate: Estimate) -> list[float]:
     Returns for each input, then each output, SI.
     """
     plant, point = model(estimate.model), estimate.operating_point
-    found = []
+    limits = []
     for role in plant.inputs:
-        known = np.abs(source.record[role].values)
-        known = known[np.isfinite(known)]
-        size = float(np.quantile(known, _MOST_OF)) if known.size else 0.0
-        found.append(_INPUT_CREDIBLE * max(size, abs(point[role])) or ABSURD)
+        magnitude = np.abs(source.record[role].values)
+        magnitude = magnitude[np.isfinite(magnitude)]
+        size = float(np.quantile(magnitude, _MOST_OF)) if magnitude.size else 0.0
+        limits.append(_INPUT_CREDIBLE * max(size, abs(point[role])) or ABSURD)
     for role in plant.outputs:
         fit = estimate.fit[role]
         spread = fit.innovation_sd / max(1.0 - fit.one_step, _LEAST)
-        found.append(_CREDIBLE * (abs(point[role]) + _SPREADS * spread))
-    return [min(x, ABSURD) if math.isfinite(x) and x > 0.0 else ABSURD for x in found]
+        limits.append(_CREDIBLE * (abs(point[role]) + _SPREADS * spread))
+    return [min(x, ABSURD) if math.isfinite(x) and x > 0.0 else ABSURD for x in limits]
 
 
 def _numbers(estimate: Estimate, source: BenchRows) -> TrackedNumbers:
@@ -269,11 +269,11 @@ def _read(path: object) -> Estimate:
 
 def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
     """Refuse an estimate of another model or rate, or one without an operating point."""
-    known, rate = float(str(estimate.record["rate_hz"])), source.replay.rate_hz
-    if estimate.model != rig.model or abs(known / rate - 1.0) > 1e-6:
+    estimate_rate, rate = float(str(estimate.record["rate_hz"])), source.replay.rate_hz
+    if estimate.model != rig.model or abs(estimate_rate / rate - 1.0) > 1e-6:
         raise EstimationError(
-            f"the start estimate is of model {estimate.model!r} at {known:g} Hz, the record of {rig.model!r} at "
-            f"{rate:g} Hz; they must agree. Identify a start from this bench at this rate"
+            f"the start estimate is of model {estimate.model!r} at {estimate_rate:g} Hz, the record of {rig.model!r} "
+            f"at {rate:g} Hz; they must agree. Identify a start from this bench at this rate"
         )
     plant, point = model(estimate.model), estimate.operating_point
     for role in (*plant.inputs, *plant.outputs):
@@ -287,21 +287,21 @@ def _check_fit(estimate: Estimate, source: BenchRows, rig: Rig) -> None:
 
 def _contradictions(estimate: Estimate, rig: Rig) -> list[str]:
     """Refuse a rig that contradicts the estimate; warn where what it says is not used."""
-    found = [said for p in rig.parameters if (said := _parameter(p, estimate))]
+    warnings = [said for p in rig.parameters if (said := _parameter(p, estimate))]
     for role in model(rig.model).inputs:
-        wanted, known = rig.channel(role).delay, estimate.delay[role]
-        if wanted != "auto" and abs(known.samples + known.fraction - wanted) > _SAME:
+        wanted, delay = rig.channel(role).delay, estimate.delay[role]
+        if wanted != "auto" and abs(delay.samples + delay.fraction - wanted) > _SAME:
             raise EstimationError(
                 f"the rig gives channels.{role}.delay = {wanted}, the start estimate has "
-                f"{counted(known.samples + known.fraction, 'sample')}; tracking uses the latter. Identify a start "
+                f"{counted(delay.samples + delay.fraction, 'sample')}; tracking uses the latter. Identify a start "
                 "with this rig, or omit the delay there"
             )
-        if wanted == "auto" and known.how == "given":
-            found.append(
-                f"the start estimate was made with a given delay of {role}, {counted(known.samples, 'sample')}; "
+        if wanted == "auto" and delay.how == "given":
+            warnings.append(
+                f"the start estimate was made with a given delay of {role}, {counted(delay.samples, 'sample')}; "
                 "the rig leaves it open, and tracking keeps it. Identify a start with this rig"
             )
-    return found
+    return warnings
 
 
 def _parameter(p: Parameter, estimate: Estimate) -> str | None:

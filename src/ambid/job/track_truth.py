@@ -28,7 +28,7 @@ def truth_beside(
     except AmbidError as refused:
         print(f"ambid: drawn without the truth: {refused}", file=sys.stderr)
         return {}
-    found = {}
+    truth = {}
     for channel in raw.channels:
         name = channel.name.removeprefix("true_")
         if name == channel.name or name not in units:
@@ -37,8 +37,8 @@ def truth_beside(
             inside = f"is in [{channel.unit}], the tracked number in [{units[name]}]"
             print(f"ambid: column {channel.name!r} {inside}: it is not drawn", file=sys.stderr)
             continue
-        found[name] = (raw.time_s, channel.values)
-    return found
+        truth[name] = (raw.time_s, channel.values)
+    return truth
 
 
 def _may_hold_truth(record: Path) -> bool:

@@ -147,9 +147,9 @@ def track(
     )  # fmt: skip
     if not (rig is None or isinstance(rig, (Rig, str, Path))):
         raise EstimationError(f"rig is a {type(rig).__name__}; it must be a Rig or the path of a rig file. Give one")
-    given = load_rig(rig) if isinstance(rig, (str, Path)) else rig
+    bench = load_rig(rig) if isinstance(rig, (str, Path)) else rig
     part = Reading(from_s=from_s, to_s=to_s, rate_hz=rate_hz, units=units, layout=layout)
-    if given is not None and given.rotor is not None:
+    if bench is not None and bench.rotor is not None:
         from ambid.job.track_rotor import track_rotor
 
         refuse_given(
@@ -160,7 +160,7 @@ def track(
             },
             "{} is for one axis; a rotor is tracked from one period to the next. Omit it",
         )
-        return replace(track_rotor(record, given, start, start_s, part, how, say), used=Followed(record=record))
+        return replace(track_rotor(record, bench, start, start_s, part, how, say), used=Followed(record=record))
     if isinstance(start, RotorEstimate):
         raise EstimationError("the start is the estimate of a rotor; the rig has no [bearings.X]. Give the rotor's rig")
     if method != "rpem" or any(settings.values()):
@@ -168,14 +168,14 @@ def track(
 
         if how.pace != "fastest" or how.flags:
             raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Omit them")
-        found = track_estimator(record, given, method, start, start_s, part, how, settings)
-        return replace(found, used=Followed(record=record, rate_hz=rate_hz))
-    source = rows_of(record, given, **part)
+        result = track_estimator(record, bench, method, start, start_s, part, how, settings)
+        return replace(result, used=Followed(record=record, rate_hz=rate_hz))
+    source = rows_of(record, bench, **part)
     say("start")
-    begin = start_of(source, known_rig(given), given=start, start_s=start_s, rig_speaks=given is not None)
+    begin = start_of(source, known_rig(bench), start=start, start_s=start_s, rig_speaks=bench is not None)
     say("track")
-    found = follow(source.replay.since(begin.first), source, begin, how)
-    return replace(found, used=Followed(record=record, rate_hz=rate_hz))
+    result = follow(source.replay.since(begin.first), source, begin, how)
+    return replace(result, used=Followed(record=record, rate_hz=rate_hz))
 
 
 def follow(

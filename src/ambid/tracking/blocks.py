@@ -96,10 +96,10 @@ class Replay:
 
     def since(self, first: int) -> Replay:
         """Return the rows whose numbers are `first` or more, in the order in which they come."""
-        kept = self.numbers >= first
-        if kept.all():
+        rows = self.numbers >= first
+        if rows.all():
             return self
-        return replace(self, values=self.values[kept], numbers=self.numbers[kept], time_s=self.time_s[kept])
+        return replace(self, values=self.values[rows], numbers=self.numbers[rows], time_s=self.time_s[rows])
 
     def __iter__(self) -> Iterator[Block]:
         steps = np.diff(self.numbers)
@@ -138,8 +138,8 @@ def blocks_of(
             )
         numbers, placed, irregular = numbers_from_time(stamps, values, record.rate_hz)
         values[~placed] = np.nan
-        known = np.flatnonzero(np.isfinite(stamps))
-        last = known[np.maximum(np.searchsorted(known, np.arange(stamps.size), side="right") - 1, 0)]
+        stamped = np.flatnonzero(np.isfinite(stamps))
+        last = stamped[np.maximum(np.searchsorted(stamped, np.arange(stamps.size), side="right") - 1, 0)]
         stamps = np.where(np.isfinite(stamps), stamps, stamps[last] + (numbers - numbers[last]) / record.rate_hz)
     values.flags.writeable = False
     return Replay(
@@ -160,15 +160,15 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
     it; `placed`: (n_rows,), bool, false for rows without a stamp where those beside it leave open which samples they
     are; `irregular`: number of intervals that are off a whole number of periods by more than 1 % of a period.
     """
-    known = np.flatnonzero(np.isfinite(time_s))
-    rows = np.diff(known)
-    advance = np.diff(time_s[known]) * rate_hz
-    if known.size < 2 or (np.abs(advance / rows - 1) <= 0.05).sum() * 2 < rows.size:
+    stamped = np.flatnonzero(np.isfinite(time_s))
+    rows = np.diff(stamped)
+    advance = np.diff(time_s[stamped]) * rate_hz
+    if stamped.size < 2 or (np.abs(advance / rows - 1) <= 0.05).sum() * 2 < rows.size:
         raise RecordError(
             f"less than half of the time stamps are one period of {rate_hz:g} Hz apart; samples cannot be numbered."
             " Print time with more digits, or correct the rate"
         )
-    equal = known[1:][(rows == 1) & (np.abs(advance) <= _EQUAL)]
+    equal = stamped[1:][(rows == 1) & (np.abs(advance) <= _EQUAL)]
     coarse = int((values[equal] != values[equal - 1]).any(axis=1).sum())
     if coarse > _COARSE * rows.size:
         raise RecordError(
@@ -180,11 +180,11 @@ def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDA
     irregular = int((np.abs(advance - whole) > JITTER * rows).sum())
     whole = np.where(whole > longest, rows, whole)  # the clock was set: nobody waits so long within a record
     placed = np.zeros(time_s.size, dtype=bool)
-    placed[known] = True
+    placed[stamped] = True
     for k in np.flatnonzero((rows > 1) & (whole == rows)):
-        placed[known[k] : known[k + 1]] = True
+        placed[stamped[k] : stamped[k + 1]] = True
     steps = np.ones(time_s.size - 1, dtype=np.int64)
-    steps[known[1:] - 1] = whole - (rows - 1)
+    steps[stamped[1:] - 1] = whole - (rows - 1)
     return _counted(steps, values), placed, irregular
 
 

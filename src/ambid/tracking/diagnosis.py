@@ -213,8 +213,8 @@ class Diagnosis:
         close = [name for name, _ in alarm.rivals]
         if alarm.runner_up is not None and alarm.runner_up[1] > _ALIKE * alarm.statistic:
             close.append(alarm.runner_up[0])
-        named = [alarm.parameter] if alarm.parameter is not None else []
-        mixed = len({self._kind(name) in _DISTURBED for name in (*named, *close)}) > 1
+        suspects = [alarm.parameter] if alarm.parameter is not None else []
+        mixed = len({self._kind(name) in _DISTURBED for name in (*suspects, *close)}) > 1
         self._waited += 1
         early = alarm.blocks == 1 or (alarm.blocks <= _TELLING + 1 and bool(alarm.rivals))
         return self._waited <= (_TELLING if mixed else int(early))
@@ -296,9 +296,9 @@ class Diagnosis:
         assert self._recovery is not None
         if evidence.last < self._recovery.ready:
             return
-        found = self._recovery.attempt(self._rpem, self._recent)
-        if found is not None:
-            self._adopt(found, t)
+        recovered = self._recovery.attempt(self._rpem, self._recent)
+        if recovered is not None:
+            self._adopt(recovered, t)
         elif self.unexplained.blocks:
             self._no_change(t)
         elif self._recovery.attempts >= _ATTEMPTS and unexplained(evidence) > WILD * self._detector.noise:
@@ -312,48 +312,48 @@ class Diagnosis:
             self._fresh_start()
             self._publication.unconfirmed = True
 
-    def _adopt(self, found: Recovered, t: float) -> None:
+    def _adopt(self, recovered: Recovered, t: float) -> None:
         """Go on with numbers that were found again, as a candidate for publication."""
-        rpem, refined = self._rpem, found.refined
-        self.update_s = max(self.update_s, found.computing_s)
-        if refined is None or not found.moved:  # it was a knock: nothing has moved
+        rpem, refined = self._rpem, recovered.refined
+        self.update_s = max(self.update_s, recovered.computing_s)
+        if refined is None or not recovered.moved:  # it was a knock: nothing has moved
             self._fresh_start()
             return
         rpem.filter, rpem.stream = refined.filter, refined.stream
         rpem.n_linearised += refined.iterations
         self.unexplained.over()
-        self._name(found, t)
+        self._name(recovered, t)
         self._fresh_start()
-        names = ", ".join(found.moved)
-        if all(self._kind(name) in _DISTURBED for name in found.moved):
+        names = ", ".join(recovered.moved)
+        if all(self._kind(name) in _DISTURBED for name in recovered.moved):
             self.settling = True
             return
         why = f"{names} re-estimated from the samples after the change"
         self._publication.propose(t, why)
         self._publication.unconfirmed = self.renewed = True
 
-    def _name(self, found: Recovered, t: float) -> None:
+    def _name(self, recovered: Recovered, t: float) -> None:
         """Say which number moved where the alarm has not, or has named another: more data are there now."""
         assert self._recovery is not None
         rpem, before = self._rpem, self._recovery.before
-        places = [rpem.numbers.names.index(name) for name in found.moved]
+        places = [rpem.numbers.names.index(name) for name in recovered.moved]
         moves = [abs(rpem.filter.q[j] - before.q[j]) / rpem.filter.sd[j] for j in places]
-        name = found.moved[int(np.argmax(moves))]
-        told = self._recovery.event
-        if told.kind == "change" and told.parameter == name:
+        name = recovered.moved[int(np.argmax(moves))]
+        first = self._recovery.event
+        if first.kind == "change" and first.parameter == name:
             return
         disturbed = self._kind(name) in _DISTURBED
-        what = f"a change of {', '.join(found.moved)} explains the data that followed"
+        what = f"a change of {', '.join(recovered.moved)} explains the data that followed"
         event = Event(
             kind="disturbed" if disturbed else "change",
-            t=told.t,
+            t=first.t,
             parameter=name,
-            why=f"{what}; at first: {told.why}",
-            values={**told.values, "named": t},
+            why=f"{what}; at first: {first.why}",
+            values={**first.values, "named": t},
         )
         if disturbed:
             pass
-        elif told.kind == "change":
+        elif first.kind == "change":
             self.changes[-1] = event
         else:
             self.changes.append(event)
@@ -362,17 +362,17 @@ class Diagnosis:
     def _no_change(self, t: float) -> None:
         """No change explains wild innovations: they are noise as long as that can be believed."""
         level, deaf = self.unexplained.level, self.unexplained.deaf
-        seen = f"the innovation variance is {level:.3g} times that at identification"
+        size = f"the innovation variance is {level:.3g} times that at identification"
         self._fresh_start()
         if self.unexplained.believable and not deaf:
             self.unexplained.over()
             self._take_as_noise(level)
             self._log.add(
-                Event(kind="disturbed", t=t, why=f"{seen}, and no change of a parameter explains it: treated as noise")
+                Event(kind="disturbed", t=t, why=f"{size}, and no change of a parameter explains it: treated as noise")
             )
             return
         if not deaf:
-            self._log.add(Event(kind="frozen", t=t, why=f"{seen}: the model does not fit, and learning is suspended"))
+            self._log.add(Event(kind="frozen", t=t, why=f"{size}: the model does not fit, and learning is suspended"))
         self.unexplained.close_ears(t)
 
     def _fresh_start(self) -> None:

@@ -170,10 +170,10 @@ class _Producer:
 
     def end(self) -> BaseException | None:
         try:
-            told: BaseException | None = self._ours.recv() if self._ours.poll(_PATIENCE_S) else None
+            failure: BaseException | None = self._ours.recv() if self._ours.poll(_PATIENCE_S) else None
             dead = False
         except EOFError:
-            told, dead = None, True
+            failure, dead = None, True
         self._process.join(_PATIENCE_S)
         if self._process.is_alive():
             self._process.terminate()
@@ -182,7 +182,7 @@ class _Producer:
             return EstimationError(
                 f"the source process ended early with exit code {self._process.exitcode}. Start it again"
             )
-        return told
+        return failure
 
 
 @contextmanager
@@ -307,9 +307,9 @@ class _Pump:
         self._deliver(self._guard.take(frame.block), self._guard.n_waiting)
         self._working += self._done - began
 
-    def _deliver(self, found: Iterable[Passed], waiting: int) -> None:
+    def _deliver(self, entries: Iterable[Passed], waiting: int) -> None:
         """Hand on what the guard lets pass, and count the latency of blocks that are done with."""
-        for passed in found:
+        for passed in entries:
             if isinstance(passed, Stretch):
                 self._consume(passed)
             elif self._reject is not None:

@@ -221,27 +221,30 @@ def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> L
     """
     problem = numbers.problem
     with one_thread():  # matrices of a few rows, and the next block waits
-        found = assemble(problem, numbers.vector(q), near=near)
-    if found is None:
+        assembled = assemble(problem, numbers.vector(q), near=near)
+    if assembled is None:
         return None
-    n, count = found.x0.size, problem.slices["initial"].start
-    M, dM = found.M, found.dM[:, :, :count]
+    n, count = assembled.x0.size, problem.slices["initial"].start
+    M, dM = assembled.M, assembled.dM[:, :, :count]
     if numbers.synchronous:
         force = problem.model.disturbances.index("force")
         a, b = q[count:]
-        M = np.hstack([M, a * found.E[:, force, None], b * found.E[:, force, None]])
+        M = np.hstack([M, a * assembled.E[:, force, None], b * assembled.E[:, force, None]])
         wide = np.zeros((n, M.shape[1], count + 2))
         wide[:, :-2, :count] = dM
-        wide[:, -2, :count], wide[:, -1, :count] = a * found.dE[:, force, :count], b * found.dE[:, force, :count]
-        wide[:, -2, count], wide[:, -1, count + 1] = found.E[:, force], found.E[:, force]
+        wide[:, -2, :count], wide[:, -1, :count] = (
+            a * assembled.dE[:, force, :count],
+            b * assembled.dE[:, force, :count],
+        )
+        wide[:, -2, count], wide[:, -1, count + 1] = assembled.E[:, force], assembled.E[:, force]
         dM = wide
     radius = float(np.abs(np.linalg.eigvals(M[:, :n])).max())
     return Linearisation(
         at=q.copy(),
         M=np.ascontiguousarray(M),
         D=np.ascontiguousarray(np.moveaxis(dM, 0, 1)),
-        C=found.C,
-        gain=found.gain,
+        C=assembled.C,
+        gain=assembled.gain,
         memory=1.0 / (1.0 - radius),
     )
 
@@ -314,7 +317,7 @@ class EvidenceStream:
     def feed(self, samples: Samples) -> tuple[int, Array, Evidence | None]:
         """Take samples until a block is complete, they are used up, or one is not finite.
 
-        Returns `used`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
+        Returns `n`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
         (used, n_outputs), innovations, SI; `evidence`: of the block that these samples complete.
         """
         u, y = samples.u, samples.y
@@ -324,29 +327,29 @@ class EvidenceStream:
         if samples.forcing is None and self._nothing.shape[0] != y.shape[0]:
             self._nothing = np.zeros((y.shape[0], self._nothing.shape[1]))
         forcing = self._nothing if samples.forcing is None else samples.forcing
-        used, counts, full = 0, self._counts, True
+        n, counts, full = 0, self._counts, True
         while full and counts[2] < counts[4]:
-            used = advance(
-                used, u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
+            n = advance(
+                n, u, y, forcing, self._M, self.at.D, self._scale, self._lags, self._history, self._s, self._rows,
                 counts, self._unit, errors, *self._scratch,
             )  # fmt: skip
             full = counts[1] + y.shape[1] > self._rows.shape[1]
             if full or counts[2] == counts[4]:
                 self._fold()
-        self.sample += used
-        return used, errors[:used], self._evidence() if counts[2] == counts[4] else None
+        self.sample += n
+        return n, errors[:n], self._evidence() if counts[2] == counts[4] else None
 
     def close(self, block: int) -> Evidence | None:
         """Return the evidence of the samples since the last block, and go on with blocks of another length.
 
         `block`: samples of the blocks to come. Returns none where nothing but settling has happened.
         """
-        found = None
+        evidence = None
         if self._counts[2]:
             self._fold()
-            found = self._evidence()
+            evidence = self._evidence()
         self._counts[4] = block
-        return found
+        return evidence
 
     def _fold(self) -> None:
         n = int(self._counts[1])
@@ -371,7 +374,7 @@ class EvidenceStream:
 
     def _evidence(self) -> Evidence:
         p, n_y = self._s.shape[1] - 1, self._W.shape[0]
-        found = Evidence(
+        evidence = Evidence(
             names=self.numbers.names,
             at=self.at.at,
             J=self._triangle[:p, :p].copy(),
@@ -384,5 +387,5 @@ class EvidenceStream:
         )
         self._triangle[:] = 0.0
         self._counts[2] = 0
-        self.latest = found
-        return found
+        self.latest = evidence
+        return evidence

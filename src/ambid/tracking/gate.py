@@ -179,20 +179,20 @@ class Gate:
         if not self._trial.add(evidence) or self._trial.blocks < self._blocks:
             return None
         new, old = self._candidate, self.accepted
-        seen = self.last = self._compare(self._trial, new, old)
-        z = self._z * math.sqrt(seen.scale)
-        claims = seen.claim > self._misfit
-        if claims and seen.separation < (2 * z) ** 2:
+        comparison = self.last = self._compare(self._trial, new, old)
+        z = self._z * math.sqrt(comparison.scale)
+        claims = comparison.claim > self._misfit
+        if claims and comparison.separation < (2 * z) ** 2:
             if self._trial.blocks < self._longest:
                 return None
-            return self._refuse(t, seen, "later data do not distinguish it from the accepted values")
-        if seen.misfit > self._misfit * seen.scale:
-            return self._refuse(t, seen, f"its own lack of fit exceeds {self._misfit * seen.scale:.3g}")
+            return self._refuse(t, comparison, "later data do not distinguish it from the accepted values")
+        if comparison.misfit > self._misfit * comparison.scale:
+            return self._refuse(t, comparison, f"its own lack of fit exceeds {self._misfit * comparison.scale:.3g}")
         # what claims nothing new comes every few blocks: it is refused only where chance is out of the question
-        allowance = max(0.0, (1 if claims else 2) * self._z * seen.sd - seen.separation)
-        if seen.gain < -allowance:
-            return self._refuse(t, seen, f"the accepted values predict better, by more than {allowance:.3g}")
-        return self._accept(new, t, f"{new.why}: {seen.text}", seen)
+        allowance = max(0.0, (1 if claims else 2) * self._z * comparison.sd - comparison.separation)
+        if comparison.gain < -allowance:
+            return self._refuse(t, comparison, f"the accepted values predict better, by more than {allowance:.3g}")
+        return self._accept(new, t, f"{new.why}: {comparison.text}", comparison)
 
     def accept(self, t: float) -> Event:
         """Accept the waiting candidate unjudged, as the operator may order; probation follows all the same.
@@ -241,10 +241,10 @@ class Gate:
         if n < self._next and n < self._probation:
             return None
         self._next = 2 * n
-        seen = self._compare(self._watched, self.accepted, self._before)
-        if -seen.gain > self._z_back * seen.sd:
-            self.last, goal = seen, self._before
-            return self._return(goal, t, f"the earlier values predict better ({seen.text})")
+        comparison = self._compare(self._watched, self.accepted, self._before)
+        if -comparison.gain > self._z_back * comparison.sd:
+            self.last, goal = comparison, self._before
+            return self._return(goal, t, f"the earlier values predict better ({comparison.text})")
         if n >= self._probation:
             self._before = None
         return None
@@ -266,7 +266,7 @@ class Gate:
             scale=scale,
         )
 
-    def _accept(self, new: Accepted, t: float, why: str, seen: Comparison | None) -> Event:
+    def _accept(self, new: Accepted, t: float, why: str, comparison: Comparison | None) -> Event:
         """Put the candidate in force, and the numbers before it on trial."""
         moved = new.values - self.accepted.values
         if self._before is None:
@@ -275,20 +275,20 @@ class Gate:
             self._next = self._blocks
         else:  # the trial goes on against the older numbers: a chain of small steps does not escape it
             self._watched.move(new.values)
-        refined = seen is not None and seen.claim <= self._misfit
-        kept = self._history
-        if refined and len(kept) > 1 and kept[-1].refined and kept[-1].t - kept[-2].t < self._apart:
-            kept.pop()
-        kept.append(Accepted(values=new.values, covariance=new.covariance, t=t, why=new.why, refined=refined))
+        refined = comparison is not None and comparison.claim <= self._misfit
+        history = self._history
+        if refined and len(history) > 1 and history[-1].refined and history[-1].t - history[-2].t < self._apart:
+            history.pop()
+        history.append(Accepted(values=new.values, covariance=new.covariance, t=t, why=new.why, refined=refined))
         self._candidate = None
-        values = dict(zip(self.names, moved.tolist(), strict=True)) if seen is None else seen.values
+        values = dict(zip(self.names, moved.tolist(), strict=True)) if comparison is None else comparison.values
         return Event(kind="accepted", t=t, why=why, values=values)
 
-    def _refuse(self, t: float, seen: Comparison, why: str) -> Event:
+    def _refuse(self, t: float, comparison: Comparison, why: str) -> Event:
         """Drop the candidate."""
         reason = "" if self._candidate is None else f"{self._candidate.why}: "
         self._candidate = None
-        return Event(kind="refused", t=t, why=f"{reason}{why} ({seen.text})", values=seen.values)
+        return Event(kind="refused", t=t, why=f"{reason}{why} ({comparison.text})", values=comparison.values)
 
     def _checked(self, values: ArrayLike, covariance: ArrayLike) -> tuple[Array, Array]:
         """Return copies, or refuse them."""
@@ -302,11 +302,11 @@ class Gate:
 
 def _squared_length(d: Array, covariance: Array) -> float:
     """Return d^T covariance^-1 d; infinite where d moves a number without variance or no covariance is given."""
-    known = covariance.diagonal() <= 0.0
-    if known.any():
-        if d[known].any():
+    certain = covariance.diagonal() <= 0.0
+    if certain.any():
+        if d[certain].any():
             return math.inf
-        d, covariance = d[~known], covariance[np.ix_(~known, ~known)]
+        d, covariance = d[~certain], covariance[np.ix_(~certain, ~certain)]
     A = covariance.copy(order="F")
     A.ravel("K")[:: d.size + 1] *= 1.0 + _REGULAR
     _, solved, failed = dposv(A, d, overwrite_a=True)
@@ -434,10 +434,10 @@ def beside(
     gains = tuple(numbers.names[j] for j in numbers.places("gain") if active[j])
     if not gains and not numbers.synchronous:
         return {}
-    found = published(numbers, accepted, "gain", dict.fromkeys(gains, not stale))
-    found = {name: found[name] for name in gains}
+    values = published(numbers, accepted, "gain", dict.fromkeys(gains, not stale))
+    values = {name: values[name] for name in gains}
     if not numbers.synchronous:
-        return found
+        return values
     at = numbers.places("unbalance")
     size = numbers.magnitude[at]
     a, b = (accepted.values[at] * size).tolist()
@@ -445,7 +445,7 @@ def beside(
         a, b, accepted.covariance[np.ix_(at, at)] * np.outer(size, size)
     )
     return {
-        **found,
+        **values,
         "unbalance": TrackedValue(value=amplitude, sd=sd, stale=stale),
         "unbalance_phase": TrackedValue(value=phase, sd=phase_sd, stale=stale),
     }

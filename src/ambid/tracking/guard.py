@@ -89,8 +89,8 @@ class RowCheck:
 
     def _filled(self, values: Array) -> Array:
         """Return the values with each one that is not a number replaced by the one before: no frozen run ends there."""
-        known = np.isfinite(values)
-        at = np.maximum.accumulate(np.where(known, np.arange(values.shape[0])[:, None], -1), axis=0)
+        finite = np.isfinite(values)
+        at = np.maximum.accumulate(np.where(finite, np.arange(values.shape[0])[:, None], -1), axis=0)
         return np.where(at >= 0, np.take_along_axis(values, np.maximum(at, 0), axis=0), self._last)
 
     def _frozen(self, values: Array, last: bool) -> tuple[Mask | None, int]:
@@ -108,14 +108,14 @@ class RowCheck:
             return None, 0
         stuck = np.zeros(n, dtype=bool)
         lengths = np.empty(values.shape, dtype=np.int64)
-        held = 0
+        undecided = 0
         for j in range(values.shape[1]):
             trailing = self._channel(j, same[:, j], lengths[:, j], stuck)
-            held = max(held, 0 if last else trailing)
-        decided = n - held
+            undecided = max(undecided, 0 if last else trailing)
+        decided = n - undecided
         if decided:
             self._last[:], self._run[:] = values[decided - 1], lengths[decided - 1]
-        return (stuck if stuck.any() else None), held
+        return (stuck if stuck.any() else None), undecided
 
     def _channel(self, j: int, same: Mask, lengths: NDArray[np.int64], stuck: Mask) -> int:
         """Fill in the running length of each row's run, mark frozen rows, and return the undecided ones at the end."""
@@ -148,13 +148,13 @@ class RowCheck:
             self._threshold[j] = max(_SHORTEST, _FACTOR * self._usual[j])
 
 
-def _add(found: dict[RowKind, Mask], kind: RowKind, cells: Mask) -> None:
+def _add(refused: dict[RowKind, Mask], kind: RowKind, cells: Mask) -> None:
     """Add the rows that hold such a cell and are of no other kind yet."""
     rows = np.asarray(cells.any(axis=1))
-    for before in found.values():
+    for before in refused.values():
         rows &= ~before
     if rows.any():
-        found[kind] = rows
+        refused[kind] = rows
 
 
 _LARGEST = 2**62  # of a sample number
@@ -311,12 +311,12 @@ class StreamGuard:
             part = Part(first=self._undecided.first, time_s=part.time_s, values=whole)
             self._undecided = None
         self._drop_undecided()
-        found, held = self._rows.judge(part.values)
-        n = part.size - held
-        if held:
+        refused, undecided = self._rows.judge(part.values)
+        n = part.size - undecided
+        if undecided:
             self._undecided = Part(first=part.first + n, time_s=part.time_s, values=part.values[n:])
         if n:
-            self._give(part.first, part.values[:n], {kind: rows[:n] for kind, rows in found.items()})
+            self._give(part.first, part.values[:n], {kind: rows[:n] for kind, rows in refused.items()})
 
     def _drop_undecided(self) -> None:
         """Refuse rows that repeat the last value of a channel when nothing follows to tell whether it was frozen."""
@@ -330,17 +330,17 @@ class StreamGuard:
         self._drop_undecided()
         self._restart = True
 
-    def _give(self, first: int, values: Array, found: Mapping[RowKind, Mask]) -> None:
+    def _give(self, first: int, values: Array, refused: Mapping[RowKind, Mask]) -> None:
         """Give out each run of sound rows."""
         sound = np.ones(values.shape[0], dtype=bool)
-        for kind, rows in found.items():
+        for kind, rows in refused.items():
             count = int(rows.sum())
             if count:
                 sound &= ~rows
                 at = first + int(np.argmax(rows))
                 self._ledger.reject(kind, count, at, f"{counted(count, 'sample')} from {at} on: {_WHY[kind]}")
         edges = [0, values.shape[0]]
-        if found:
+        if refused:
             edges = np.flatnonzero(np.diff(np.concatenate([[0], sound.astype(np.int8), [0]]))).tolist()
         for start, stop in zip(edges[::2], edges[1::2], strict=True):
             restart = self._restart or first + start != self._given_to

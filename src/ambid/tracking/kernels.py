@@ -143,7 +143,7 @@ def absorb(
     believed. With a gain D K, K optimal and D diagonal, the covariance is that of K plus (I - D) K V K^T (I - D), and
     K V K^T the sum of what the rows have taken off one by one (Joseph's form). `K` (p + 2, p) is scratch.
     """
-    p, total, part, held = q.size, 0.0, 1.0, False
+    p, total, part, schmidt = q.size, 0.0, 1.0, False
     step, f = K[p], K[p + 1]
     for j in range(p):
         step[j] = 0.0
@@ -160,13 +160,13 @@ def absorb(
             step[j] -= K[i, j] * root * rho
     for j in range(p):
         if not active[j]:
-            held = True
+            schmidt = True
         elif positive[j] and -step[j] > _MOST * q[j]:
             part = min(part, -_MOST * q[j] / step[j])
     for j in range(p):
         if active[j]:
             q[j] += part * step[j]
-    if held or part < 1.0:
+    if schmidt or part < 1.0:
         for i in range(p):
             for j in range(p):
                 f[j] = K[i, j] * (1.0 - part) if active[j] else K[i, j]
@@ -211,13 +211,13 @@ def filter_ring(
 
 
 @compiled(error_model="numpy", fastmath={"contract"})
-def smooth_ring(J: Array, count: int, first: int, K: Array, found: Array, N: Array) -> None:
-    """Fill the first rows of `found` (4, p) with the sums of lambda_j^2 and of N_jj, twice the score their difference.
+def smooth_ring(J: Array, count: int, first: int, K: Array, sums: Array, N: Array) -> None:
+    """Fill the first rows of `sums` (4, p) with the sums of lambda_j^2 and of N_jj, twice the score their difference.
 
     Disturbance smoother backward over what `filter_ring` kept (Koopman and Shephard 1992; Durbin and Koopman 2012, sec.
     4.5 and 6.4). `N` (p, p) is scratch.
     """
-    size, p, squares, powers, lam, drop = J.shape[0], J.shape[1], found[0], found[1], found[2], found[3]
+    size, p, squares, powers, lam, drop = J.shape[0], J.shape[1], sums[0], sums[1], sums[2], sums[3]
     for a in range(p):
         squares[a] = powers[a] = lam[a] = 0.0
         for c in range(p):
@@ -350,7 +350,7 @@ def _gather(base: Array, m: int, acc: Array, other: Array) -> None:
 @compiled(error_model="numpy")
 def watch(
     bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array, tested: Counts,
-    drift: Array, longest: int, gain: float, noise: float, acc: Array, other: Array, M: Array, X: Array, found: Array,
+    drift: Array, longest: int, gain: float, noise: float, acc: Array, other: Array, M: Array, X: Array, tests: Array,
 ) -> bool:  # fmt: skip
     """Test the windows that end with the newest block, learn how much larger than chance quiet statistics are.
 
@@ -360,7 +360,7 @@ def watch(
     (windows, tests): log of overdispersion. `marks` (2, tests): threshold of each test, and the point that few quiet
     statistics pass. `tested` (hypotheses,): column of each. `drift` (p,): growth of variance per block. `longest`
     window, blocks; `gain` of learning, below 0 while settling; `noise` level. `acc` (p, p + 1), `other` (p + 1, p), `M`
-    (p, p), `X` (p, p + 1) are scratch. `found` (windows, 10 + tests), of the windows that were looked at: whether a
+    (p, p), `X` (p, p + 1) are scratch. `tests` (windows, 10 + tests), of the windows that were looked at: whether a
     threshold was passed, blocks, first sample, likeliest hypothesis, its statistic, size, sd, joint, rest, noise; all
     statistics. Returns whether any was passed.
     """
@@ -388,9 +388,9 @@ def watch(
                 continue
             whiten(acc, history[int(note[3]) % history.shape[0]], drift, length, M, X)
             window = m - 1 if level == 0 else 2 * level + m - 1
-            found[window, 1], found[window, 2] = length, note[2]
-            _test(X, rest, freedom, learned[window], marks, tested, speed, noise, found[window])
-            alarm = alarm or found[window, 0] > 0.0
+            tests[window, 1], tests[window, 2] = length, note[2]
+            _test(X, rest, freedom, learned[window], marks, tested, speed, noise, tests[window])
+            alarm = alarm or tests[window, 0] > 0.0
         if n_bases % 2 == 1 or level + 1 == levels:
             break
         counts[level + 1] += 1

@@ -47,7 +47,7 @@ def line_json(line: TrackLine) -> dict[str, Any]:
     ``event`` is the most important of ``events``, None without any; ``ci95`` is value ± 1.96 sd; a number that is not
     known is None.
     """
-    found: dict[str, Any] = {
+    document: dict[str, Any] = {
         "t": plain_json(line.t),
         "parameters": {name: _value(v) for name, v in line.parameters.items()},
         "error": plain_json(line.error),
@@ -55,10 +55,10 @@ def line_json(line: TrackLine) -> dict[str, Any]:
         "event": None if not line.events else event_json(most_important(line.events)),
     }
     if line.events:
-        found["events"] = [event_json(e) for e in line.events]
+        document["events"] = [event_json(e) for e in line.events]
     if line.extra:
-        found["extra"] = {name: _value(v) for name, v in line.extra.items()}
-    return found
+        document["extra"] = {name: _value(v) for name, v in line.extra.items()}
+    return document
 
 
 def event_json(event: Event) -> dict[str, Any]:
@@ -74,8 +74,8 @@ def summary_json(summary: TrackSummary, verdict: Verdict) -> dict[str, Any]:
         "unanswered": [event_json(e) for e in summary.unanswered],
         "latency_s": None if summary.latency is None else fields_json(summary.latency),
     }
-    found = {**fields_json(summary, without=("changes", "unanswered", "latency")), **more}
-    return {"verdict": plain_json(verdict), "summary": found}
+    document = {**fields_json(summary, without=("changes", "unanswered", "latency")), **more}
+    return {"verdict": plain_json(verdict), "summary": document}
 
 
 def track_document(track: Track) -> str:
@@ -87,11 +87,11 @@ def track_document(track: Track) -> str:
 def _value(v: TrackedValue) -> dict[str, Any]:
     value, sd = float(v.value), float(v.sd)
     low, high = value - NORMAL_95 * sd, value + NORMAL_95 * sd
-    known = math.isfinite(low) and math.isfinite(high)
+    finite = math.isfinite(low) and math.isfinite(high)
     return {
         "value": value if math.isfinite(value) else None,
         "sd": sd if math.isfinite(sd) else None,
-        "ci95": [low, high] if known else None,
+        "ci95": [low, high] if finite else None,
         "stale": bool(v.stale),
     }
 
@@ -329,9 +329,9 @@ def _header(document: Mapping[str, Any]) -> TrackHeader:
 def _line_or_summary(document: Mapping[str, Any]) -> TrackLine | TrackSummary:
     if "summary" in document:
         s = document["summary"]
-        found = {"counts": {}, "unanswered": [], **s, "latency": s.get("latency_s")}
-        found |= {k: [{"kind": "change", **_event(e)} for e in found[k]] for k in ("changes", "unanswered")}
-        return read_as(TrackSummary, found)
+        fields = {"counts": {}, "unanswered": [], **s, "latency": s.get("latency_s")}
+        fields |= {k: [{"kind": "change", **_event(e)} for e in fields[k]] for k in ("changes", "unanswered")}
+        return read_as(TrackSummary, fields)
     one = document.get("event")
     events = document.get("events", [] if one is None else [one])
     return read_as(TrackLine, {**document, "events": [_event(e) for e in events]})

@@ -131,9 +131,9 @@ class ExcitationMonitor:
         self._at = tuple(self.names.index(name) for name in self._judged)
         self._parameter = np.array([name in reference_rate for name in self.names])
         self._reference = np.array([reference_rate.get(name, 0.0) for name in self.names])
-        known = np.inf if enough == 0.0 else enough**-2.0
+        information = np.inf if enough == 0.0 else enough**-2.0
         # information, and rate of it, below both of which a frozen number stays so, and a fresh one freezes
-        self._limits = (known, thaw * self._reference), (known / _WORSE**2, freeze * self._reference)
+        self._limits = (information, thaw * self._reference), (information / _WORSE**2, freeze * self._reference)
         self._block, self._window, self._decay = block_s, window_s, math.exp(-block_s / window_s)
         self._keep = math.sqrt(self._decay)
         self.duration_s = 0.0
@@ -183,14 +183,14 @@ class ExcitationMonitor:
             sd, reference = float(self.sd[j]), float(self._reference[j])
             rate = 1.0 / (sd * sd * self.duration_s)
             part = rate / reference if reference > 0 else math.inf
-            seen = f"the last {self._window:g} s alone determine {name} to {100 * sd:.3g} %"
+            text = f"the last {self._window:g} s alone determine {name} to {100 * sd:.3g} %"
             if sd > 0.5 / _RIDGE:
-                seen = f"the last {self._window:g} s contain no information on {name}"
+                text = f"the last {self._window:g} s contain no information on {name}"
             events.append(
                 Event(
                     kind="thawed" if thawed else "frozen",
                     t=t,
-                    why=f"{seen}, {100 * part:.2g} % of the information rate at identification",
+                    why=f"{text}, {100 * part:.2g} % of the information rate at identification",
                     parameter=name,
                     values={"sd": sd, "rate": rate, "reference_rate": reference},
                 )
@@ -244,16 +244,16 @@ class Alarm:
     @property
     def why(self) -> str:
         """The alarm in one line."""
-        seen = f"{counted(self.blocks, 'block')} from sample {self.onset}"
+        window = f"{counted(self.blocks, 'block')} from sample {self.onset}"
         if self.parameter is None:
             what = f"noise at {self.noise:.2f} of its usual level, all parameters together at {self.joint:.0f}"
             return (
-                f"no single parameter explains {seen}: {what} (statistic {self.statistic:.0f}, limit "
+                f"no single parameter explains {window}: {what} (statistic {self.statistic:.0f}, limit "
                 f"{self.threshold:.0f})"
             )
         doubt = f"; {', '.join(n for n, _ in self.rivals)} would explain it nearly as well" if self.rivals else ""
         move = f"{self.parameter} changed by {100 * self.size:+.3g} % (sd {100 * self.sd:.2g} %)"
-        return f"{move} in {seen} (statistic {self.statistic:.0f}, limit {self.threshold:.0f}){doubt}"
+        return f"{move} in {window} (statistic {self.statistic:.0f}, limit {self.threshold:.0f}){doubt}"
 
 
 class ChangeDetector:

@@ -65,18 +65,18 @@ def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> Noi
 
     Returns form "given" with a gain that forgets where the estimate's own predictor does not forget soon enough.
     """
-    found = estimate.noise
-    gain = found.gain * scales.output / scales.state[:, None]
-    if found.form == "gain":
+    noise = estimate.noise
+    gain = noise.gain * scales.output / scales.state[:, None]
+    if noise.form == "gain":
         entries = gain.ravel()
         return NoiseNumbers(form="gain", numbers=entries, sd=_GAIN_SD * (np.abs(entries) + 0.1), gain=gain)
     A, C, E = _discrete(plant, estimate, scales)
     longest = max(MEMORY_S * rate_of(estimate), _LEAST_MEMORY)
-    if found.form == "levels":
-        sensor = np.array([found.sensor_sd[o] for o in plant.outputs]) / scales.output
-        held = np.array([found.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
+    if noise.form == "levels":
+        sensor = np.array([noise.sensor_sd[o] for o in plant.outputs]) / scales.output
+        disturbance = np.array([noise.disturbance_sd[d] for d in plant.disturbances]) / scales.disturbance
         with np.errstate(divide="ignore"):
-            numbers = np.log(np.concatenate([held, sensor[1:]]) / sensor[0])
+            numbers = np.log(np.concatenate([disturbance, sensor[1:]]) / sensor[0])
         if np.all(np.isfinite(numbers)) and _memory(A - gain @ C) <= longest:
             sd = np.full(numbers.size, _LOG_LEVEL_SD * np.sqrt(overdispersion_of(estimate)))
             return NoiseNumbers(form="levels", numbers=numbers, sd=sd, gain=gain)
@@ -167,8 +167,8 @@ def _check_agreement(speed: Array, angle: Array, period: float) -> None:
     """Refuse a speed that is not the derivative of the angle; a unit that is wrong is off by a factor."""
     expected = 0.5 * (speed[1:] + speed[:-1]) * period
     turned = np.mod(np.diff(angle) + np.pi, 2.0 * np.pi) - np.pi  # an angle may be wrapped
-    known = np.isfinite(expected) & np.isfinite(turned)
-    expected, turned = expected[known], turned[known]
+    finite = np.isfinite(expected) & np.isfinite(turned)
+    expected, turned = expected[finite], turned[finite]
     way = np.cumsum(np.abs(expected))
     parts = 0 if way.size == 0 else min(_PARTS, int(way[-1] / _PART_RAD))
     if parts == 0:
@@ -303,7 +303,7 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
     sizes = [max(abs(values[k]), reference.get(k, 0.0)) or 1.0 for k in free] + [1.0] * len(plant.gains)
     problem = _problem(plant, estimate, scales, noise, (*free, *plant.gains), np.array(sizes))
     groups = _groups(problem, estimate, noise, free, top_speed if synchronous else None)
-    found = TrackedNumbers(
+    numbers = TrackedNumbers(
         names=tuple(name for g in groups for name in g.names),
         kinds=tuple(g.kind for g in groups for _ in g.names),
         units=tuple(unit for g in groups for unit in g.units),
@@ -318,9 +318,9 @@ def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed:
         speed=top_speed,
         warnings=_poorly_known(estimate),
     )
-    if assemble(problem, found.vector(found.start), with_derivatives=False) is None:
+    if assemble(problem, numbers.vector(numbers.start), with_derivatives=False) is None:
         raise EstimationError("the start estimate gives no stable predictor. Identify the bench again")
-    return found
+    return numbers
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -371,7 +371,7 @@ def _groups(
     plant, scales = problem.model, problem.scales
     n, count, specs = len(free), noise.numbers.size, {s.name: s.unit for s in plant.parameters}
     gains = problem.estimated[n:]
-    size, held = problem.magnitude[:n], scales.disturbance
+    size, unit = problem.magnitude[:n], scales.disturbance
     groups = [
         _Group(
             kind="parameter", names=free, units=tuple(specs[k] for k in free), magnitude=size,
@@ -389,12 +389,12 @@ def _groups(
         ),
         _Group(
             kind="offset", names=tuple(f"offset_{d}" for d in plant.disturbances),
-            units=tuple(plant.units[d] for d in plant.disturbances), magnitude=held, start=np.zeros(held.size),
-            covariance=_OFFSET_SD**2 * np.eye(held.size),
+            units=tuple(plant.units[d] for d in plant.disturbances), magnitude=unit, start=np.zeros(unit.size),
+            covariance=_OFFSET_SD**2 * np.eye(unit.size),
         ),
     ]  # fmt: skip
     if top_speed is not None and "force" in plant.disturbances:
-        size = np.full(2, held[plant.disturbances.index("force")] / top_speed**2)
+        size = np.full(2, unit[plant.disturbances.index("force")] / top_speed**2)
         groups.append(
             _Group(
                 kind="unbalance", names=UNBALANCE, units=("kg m",) * 2, magnitude=size, start=np.zeros(2),
@@ -427,11 +427,11 @@ def _delay(problem: PredictorProblem, estimate: Estimate) -> list[_Group]:
     """The delay beyond the whole samples, in samples, where the start has estimated it."""
     if not problem.fractional:
         return []
-    found = estimate.delay[problem.model.inputs[0]]
+    delay = estimate.delay[problem.model.inputs[0]]
     return [
         _Group(
-            kind="noise", names=("delay",), units=("1",), magnitude=np.ones(1), start=np.array([found.fraction]),
-            covariance=np.array([[float(found.sd or 0.0) ** 2]]),
+            kind="noise", names=("delay",), units=("1",), magnitude=np.ones(1), start=np.array([delay.fraction]),
+            covariance=np.array([[float(delay.sd or 0.0) ** 2]]),
         )
     ]  # fmt: skip
 

@@ -251,17 +251,17 @@ class BlockOrder:
 
     def _begin(self, part: Part) -> None:
         """Hold the first block until another confirms it: a damaged number must not number the stream."""
-        held = self._doubtful
-        if held is None:
+        doubtful = self._doubtful
+        if doubtful is None:
             self._doubtful = part
-        elif self._confirms(held, part):
+        elif self._confirms(doubtful, part):
             self._doubtful = None
-            low, high = sorted((held, part), key=lambda each: each.first)
+            low, high = sorted((doubtful, part), key=lambda each: each.first)
             self._start(low)
             self.n_reordered += low is part
             self._line_up(low)
             self._line_up(high)
-        elif held.first == part.first and held.size == part.size:
+        elif doubtful.first == part.first and doubtful.size == part.size:
             self._reject("repeated", part, "came again")
         else:
             self._dismiss()
@@ -290,13 +290,13 @@ class BlockOrder:
 
     def _doubt(self, part: Part) -> None:
         """Hold a block that contradicts the stream, or follow it and the one before if they agree with each other."""
-        held = self._doubtful
-        if held is None or not self._confirms(held, part):
+        doubtful = self._doubtful
+        if doubtful is None or not self._confirms(doubtful, part):
             self._dismiss()
             self._doubtful = part
             return
         self._doubtful = None
-        low, high = sorted((held, part), key=lambda each: each.first)
+        low, high = sorted((doubtful, part), key=lambda each: each.first)
         if low.first - self.next > self._leap and self._runs_on(low):
             self._count_anew([low, high])  # nobody lost so much in no time
             return

@@ -83,17 +83,17 @@ def refine(
         evidence = stream.close(block)
         if evidence is None:
             return None
-        found = before.copy()
-        misfit = found.absorb(evidence, noise)
-        step = float(np.max(np.abs(found.q - q) / found.sd))
+        updated = before.copy()
+        misfit = updated.absorb(evidence, noise)
+        step = float(np.max(np.abs(updated.q - q) / updated.sd))
         # steps shrink at least as fast as they have: what the next one would be needs no look
         left, last = step * min(1.0, step / last) if last else step, step
         if left < _SETTLED or iteration == _ITERATIONS:
             return Refined(
-                filter=found, stream=stream, evidence=evidence, misfit=misfit, converged=left < _SETTLED,
+                filter=updated, stream=stream, evidence=evidence, misfit=misfit, converged=left < _SETTLED,
                 iterations=iteration,
             )  # fmt: skip
-        q = found.q.copy()
+        q = updated.q.copy()
     return None
 
 

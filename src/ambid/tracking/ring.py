@@ -126,8 +126,8 @@ def write_frame(buffer: memoryview, at: int, sequence: int, block: Block, arrive
 
 def read_frame(buffer: memoryview, at: int, sequence: int, capacity: int) -> Frame | None:
     """Return the frame of this sequence number; None if the slot holds another one or a part of one."""
-    found, check, first, time_s, arrived_s, rows, columns, size, _, kind = _HEAD.unpack_from(buffer, at)
-    if found != sequence or not 0 <= size <= capacity:
+    written, check, first, time_s, arrived_s, rows, columns, size, _, kind = _HEAD.unpack_from(buffer, at)
+    if written != sequence or not 0 <= size <= capacity:
         return None
     data = bytes(buffer[at + _UNCHECKED : at + _HEAD.size + size])
     if crc32(data, sequence & 0xFFFFFFFF) != check:
@@ -274,11 +274,11 @@ class BlockRing:
         if not _divisible(block, self._capacity):
             return self._put(block, arrived)
         rows = self._capacity // (values.shape[1] * 8)
-        kept = True
+        complete = True
         for k in range(0, values.shape[0], rows):
             time_s = block.time_s + k / self.rate_hz
-            kept &= self._put(Block(first=block.first + k, time_s=time_s, values=values[k : k + rows]), arrived)
-        return kept
+            complete &= self._put(Block(first=block.first + k, time_s=time_s, values=values[k : k + rows]), arrived)
+        return complete
 
     def _put(self, block: Block, arrived: float) -> bool:
         written = self._produced[_WRITTEN]

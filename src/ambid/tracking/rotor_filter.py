@@ -170,17 +170,17 @@ class RotorFilter:
     def _changed(self, window: Sequence[Block], error: float, alarm: Alarm | None) -> Step:
         """Fit blocks since a change with the numbers that age released, and say which of them jumped."""
         before, last = self._before, window[-1]
-        fitted, used = self._fit(window, before, self.ages)
-        if last not in used:
-            if used:  # what came before it is explained: it is the first of the change
+        fitted, explained = self._fit(window, before, self.ages)
+        if last not in explained:
+            if explained:  # what came before it is explained: it is the first of the change
                 self._since, self._before = last.first, self._recent[-1][1]
-            fitted, used = self._fit([last], self._before, self.ages, self._near(last, self._before.q))
-        if not used:
+            fitted, explained = self._fit([last], self._before, self.ages, self._near(last, self._before.q))
+        if not explained:
             return self._unexplained(last, error)
         before = self._before
-        names, statistics = self._named(used, fitted, before)
-        again, kept = self._fit(used, before, np.array([n in names for n in self.unknowns.names]), fitted.q)
-        fitted = again if kept else fitted
+        names, statistics = self._named(explained, fitted, before)
+        again, again_fits = self._fit(explained, before, np.array([n in names for n in self.unknowns.names]), fitted.q)
+        fitted = again if again_fits else fitted
         events = self._told(names, statistics, fitted, before)
         if not names:  # something else than a number made the alarm
             why = "a disturbance has passed: no number changed" if self._doubt else ""
@@ -213,14 +213,14 @@ class RotorFilter:
     def _told(self, names: Sequence[str], statistics: Array, after: State, before: State) -> tuple[Event, ...]:
         now, then = (self._problem(None).point(s.q).theta for s in (after, before))
         assert self._since is not None
-        found, t = [], self._time(self._since)
+        events, t = [], self._time(self._since)
         sds = np.sqrt(np.diag(before.P) + np.diag(after.P))
         for name, statistic in zip(names, statistics.tolist(), strict=True):
             size, sd = now[name] / then[name] - 1.0, float(sds[self.unknowns.names.index(name)])
             why = f"{name} changed by {100.0 * size:+.3g} % (sd {100.0 * sd:.2g} %) in the block from {t:.4g} s"
             values = {"before": then[name], "after": now[name], "statistic": statistic}
-            found.append(Event(kind="change", parameter=name, t=t, why=why, values=values))
-        return tuple(found)
+            events.append(Event(kind="change", parameter=name, t=t, why=why, values=values))
+        return tuple(events)
 
     def _near(self, block: Block, q: Array) -> Array:
         """Return a point from which modes that moved farther than they are wide are found: one frequency at a time."""
@@ -239,9 +239,9 @@ class RotorFilter:
         `near`: where the search of the first begins.
         """
         state = replace(before, P=before.P + np.diag(np.where(released, _RELEASED**2, 0.0)))
-        used: list[Block] = []
+        explained: list[Block] = []
         for block in blocks:
-            prior, q = state, state.q if near is None or used else near
+            prior, q = state, state.q if near is None or explained else near
             evidence = self._evidence(block, q)
             for _ in range(_STEPS):
                 new = _updated(prior, evidence.J, evidence.residual(prior.q))
@@ -253,32 +253,32 @@ class RotorFilter:
                     break
             if evidence.rest <= self._limit(evidence):
                 state = _updated(prior, evidence.J, evidence.residual(prior.q))
-                used.append(block)
-        return state, used
+                explained.append(block)
+        return state, explained
 
     def _named(self, blocks: Sequence[Block], after: State, before: State) -> tuple[tuple[str, ...], Array]:
         """Return the numbers whose jumps explain blocks, the one that explains most first, and their statistics."""
         from scipy.special import chdtri
 
-        found = [self._evidence(b, after.q) for b in blocks]
-        J = np.concatenate([e.J for e in found])
+        evidences = [self._evidence(b, after.q) for b in blocks]
+        J = np.concatenate([e.J for e in evidences])
         root = np.linalg.cholesky(_spread(J, before.P))
-        left = np.linalg.solve(root, np.concatenate([e.residual(before.q) for e in found]))
+        left = np.linalg.solve(root, np.concatenate([e.residual(before.q) for e in evidences]))
         A, places = np.linalg.solve(root, J), np.flatnonzero(self.ages).tolist()
         noise = max(self._detector.noise, 1.0)
         whole = _explained(A[:, places], left) / noise
-        taken: list[int] = []
+        places_taken: list[int] = []
         gains: list[float] = []
         so_far = 0.0
-        while len(taken) < len(places):
-            missing = len(places) - len(taken)
+        while len(places_taken) < len(places):
+            missing = len(places) - len(places_taken)
             if whole - so_far <= max(float(chdtri(missing, _TAIL)), _REST * whole):
                 break
-            tried = {k: _explained(A[:, [*taken, k]], left) / noise for k in places if k not in taken}
+            tried = {k: _explained(A[:, [*places_taken, k]], left) / noise for k in places if k not in places_taken}
             best = max(tried, key=lambda k: tried[k])
             gains.append(tried[best] - so_far)
-            taken, so_far = [*taken, best], tried[best]
-        return tuple(self.unknowns.names[k] for k in taken), np.array(gains)
+            places_taken, so_far = [*places_taken, best], tried[best]
+        return tuple(self.unknowns.names[k] for k in places_taken), np.array(gains)
 
     def _problem(self, block: Block | None) -> Likelihood:
         experiments = [] if block is None else [block.experiment]
@@ -318,5 +318,5 @@ def _updated(prior: State, J: Array, left: Array) -> State:
 
 def _explained(A: Array, left: Array) -> float:
     """Return how much of squares the columns of A explain."""
-    found = np.linalg.lstsq(A, left, rcond=1e-12)[0]
-    return float(left @ left - np.sum((left - A @ found) ** 2))
+    solution = np.linalg.lstsq(A, left, rcond=1e-12)[0]
+    return float(left @ left - np.sum((left - A @ solution) ** 2))

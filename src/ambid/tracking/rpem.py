@@ -169,7 +169,7 @@ class DriftRates:
         self._count = min(self._count + 1, _WINDOW)
         self._since += 1
 
-    def adapt(self, known: ParameterFilter, noise: float) -> None:
+    def adapt(self, present: ParameterFilter, noise: float) -> None:
         """Look at the window where a look is due; where something walks faster than thought, filter its end again.
 
         `noise`: variance of the evidence's residual.
@@ -177,7 +177,7 @@ class DriftRates:
         if self._chunk.blocks or self._count < _FEWEST or self._since < _EVERY:
             return
         self._since = 0
-        active, before = known.active, self.variance
+        active, before = present.active, self.variance
         if self._looks % (_SELDOM // _EVERY) == 0:
             self._raise(self._ratio(self._count, active, noise))
         self._looks += 1
@@ -191,7 +191,7 @@ class DriftRates:
             # filter the recent past again: with the rates as they were, what moved was taken for chance
             _, _, q, P = self._run(min(max(_RECENT), self._count), active, noise)
             if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
-                known.set(np.where(active, q, known.q), P)
+                present.set(np.where(active, q, present.q), P)
 
     def restart(self) -> None:
         """Forget the window: a jump in it would pass for drift."""
@@ -204,17 +204,17 @@ class DriftRates:
     def _ratio(self, count: int, active: NDArray[np.bool_], noise: float) -> Array:
         """Sum of lambda_j^2 over sum of N_jj in the last `count` chunks: above 1 where number j walks faster."""
         squares, powers, _, _ = self._run(count, active, noise)
-        told = active & (powers > 0.0)
-        return np.where(told, squares / np.where(told, powers, 1.0), 1.0)
+        informed = active & (powers > 0.0)
+        return np.where(informed, squares / np.where(informed, powers, 1.0), 1.0)
 
     def _run(self, count: int, active: NDArray[np.bool_], noise: float) -> tuple[Array, Array, Array, Array]:
         step = np.sqrt(np.where(active, self.variance, 0.0) * self._chunk_s)
         first = (self._next - count) % _WINDOW
         q, P, (K, N) = self._q[first].copy(), self._P[first].copy(), self._scratch
-        found = np.empty((4, q.size))
+        sums = np.empty((4, q.size))
         filter_ring(self._J, self._r, self._at, count, first, q, P, step, noise, K)
-        smooth_ring(self._J, count, first, K, found, N)
-        return found[0], found[1], q, P
+        smooth_ring(self._J, count, first, K, sums, N)
+        return sums[0], sums[1], q, P
 
 
 Memory = float | Literal["auto", "all"]
@@ -334,10 +334,10 @@ class PhysicalRpem:
             return self._one(samples).reshape(np.shape(outputs))
         errors = np.full(samples.y.shape, np.nan)
         while k < n:
-            used, found, evidence = self.stream.feed(samples.part(k))
-            errors[k : k + used] = found
-            k += used
-            self.n_used += used
+            n_taken, innovations, evidence = self.stream.feed(samples.part(k))
+            errors[k : k + n_taken] = innovations
+            k += n_taken
+            self.n_used += n_taken
             if evidence is not None:
                 self.take(evidence)
             elif k < n:
@@ -348,11 +348,11 @@ class PhysicalRpem:
 
     def _one(self, samples: Samples) -> Array:
         """Take in one sample; the same as below, without what only a block needs."""
-        used, errors, evidence = self.stream.feed(samples)
-        self.n_used += used
+        n_taken, errors, evidence = self.stream.feed(samples)
+        self.n_used += n_taken
         if evidence is not None:
             self.take(evidence)
-        elif not used:
+        elif not n_taken:
             self.n_rejected += 1
             self.stream.restart(self.stream.sample + 1)
             return np.full(samples.y.shape, np.nan)
@@ -461,8 +461,8 @@ def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRate
     walk as wide as each alone is known would loosen the ratios.
     """
     size = np.sqrt(np.diag(numbers.covariance))
-    known = 1.0 / np.diag(np.linalg.inv(numbers.covariance / np.outer(size, size))) * size**2
-    one_second = known * numbers.information_s
+    information = 1.0 / np.diag(np.linalg.inv(numbers.covariance / np.outer(size, size))) * size**2
+    one_second = information * numbers.information_s
     one_second[numbers.places("offset", "unbalance")] = _OFFSET_RATE
     one_second[numbers.places("gain")] = 0.0
     if memory == "all":
@@ -470,8 +470,8 @@ def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRate
     if memory != "auto":
         if not memory > 0.0:
             raise EstimationError(f"the memory is {memory} s; it must be positive. Give seconds, 'auto' or 'all'")
-        held = one_second / memory**2
-        return DriftRates(held, held, held, block_s)
+        constant = one_second / memory**2
+        return DriftRates(constant, constant, constant, block_s)
     first = min(max(_START_MEMORY * numbers.information_s, _SHORTEST_S), _LONGEST_S)
     begin, slowest, fastest = (one_second / s**2 for s in (first, _LONGEST_S, _SHORTEST_S))
     if numbers.problem.noise == "gain":

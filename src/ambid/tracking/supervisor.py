@@ -79,9 +79,9 @@ class Supervisor:
     @property
     def parameters(self) -> dict[str, TrackedValue]:
         """Published physical parameters, SI; stale where they are not informed, or known to be no longer right."""
-        shown = (self.publication.accepted, self._fresh, self._trusted())
-        if self._shown is None or any(a is not b for a, b in zip(self._shown, shown, strict=True)):
-            accepted, fresh, trusted = self._shown = shown
+        source = (self.publication.accepted, self._fresh, self._trusted())
+        if self._shown is None or any(a is not b for a, b in zip(self._shown, source, strict=True)):
+            accepted, fresh, trusted = self._shown = source
             now = {name: one and trusted for name, one in fresh.items()}
             self._parameters = published(self.rpem.numbers, accepted, "parameter", now)
         return dict(self._parameters)
@@ -128,14 +128,14 @@ class Supervisor:
         k, n = 0, samples.y.shape[0]
         while k < n:
             part = samples.part(k) if k else samples
-            used, found, evidence = self.rpem.stream.feed(part)
-            errors[k : k + used] = found
-            self.diagnosis.keep(part.part(0, used), first + k + used)
-            k += used
-            self.rpem.n_used += used
+            n_taken, innovations, evidence = self.rpem.stream.feed(part)
+            errors[k : k + n_taken] = innovations
+            self.diagnosis.keep(part.part(0, n_taken), first + k + n_taken)
+            k += n_taken
+            self.rpem.n_used += n_taken
             if evidence is not None:
                 self._take(evidence)
-            elif used == 0:
+            elif n_taken == 0:
                 raise ValueError(
                     f"sample {first + k} is not finite; the guard of the stream omits such samples. Omit it"
                 )
@@ -191,8 +191,8 @@ class Supervisor:
         if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
             before = self.level.above
             error = self.level.update(evidence, self.publication.accepted.values)
-            told = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
-            if self.level.above and not (before or told):
+            explained = self.diagnosis.doubted or self.diagnosis.settling or self.diagnosis.noise > 1.0
+            if self.level.above and not (before or explained):
                 why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
                 self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
         self._obey(t)
