@@ -226,7 +226,7 @@ def _joint(
 ) -> _Run:
     """Physical parameters in one filter with the plant's states; with a memory they walk as much as they are unsure."""
     source = rows_of(record, rig, **part)
-    begin = start_of(source, rig or default_rig(), given=start, start_s=start_s, rig_speaks=rig is not None)
+    begin = start_of(source, rig or default_rig(), start=start, start_s=start_s, rig_speaks=rig is not None)
     estimate, rate, plant = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
     free = estimate.covariance_names
     sd = dict(zip(free, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))

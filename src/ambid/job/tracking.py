@@ -197,7 +197,10 @@ def follow(
         tally.add(line)
         return take(line)
 
-    reporter = Reporter(supervisor, every_s=how.every_s, on_line=counted, flags=how.flags, t0=source.t0, first=first)
+    reporter = Reporter(
+        supervisor, every_s=how.every_s, on_line=counted, flags=how.flags, t0=source.t0, first=first,
+        foreseen=source.events,
+    )  # fmt: skip
     samples = None if live else int(np.count_nonzero(source.replay.numbers >= first))
     top = header(
         supervisor, limit=how.limit, every_s=reporter.every_s, method=f"rpem, memory {how.memory}",

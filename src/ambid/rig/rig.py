@@ -56,6 +56,8 @@ class RigChannel:
         another channel is logged later than the rest.
     variable : str or None
         Variable of a ``.mat`` file that holds the column; None: it is called like the column.
+    sensors : tuple of RigChannel
+        Two or more columns that are made into this one, where several sensors look at one position.
     """
 
     role: str
@@ -64,6 +66,7 @@ class RigChannel:
     calibration: Calibration | None = None
     delay: int | Literal["auto"] = 0
     variable: str | None = None
+    sensors: tuple[RigChannel, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -477,6 +480,9 @@ def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
     lines += _calibration_lines(c.calibration, c.role, folder) if c.calibration else []
     if is_input or c.delay:
         lines.append('delay = "auto"' if c.delay == "auto" else f"delay = {c.delay}")
+    for sensor in c.sensors:
+        _, *entries = _channel_lines(sensor, folder, is_input=False)
+        lines += ["", f"[[channels.{c.role}.sensors]]", *entries]
     return lines
 
 

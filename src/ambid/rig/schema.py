@@ -51,6 +51,7 @@ class ChannelEntry(_Entry):
     """``[channels.<role>]``: which column is this role, and how its values become the role's unit."""
 
     column: Name | None = None
+    sensors: Annotated[tuple[ChannelEntry, ...], Field(min_length=2)] | None = None
     variable: Text | None = None
     unit: Text | None = None
     gain: Number | None = None

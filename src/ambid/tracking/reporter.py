@@ -6,6 +6,7 @@ samples are missing or rejected the lines go on: they say so.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING
 
@@ -28,7 +29,8 @@ class Reporter:
 
     `supervisor`: its `log` calls `Reporter.note`; `every_s`: reporting interval, s; `on_line`: called with each line;
     may return flags that an operator set; `flags`: what an operator sets and when, s of record; `t0`: time of sample 0,
-    s of record; `first`: number of the first sample that is tracked.
+    s of record; `first`: number of the first sample that is tracked; `foreseen`: events that are known before, each
+    told in the line of its time.
 
     `every_s`: reporting interval, at least one sample long; `lines`: lines made, samples used, samples rejected;
     `samples`: lines made, samples used, samples rejected; `rejected`: lines made, samples used, samples rejected.
@@ -43,8 +45,10 @@ class Reporter:
         flags: Sequence[tuple[float, str]] = (),
         t0: float = 0.0,
         first: int = 0,
+        foreseen: Sequence[Event] = (),
     ) -> None:
         self.supervisor, self._on_line, self._t0 = supervisor, on_line, t0
+        self._foreseen = deque(sorted(foreseen, key=lambda event: event.t))
         self._rate = supervisor.rpem.numbers.rate_hz
         self.every_s = max(every_s, 1.0 / self._rate)
         self._count = int(first / (self.every_s * self._rate))
@@ -124,6 +128,8 @@ class Reporter:
         s = self.supervisor
         self._obey(self._next)
         s.wait(self._next)
+        while self._foreseen and self._foreseen[0].t <= self._t0 + self._count * self.every_s:
+            s.log.add(self._foreseen.popleft())
         events, self._events = tuple(self._events), []
         line = TrackLine(
             t=self._t0 + self._count * self.every_s,
