@@ -267,13 +267,13 @@ class Attempt:
         self.timing_s[stage] = self.timing_s.get(stage, 0.0) + now - began
         return now
 
-    def note_curve(self, found: Found, method: str, n: int, size: float) -> None:
+    def note_curve(self, ended: Found, method: str, n: int, size: float) -> None:
         """Add the learning curve of a search over `n` errors of unit variance, `size` in deviations of the outputs."""
         curve = LearningCurve(
             method=method,
-            seconds=np.array(found.seconds),
-            training=np.sqrt(np.array(found.costs) / max(n, 1)) * size,
-            held_out=np.array(found.held_out),
+            seconds=np.array(ended.seconds),
+            training=np.sqrt(np.array(ended.costs) / max(n, 1)) * size,
+            held_out=np.array(ended.held_out),
         )
         self.curves.append(curve)
 
@@ -376,21 +376,21 @@ def rules(settings: type) -> dict[str, _Rule]:
     return {f.name: f.metadata["rule"] for f in fields(settings)}
 
 
-def read_settings(settings: type[S], structure: str, given: Mapping[str, object]) -> S:
+def read_settings(settings: type[S], structure: str, values: Mapping[str, object]) -> S:
     """Check what was given by name, and complete it."""
-    known = rules(settings)
+    allowed = rules(settings)
     default = {f.name: f.default for f in fields(settings)}  # type: ignore[arg-type]
-    taken: dict[str, object] = {}
-    for name, value in given.items():
-        if name not in known:
+    chosen: dict[str, object] = {}
+    for name, value in values.items():
+        if name not in allowed:
             raise EstimationError(
-                f"{structure}: setting {name!r} is unknown; known: {', '.join(known)}.{nearest(name, list(known))}"
+                f"{structure}: setting {name!r} is unknown; known: {', '.join(allowed)}.{nearest(name, list(allowed))}"
             )
         if value == "auto" and default[name] is None:
             continue
-        known[name].check(structure, name, value)
-        taken[name] = value
-    return settings(**taken)
+        allowed[name].check(structure, name, value)
+        chosen[name] = value
+    return settings(**chosen)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -407,8 +407,8 @@ class NonlinearStructure:
     @property
     def estimator(self) -> Callable[..., NonlinearFit]:
         """The function that fits it."""
-        found: Callable[..., NonlinearFit] = _load(self.home)
-        return found
+        function: Callable[..., NonlinearFit] = _load(self.home)
+        return function
 
     @property
     def settings(self) -> Mapping[str, str]:
@@ -480,9 +480,9 @@ NONLINEAR_STRUCTURES: Mapping[str, NonlinearStructure] = {s.name: s for s in _EN
 def nonlinear_structure(name: str) -> NonlinearStructure:
     """Return a nonlinear structure of the register by name, such as ``"narmax"``."""
     if name not in NONLINEAR_STRUCTURES:
-        known = ", ".join(NONLINEAR_STRUCTURES)
+        names = ", ".join(NONLINEAR_STRUCTURES)
         raise EstimationError(
-            f"structure {name!r} is unknown; known: {known}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
+            f"structure {name!r} is unknown; known: {names}.{nearest(name, list(NONLINEAR_STRUCTURES))}"
         )
     return NONLINEAR_STRUCTURES[name]
 
@@ -560,25 +560,25 @@ def model_to_json(model: NonlinearModel) -> dict[str, Any]:
     return {"kind": model.kind, **model.as_json()}
 
 
-def model_from_json(found: Mapping[str, Any]) -> NonlinearModel:
+def model_from_json(document: Mapping[str, Any]) -> NonlinearModel:
     """Read a model back.
 
-    `found`: that `model_to_json` made.
+    `document`: that `model_to_json` made.
     """
-    if not isinstance(found, Mapping) or not isinstance(found.get("kind"), str):
+    if not isinstance(document, Mapping) or not isinstance(document.get("kind"), str):
         raise EstimationError("the model has no kind; a file of a nonlinear fit names it. Write the file again")
-    module, name = _home(found["kind"]).split(":")
+    module, name = _home(document["kind"]).split(":")
     read: Callable[[dict[str, Any]], NonlinearModel] = attrgetter(name)(import_module(module))
     try:
-        return read({k: v for k, v in found.items() if k != "kind"})
+        return read({k: v for k, v in document.items() if k != "kind"})
     except (AttributeError, IndexError, KeyError, TypeError, ValueError) as error:
         raise EstimationError(
-            f"no model of kind {found['kind']} ({type(error).__name__}: {error}). Write the file again"
+            f"no model of kind {document['kind']} ({type(error).__name__}: {error}). Write the file again"
         ) from error
 
 
 def _home(kind: str) -> str:
     if kind not in MODEL_KINDS:
-        known = ", ".join(MODEL_KINDS)
-        raise EstimationError(f"model kind {kind!r} is unknown; known: {known}.{nearest(kind, list(MODEL_KINDS))}")
+        names = ", ".join(MODEL_KINDS)
+        raise EstimationError(f"model kind {kind!r} is unknown; known: {names}.{nearest(kind, list(MODEL_KINDS))}")
     return MODEL_KINDS[kind]

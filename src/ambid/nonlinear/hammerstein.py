@@ -131,9 +131,9 @@ class HammersteinFunction(LaggedFunction):
         return {"sizes": asdict(self)}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back."""
-        return cls(**{k: int(v) for k, v in found["sizes"].items()})
+        return cls(**{k: int(v) for k, v in document["sizes"].items()})
 
     def start(self, data: Scaled) -> Array:
         """Return parameters by least squares on the polynomial multiplied out, its rank reduced to one."""
@@ -160,26 +160,26 @@ def hammerstein(
     data = scaled_records("hammerstein", records, lag=max(s.ny, s.nk + s.nu - 1, 1))
     if data.n_outputs > 1 or not data.u_level.size:
         raise EstimationError("hammerstein: a model has one output, and inputs. Choose one output, and an input")
-    of = HammersteinFunction(m=data.u_level.size, ny=s.ny, nu=s.nu, nk=s.nk, degree=s.degree)
+    function = HammersteinFunction(m=data.u_level.size, ny=s.ny, nu=s.nu, nk=s.nk, degree=s.degree)
     draft = Draft(
-        structure="hammerstein", records=records, settings=asdict(s), seed=seed, data=data, function=of,
-        theta=of.start(data),
+        structure="hammerstein", records=records, settings=asdict(s), seed=seed, data=data, function=function,
+        theta=function.start(data),
     )  # fmt: skip
     ticks = portions(tick, (1.0, 2.0 * (s.focus == "simulation")))
 
     def identify() -> None:
         began = perf_counter()
-        problem = problem_at(of, data.parts, draft.theta)
-        found = search(problem, draft.theta, stage="search", most=s.iterations, tick=ticks[0], keep=draft.keep)
-        draft.keep(found.theta)
-        draft.settle(found, problem, "Levenberg-Marquardt, prediction errors")
+        problem = problem_at(function, data.parts, draft.theta)
+        ended = search(problem, draft.theta, stage="search", most=s.iterations, tick=ticks[0], keep=draft.keep)
+        draft.keep(ended.theta)
+        draft.settle(ended, problem, "Levenberg-Marquardt, prediction errors")
         began = draft.timed("search", began)
         if s.focus == "simulation":
-            refine(draft, partial(problem_at, of, data.parts, free=True), s.iterations, ticks[1], "terms")
+            refine(draft, partial(problem_at, function, data.parts, free=True), s.iterations, ticks[1], "terms")
             draft.timed("simulation errors", began)
 
     reason = draft.guarded(identify)
-    problem = problem_at(of, data.parts, draft.theta, free=draft.free)
+    problem = problem_at(function, data.parts, draft.theta, free=draft.free)
     if reason or not np.isfinite(problem.cost(draft.theta)):
         return draft.failed(reason or NO_WEIGHTS)
     return finish(draft, problem, laplace(problem, draft.theta), units="lags or powers")

@@ -138,9 +138,9 @@ class HybridFunction(LaggedFunction):
     def regressors(self) -> Regressors:
         """What the network sees, innovations, then whatever else the terms look at."""
         x = lags(self.p, self.m, ny=self.ny, nu=self.nu, nk=self.nk, ne=self.ne)
-        known = set(zip(x.column.tolist(), x.back.tolist(), strict=True))
+        pairs = set(zip(x.column.tolist(), x.back.tolist(), strict=True))
         factors = {(column_of(f, self.p, self.m), f.lag) for _, _, term in self.owned for f in term}
-        more = np.array(sorted(factors - known), dtype=np.int64).reshape(-1, 2)
+        more = np.array(sorted(factors - pairs), dtype=np.int64).reshape(-1, 2)
         column, back = np.append(x.column, more[:, 0]), np.append(x.back, more[:, 1])
         return Regressors(n_outputs=self.p, n_inputs=self.m, column=column, back=back)
 
@@ -183,12 +183,12 @@ class HybridFunction(LaggedFunction):
         """Of all parameters."""
         out = channel_names("y", self.p)
         before = [f"{name}: " if self.p > 1 else "" for name in out]
-        found = [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.terms[o]]
-        found += [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.noise_terms]
+        names = [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.terms[o]]
+        names += [before[o] + term_name(x, self.p, self.m) for o in range(self.p) for x in self.noise_terms]
         z = self.regressors.names[: self.width]
-        found += [f"{name}: unit {k + 1}" for name in out for k in range(self.neurons)]
-        found += [f"unit {k + 1}: {x}" for k in range(self.neurons) for x in z]
-        return (*found, *(f"unit {k + 1}: 1" for k in range(self.neurons)))
+        names += [f"{name}: unit {k + 1}" for name in out for k in range(self.neurons)]
+        names += [f"unit {k + 1}: {x}" for k in range(self.neurons) for x in z]
+        return (*names, *(f"unit {k + 1}: 1" for k in range(self.neurons)))
 
     def unit(self, y_scale: Array, u_scale: Array) -> Array:
         """Coefficients of the polynomial and of C are in SI; weights of the network stay scaled."""
@@ -229,13 +229,13 @@ class HybridFunction(LaggedFunction):
         return {"terms": terms_to_json(self.terms), "ne": self.ne, "sizes": {**sizes, "neurons": self.neurons}}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back."""
-        sizes = {k: int(v) for k, v in found["sizes"].items()}
-        p, m, ne = sizes.pop("n_outputs"), sizes.pop("n_inputs"), found["ne"]
+        sizes = {k: int(v) for k, v in document["sizes"].items()}
+        p, m, ne = sizes.pop("n_outputs"), sizes.pop("n_inputs"), document["ne"]
         if not isinstance(ne, int) or ne < 0:
             raise ValueError("ne is no order")
-        return cls(terms=terms_from_json(found["terms"], p, m), ne=ne, p=p, m=m, **sizes)
+        return cls(terms=terms_from_json(document["terms"], p, m), ne=ne, p=p, m=m, **sizes)
 
 
 @dataclass(slots=True, kw_only=True)
@@ -362,8 +362,8 @@ def transfer(old: HybridFunction, theta: Array, new: HybridFunction) -> Array:
 
     C is drawn towards zero where it would not be invertible.
     """
-    known = dict(zip(old.names, theta, strict=True))
-    return new.make_invertible(np.array([known.get(name, 0.0) for name in new.names], dtype=np.float64))
+    values = dict(zip(old.names, theta, strict=True))
+    return new.make_invertible(np.array([values.get(name, 0.0) for name in new.names], dtype=np.float64))
 
 
 def _search(s: HybridSettings, draft: _Hybrid, stage: str, tick: Tick | None) -> LaggedProblem:
@@ -372,7 +372,7 @@ def _search(s: HybridSettings, draft: _Hybrid, stage: str, tick: Tick | None) ->
     problem = hybrid_problem(function, draft.data.parts, draft.theta, s.prior)
     if tick is not None:
         tick(stage, 0.0)
-    found = search(
+    ended = search(
         problem,
         draft.theta,
         stage=stage,
@@ -383,8 +383,8 @@ def _search(s: HybridSettings, draft: _Hybrid, stage: str, tick: Tick | None) ->
         tick=tick,
         keep=partial(draft.take, function),
     )
-    draft.take(function, found.theta)
-    draft.settle(found, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
+    draft.take(function, ended.theta)
+    draft.settle(ended, problem, f"{stage}: Levenberg-Marquardt, prediction errors")
     return problem
 
 
@@ -410,13 +410,13 @@ def train(
     for k in range(starts):
         alone = every.at(level if k % 2 else np.where(live, level, 0.0), live)
         start = draw_start(alone, n, alone.base[live], function.neurons, function.width, rng, _DRAWS)
-        found = search(
+        ended = search(
             alone, start, stage="network on the residual", tick=shares[2 * k], n_linear=n,
             solved=partial(solve_linear, alone, n), **_ROUGH,
         )  # fmt: skip
-        both = search(every, alone.whole(found.theta), stage="starts of all together", tick=shares[2 * k + 1], **_ROUGH)
+        both = search(every, alone.whole(ended.theta), stage="starts of all together", tick=shares[2 * k + 1], **_ROUGH)
         if not k and draft is not None:
-            draft.note(found, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
+            draft.note(ended, alone, "network on the residual: Levenberg-Marquardt, prediction errors")
         if both.cost < least:
             best, least = both.theta, both.cost
     return best
@@ -436,20 +436,20 @@ def _choose_neurons(
         return 0
     ends = [1.0 - share * j for j in range(int(np.clip(_MOST_ROWS // n, 1, min(_FOLDS, 0.6 / share))))]
 
-    def score(of: dict[str, Any], tick: Tick | None) -> float:
-        one, squares = replace(function, neurons=of["neurons"]), 0.0
+    def score(size: dict[str, Any], tick: Tick | None) -> float:
+        one, squares = replace(function, neurons=size["neurons"]), 0.0
         for end, own in zip(ends, portions(tick, ends), strict=True):
             some = tuple((y[: round(end * y.shape[0])], u[: round(end * y.shape[0])]) for y, u in parts)
-            training, held = split(some, share / end, function.lag)
+            training, validation = split(some, share / end, function.lag)
             theta = train(s, one, linear, training, draft.seed, 2, part_of(own, 0.0, 0.8)) if one.neurons else linear
             problem = hybrid_problem(one, training, theta, s.prior)
             theta = search(problem, theta, stage="choice of neurons", tick=part_of(own, 0.8, 1.0), **_ROUGH).theta
-            squares += rms_error(one, theta, held) ** 2
+            squares += rms_error(one, theta, validation) ** 2
         return float(np.sqrt(squares / len(ends)))
 
     sizes = [{"neurons": h} for h in _NEURONS]
-    found = choose_smallest(sizes, score, draft.details["tried"], _AS_GOOD, tick)
-    return int(found["neurons"])
+    best = choose_smallest(sizes, score, draft.details["tried"], _AS_GOOD, tick)
+    return int(best["neurons"])
 
 
 # --- noise model and terms --------------------------------------------------------------------------------------------
@@ -463,17 +463,19 @@ def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick 
     """
     old = problem.function
     assert isinstance(old, HybridFunction)
-    first, found = max(old.lag, MOST_NOISE), list[tuple[float, HybridFunction, Array]]()
+    first, trials = max(old.lag, MOST_NOISE), list[tuple[float, HybridFunction, Array]]()
     for ne, share in enumerate(portions(tick, (1.0,) * (MOST_NOISE + 1))):
-        of = replace(old, ne=ne)
-        if not of.n_theta:  # a polynomial without terms: only the noise model is left
+        trial = replace(old, ne=ne)
+        if not trial.n_theta:  # a polynomial without terms: only the noise model is left
             continue
-        parts = tuple((y[first - of.lag :], u[first - of.lag :]) for y, u in problem.parts)  # for all the same errors
-        at = replace(hybrid_problem(of, parts, transfer(old, theta, of), prior), weight=problem.weight)
+        parts = tuple(
+            (y[first - trial.lag :], u[first - trial.lag :]) for y, u in problem.parts
+        )  # for all the same errors
+        at = replace(hybrid_problem(trial, parts, transfer(old, theta, trial), prior), weight=problem.weight)
         ended = search(at, at.base, stage="order of the noise model", tick=share, **_ROUGH)
         value = at.n_errors * np.log(max(ended.cost / at.n_errors, 1e-26))
-        found.append((value + penalty("bic", of.n_linear, max(at.n_errors // of.p, 2), 1), of, ended.theta))
-    return min(found, key=lambda x: x[0])[1:]
+        trials.append((value + penalty("bic", trial.n_linear, max(at.n_errors // trial.p, 2), 1), trial, ended.theta))
+    return min(trials, key=lambda x: x[0])[1:]
 
 
 def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tick | None) -> None:
@@ -486,27 +488,31 @@ def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tic
     for k in range(draft.function.n_terms):
         if tick is not None:
             tick("terms beside the network", guessed(k, 4.0))
-        of, theta = draft.function, draft.theta
+        function, theta = draft.function, draft.theta
         R = problem.triangle(theta)[:, :-1]
         P, _ = information_inverse(R)
         if P is None:
             return
-        m = max(draft.details["candidates"] * of.p, of.n_linear)
-        price = penalty("ebic", of.n_linear, n, m) - penalty("ebic", of.n_linear - 1, n, m)
-        shared = _inflation(R, P, of.n_linear)[: of.n_terms] > _SHARED
-        alone = np.array([len(of.terms[o]) == 1 for o, _, _ in of.owned])
-        loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: of.n_terms])
+        m = max(draft.details["candidates"] * function.p, function.n_linear)
+        price = penalty("ebic", function.n_linear, n, m) - penalty("ebic", function.n_linear - 1, n, m)
+        shared = _inflation(R, P, function.n_linear)[: function.n_terms] > _SHARED
+        alone = np.array([len(function.terms[o]) == 1 for o, _, _ in function.owned])
+        loss = np.where(shared | alone, np.inf, (theta**2 / np.diag(P))[: function.n_terms])
         worst = int(np.argmin(loss))
         if not loss[worst] < price:
             return
-        o, _, term = of.owned[worst]
-        fewer = replace(of, terms=tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(of.terms)))
-        at = replace(hybrid_problem(fewer, problem.parts, transfer(of, theta, fewer), s.prior), weight=problem.weight)
-        found = search(at, at.base, stage="", damping=1e-4, **_ROUGH)
-        if not found.cost - problem.cost(theta) < price:
+        o, _, term = function.owned[worst]
+        fewer = replace(
+            function, terms=tuple(tuple(x for x in t if (q, x) != (o, term)) for q, t in enumerate(function.terms))
+        )
+        at = replace(
+            hybrid_problem(fewer, problem.parts, transfer(function, theta, fewer), s.prior), weight=problem.weight
+        )
+        ended = search(at, at.base, stage="", damping=1e-4, **_ROUGH)
+        if not ended.cost - problem.cost(theta) < price:
             return
         problem = at
-        draft.take(fewer, found.theta)
+        draft.take(fewer, ended.theta)
 
 
 def _inflation(R: Array, P: Array, n_linear: int) -> Array:
@@ -522,55 +528,55 @@ def _inflation(R: Array, P: Array, n_linear: int) -> Array:
 
 
 def _finish(s: HybridSettings, draft: _Hybrid) -> NonlinearFit:
-    of, records = draft.function, draft.records
-    draft.settings |= {"ne": of.ne, "neurons": of.neurons}
-    problem = hybrid_problem(of, draft.data.parts, draft.theta, s.prior)
+    function, records = draft.function, draft.records
+    draft.settings |= {"ne": function.ne, "neurons": function.neurons}
+    problem = hybrid_problem(function, draft.data.parts, draft.theta, s.prior)
     if not np.isfinite(problem.cost(draft.theta)):
         return draft.failed(DIVERGED)
-    found = laplace(problem, draft.theta)
-    radius = of.noise_radius(draft.theta)
+    posterior = laplace(problem, draft.theta)
+    radius = function.noise_radius(draft.theta)
     if radius > _NEAR:
         draft.warnings.append(
             f"C has a root at {radius:.4g}, close to the unit circle, which the search must not cross: its "
             "standard deviation is unreliable, and the predictor forgets its start slowly. A differenced or "
             "detrended output causes this"
         )
-    if found.covariance is not None:
-        inflated = _inflation(found.triangle, found.covariance, of.n_linear)[: of.n_terms]
-        names = ", ".join(name for name, x in zip(of.names, inflated, strict=False) if x > _SHARED)
+    if posterior.covariance is not None:
+        inflated = _inflation(posterior.triangle, posterior.covariance, function.n_linear)[: function.n_terms]
+        names = ", ".join(name for name, x in zip(function.names, inflated, strict=False) if x > _SHARED)
         if names:
             draft.warnings.append(
                 f"the network can replace these terms, so that their values are not unique: {names}. Use fewer "
                 "neurons or a smaller prior"
             )
-    spare = _spare_units(of, draft.theta, problem, found)
+    spare = _spare_units(function, draft.theta, problem, posterior)
     terms: dict[str, list[dict[str, object]]] = {}
     for o, out in enumerate(records[0].outputs):
-        names_of = [term_name(x, of.p, of.m) for x in (*of.terms[o], *of.noise_terms)]
+        names_of = [term_name(x, function.p, function.m) for x in (*function.terms[o], *function.noise_terms)]
         terms[out] = [{"term": x, "err": draft.err.get((out, x))} for x in names_of]
     draft.details |= {"terms": terms, "levels": draft.data.levels(records[0])}
     why_not = (
-        f"no standard deviations: {spare} of {of.neurons} units improve the fit by less than their parameters "
-        f"cost, and intervals would be too narrow. Give neurons = {of.neurons - spare}"
+        f"no standard deviations: {spare} of {function.neurons} units improve the fit by less than their parameters "
+        f"cost, and intervals would be too narrow. Give neurons = {function.neurons - spare}"
     )
     return finish(
-        draft, problem, found, units="neurons or terms", how="laplace", why_not=why_not if spare else "",
+        draft, problem, posterior, units="neurons or terms", how="laplace", why_not=why_not if spare else "",
         noise=s.ne != 0, instead="Raise ne",
     )  # fmt: skip
 
 
-def _spare_units(of: HybridFunction, theta: Array, problem: LaggedProblem, found: Laplace) -> int:
+def _spare_units(function: HybridFunction, theta: Array, problem: LaggedProblem, posterior: Laplace) -> int:
     """Units whose output weights' Wald statistic is below Bayes' price of the unit's numbers.
 
     Beside them coefficients of the polynomial are off by 1.5 to 2 times their deviations: the likelihood is far from
     quadratic in what a unit does that is hardly there.
     """
-    if found.covariance is None:
+    if posterior.covariance is None:
         return 0
-    price = (of.p + of.width + 1) * np.log(problem.n_errors / of.p)
+    price = (function.p + function.width + 1) * np.log(problem.n_errors / function.p)
     spare = 0
-    for k in range(of.neurons):
-        own = of.n_linear + k + of.neurons * np.arange(of.p)
-        wald = theta[own] @ np.linalg.solve(found.covariance[np.ix_(own, own)], theta[own])
+    for k in range(function.neurons):
+        own = function.n_linear + k + function.neurons * np.arange(function.p)
+        wald = theta[own] @ np.linalg.solve(posterior.covariance[np.ix_(own, own)], theta[own])
         spare += bool(wald < price)
     return spare

@@ -59,7 +59,7 @@ def run(
     lag, p, n_e, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
     x, f, num, den = np.zeros(D), np.zeros(p), np.zeros(p), np.ones(p)
-    seen = np.zeros(Q)
+    projected = np.zeros(Q)
     innovations = z.shape[1] > n_e
     recursive = free == 1
     for d in range(D):
@@ -91,13 +91,13 @@ def run(
                 f[o] += W2[o, i] * v
         if s.size > 0:
             for j in range(Q):
-                seen[j] = 0.0
+                projected[j] = 0.0
                 for d in range(D):
-                    seen[j] += M[j, d] * x[d]
+                    projected[j] += M[j, d] * x[d]
             for k in range(s.size):
                 v = 0.0
                 for j in range(Q):
-                    v += (seen[j] - C[k, j]) ** 2
+                    v += (projected[j] - C[k, j]) ** 2
                 v = np.exp(-0.5 * v * np.exp(-2.0 * s[k]))
                 for o in range(p):
                     f[o] += W[o, k] * v
@@ -238,14 +238,14 @@ def run_states(
 
 @compiled(error_model="numpy")
 def slope_states(
-    M: Array, heads: Table, W1: Array, b1: Array, W2: Array, rho: float, D: Array, used: Table, u: Array, X: Array,
+    M: Array, heads: Table, W1: Array, b1: Array, W2: Array, rho: float, D: Array, changed: Table, u: Array, X: Array,
     E: Array, s: Array, out: Array,
 ) -> None:  # fmt: skip
     """Write the slopes of the predictions, out (n_samples, p, P); s (n or n + 1, P): of the state, first to last.
 
     Columns: directions D (n, n + m + q + p, P1) of M, the last of them that of rho where there is a sensor, W1 row by
-    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `used` (n, n + m + q + p) is 0 where no
-    direction changes an entry.
+    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `changed` (n, n + m + q + p) is 0 where
+    no direction changes an entry.
     """
     N, m, n, p, (q, h) = u.shape[0], u.shape[1], M.shape[0], heads.size, W2.shape
     P1, P, nz, sensor = D.shape[2], s.shape[1], n + m - 1, X.shape[1] > n
@@ -282,7 +282,7 @@ def slope_states(
                     for c in range(P):
                         new[i, c] += w * s[j, c]
             for j in range(v.size):
-                if used[i, j] == 1:
+                if changed[i, j] == 1:
                     w = v[j]
                     for c in range(P1):
                         new[i, c] += D[i, j, c] * w

@@ -83,8 +83,8 @@ class Terms:
     @cached_property
     def _owned(self) -> tuple[tuple[slice | Table, slice | Table], ...]:
         """Where numerator and denominator of each output stand in theta."""
-        found = [[np.flatnonzero(np.all(self.place == (o, b), axis=1)) for b in (0, 1)] for o in range(self.n_outputs)]
-        return tuple((_as_slice(up), _as_slice(down)) for up, down in found)
+        places = [[np.flatnonzero(np.all(self.place == (o, b), axis=1)) for b in (0, 1)] for o in range(self.n_outputs)]
+        return tuple((_as_slice(up), _as_slice(down)) for up, down in places)
 
     @cached_property
     def _rational(self) -> bool:
@@ -135,8 +135,8 @@ class Terms:
 
     def values(self, theta: Array, rows: tuple[Array, ...]) -> Array:
         """As `Block.values`."""
-        found = self._numerators(theta, rows[0])
-        return found / self.denominators(theta, rows) if self._rational else found
+        numerators = self._numerators(theta, rows[0])
+        return numerators / self.denominators(theta, rows) if self._rational else numerators
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
         """As `Block.derivatives`."""
@@ -296,14 +296,14 @@ class Radial:
         a, b, _ = np.cumsum(self.sizes)
         return theta[:a].reshape(self.n_outputs, -1), theta[a:b].reshape(self.neurons, self.n_seen), theta[b:]
 
-    def squared(self, theta: NDArray[Any], seen: Array) -> NDArray[Any]:
+    def squared(self, theta: NDArray[Any], projected: Array) -> NDArray[Any]:
         """Return squared distances of M x from the centres, in widths, shape (n, neurons)."""
         _, C, s = self.parts(theta)
-        q = np.zeros((seen.shape[0], self.neurons), dtype=C.dtype)
+        q = np.zeros((projected.shape[0], self.neurons), dtype=C.dtype)
         for j in range(self.n_seen):
-            q += (seen[:, j, None] - C[:, j]) ** 2
-        found: NDArray[Any] = q * np.exp(-2.0 * s)
-        return found
+            q += (projected[:, j, None] - C[:, j]) ** 2
+        scaled: NDArray[Any] = q * np.exp(-2.0 * s)
+        return scaled
 
     def uses(self, at: Table) -> bool:
         """As `Block.uses`."""
@@ -321,16 +321,16 @@ class Radial:
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
         """As `Block.derivatives`."""
-        (seen,), p, h = rows, self.n_outputs, self.neurons
+        (projected,), p, h = rows, self.n_outputs, self.neurons
         W, C, s = self.parts(theta)
-        n, (a, b, _) = seen.shape[0], np.cumsum(self.sizes)
-        q = self.squared(theta, seen)
+        n, (a, b, _) = projected.shape[0], np.cumsum(self.sizes)
+        q = self.squared(theta, projected)
         phi = np.exp(-0.5 * q)
         geometry, bends = bool(np.any(live[a:])), self.bends(at)
         out = np.zeros((n, p, self.n_theta if geometry else a))
         by_x = np.zeros((n if bends else 1, p, at.size))
         if geometry or bends:
-            by_seen = -(phi * np.exp(-2.0 * s))[:, :, None] * (seen[:, None, :] - C)
+            by_seen = -(phi * np.exp(-2.0 * s))[:, :, None] * (projected[:, None, :] - C)
         for o in range(p):
             out[:, o, o * h : (o + 1) * h] = phi
             if geometry:
@@ -402,10 +402,10 @@ def channel_names(letter: str, n: int) -> list[str]:
 
 def lags(n_outputs: int, n_inputs: int, *, ny: int, nu: int, nk: int, ne: int = 0) -> Regressors:
     """Return `ny` lags of every output, `nu` of every input from `nk` on, then `ne` of the innovations, lag by lag."""
-    of = [(o, k) for o in range(n_outputs) for k in range(1, ny + 1)]
-    of += [(n_outputs + i, nk + k) for i in range(n_inputs) for k in range(nu)]
-    of += [(n_outputs + n_inputs + o, k) for k in range(1, ne + 1) for o in range(n_outputs)]
-    table = np.array(of, dtype=np.int64).reshape(-1, 2)
+    pairs = [(o, k) for o in range(n_outputs) for k in range(1, ny + 1)]
+    pairs += [(n_outputs + i, nk + k) for i in range(n_inputs) for k in range(nu)]
+    pairs += [(n_outputs + n_inputs + o, k) for k in range(1, ne + 1) for o in range(n_outputs)]
+    table = np.array(pairs, dtype=np.int64).reshape(-1, 2)
     column, back = (np.ascontiguousarray(x) for x in table.T)
     return Regressors(n_outputs=n_outputs, n_inputs=n_inputs, column=column, back=back)
 
@@ -420,10 +420,10 @@ class Rows:
     y: Array  # (n, n_outputs), measured
     prepared: tuple[tuple[Array, ...], ...]  # by block
 
-    def part(self, of: slice) -> Rows:
+    def part(self, span: slice) -> Rows:
         """Return some of the rows."""
-        prepared = tuple(tuple(a[of] for a in one) for one in self.prepared)
-        return Rows(z=self.z, first=self.first + (of.start or 0), x=self.x[of], y=self.y[of], prepared=prepared)
+        prepared = tuple(tuple(a[span] for a in one) for one in self.prepared)
+        return Rows(z=self.z, first=self.first + (span.start or 0), x=self.x[span], y=self.y[span], prepared=prepared)
 
 
 class LaggedFunction(ABC):
@@ -454,16 +454,16 @@ class LaggedFunction(ABC):
 
     @classmethod
     @abstractmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back."""
 
     @classmethod
-    def read_model(cls, found: dict[str, Any]) -> LaggedModel:
+    def read_model(cls, document: dict[str, Any]) -> LaggedModel:
         """Read a model of the family back."""
-        of = cls.from_json(found)
-        n_cloud = np.arange(of.regressors.column.size)[of.in_cloud].size
-        numbers = read_numbers(found, of.n_theta, of.n_inputs, of.n_outputs, n_cloud)
-        return LaggedModel(dt=float(found["dt_s"]), function=of, **numbers)
+        function = cls.from_json(document)
+        n_cloud = np.arange(function.regressors.column.size)[function.in_cloud].size
+        numbers = read_numbers(document, function.n_theta, function.n_inputs, function.n_outputs, n_cloud)
+        return LaggedModel(dt=float(document["dt_s"]), function=function, **numbers)
 
     @property
     def n_outputs(self) -> int:
@@ -529,21 +529,21 @@ class LaggedFunction(ABC):
 
     def values(self, theta: Array, rows: Rows) -> Array:
         """Return the function, shape (n, n_outputs)."""
-        found = [b.values(t, r) for b, t, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True)]
-        return np.asarray(sum(found[1:], found[0]))
+        summands = [b.values(t, r) for b, t, r in zip(self.blocks, self.split(theta), rows.prepared, strict=True)]
+        return np.asarray(sum(summands[1:], summands[0]))
 
     def derivatives(self, theta: Array, rows: Rows, at: Table, live: Mask | None = None) -> tuple[Array, Array]:
         """Return slopes of the function by the live parameters, and by the regressors at some places."""
         live = np.ones(self.n_theta, dtype=np.bool_) if live is None else live
         own = np.split(live, self.edges[1:-1])
-        found = [
+        summands = [
             b.derivatives(t, r, m, at)
             for b, t, r, m in zip(self.blocks, self.split(theta), rows.prepared, own, strict=True)
         ]
-        by_x = found[0][1]
-        for _, more in found[1:]:
+        by_x = summands[0][1]
+        for _, more in summands[1:]:
             by_x = by_x + more
-        return np.concatenate([d for d, _ in found], axis=2), by_x
+        return np.concatenate([d for d, _ in summands], axis=2), by_x
 
     @cached_property
     def affine(self) -> bool:
@@ -555,11 +555,11 @@ class LaggedFunction(ABC):
 
         NaN from where innovations diverge on.
         """
-        found, z = self._predicted(theta, rows)
+        predictions, z = self._predicted(theta, rows)
         if z is None:
-            return found, rows
+            return predictions, rows
         measured = np.concatenate([rows.z[: self.lag, : self.n_outputs], rows.y])
-        return found, self.rows_of(z, measured, None if self.folded else rows)
+        return predictions, self.rows_of(z, measured, None if self.folded else rows)
 
     def errors(self, theta: Array, rows: Rows) -> Array:
         """Return one-step errors, shape (n, n_outputs), NaN from a divergence on."""
@@ -691,17 +691,17 @@ class LaggedModel(ScaledModel):
         out = np.full(ys.shape, np.nan)
         if ys.shape[0] > self.lag:
             out[self.lag :] = self.function.predict(self.scaled_theta, self.function.rows(ys, us))[0]
-        found: Array = self.y_level + self.y_scale * out
-        return found
+        predictions: Array = self.y_level + self.y_scale * out
+        return predictions
 
     def jacobian(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.jacobian`, past innovations included."""
         ys, us = scaled(self, u, y)
         out = np.zeros((*ys.shape, self.theta.size))
         if ys.shape[0] > self.lag:
-            of, theta = self.function, self.scaled_theta
-            _, rows = of.predict(theta, of.rows(ys, us))
-            out[self.lag :] = of.fold(of.slopes(theta, rows, free=False), rows)
+            function, theta = self.function, self.scaled_theta
+            _, rows = function.predict(theta, function.rows(ys, us))
+            out[self.lag :] = function.fold(function.slopes(theta, rows, free=False), rows)
         return out * (self.y_scale[:, None] / self.unit)
 
     def simulate(self, u: Array, y: Array) -> Array:
@@ -715,9 +715,9 @@ class LaggedModel(ScaledModel):
     def novelty(self, u: Array, y: Array) -> Array:
         """As `NonlinearModel.novelty`, of the regressors (see `nonlinear.records`)."""
         ys, us = scaled(self, u, y)
-        of, out = self.function, np.full(ys.shape[0], np.nan)
+        function, out = self.function, np.full(ys.shape[0], np.nan)
         if ys.shape[0] > self.lag:
-            out[self.lag :] = self.cloud.novelty(of.training_rows(self.scaled_theta, of.rows(ys, us)))
+            out[self.lag :] = self.cloud.novelty(function.training_rows(self.scaled_theta, function.rows(ys, us)))
         return out
 
     def as_json(self) -> dict[str, Any]:

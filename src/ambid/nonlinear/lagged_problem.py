@@ -69,10 +69,10 @@ class LaggedProblem:
 
     def errors(self, v: Array) -> list[Array]:
         """Return the errors of each record, scaled, shape (n_samples - lag, n_outputs); NaN from a divergence on."""
-        of, theta = self.function, self.whole(v)
+        function, theta = self.function, self.whole(v)
         if self.free:
-            return [(y - of.free_run(theta, y, u)[0])[of.lag :] for y, u in self.parts]
-        return [of.errors(theta, rows) for rows in self.rows()]
+            return [(y - function.free_run(theta, y, u)[0])[function.lag :] for y, u in self.parts]
+        return [function.errors(theta, rows) for rows in self.rows()]
 
     def cost(self, theta: Array) -> float:
         """Return the sum of squared weighted errors and of the prior's rows; infinite where the model diverges."""
@@ -80,53 +80,53 @@ class LaggedProblem:
         if not self.free and not self.function.is_stable(whole):
             return np.inf
         with np.errstate(over="ignore", invalid="ignore"):
-            found = float(np.sum(self._prior(whole)[self.live] ** 2))
-            found += sum(float(np.sum((e @ self.weight.T) ** 2)) for e in self.errors(whole))
-        return found if np.isfinite(found) else np.inf
+            total = float(np.sum(self._prior(whole)[self.live] ** 2))
+            total += sum(float(np.sum((e @ self.weight.T) ** 2)) for e in self.errors(whole))
+        return total if np.isfinite(total) else np.inf
 
     def triangle(self, theta: Array) -> Array:
         """Return the triangle of [J | r], the prior's rows included."""
         with np.errstate(over="ignore", invalid="ignore"):
-            found = [triangle_of([b.reshape(-1, b.shape[2])]) for _, b in self.blocks(theta) if b.size]
+            triangles = [triangle_of([b.reshape(-1, b.shape[2])]) for _, b in self.blocks(theta) if b.size]
         if np.any(self.precision):
-            found.append(self.prior_rows(theta))
-        return found[0] if len(found) == 1 else triangle_of([np.concatenate(found)])
+            triangles.append(self.prior_rows(theta))
+        return triangles[0] if len(triangles) == 1 else triangle_of([np.concatenate(triangles)])
 
     def blocks(self, v: Array) -> Iterator[tuple[int, Array]]:
         """Yield record number and weighted slopes and errors of some of its rows, (n, n_outputs, n_live + 1)."""
-        of, theta = self.function, self.whole(v)
-        at = of.regressors.own if self.free else of.regressors.noisy
-        reach = int(of.regressors.back[at].max(initial=0))
+        function, theta = self.function, self.whole(v)
+        at = function.regressors.own if self.free else function.regressors.noisy
+        reach = int(function.regressors.back[at].max(initial=0))
         for k, (y, u) in enumerate(self.parts):
             if self.free:
-                run, z = of.free_run(theta, y, u)
-                left, rows = (y - run)[of.lag :], of.rows_of(z, y)
+                run, z = function.free_run(theta, y, u)
+                left, rows = (y - run)[function.lag :], function.rows_of(z, y)
             else:
-                predicted, rows = of.predict(theta, self.rows()[k])
+                predicted, rows = function.predict(theta, self.rows()[k])
                 left = rows.y - predicted
             before: Array | None = None
             for first in range(0, left.shape[0], _BLOCK):
                 part = slice(first, first + _BLOCK)
                 some = rows.part(part)
-                J = of.slopes(theta, some, free=self.free, live=self.live, before=before)
+                J = function.slopes(theta, some, free=self.free, live=self.live, before=before)
                 if reach:
                     before = J[-reach:].copy() if before is None else np.concatenate([before, J])[-reach:]
-                J = of.fold(J, some)
+                J = function.fold(J, some)
                 yield k, np.matmul(self.weight, np.concatenate([J, left[part, :, None]], axis=2))
 
     def sample_rows(self, v: Array) -> list[Array]:
         """Return slopes and errors of every sample, of unit variance, (n_samples - lag, n_outputs, n_live + 1)."""
-        found: list[list[Array]] = [[] for _ in self.parts]
+        rows: list[list[Array]] = [[] for _ in self.parts]
         for k, block in self.blocks(v):
-            found[k].append(block)
-        return [np.concatenate(x) for x in found]
+            rows[k].append(block)
+        return [np.concatenate(x) for x in rows]
 
     def prior_rows(self, v: Array) -> Array:
         """Return slopes and rows of the prior, (n_priors, n_live + 1)."""
-        held = self.live & (self.precision > 0)
-        out = np.zeros((np.count_nonzero(held), np.count_nonzero(self.live) + 1))
-        out[np.arange(out.shape[0]), np.flatnonzero(held[self.live])] = self.precision[held]
-        out[:, -1] = self._prior(self.whole(v))[held]
+        informed = self.live & (self.precision > 0)
+        out = np.zeros((np.count_nonzero(informed), np.count_nonzero(self.live) + 1))
+        out[np.arange(out.shape[0]), np.flatnonzero(informed[self.live])] = self.precision[informed]
+        out[:, -1] = self._prior(self.whole(v))[informed]
         return out
 
     def _prior(self, theta: Array) -> Array:
@@ -180,12 +180,12 @@ def problem_at(
     Errors have unit variance there, or a `weight`.
     """
     none = np.zeros(function.n_theta)
-    found = LaggedProblem(
+    problem = LaggedProblem(
         function=function, parts=parts, weight=np.eye(function.n_outputs) if weight is None else weight, base=theta,
         live=np.ones(none.size, dtype=np.bool_) if live is None else live, mean=none if mean is None else mean,
         precision=none if precision is None else precision, free=free, joint=joint,
     )  # fmt: skip
-    return found.at(theta) if weight is None else found
+    return problem.at(theta) if weight is None else problem
 
 
 def whitening(noise: Array) -> Array:
@@ -216,16 +216,16 @@ def split(parts: Parts, share: float, lag: int) -> tuple[Parts, Parts]:
         return parts, ()
     cuts = [max(round(y.shape[0] * (1.0 - share)), lag + 1) for y, _ in parts]
     training = tuple((y[:c], u[:c]) for c, (y, u) in zip(cuts, parts, strict=True))
-    held = tuple((y[c - lag :], u[c - lag :]) for c, (y, u) in zip(cuts, parts, strict=True))
-    return training, held
+    validation = tuple((y[c - lag :], u[c - lag :]) for c, (y, u) in zip(cuts, parts, strict=True))
+    return training, validation
 
 
 def rms_error(function: LaggedFunction, theta: Array, parts: Parts, *, free: bool = False) -> float:
     """Return the root mean square error in deviations of the outputs; infinite where the model diverges."""
     problem = problem_at(function, parts, theta, weight=np.eye(function.n_outputs), free=free)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
-    return found if np.isfinite(found) else np.inf
+        error = float(np.sqrt(np.mean(np.concatenate(problem.errors(theta)) ** 2)))
+    return error if np.isfinite(error) else np.inf
 
 
 Size = dict[str, Any]
@@ -242,21 +242,21 @@ def choose_smallest(
     """
     if len(sizes) == 1:
         return sizes[0]
-    found = list[float]()
+    errors = list[float]()
     for one, share in zip(sizes, portions(tick, (1.0,) * len(sizes)), strict=True):
         if share is not None:
             share(f"choice of {' and '.join(one)}", 0.0)
-        found.append(score(one, share))
-        tried.append({**one, "held_out_rms": found[-1]})
-    return sizes[next((k for k, x in enumerate(found) if x <= near * min(found)), 0)]
+        errors.append(score(one, share))
+        tried.append({**one, "held_out_rms": errors[-1]})
+    return sizes[next((k for k, x in enumerate(errors) if x <= near * min(errors)), 0)]
 
 
 def lag_sizes(ny: int | None, nu: int | None, nk: int, parts: Parts, share: float) -> list[Size]:
     """Return the lags that are compared where they are left open, each once; none too many for what is held out."""
     short, some = min(y.shape[0] for y, _ in parts), bool(parts[0][1].shape[1])
     tries = [k for k in _LAGS if 3 * (k + nk) < short * share] or [1]
-    found = [{"ny": k if ny is None else ny, "nu": (k if nu is None else nu) * some} for k in tries]
-    return [x for i, x in enumerate(found) if x not in found[:i]]
+    sizes = [{"ny": k if ny is None else ny, "nu": (k if nu is None else nu) * some} for k in tries]
+    return [x for i, x in enumerate(sizes) if x not in sizes[:i]]
 
 
 def solve_linear(problem: LaggedProblem, n: int, v: Array) -> Array:
@@ -364,16 +364,16 @@ class Draft(Attempt, Generic[F]):
         """Take over other parameters."""
         self.theta = theta
 
-    def note(self, found: Found, problem: LaggedProblem, method: str) -> None:
+    def note(self, ended: Found, problem: LaggedProblem, method: str) -> None:
         """Add the learning curve of a search."""
-        noise = np.linalg.inv(problem.weight) if np.isfinite(found.cost) else np.eye(problem.weight.shape[0])
+        noise = np.linalg.inv(problem.weight) if np.isfinite(ended.cost) else np.eye(problem.weight.shape[0])
         size = float(np.sqrt(np.sum(noise**2) / noise.shape[0]))
-        self.note_curve(found, method, problem.n_errors, size)
+        self.note_curve(ended, method, problem.n_errors, size)
 
-    def settle(self, found: Found, problem: LaggedProblem, method: str) -> None:
+    def settle(self, ended: Found, problem: LaggedProblem, method: str) -> None:
         """Add the learning curve of a search, and whether it converged."""
-        self.note(found, problem, method)
-        self.status = "converged" if found.converged else "stalled"
+        self.note(ended, problem, method)
+        self.status = "converged" if ended.converged else "stalled"
 
 
 def train_watched(
@@ -390,8 +390,8 @@ def train_watched(
 
     `problem_of` gives the problem of some records about parameters, `n_linear` see `solve_linear`.
     """
-    training, held = split(draft.data.parts, share, draft.function.lag)
-    first, second = portions(tick, (1.0, 1.0 * bool(held)))
+    training, validation = split(draft.data.parts, share, draft.function.lag)
+    first, second = portions(tick, (1.0, 1.0 * bool(validation)))
 
     def run(some: Parts, **more: Any) -> tuple[LaggedProblem, Found]:
         problem = problem_of(some, draft.theta)
@@ -401,18 +401,18 @@ def train_watched(
         )
 
     def watch(theta: Array) -> float:
-        return rms_error(draft.function, theta, held)
+        return rms_error(draft.function, theta, validation)
 
-    problem, found = run(training, stage="training", held_out=watch if held else None, tick=first)
-    draft.keep(found.theta)
-    draft.note(found, problem, method)
-    draft.stopped_early = found.stopped_early
-    draft.held_out = watch(found.theta) if held else float("nan")
-    if held and not found.stopped_early:
-        _, found = run(draft.data.parts, stage="all data", tick=second)
-        draft.keep(found.theta)
-    draft.status = "converged" if found.converged else "stalled"
-    return found
+    problem, ended = run(training, stage="training", held_out=watch if validation else None, tick=first)
+    draft.keep(ended.theta)
+    draft.note(ended, problem, method)
+    draft.stopped_early = ended.stopped_early
+    draft.held_out = watch(ended.theta) if validation else float("nan")
+    if validation and not ended.stopped_early:
+        _, ended = run(draft.data.parts, stage="all data", tick=second)
+        draft.keep(ended.theta)
+    draft.status = "converged" if ended.converged else "stalled"
+    return ended
 
 
 def refine(
@@ -434,16 +434,16 @@ def refine(
     rounds = 1 if draft.function.n_outputs == 1 else 2  # the sizes of several outputs' errors are known only afterwards
     for part in portions(tick, (1.0,) * rounds):
         start = draft.theta[problem.live]
-        found = search(problem, start, stage="simulation errors", most=most, tick=part, keep=keep)
-        keep(found.theta)
-        draft.settle(found, problem, "Levenberg-Marquardt, simulation errors")
+        ended = search(problem, start, stage="simulation errors", most=most, tick=part, keep=keep)
+        keep(ended.theta)
+        draft.settle(ended, problem, "Levenberg-Marquardt, simulation errors")
         problem = problem_of(draft.theta)
 
 
 def finish(
     draft: Draft[Any],
     problem: LaggedProblem,
-    found: Laplace,
+    posterior: Laplace,
     *,
     units: str,
     how: str = "auto",
@@ -456,10 +456,10 @@ def finish(
     `units` are what a model has too many of, `how` is the setting ``uncertainty``; `why_not` says why there are no
     standard deviations. Without a `noise` model feedback does harm; `instead` says what to do then.
     """
-    records, data, taken = draft.records, draft.data, found.effective / problem.n_errors
-    if taken > _CROWDED:
+    records, data, share = draft.records, draft.data, posterior.effective / problem.n_errors
+    if share > _CROWDED:
         draft.warnings.append(
-            f"the data determine {taken:.0%} as many parameters as there are errors: the model overfits, and "
+            f"the data determine {share:.0%} as many parameters as there are errors: the model overfits, and "
             f"standard deviations are unreliable. Use fewer {units}, or a longer record"
         )
     if draft.stopped_early:
@@ -480,7 +480,7 @@ def finish(
         )
     robust = how == "sandwich" or (draft.free and how == "auto")
     origin = "sandwich" if robust else "laplace" if np.any(problem.precision) else "information"
-    covariance = found.covariance
+    covariance = posterior.covariance
     if robust and not why_not:
         covariance = sandwich_at(problem, problem.whole(draft.theta)[problem.live])
     if draft.sampled is not None:
@@ -495,27 +495,27 @@ def finish(
     elif covariance is None and not why_not:
         why_not = (
             "no standard deviations: data and prior do not determine the parameters (condition number "
-            f"{found.condition:.1e}). Use fewer {units}, or more excitation"
+            f"{posterior.condition:.1e}). Use fewer {units}, or more excitation"
         )
     if why_not:
         draft.warnings.append(why_not)
-    began, of, whole = perf_counter(), draft.function, None
-    unit = np.broadcast_to(of.unit(data.y_scale, data.u_scale), draft.theta.shape)
+    began, function, whole = perf_counter(), draft.function, None
+    unit = np.broadcast_to(function.unit(data.y_scale, data.u_scale), draft.theta.shape)
     if covariance is not None and not why_not:
         whole = np.zeros((draft.theta.size, draft.theta.size))
         whole[np.ix_(problem.live, problem.live)] = covariance
         whole *= unit[:, None] * unit
-    x = np.concatenate([of.training_rows(draft.theta, r) for r in problem.rows()])
+    x = np.concatenate([function.training_rows(draft.theta, r) for r in problem.rows()])
     model = LaggedModel(
-        dt=records[0].dt, function=of, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
-        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=of.ellipsoid),
+        dt=records[0].dt, function=function, theta=draft.theta * unit, u_level=data.u_level, u_scale=data.u_scale,
+        y_level=data.y_level, y_scale=data.y_scale, cloud=cloud_of(x, ellipsoid=function.ellipsoid),
     )  # fmt: skip
     draft.timed("result", began)
     draft.timing_s["all"] = sum(draft.timing_s.values())
     if np.any(problem.precision):
-        draft.details = {"effective_parameters": found.effective, **draft.details}
+        draft.details = {"effective_parameters": posterior.effective, **draft.details}
     return draft.result(
         model=model, covariance=whole, covariance_from="" if whole is None else origin,
         n_estimated=int(np.count_nonzero(problem.live)),
-        noise_covariance=found.noise * data.y_scale[:, None] * data.y_scale,
+        noise_covariance=posterior.noise * data.y_scale[:, None] * data.y_scale,
     )  # fmt: skip

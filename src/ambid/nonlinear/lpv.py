@@ -86,9 +86,9 @@ class LpvSettings:
     iterations: int = whole("of each search, at most; 60", 1, 2000, 60)
 
 
-def lpv_settings(given: Settings, first: IOData) -> tuple[LpvSettings, Schedule, tuple[int, ...]]:
+def lpv_settings(settings: Settings, first: IOData) -> tuple[LpvSettings, Schedule, tuple[int, ...]]:
     """Check settings beside one of the records, and complete them; with schedule and inputs that excite."""
-    s = read_settings(LpvSettings, "lpv", given)
+    s = read_settings(LpvSettings, "lpv", settings)
     if first.n_outputs != 1:
         raise EstimationError(
             f"lpv takes one output, not {', '.join(first.outputs)}; fit them separately, with the same schedule. "
@@ -146,13 +146,13 @@ def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
 
     reason = fitting.guarded(identify)
     fitting.timed("all", began)
-    of = fitting.shape
+    shape = fitting.shape
     form = {(False, False): s.error_form, (True, False): "ar", (False, True): "ma", (True, True): "arma"}
     fitting.settings |= {
-        "degree": of.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(of.ar, of.ma),
-        "form": of.form, "error_form": form[of.ar > 0, of.ma > 0],
+        "degree": shape.degree, "time_constant": fitting.schedule.time_constant, "error_order": max(shape.ar, shape.ma),
+        "form": shape.form, "error_form": form[shape.ar > 0, shape.ma > 0],
     }  # fmt: skip
-    if reason or fitting.reason or not np.isfinite(fitting.problem(of).cost(fitting.theta)):
+    if reason or fitting.reason or not np.isfinite(fitting.problem(shape).cost(fitting.theta)):
         return fitting.failed(reason or fitting.reason or DIVERGED)
     return _finish(fitting)
 
@@ -246,8 +246,8 @@ class LevelProblem:
         return v
 
     def _at(self, v: Array) -> LpvProblem:
-        of = replace(self.fitting.schedule, time_constant=float(np.exp(v[-1])))
-        return replace(self.fitting.problem(self.shape, of, beside=True), weight=self.weight)
+        schedule = replace(self.fitting.schedule, time_constant=float(np.exp(v[-1])))
+        return replace(self.fitting.problem(self.shape, schedule, beside=True), weight=self.weight)
 
 
 # --- starts by least squares ------------------------------------------------------------------------------------------
@@ -255,8 +255,8 @@ class LevelProblem:
 
 def least_squares(shape: LpvShape, parts: Sequence[Part], first: int) -> Array:
     """Fit A y = B u + c + e, all coefficients functions of p, from sample `first` on; D and C stay zero."""
-    found = _solve([shape.rows(p, p.y, first) for p in parts], [p.y[first:] for p in parts])[0]
-    return np.concatenate([found, np.zeros(shape.ar + shape.ma)])
+    theta = _solve([shape.rows(p, p.y, first) for p in parts], [p.y[first:] for p in parts])[0]
+    return np.concatenate([theta, np.zeros(shape.ar + shape.ma)])
 
 
 def from_earlier(
@@ -275,14 +275,14 @@ def from_earlier(
     """
     rows, targets = [], []
     for part, before in zip(parts, earlier or parts, strict=True):
-        found = errors(old, before, theta)
-        if not found.finite:
+        run = errors(old, before, theta)
+        if not run.finite:
             return None
         n = part.y.size
-        by = [shape.rows(part, found.x if shape.form == "output" else part.y, first)]
-        for signal, size in ((found.x - part.y, shape.ar), (found.e, shape.ma)):
-            by += [signal[first - k : n - k, None] for k in range(1, size + 1)]
-        rows.append(np.hstack(by))
+        columns = [shape.rows(part, run.x if shape.form == "output" else part.y, first)]
+        for signal, size in ((run.x - part.y, shape.ar), (run.e, shape.ma)):
+            columns += [signal[first - k : n - k, None] for k in range(1, size + 1)]
+        rows.append(np.hstack(columns))
         targets.append(part.y[first:])
     start, cost = _solve(rows, targets)
     if shape.ma:
@@ -302,10 +302,10 @@ def carry_over(shape: LpvShape, old: LpvShape, theta: Array, at: Array = _EVEN, 
         return np.asarray(np.linalg.lstsq(after, before @ values, rcond=None)[0], dtype=np.float64)
 
     out = np.zeros(shape.n_theta)
-    known = {name: k for k, name in enumerate(old.coefficients)}
+    places = {name: k for k, name in enumerate(old.coefficients)}
     for k, name in enumerate(shape.coefficients):
-        if name in known:
-            source, target = theta[old.place(known[name])], shape.place(k)
+        if name in places:
+            source, target = theta[old.place(places[name])], shape.place(k)
             n = target.stop - target.start
             out[target] = source if n == source.size and at is earlier else carried(source, n)
     return out
@@ -316,8 +316,8 @@ def _solve(rows: Sequence[Array], targets: Sequence[Array]) -> tuple[Array, floa
     R = triangle_of([np.column_stack([X, t]) for X, t in zip(rows, targets, strict=True)])
     if not np.all(np.isfinite(R)):
         return np.zeros(R.shape[1] - 1), np.inf
-    found = solve(R[:, :-1], R[:, -1])
-    return found, float(np.sum((R[:, -1] - R[:, :-1] @ found) ** 2))
+    solution = solve(R[:, :-1], R[:, -1])
+    return solution, float(np.sum((R[:, -1] - R[:, :-1] @ solution) ** 2))
 
 
 # --- candidates -------------------------------------------------------------------------------------------------------
@@ -342,8 +342,8 @@ class Candidate:
 
     def summary(self) -> dict[str, object]:
         """Return what it is and how good, for the details of a fit."""
-        of, found = self.shape, {k: v if np.isfinite(v := self.value(k)) else None for k in ("aicc", "bic")}
-        return {"form": of.form, "degree": of.degree, "ar": of.ar, "ma": of.ma, **found}
+        shape, criteria = self.shape, {k: v if np.isfinite(v := self.value(k)) else None for k in ("aicc", "bic")}
+        return {"form": shape.form, "degree": shape.degree, "ar": shape.ar, "ma": shape.ma, **criteria}
 
 
 @dataclass(slots=True, kw_only=True)
@@ -362,19 +362,21 @@ class Fitting(Attempt):
 
     def parts(self, shape: LpvShape, schedule: Schedule | None = None) -> tuple[Part, ...]:
         """Return the records, ready for a shape, with the schedule of the fit or another."""
-        of = schedule or self.schedule
+        chosen = schedule or self.schedule
         return tuple(
-            part_of(shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
+            part_of(shape, y[:, 0], u, chosen.scaled(chosen.signal(x.u, x.y, x.dt)))
             for x, (y, u) in zip(self.records, self.data.parts, strict=True)
         )
 
     def problem(self, shape: LpvShape, schedule: Schedule | None = None, *, beside: bool = False) -> LpvProblem:
         """Return what is searched in for a shape; with slopes by the set point's time constant if `beside`."""
-        of = schedule or self.schedule
+        chosen = schedule or self.schedule
         near = [
-            self.parts(shape, replace(of, time_constant=of.time_constant * np.exp(x))) for x in (STEP, -STEP) if beside
+            self.parts(shape, replace(chosen, time_constant=chosen.time_constant * np.exp(x)))
+            for x in (STEP, -STEP)
+            if beside
         ]
-        parts = self.parts(shape, of)
+        parts = self.parts(shape, chosen)
         return LpvProblem(shape=shape, parts=parts, first=self.first, beside=tuple(zip(*near, strict=True)))
 
     def refine_level(self, best: Candidate, tick: Tick | None) -> Array:
@@ -382,13 +384,13 @@ class Fitting(Attempt):
         weight = float(np.sqrt(best.n / best.cost))
         problem = LevelProblem(fitting=self, shape=best.shape, weight=weight)
         start = np.append(best.theta, np.log(self.schedule.time_constant))
-        found = search(
+        vector = search(
             problem, start, stage="set point", most=self.most, tolerance=1e-9, enough=0.01, move=problem.move, tick=tick
         ).theta
-        old, self.schedule = self.schedule, self.schedule.over(self.records, float(np.exp(found[-1])))
+        old, self.schedule = self.schedule, self.schedule.over(self.records, float(np.exp(vector[-1])))
         earlier = old.scaled(self.schedule.middle + self.schedule.half * _EVEN)
         self.tried = [replace(x, theta=carry_over(x.shape, x.shape, x.theta, _EVEN, earlier)) for x in self.tried]
-        return carry_over(best.shape, best.shape, found[:-1], _EVEN, earlier)
+        return carry_over(best.shape, best.shape, vector[:-1], _EVEN, earlier)
 
     @property
     def level_counts(self) -> bool:
@@ -415,27 +417,27 @@ class Fitting(Attempt):
             return Candidate(shape=shape, theta=start)
         weight = 1.0 / max(np.sqrt(cost / max(problem.n_errors, 1)), 1e-12)
 
-        def keep(found: Array) -> None:
+        def keep(theta: Array) -> None:
             if last:
-                self.theta = found
+                self.theta = theta
 
-        found = search(
+        ended = search(
             replace(problem, weight=weight), start, stage=stage, most=self.most, tolerance=1e-9,
             enough=1e-8 if last else _ENOUGH, tick=tick, keep=keep,
         )  # fmt: skip
         if last:
-            self.theta, self.status = found.theta, "converged" if found.converged else "stalled"
-            self.note_curve(found, "Levenberg-Marquardt, prediction errors", problem.n_errors, 1.0 / weight)
+            self.theta, self.status = ended.theta, "converged" if ended.converged else "stalled"
+            self.note_curve(ended, "Levenberg-Marquardt, prediction errors", problem.n_errors, 1.0 / weight)
         n, starts_n = problem.n_errors, len(problem.parts) * shape.n_start
-        return Candidate(shape=shape, theta=found.theta, cost=found.cost / weight**2, n=n, starts=starts_n)
+        return Candidate(shape=shape, theta=ended.theta, cost=ended.cost / weight**2, n=n, starts=starts_n)
 
-    def better(self, found: Candidate, best: Candidate | None, criterion: str) -> Candidate:
+    def better(self, candidate: Candidate, best: Candidate | None, criterion: str) -> Candidate:
         """Return the better of two, which is held on to."""
-        if best is not None and np.isfinite(best.cost) and not found.value(criterion) < best.value(criterion):
+        if best is not None and np.isfinite(best.cost) and not candidate.value(criterion) < best.value(criterion):
             return best
-        if np.isfinite(found.cost):
-            self.shape, self.theta = found.shape, found.theta
-        return found
+        if np.isfinite(candidate.cost):
+            self.shape, self.theta = candidate.shape, candidate.theta
+        return candidate
 
 
 # --- what is chosen where nothing is said -----------------------------------------------------------------------------
@@ -479,9 +481,9 @@ def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | 
     earlier, values = fitting.parts(shape), list[float]()
     trial = replace(shape, degree=2 if degree is None else max(degree, 1))
     tried = [fitting.schedule.over(fitting.records, tau) for tau in grid]
-    for of in tried if len(grid) > 1 and np.isfinite(model.cost) else ():
-        found = from_earlier(trial, fitting.parts(trial, of), fitting.first, shape, model.theta, earlier)
-        cost = np.inf if found is None else found[1]
+    for schedule in tried if len(grid) > 1 and np.isfinite(model.cost) else ():
+        candidate = from_earlier(trial, fitting.parts(trial, schedule), fitting.first, shape, model.theta, earlier)
+        cost = np.inf if candidate is None else candidate[1]
         values.append(Candidate(shape=trial, theta=model.theta, cost=cost, n=model.n).value("bic"))
     fitting.limits = grid[0], max(dt * _MOST * shortest, grid[-1])
     chosen = slowest_that_does(grid, values) if values and np.isfinite(min(values)) else grid[0]
@@ -499,9 +501,9 @@ def by_degree(
         starts = [carry_over(trial, white, fitting.by_equations(white))]
         if np.isfinite(best.cost):
             starts.append(carry_over(trial, best.shape, best.theta))
-        found = fitting.search(trial, starts, own, f"degree {degree}")
-        fitting.tried.append(found)
-        best = fitting.better(found, best, criterion)
+        candidate = fitting.search(trial, starts, own, f"degree {degree}")
+        fitting.tried.append(candidate)
+        best = fitting.better(candidate, best, criterion)
     return best
 
 
@@ -524,14 +526,14 @@ def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick:
         for ar, ma in ([(x.ar, 0), (0, x.ma)] if x.ar and x.ma else []) + [(x.ar, x.ma)]
     ]
     steps = list(dict.fromkeys(steps))
-    known = {best.shape: best}
+    fitted = {best.shape: best}
     chosen = best if best.shape in wanted else None
     white = replace(best.shape, ar=0, ma=0, form="equation")
     process = best.theta[: white.n_theta]
     for shape, own in zip(steps, portions(tick, [1.0] * len(steps)), strict=True):
-        if shape in known:
+        if shape in fitted:
             continue
-        earlier = [x for x in known.values() if np.isfinite(x.cost)]
+        earlier = [x for x in fitted.values() if np.isfinite(x.cost)]
         earlier.sort(key=lambda x: (x.shape.form != shape.form, x.value("bic")))
         if shape.form == "output" and both and not earlier[0].shape.is_stable(earlier[0].theta):
             continue  # earlier[0]: the best of the equation form, or of the output form, which is stable
@@ -540,11 +542,11 @@ def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick:
             regression = from_earlier(shape, fitting.parts(shape), fitting.first, x.shape, x.theta)
             starts += [carry_over(shape, x.shape, x.theta), None if regression is None else regression[0]]
         kinds = [f"{k} {n}" for k, n in (("AR", shape.ar), ("MA", shape.ma)) if n]
-        found = fitting.search(shape, starts, own, f"{shape.form} form, {', '.join(kinds) or 'white'} errors")
-        fitting.tried.append(found)
-        known[shape] = found
+        candidate = fitting.search(shape, starts, own, f"{shape.form} form, {', '.join(kinds) or 'white'} errors")
+        fitting.tried.append(candidate)
+        fitted[shape] = candidate
         if shape in wanted:
-            chosen = fitting.better(found, chosen, "bic")
+            chosen = fitting.better(candidate, chosen, "bic")
     return chosen or best
 
 
@@ -554,16 +556,16 @@ def by_form(fitting: Fitting, wanted: Sequence[LpvShape], best: Candidate, tick:
 def _finish(fitting: Fitting) -> NonlinearFit:
     """Return the fit of a model that runs."""
     records = fitting.records
-    problem, theta, of, d = fitting.problem(fitting.shape), fitting.theta, fitting.schedule, fitting.data
+    problem, theta, level, d = fitting.problem(fitting.shape), fitting.theta, fitting.schedule, fitting.data
     noise = problem.cost(theta) / problem.freedom
     R = fitting.problem(fitting.shape, beside=fitting.level_counts).triangle(theta)
     inverse, condition = information_inverse(R[:, :-1]) if np.all(np.isfinite(R)) else (None, np.inf)
     near = [
-        regressors(fitting.shape, y[:, 0], u, of.scaled(of.signal(x.u, x.y, x.dt)))
+        regressors(fitting.shape, y[:, 0], u, level.scaled(level.signal(x.u, x.y, x.dt)))
         for x, (y, u) in zip(records, d.parts, strict=True)
     ]
     model = LpvModel(
-        dt=records[0].dt, shape=fitting.shape, schedule=of, theta=theta,
+        dt=records[0].dt, shape=fitting.shape, schedule=level, theta=theta,
         u_level=d.u_level, u_scale=d.u_scale, y_level=d.y_level, y_scale=d.y_scale,
         cloud=cloud_of(np.concatenate(near)),
     )  # fmt: skip
@@ -579,10 +581,10 @@ def _finish(fitting: Fitting) -> NonlinearFit:
         covariance = (
             (noise * inverse[: theta.size, : theta.size] + _disagreement(fitting)) * model.unit[:, None] * model.unit
         )
-    column = records[0].outputs[0] if of.column < 0 else of.name
+    column = records[0].outputs[0] if level.column < 0 else level.name
     fitting.details = {
         "schedule": {
-            "signal": of.name, "low": of.low, "high": of.high, "time_constant_s": of.time_constant,
+            "signal": level.name, "low": level.low, "high": level.high, "time_constant_s": level.time_constant,
             "unit": records[0].units[column],
         },
         "condition": condition, "frozen": _frozen_table(model, covariance, records[0].inputs),
@@ -611,44 +613,46 @@ def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[st
             inputs[column]: (g, sd) for column, g, sd in zip(model.shape.columns, at.dc_gain, gain_sd, strict=True)
         }
         out.append({"p": p, "poles_rad_s": poles, "dc_gain": gains})
-    found: list[dict[str, object]] = plain_json(out)
-    return found
+    table: list[dict[str, object]] = plain_json(out)
+    return table
 
 
 def _cautions(records: Sequence[IOData], fitting: Fitting) -> list[str]:
-    found, of = list[str](), fitting.shape
-    if of.columns and not (of.ar or of.ma) and not all(x.open_loop for x in records):
-        what = "noise is white" if of.form == "output" else "equation errors are white"
-        found.append(
+    cautions, shape = list[str](), fitting.shape
+    if shape.columns and not (shape.ar or shape.ma) and not all(x.open_loop for x in records):
+        what = "noise is white" if shape.form == "output" else "equation errors are white"
+        cautions.append(
             f"without an error model (error_order = 0) lpv is biased by feedback unless its {what}. Raise "
             f"error_order, or give {setting('open_loop', True)} if the records are open loop"
         )
-    if not of.columns and records[0].n_inputs:
-        found.append(
+    if not shape.columns and records[0].n_inputs:
+        cautions.append(
             f"no input acts on the output: {fitting.schedule.name!r}, the only one, changes coefficients only. "
             "Name the input that does"
         )
-    if of.degree == 0:
-        found.append(
+    if shape.degree == 0:
+        cautions.append(
             f"no coefficient depends on the scheduling signal {fitting.schedule.name!r} (degree 0"
             f"{'' if not fitting.tried or len(fitting.tried) < 2 else ', by the criterion'}): this is a linear model"
         )
     close = [str(x.shape.degree) for x, worse in _other_degrees(fitting) if abs(worse) < _CLOSE]
     if close:
-        found.append(
-            f"the choice of degree {of.degree} is not clear: degree {' and '.join(close)} fits about as well. The "
+        cautions.append(
+            f"the choice of degree {shape.degree} is not clear: degree {' and '.join(close)} fits about as well. The "
             "standard deviations include their difference. Give the degree if you know it"
         )
-    return found
+    return cautions
 
 
 def _other_degrees(fitting: Fitting) -> list[tuple[Candidate, float]]:
     """Candidates of other degrees, everything else alike, and by how much Akaike's criterion is worse of each."""
-    of = fitting.shape
+    shape = fitting.shape
     alike = {
-        x.shape.degree: x for x in fitting.tried if replace(x.shape, degree=of.degree) == of and np.isfinite(x.cost)
+        x.shape.degree: x
+        for x in fitting.tried
+        if replace(x.shape, degree=shape.degree) == shape and np.isfinite(x.cost)
     }
-    own = alike.pop(of.degree, None)
+    own = alike.pop(shape.degree, None)
     return [] if own is None else [(x, x.value("aicc") - own.value("aicc")) for x in alike.values()]
 
 
@@ -658,11 +662,11 @@ def _disagreement(fitting: Fitting) -> Array:
     Each other degree counts by its Akaike weight with the square of what its coefficients differ by over the range of
     p: unconditional variance, sec. 4.3.
     """
-    of, theta = fitting.shape, fitting.theta
-    found = [
-        (np.exp(-max(worse, 0.0) / 2.0), carry_over(of, x.shape, x.theta) - theta)
+    shape, theta = fitting.shape, fitting.theta
+    others = [
+        (np.exp(-max(worse, 0.0) / 2.0), carry_over(shape, x.shape, x.theta) - theta)
         for x, worse in _other_degrees(fitting)
     ]
-    total = 1.0 + sum(w for w, _ in found)
-    out: Array = sum((w / total * np.outer(d, d) for w, d in found), np.zeros((theta.size, theta.size)))
+    total = 1.0 + sum(w for w, _ in others)
+    out: Array = sum((w / total * np.outer(d, d) for w, d in others), np.zeros((theta.size, theta.size)))
     return out

@@ -90,8 +90,8 @@ class Schedule:
 
     def over(self, records: Sequence[IOData], time_constant: float) -> Schedule:
         """Return the schedule with a low-pass, and the range that it then has in the records."""
-        of = replace(self, time_constant=time_constant)
-        whole = np.concatenate([of.signal(x.u, x.y, x.dt)[1:] for x in records])
+        schedule = replace(self, time_constant=time_constant)
+        whole = np.concatenate([schedule.signal(x.u, x.y, x.dt)[1:] for x in records])
         low, high = float(whole.min()), float(whole.max())
         if not high - low > 1e-12 * max(abs(low), abs(high)):
             raise EstimationError(
@@ -99,7 +99,7 @@ class Schedule:
                 "distinguished from a linear one. Give records at several set points, or fit a linear structure "
                 "(bj, ararmax)"
             )
-        return replace(of, low=low, high=high)
+        return replace(schedule, low=low, high=high)
 
     def scaled(self, p: Array | float) -> Array:
         """Return p as the functions of it take it, -1 to 1 in training."""
@@ -195,8 +195,8 @@ class LpvShape:
     def split(self, theta: Array) -> tuple[Array, Array, Array, Array]:
         """Return coefficients by function of p, of A (order, K) and of inputs and constant; and those of D and C."""
         n, K = self.n_process_theta, self.degree + 1
-        by = np.append(theta[:n], np.zeros(self.n_process * K - n)).reshape(-1, K)
-        return by[: self.order], by[self.order :], theta[n : n + self.ar], theta[n + self.ar :]
+        columns = np.append(theta[:n], np.zeros(self.n_process * K - n)).reshape(-1, K)
+        return columns[: self.order], columns[self.order :], theta[n : n + self.ar], theta[n + self.ar :]
 
     def lagged_inputs(self, u: Array) -> Array:
         """Return the scaled inputs that each sample depends on, zeros before the record, and a column of ones."""
@@ -212,9 +212,9 @@ class LpvShape:
     def rows(self, part: Part, z: Array, first: int) -> Array:
         """Return the regressors of A (past values of z), B and the constant from sample `first` on."""
         n, phi = z.size, part.phi[first:]
-        by = [-z[first - k : n - k, None] * phi for k in range(1, self.order + 1)]
-        by += [part.W[first:, i, None] * phi for i in range(part.W.shape[1] - 1)]
-        return np.hstack([*by, phi[:, : self.n_offset]])
+        columns = [-z[first - k : n - k, None] * phi for k in range(1, self.order + 1)]
+        columns += [part.W[first:, i, None] * phi for i in range(part.W.shape[1] - 1)]
+        return np.hstack([*columns, phi[:, : self.n_offset]])
 
     def is_stable(self, theta: Array) -> bool:
         """Whether the frozen process part is stable over the range of p."""
@@ -363,27 +363,27 @@ class LpvProblem:
         P, k, rows = self.shape.n_theta, self.shape.n_start, list[Array]()
         for r, part in enumerate(self.parts):
             start, e = self._project(part, theta)
-            found = None if e is None else errors(self.shape, part, theta, start, slopes=2)
-            if found is None or not found.finite:
+            run = None if e is None else errors(self.shape, part, theta, start, slopes=2)
+            if run is None or not run.finite:
                 return np.full((P + 1, P + 1 + bool(self.beside)), np.nan)
-            J = [found.J[:, P:], found.J[:, :P]]
+            J = [run.J[:, P:], run.J[:, :P]]
             for slower, faster in self.beside[r : r + 1]:
                 later, sooner = (errors(self.shape, x, theta, start).g for x in (slower, faster))
                 J.append((later - sooner)[:, None] / (2.0 * STEP))
-            R = triangle_of([np.column_stack([*J, found.e])[self.first :]])
+            R = triangle_of([np.column_stack([*J, run.e])[self.first :]])
             rows.append(np.asarray(np.linalg.qr(R, mode="r"))[k:, k:])
         return triangle_of(rows) * self.weight
 
     def _project(self, part: Part, theta: Array) -> tuple[Array, Array | None]:
         """Start that explains most, and the innovations with it."""
         k, P = self.shape.n_start, self.shape.n_theta
-        found = errors(self.shape, part, theta, slopes=1 if k else 0)
-        if not found.finite:
+        run = errors(self.shape, part, theta, slopes=1 if k else 0)
+        if not run.finite:
             return np.zeros(k), None
-        e = found.e[self.first :]
+        e = run.e[self.first :]
         if not k:
             return np.zeros(0), e
-        J = found.J[self.first :, P:]
+        J = run.J[self.first :, P:]
         if not np.all(np.isfinite(J)):
             return np.zeros(k), None
         R = triangle_of([np.column_stack([J, e])])
@@ -414,10 +414,10 @@ def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False
     if not k or part.y.size < last:
         return np.zeros(k), np.zeros((k, P))
     head = part.head(last)
-    found = errors(shape, head, theta, slopes=1)
-    if not found.finite:
+    run = errors(shape, head, theta, slopes=1)
+    if not run.finite:
         return None
-    e, J = found.e[shape.lag :], found.J[shape.lag :, P:]
+    e, J = run.e[shape.lag :], run.J[shape.lag :, P:]
     weight = np.ones(k)
     weight[: k - shape.ma] = _STATES
     H = J.T @ J + np.diag(weight)
@@ -495,12 +495,12 @@ class LpvModel(ScaledModel):
     @cached_property
     def unit(self) -> Array:
         """What a scaled parameter of 1 is in SI, shape (n_theta,)."""
-        of = self.shape
-        out, y = np.ones(of.n_theta), float(self.y_scale[0])
-        for i, column in enumerate(of.columns):
-            for k in range(of.nb):
-                out[of.place(of.order + i * of.nb + k)] = y / self.u_scale[column]
-        out[of.place(of.n_process - 1)] = y
+        shape = self.shape
+        out, y = np.ones(shape.n_theta), float(self.y_scale[0])
+        for i, column in enumerate(shape.columns):
+            for k in range(shape.nb):
+                out[shape.place(shape.order + i * shape.nb + k)] = y / self.u_scale[column]
+        out[shape.place(shape.n_process - 1)] = y
         return out
 
     def at(self, p: float, covariance: Array | None = None) -> Frozen:
@@ -508,11 +508,11 @@ class LpvModel(ScaledModel):
 
         Outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs.
         """
-        of, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
-        na, nb, m = of.order, of.nb, len(of.columns)
-        G = np.zeros((of.n_process - 1, of.n_theta))
-        for k in range(of.n_process - 1):
-            G[k, of.place(k)] = basis_values(s, of.degree + 1)[0]
+        shape, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
+        na, nb, m = shape.order, shape.nb, len(shape.columns)
+        G = np.zeros((shape.n_process - 1, shape.n_theta))
+        for k in range(shape.n_process - 1):
+            G[k, shape.place(k)] = basis_values(s, shape.degree + 1)[0]
         values = G @ self.theta
         a, b = np.concatenate([[1.0], values[:na]]), values[na:].reshape(m, nb)
         z = roots_of(a)
@@ -521,14 +521,14 @@ class LpvModel(ScaledModel):
             gain = b.sum(axis=1) / a.sum()
             slope = root_derivative(a, z)[:, 1:] / (z * self.dt)[:, None]
         turn = np.lexsort((-poles.imag, -poles.real))
-        found = Frozen(a=a, b=b, poles=poles[turn], dc_gain=gain)
+        frozen = Frozen(a=a, b=b, poles=poles[turn], dc_gain=gain)
         if covariance is None:
-            return found
+            return frozen
         P = G @ covariance @ G.T
         by_gain = np.hstack([-gain[:, None].repeat(na, axis=1), np.eye(m).repeat(nb, axis=1)]) / a.sum()
         sd = np.sqrt(np.maximum(np.diag(P), 0.0))
         return replace(
-            found, a_sd=np.concatenate([[0.0], sd[:na]]), b_sd=sd[na:].reshape(m, nb),
+            frozen, a_sd=np.concatenate([[0.0], sd[:na]]), b_sd=sd[na:].reshape(m, nb),
             poles_sd=(_spread(slope.real, P[:na, :na]) + 1j * _spread(slope.imag, P[:na, :na]))[turn],
             dc_gain_sd=_spread(by_gain, P),
         )  # fmt: skip
@@ -537,10 +537,10 @@ class LpvModel(ScaledModel):
         """As `NonlinearModel.predict`; NaN everywhere if the predictor diverges."""
         part = self._part(u, y)
         start = beginning(self.shape, part, self.scaled_theta)
-        found = None if start is None else errors(self.shape, part, self.scaled_theta, start[0])
+        run = None if start is None else errors(self.shape, part, self.scaled_theta, start[0])
         out = np.full((part.y.size, 1), np.nan)
-        if found is not None and found.finite:
-            out[self.lag :, 0] = found.g[self.lag :]
+        if run is not None and run.finite:
+            out[self.lag :, 0] = run.g[self.lag :]
         predicted: Array = self.y_level + self.y_scale * out
         return predicted
 
@@ -548,10 +548,10 @@ class LpvModel(ScaledModel):
         """As `NonlinearModel.jacobian`."""
         part, P = self._part(u, y), self.theta.size
         start = beginning(self.shape, part, self.scaled_theta, slopes=True)
-        found = None if start is None else errors(self.shape, part, self.scaled_theta, start[0], slopes=2)
+        run = None if start is None else errors(self.shape, part, self.scaled_theta, start[0], slopes=2)
         J = np.full((part.y.size, P), np.nan)
-        if start is not None and found is not None and found.finite:
-            J = found.J[:, :P] + found.J[:, P:] @ start[1]
+        if start is not None and run is not None and run.finite:
+            J = run.J[:, :P] + run.J[:, P:] @ start[1]
         out = (J * (self.y_scale / self.unit))[:, None, :]
         out[: self.lag] = 0.0
         return np.asarray(out)
@@ -562,15 +562,15 @@ class LpvModel(ScaledModel):
 
         whole, head = with_head(self, u, y)
         ys, us = scaled(self, u, whole)
-        of, found, column = self.shape, np.ascontiguousarray(ys[:, 0]), self.schedule.column
-        s = np.zeros(found.size) if column < 0 else self.schedule.scaled(np.asarray(u, dtype=np.float64)[:, column])
+        shape, outputs, column = self.shape, np.ascontiguousarray(ys[:, 0]), self.schedule.column
+        s = np.zeros(outputs.size) if column < 0 else self.schedule.scaled(np.asarray(u, dtype=np.float64)[:, column])
         level, size = float(self.y_level[0]), float(self.y_scale[0])
-        a, b, _, _ = of.split(self.scaled_theta)
+        a, b, _, _ = shape.split(self.scaled_theta)
         scheduled_run(
-            found, of.lagged_inputs(us), np.ascontiguousarray(s), head, a, b,
+            outputs, shape.lagged_inputs(us), np.ascontiguousarray(s), head, a, b,
             self.schedule.share(self.dt), (self.schedule.middle - level) / size, self.schedule.half / size,
         )  # fmt: skip
-        out: Array = self.y_level + self.y_scale * found[:, None]
+        out: Array = self.y_level + self.y_scale * outputs[:, None]
         out[:head] = whole[:head]
         return out
 
@@ -600,28 +600,28 @@ class LpvModel(ScaledModel):
 
     def as_json(self) -> dict[str, Any]:
         """As `NonlinearModel.as_json`."""
-        of = {"shape": fields_json(self.shape), "schedule": fields_json(self.schedule)}
-        return {"dt_s": self.dt, "n_inputs": self.n_inputs, **of, **self.numbers_json()}
+        parts = {"shape": fields_json(self.shape), "schedule": fields_json(self.schedule)}
+        return {"dt_s": self.dt, "n_inputs": self.n_inputs, **parts, **self.numbers_json()}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
-        m, shape = int(found["n_inputs"]), read_as(LpvShape, found["shape"], "shape")
-        schedule, columns = read_as(Schedule, found["schedule"], "schedule"), shape.columns
+        m, shape = int(document["n_inputs"]), read_as(LpvShape, document["shape"], "shape")
+        schedule, columns = read_as(Schedule, document["schedule"], "schedule"), shape.columns
         words = shape.form in ("equation", "output") and shape.offset in ("scheduled", "constant")
         if not words or not schedule.high > schedule.low:
             raise ValueError("form, offset or range of the schedule are invalid")
         sizes = (shape.order, shape.nb, shape.nk, shape.ar, shape.ma, shape.degree)
         if not all(0 <= k < m for k in columns) or not -1 <= schedule.column < m or min(sizes) < 0:
             raise ValueError("columns or orders are invalid")
-        numbers = read_numbers(found, shape.n_theta, m, 1, shape.n_process)
-        return cls(dt=float(found["dt_s"]), shape=shape, schedule=schedule, **numbers)
+        numbers = read_numbers(document, shape.n_theta, m, 1, shape.n_process)
+        return cls(dt=float(document["dt_s"]), shape=shape, schedule=schedule, **numbers)
 
 
-def _spread(by: Array, P: Array) -> Array:
+def _spread(slopes: Array, P: Array) -> Array:
     """Standard deviations of values with these slopes."""
-    found: Array = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", by, P, by), 0.0))
-    return found
+    sd: Array = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", slopes, P, slopes), 0.0))
+    return sd
 
 
 def regressors(shape: LpvShape, y: Array, u: Array, s: Array) -> Array:

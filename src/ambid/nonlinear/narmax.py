@@ -132,29 +132,29 @@ def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick |
     choosing, below, noise, pruning, last = portions(tick, costs)
     began = perf_counter()
     if by_run:
-        found = choose_by_simulation(s, parts, choosing, lambda x: fitting.take(x, free=True))
+        choice = choose_by_simulation(s, parts, choosing, lambda x: fitting.take(x, free=True))
     else:
-        found = process_terms(s, parts, choosing)
+        choice = process_terms(s, parts, choosing)
     if s.kind == "rational":
-        found = rational_terms(s, found, parts, part_of(below, 0.0, 0.5))
-        found = _search(parts, found, fitting, part_of(below, 0.5, 1.0))
+        choice = rational_terms(s, choice, parts, part_of(below, 0.0, 0.5))
+        choice = _search(parts, choice, fitting, part_of(below, 0.5, 1.0))
     if not (by_run and free):
         if by_run:  # coefficients by one-step errors for terms that were chosen, and fitted, by the free run
-            found = found.with_theta(found.search(parts, free=False).theta)
-        _keep(fitting, parts, found)
+            choice = choice.with_theta(choice.search(parts, free=False).theta)
+        _keep(fitting, parts, choice)
         began = fitting.timed("terms", began)
         if s.ne:
-            found = add_noise_terms(s, found, parts, part_of(noise, 0.0, 0.4))
-            found = _search(parts, found, fitting, part_of(noise, 0.4, 1.0))
+            choice = add_noise_terms(s, choice, parts, part_of(noise, 0.0, 0.4))
+            choice = _search(parts, choice, fitting, part_of(noise, 0.4, 1.0))
         began = fitting.timed("noise terms", began)
-        found = _prune(s, parts, found, fitting, pruning)
+        choice = _prune(s, parts, choice, fitting, pruning)
         began = fitting.timed("pruning", began)
     else:
         began = fitting.timed("terms", began)
     if free:
-        found = found.without_noise()
-        if np.isfinite(found.cost(parts, free=True)):
-            _search(parts, found, fitting, last, free=True)
+        choice = choice.without_noise()
+        if np.isfinite(choice.cost(parts, free=True)):
+            _search(parts, choice, fitting, last, free=True)
         else:
             fitting.status = "stalled"
             fitting.warnings.append(
@@ -164,49 +164,49 @@ def _run_stages(s: NarmaxSettings, parts: Parts, fitting: _Fitting, tick: Tick |
         fitting.timed("simulation errors", began)
 
 
-def _weight(found: Choice, parts: Parts, *, free: bool = False) -> Array:
+def _weight(choice: Choice, parts: Parts, *, free: bool = False) -> Array:
     """What gives the errors of a choice unit variance."""
-    problem = found.problem(parts, free=free)
-    return problem.weight_for(np.concatenate(problem.errors(found.theta)))
+    problem = choice.problem(parts, free=free)
+    return problem.weight_for(np.concatenate(problem.errors(choice.theta)))
 
 
-def _keep(fitting: _Fitting, parts: Parts, found: Choice) -> None:
+def _keep(fitting: _Fitting, parts: Parts, choice: Choice) -> None:
     """Keep a choice if it runs."""
-    if np.isfinite(found.cost(parts)):
-        fitting.take(found, free=False)
+    if np.isfinite(choice.cost(parts)):
+        fitting.take(choice, free=False)
 
 
 def _search(
-    parts: Parts, found: Choice, fitting: _Fitting, tick: Tick | None, *, free: bool = False, most: int = _ITERATIONS
+    parts: Parts, choice: Choice, fitting: _Fitting, tick: Tick | None, *, free: bool = False, most: int = _ITERATIONS
 ) -> Choice:
     """Search for coefficients; a model that is linear in them and has no innovations is where it should be already."""
-    if not free and not np.any(found.function.noisy) and not found.function.is_rational:
-        _keep(fitting, parts, found)
-        return found
-    weight = _weight(found, parts, free=free)
+    if not free and not np.any(choice.function.noisy) and not choice.function.is_rational:
+        _keep(fitting, parts, choice)
+        return choice
+    weight = _weight(choice, parts, free=free)
 
     def keep(theta: Array) -> None:
-        fitting.take(found.with_theta(theta), free=free)
+        fitting.take(choice.with_theta(theta), free=free)
 
-    ended = found.search(parts, weight=weight, free=free, most=most, tick=tick, keep=keep)
+    ended = choice.search(parts, weight=weight, free=free, most=most, tick=tick, keep=keep)
     if not np.isfinite(ended.cost):
-        return found
-    problem = found.problem(parts, free=free, weight=weight)
+        return choice
+    problem = choice.problem(parts, free=free, weight=weight)
     fitting.settle(ended, problem, f"Levenberg-Marquardt, {'simulation' if free else 'prediction'} errors")
     keep(ended.theta)
-    return found.with_theta(ended.theta)
+    return choice.with_theta(ended.theta)
 
 
-def _prune(s: NarmaxSettings, parts: Parts, found: Choice, fitting: _Fitting, tick: Tick | None) -> Choice:
+def _prune(s: NarmaxSettings, parts: Parts, choice: Choice, fitting: _Fitting, tick: Tick | None) -> Choice:
     if s.pruning == "none":
-        return found
+        return choice
     if s.pruning == "simulation":
-        n = samples(parts, found.function.lag)
+        n = samples(parts, choice.function.lag)
         fewer = prune_by_simulation(
-            found, parts, lambda x: x.value(s.criterion, parts, n, free=True), part_of(tick, 0.0, 0.6)
+            choice, parts, lambda x: x.value(s.criterion, parts, n, free=True), part_of(tick, 0.0, 0.6)
         )
-        return found if fewer is found else _search(parts, fewer, fitting, part_of(tick, 0.6, 1.0))
-    weight = _weight(found, parts)
+        return choice if fewer is choice else _search(parts, fewer, fitting, part_of(tick, 0.6, 1.0))
+    weight = _weight(choice, parts)
 
     def prune(x: Choice, share: float, *, noise: bool = True, most: int = _ITERATIONS) -> Choice:
         for k in range(_PRUNINGS):  # a search between, for what may go is judged where the rest is at its best
@@ -217,10 +217,10 @@ def _prune(s: NarmaxSettings, parts: Parts, found: Choice, fitting: _Fitting, ti
                 break
         return x
 
-    best = prune(found, 0.0)
+    best = prune(choice, 0.0)
     ended = fitting.status
-    richer = add_all_noise(s, found)
-    if richer is not found and np.any(found.function.noisy):
+    richer = add_all_noise(s, choice)
+    if richer is not choice and np.any(choice.function.noisy):
         # An equation multiplied by a polynomial in q^-1 predicts as well, with other noise terms: only where all of
         # these are there can the surplus process terms go one by one.
         other = _search(parts, richer, fitting, part_of(tick, 0.25, 0.5), most=_ROUGHLY)
@@ -232,35 +232,35 @@ def _prune(s: NarmaxSettings, parts: Parts, found: Choice, fitting: _Fitting, ti
     return best
 
 
-def _value(s: NarmaxSettings, parts: Parts, found: Choice, weight: Array) -> float:
+def _value(s: NarmaxSettings, parts: Parts, choice: Choice, weight: Array) -> float:
     """Information criterion of the one-step errors of all outputs."""
-    n = samples(parts, found.function.lag) * found.function.n_outputs
-    return found.value(s.criterion, parts, n, weight=weight)
+    n = samples(parts, choice.function.lag) * choice.function.n_outputs
+    return choice.value(s.criterion, parts, n, weight=weight)
 
 
 def _finish(s: NarmaxSettings, fitting: _Fitting) -> NonlinearFit:
     """Return the fit of a model that runs."""
-    of, theta, first = fitting.function, fitting.theta, fitting.records[0]
+    function, theta, first = fitting.function, fitting.theta, fitting.records[0]
     problem = fitting.choice.problem(fitting.data.parts, free=fitting.free).at(theta)
-    found = laplace(problem, theta)
+    posterior = laplace(problem, theta)
     terms = {
         first.outputs[o]: [
-            {"term": term_name(x, of.n_outputs, of.m), "err": fitting.choice.err.get((o, x))} for x in own
+            {"term": term_name(x, function.n_outputs, function.m), "err": fitting.choice.err.get((o, x))} for x in own
         ]
-        for o, own in enumerate(of.numerators)
+        for o, own in enumerate(function.numerators)
     }
     fitting.details = {
         "terms": terms, "candidates": fitting.choice.n_candidates, "passes": fitting.choice.passes,
         "levels": fitting.data.levels(first),
     }  # fmt: skip
     fitting.settings["focus"] = "simulation" if fitting.free else "prediction"
-    for rows in problem.rows() if of.is_rational else ():
-        below = of.terms_block.denominators(theta, of.predict(theta, rows)[1].prepared[0])
+    for rows in problem.rows() if function.is_rational else ():
+        below = function.terms_block.denominators(theta, function.predict(theta, rows)[1].prepared[0])
         if np.any(np.min(below, axis=0) < _NEAR_ZERO * np.max(np.abs(below), axis=0)):
             near_zero = "a denominator comes near zero on the training data: predictions there are unreliable"
             fitting.warnings.append(near_zero)
             break
     return finish(
-        fitting, problem, found, units="terms", noise=s.ne > 0 and not fitting.free,
+        fitting, problem, posterior, units="terms", noise=s.ne > 0 and not fitting.free,
         instead="Give focus = prediction" if fitting.free else "Raise ne",
     )  # fmt: skip

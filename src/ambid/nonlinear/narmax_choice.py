@@ -111,13 +111,13 @@ _WITH_MAGNITUDE: Mapping[str, object] = {
 }
 
 
-def narmax_settings(given: Mapping[str, object], *, n_inputs: int) -> NarmaxSettings:
+def narmax_settings(settings: Mapping[str, object], *, n_inputs: int) -> NarmaxSettings:
     """Check settings and complete them; without inputs there are no lags of them."""
-    s = read_settings(NarmaxSettings, "narmax", given)
+    s = read_settings(NarmaxSettings, "narmax", settings)
     if s.output != "signed":  # a sign that is not measured is found by simulation
         for name, value in _WITH_MAGNITUDE.items():
-            if given.get(name, value) != value:
-                raise EstimationError(f"narmax: output = {s.output} needs {name} = {value}; it is {given[name]!r}")
+            if settings.get(name, value) != value:
+                raise EstimationError(f"narmax: output = {s.output} needs {name} = {value}; it is {settings[name]!r}")
         s = replace(s, **_WITH_MAGNITUDE)  # type: ignore[arg-type]
     if not n_inputs:
         s = replace(s, nu=0, nk=1)
@@ -204,16 +204,16 @@ def process_terms(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> Choice:
     """Choose the terms without innovations by orthogonal least squares, and their coefficients by least squares."""
     p, m = parts[0][0].shape[1], parts[0][1].shape[1]
     terms = process_candidates(s, p, m)
-    found = candidates(terms, parts, s.lag)
+    rows = candidates(terms, parts, s.lag)
     num, theta, err, passes = [], [], {}, 0
     for o in range(p):
         target = np.concatenate([y[s.lag :, o] for y, _ in parts])
-        chosen = _choose(s, found, target, part_of(tick, o / p, (o + 1) / p))
+        chosen = _choose(s, rows, target, part_of(tick, o / p, (o + 1) / p))
         n_best = len(chosen.order) if s.selection == "all" else max(chosen.n_best, 1)  # no model without a term
         picks = chosen.order[:n_best] or (0,)
         err.update({(o, terms[k]): float(x) for k, x in zip(picks, chosen.err, strict=False)})
         num.append(tuple(terms[k] for k in picks))
-        theta.append(least_squares(found.columns(picks), target))
+        theta.append(least_squares(rows.columns(picks), target))
         passes = max(passes, chosen.passes)
     function = PolynomialFunction(numerators=tuple(num), denominators=((),) * p, m=m)
     return Choice(function=function, theta=np.concatenate(theta), err=err, n_candidates=len(terms), passes=passes)
@@ -225,16 +225,16 @@ def process_candidates(s: NarmaxSettings, n_outputs: int, n_inputs: int) -> tupl
     return products(factors, s.degree, constant=bool(s.constant), odd=s.symmetry == "odd")
 
 
-def is_sampled_fast(found: Choice) -> bool:
+def is_sampled_fast(model: Choice) -> bool:
     """Return whether an output's last value takes so much of an error reduction ratio that the ratios say little."""
-    return any(x == (Factor("y", o, 1),) and ratio > _NEARLY_ALL for (o, x), ratio in found.err.items())
+    return any(x == (Factor("y", o, 1),) and ratio > _NEARLY_ALL for (o, x), ratio in model.err.items())
 
 
-def _choose(s: NarmaxSettings, found: Candidates | MatrixCandidates, y: Array, tick: Tick | None) -> Selection:
+def _choose(s: NarmaxSettings, pool: Candidates | MatrixCandidates, y: Array, tick: Tick | None) -> Selection:
     """Choose as the settings say."""
-    most = len(found.terms) if s.selection == "all" else min(s.terms, max(y.size // 5, 1))
+    most = len(pool.terms) if s.selection == "all" else min(s.terms, max(y.size // 5, 1))
     tell = None if tick is None else lambda done: tick("choice of terms", done)
-    return select_terms(found, y, most=most, criterion=s.criterion, tick=tell)
+    return select_terms(pool, y, most=most, criterion=s.criterion, tick=tell)
 
 
 def rational_terms(s: NarmaxSettings, polynomial: Choice, parts: Parts, tick: Tick | None) -> Choice:
@@ -253,16 +253,16 @@ def rational_terms(s: NarmaxSettings, polynomial: Choice, parts: Parts, tick: Ti
         for k in range(_RATIONAL_ROUNDS):
             begin, each = (o * _RATIONAL_ROUNDS + k) / (p * _RATIONAL_ROUNDS), 1.0 / (p * _RATIONAL_ROUNDS)
             matrix = np.hstack([P, -yhat[:, None] * D])
-            found = _choose(s, MatrixCandidates(matrix=matrix), target, part_of(tick, begin, begin + each))
-            picks = np.array(sorted(found.chosen, key=lambda k: k >= len(up)), dtype=np.int64)
+            pick = _choose(s, MatrixCandidates(matrix=matrix), target, part_of(tick, begin, begin + each))
+            picks = np.array(sorted(pick.chosen, key=lambda k: k >= len(up)), dtype=np.int64)
             trial, below = least_squares(matrix[:, picks], target), picks >= len(up)
             divided = 1.0 + D[:, picks[below] - len(up)] @ trial[below]
             if not (picks.size and np.all(divided > 1e-3)):
                 break
             best, c = [(o, int(k >= len(up)), both[k]) for k in picks], trial
             yhat = (P[:, picks[~below]] @ trial[~below]) / divided
-            err.update({(o, up[k]): float(x) for k, x in zip(found.chosen, found.err, strict=False) if k < len(up)})
-            passes = max(passes, found.passes)
+            err.update({(o, up[k]): float(x) for k, x in zip(pick.chosen, pick.err, strict=False) if k < len(up)})
+            passes = max(passes, pick.passes)
         owned += best
         theta.append(c)
     function = polynomial.function.with_terms(owned)
@@ -292,8 +292,8 @@ def add_noise_terms(s: NarmaxSettings, process: Choice, parts: Parts, tick: Tick
             if rounds < _CHOOSING:  # process terms are in the regression, not in the choice
                 rows, first = candidates((*own[o], *extra), parts, s.lag, errors, over[o]), range(len(own[o]))
                 most = len(first) + s.terms
-                found = select_terms(rows, targets[o], most=most, criterion=s.criterion, first=first)
-                chosen[o] = tuple(rows.terms[k] for k in found.chosen if k >= len(first))
+                selection = select_terms(rows, targets[o], most=most, criterion=s.criterion, first=first)
+                chosen[o] = tuple(rows.terms[k] for k in selection.chosen if k >= len(first))
             num.append((*own[o], *chosen[o]))
             rows = candidates(num[o], parts, s.lag, errors, over[o])
             theta.append(least_squares(rows.columns(range(len(num[o]))), targets[o]))
@@ -315,21 +315,21 @@ def _innovations_of_long_model(process: Choice, parts: Parts, errors: list[Array
     Where noise on the output is sampled fast, least squares without noise terms is so biased that its errors are nearly
     white, and no noise term pays beside them.
     """
-    n, of = min(int(y.shape[0]) for y, _ in parts), process.function
-    most = min(_LONG, n // (10 * (of.n_outputs + of.m)))
-    if of.is_rational or most <= of.lag:
+    n, function = min(int(y.shape[0]) for y, _ in parts), process.function
+    most = min(_LONG, n // (10 * (function.n_outputs + function.m)))
+    if function.is_rational or most <= function.lag:
         return errors
-    linear = [(f,) for f in lagged(of.n_outputs, of.m, ny=most, nu=most, nk=1)]
+    linear = [(f,) for f in lagged(function.n_outputs, function.m, ny=most, nu=most, nk=1)]
     num, theta = [], []
-    for o, terms in enumerate(of.numerators):
+    for o, terms in enumerate(function.numerators):
         num.append((*terms, *(x for x in linear if x not in terms)))
         rows = candidates(num[o], parts, most)
         theta.append(least_squares(rows.columns(range(len(num[o]))), np.concatenate([y[most:, o] for y, _ in parts])))
-    found = innovations(process.with_numerators(num, theta), parts)
-    if found is None:
+    improved = innovations(process.with_numerators(num, theta), parts)
+    if improved is None:
         return errors
-    size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, found)]
-    return found if np.any(size[1] < _LESS * size[0]) else errors
+    size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, improved)]
+    return improved if np.any(size[1] < _LESS * size[0]) else errors
 
 
 def _over_denominator(s: NarmaxSettings, process: Choice, parts: Parts, output: int) -> tuple[Array, ...] | None:
@@ -342,20 +342,20 @@ def _over_denominator(s: NarmaxSettings, process: Choice, parts: Parts, output: 
     return tuple(np.split(1.0 / values, np.cumsum(rows.rows)[:-1]))
 
 
-def add_all_noise(s: NarmaxSettings, found: Choice) -> Choice:
+def add_all_noise(s: NarmaxSettings, model: Choice) -> Choice:
     """Return the choice with every innovation that it may have, those that are new at zero; the same if none is."""
-    of = found.function
-    extra = [(f,) for f in lagged(of.n_outputs, of.m, ny=0, nu=0, nk=1, ne=s.ne)]
-    more = [[x for x in extra if x not in terms] for terms in of.numerators]
+    function = model.function
+    extra = [(f,) for f in lagged(function.n_outputs, function.m, ny=0, nu=0, nk=1, ne=s.ne)]
+    more = [[x for x in extra if x not in terms] for terms in function.numerators]
     if not any(more):
-        return found
-    num = [(*terms, *new) for terms, new in zip(of.numerators, more, strict=True)]
-    return found.with_numerators(num, [np.append(found.coefficients(o), np.zeros(len(x))) for o, x in enumerate(more)])
+        return model
+    num = [(*terms, *new) for terms, new in zip(function.numerators, more, strict=True)]
+    return model.with_numerators(num, [np.append(model.coefficients(o), np.zeros(len(x))) for o, x in enumerate(more)])
 
 
-def innovations(found: Choice, parts: Parts) -> list[Array] | None:
+def innovations(model: Choice, parts: Parts) -> list[Array] | None:
     """Return the one-step errors of each record, zero before the first prediction; None where they diverge."""
-    errors, lag = found.problem(parts).errors(found.theta), found.function.lag
+    errors, lag = model.problem(parts).errors(model.theta), model.function.lag
     if not all(np.all(np.isfinite(e)) for e in errors):
         return None
     return [np.concatenate([np.zeros((lag, e.shape[1])), e]) for e in errors]
@@ -364,54 +364,54 @@ def innovations(found: Choice, parts: Parts) -> list[Array] | None:
 # --- pruning ----------------------------------------------------------------------------------------------------------
 
 
-def prune_by_prediction(found: Choice, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Choice:
+def prune_by_prediction(model: Choice, parts: Parts, weight: Array, criterion: str, *, noise: bool = True) -> Choice:
     """Leave out terms as long as the information criterion of the one-step errors falls; `noise`: innovations too."""
-    n = samples(parts, found.function.lag)
-    m = max(found.n_candidates, found.theta.size)
-    while found.theta.size > found.function.n_outputs:
-        R, cost = found.problem(parts, weight=weight).triangle(found.theta), found.cost(parts, weight=weight)
+    n = samples(parts, model.function.lag)
+    m = max(model.n_candidates, model.theta.size)
+    while model.theta.size > model.function.n_outputs:
+        R, cost = model.problem(parts, weight=weight).triangle(model.theta), model.cost(parts, weight=weight)
         if not np.all(np.isfinite(R)):
             break
-        loss, inverse = _find_losses(R, found.theta)
-        saved = penalty(criterion, found.theta.size, n, m) - penalty(criterion, found.theta.size - 1, n, m)
-        may = _may_go(found, noise=noise)
+        loss, inverse = _find_losses(R, model.theta)
+        saved = penalty(criterion, model.theta.size, n, m) - penalty(criterion, model.theta.size - 1, n, m)
+        may = _may_go(model, noise=noise)
         order = np.argsort(np.where(may, loss, np.inf), kind="stable")[:_PRUNED]
-        trials = (_readjust(found, inverse, int(k)) for k in order if may[k] and loss[k] < saved)
+        trials = (_readjust(model, inverse, int(k)) for k in order if may[k] and loss[k] < saved)
         fewer = next((x for x in trials if x.cost(parts, weight=weight) < _WORSE * cost), None)
         if fewer is None:
             break
-        found = fewer
-    return found
+        model = fewer
+    return model
 
 
 def prune_by_simulation(
-    found: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None, *, anew: bool = False
+    model: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None, *, anew: bool = False
 ) -> Choice:
     """Leave out process terms as long as `value` falls, an information criterion of the simulation errors.
 
     With `again` only the least significant term is tried at a time, and coefficients are searched again without it.
     """
-    now, before = value(found), found.theta.size
-    while found.theta.size > max(found.function.n_outputs, 2 * anew) and np.isfinite(now):
+    now, before = value(model), model.theta.size
+    while model.theta.size > max(model.function.n_outputs, 2 * anew) and np.isfinite(now):
         if tick is not None:
-            tick("simulation-error pruning", guessed(before - found.theta.size, _USUAL_PRUNED))
-        R = found.problem(parts, free=anew).triangle(found.theta)
+            tick("simulation-error pruning", guessed(before - model.theta.size, _USUAL_PRUNED))
+        R = model.problem(parts, free=anew).triangle(model.theta)
         if not np.all(np.isfinite(R)):
             break
-        loss, inverse = _find_losses(R, found.theta)
-        may = np.flatnonzero(_may_go(found, noise=False))
+        loss, inverse = _find_losses(R, model.theta)
+        may = np.flatnonzero(_may_go(model, noise=False))
         if anew:
             may = may[np.argmin(loss[may], keepdims=True)]
         if anew:
-            trials = [_simulated(found.without(int(k), np.delete(found.theta, k)), parts) for k in may]
+            trials = [_simulated(model.without(int(k), np.delete(model.theta, k)), parts) for k in may]
         else:
-            trials = [_readjust(found, inverse, int(k)) for k in may]
+            trials = [_readjust(model, inverse, int(k)) for k in may]
         values = [value(x) for x in trials]
         if not values or not min(values) < now:
             break
         best = int(np.argmin(values))
-        found, now = trials[best], values[best]
-    return found
+        model, now = trials[best], values[best]
+    return model
 
 
 def _find_losses(R: Array, theta: Array) -> tuple[Array, Array]:
@@ -422,17 +422,17 @@ def _find_losses(R: Array, theta: Array) -> tuple[Array, Array]:
     return theta**2 / np.maximum(variance, 1e-300), inverse
 
 
-def _readjust(found: Choice, inverse: Array, k: int) -> Choice:
+def _readjust(model: Choice, inverse: Array, k: int) -> Choice:
     """The choice without term k, the other coefficients adjusted."""
     covariance = inverse @ inverse[k]
-    return found.without(k, np.delete(found.theta - covariance * (found.theta[k] / max(covariance[k], 1e-300)), k))
+    return model.without(k, np.delete(model.theta - covariance * (model.theta[k] / max(covariance[k], 1e-300)), k))
 
 
-def _may_go(found: Choice, *, noise: bool) -> np.ndarray:
+def _may_go(model: Choice, *, noise: bool) -> np.ndarray:
     """Whether a term may be left out: an output keeps one term at least, innovations go only with `noise`."""
-    of = found.function
-    alone = np.array([not below and len(of.numerators[o]) == 1 for o, below, _ in of.owned])
-    return np.asarray(~alone & (noise | ~of.noisy))
+    function = model.function
+    alone = np.array([not below and len(function.numerators[o]) == 1 for o, below, _ in function.owned])
+    return np.asarray(~alone & (noise | ~function.noisy))
 
 
 # --- by simulation ----------------------------------------------------------------------------------------------------
@@ -450,45 +450,45 @@ def choose_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, kee
     first, trials, tried = part_of(tick, 0.0, 0.3), part_of(tick, 0.3, 1.0), 0
     if s.output == "signed":
         linear = replace(s, degree=1, selection="all", ne=0)
-        found = _simulated(process_terms(linear, parts, None), parts)
+        model = _simulated(process_terms(linear, parts, None), parts)
     else:
-        found = _start_of_magnitude(s, parts, first)
-    found = replace(found, n_candidates=len(terms))
+        model = _start_of_magnitude(s, parts, first)
+    model = replace(model, n_candidates=len(terms))
 
     def value(x: Choice) -> float:
         return x.value(s.criterion, parts, n, free=True)
 
-    now = value(found)
+    now = value(model)
     if not np.isfinite(now):
-        return found
-    keep(found)
-    while found.theta.size < most:
+        return model
+    keep(model)
+    while model.theta.size < most:
         better = None
-        for term in _promising(found, terms, parts)[:_ADDED]:
+        for term in _promising(model, terms, parts)[:_ADDED]:
             if trials is not None:
                 trials("choice of terms by simulation", guessed(tried, _USUAL_TRIALS))
             tried += 1
-            wider = found.with_numerators([(*found.function.numerators[0], term)], [np.append(found.theta, 0.0)])
+            wider = model.with_numerators([(*model.function.numerators[0], term)], [np.append(model.theta, 0.0)])
             trial = prune_by_simulation(_simulated(wider, parts), parts, value, anew=True)
             if value(trial) < now:
                 better = trial
                 break
         if better is None:
             break
-        found, now = better, value(better)
-        keep(found)
-    return found
+        model, now = better, value(better)
+        keep(model)
+    return model
 
 
-def _simulated(found: Choice, parts: Parts) -> Choice:
-    return found.with_theta(found.search(parts, free=True, most=25).theta)
+def _simulated(model: Choice, parts: Parts) -> Choice:
+    return model.with_theta(model.search(parts, free=True, most=25).theta)
 
 
-def _promising(found: Choice, terms: tuple[Term, ...], parts: Parts) -> list[Term]:
+def _promising(model: Choice, terms: tuple[Term, ...], parts: Parts) -> list[Term]:
     """Candidates outside the model, the largest error reduction ratio beside its terms first."""
-    inside = found.function.numerators[0]
+    inside = model.function.numerators[0]
     outside = [x for x in terms if x not in set(inside)]
-    wide = found.with_numerators([(*inside, *outside)], [np.append(found.theta, np.zeros(len(outside)))])
+    wide = model.with_numerators([(*inside, *outside)], [np.append(model.theta, np.zeros(len(outside)))])
     R, k = wide.problem(parts, free=True).triangle(wide.theta), len(inside)
     if not outside or not np.all(np.isfinite(R)):
         return []
@@ -507,8 +507,8 @@ def _start_of_magnitude(s: NarmaxSettings, parts: Parts, tick: Tick | None) -> C
             tick("sign of the output", k / _REFINED)
         theta = np.concatenate([-A[1:], gain * (np.array(delays) == d)])
         trial = Choice(function=function, theta=theta)
-        found = trial.search(parts, free=True, most=30)
-        if best is None or found.cost < least:
-            best, least = trial.with_theta(found.theta), found.cost
+        ended = trial.search(parts, free=True, most=30)
+        if best is None or ended.cost < least:
+            best, least = trial.with_theta(ended.theta), ended.cost
     assert best is not None
     return best

@@ -125,9 +125,9 @@ class NarxFunction(LaggedFunction):
         return {"sizes": {"n_outputs": self.p, "n_inputs": self.m, **sizes}}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back."""
-        sizes = {k: int(v) for k, v in found["sizes"].items()}
+        sizes = {k: int(v) for k, v in document["sizes"].items()}
         return cls(p=sizes.pop("n_outputs"), m=sizes.pop("n_inputs"), **sizes)
 
 
@@ -148,10 +148,10 @@ def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: 
     )  # fmt: skip
     if reason := draft.guarded(lambda: _identify(s, draft, tick)):
         return draft.failed(reason)
-    of = draft.function
-    draft.settings |= {"ny": of.ny, "nu": of.nu, "neurons": of.neurons}
+    network = draft.function
+    draft.settings |= {"ny": network.ny, "nu": network.nu, "neurons": network.neurons}
     draft.settings["focus"] = "simulation" if draft.free else "prediction"
-    problem = narx_problem(of, data.parts, draft.theta, s.prior, free=draft.free)
+    problem = narx_problem(network, data.parts, draft.theta, s.prior, free=draft.free)
     if not np.isfinite(problem.cost(draft.theta)):
         return draft.failed(NO_WEIGHTS)
     draft.details = {"stopped_early": draft.stopped_early, "held_out_rms": draft.held_out, **draft.details}
@@ -196,10 +196,10 @@ def _choose_sizes(s: NarxSettings, draft: Draft[NarxFunction], tick: Tick | None
     def score(size: Size, tick: Tick | None) -> float:
         function = _function(parts, size["ny"], size["nu"], s.nk, size["neurons"])
         most = max(_MOST_ROWS // len(parts), 4 * function.lag + 40)
-        training, held = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
+        training, validation = split(tuple((y[:most], u[:most]) for y, u in parts), share, function.lag)
         problem = narx_problem(function, training, linear_start(function, training, int(function.edges[1])), s.prior)
         start = _random_start(problem, function, np.random.default_rng(draft.seed))
-        watch = partial(_error, function, held)
+        watch = partial(_error, function, validation)
         return min(
             _train(problem, function, start, stage="choice", most=_ITERATIONS, held_out=watch, tick=tick).held_out
         )
@@ -230,17 +230,17 @@ def _train(problem: LaggedProblem, function: NarxFunction, start: Array, **optio
 
 def _train_all(s: NarxSettings, function: NarxFunction, draft: Draft[NarxFunction], tick: Tick | None) -> None:
     """Train from several starts, and go on with the best."""
-    training, held = split(draft.data.parts, s.held_out, function.lag)
+    training, validation = split(draft.data.parts, s.held_out, function.lag)
     draft.function, draft.theta = function, linear_start(function, training, int(function.edges[1]))
     problem = narx_problem(function, training, draft.theta, s.prior)
     rng, least = np.random.default_rng(draft.seed), np.inf
-    watch = partial(_error, function, held) if held else None
+    watch = partial(_error, function, validation) if validation else None
     starts = s.starts if function.neurons else 1
-    first, second = portions(tick, (starts * _FIRST, 2 * _FIRST * (1 + bool(held))))
+    first, second = portions(tick, (starts * _FIRST, 2 * _FIRST * (1 + bool(validation))))
     for share in portions(first, (1.0,) * starts):
         start, most = _random_start(problem, function, rng), min(_FIRST, s.iterations)
         ended = _train(problem, function, start, stage="starts", most=most, held_out=watch, tick=share)
-        error = min(ended.held_out) if held else ended.cost
+        error = min(ended.held_out) if validation else ended.cost
         if error < least:
             least = error
             draft.keep(ended.theta)

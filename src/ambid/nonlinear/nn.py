@@ -120,19 +120,19 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
         _check_magnitude(records, {k: v for k, v in chosen.items() if k in settings})
     s: dict[str, Any] = {"starts": 20, **chosen, **_MAGNITUDE} if unsigned else {**_SIGNED, **chosen}
     data = scaled_records("nn", records, lag=40 + int(s.get("delay", 0)), levels="zero" if unsigned else "mean")
-    asked, first = str(s["form"]), records[0]
+    requested, first = str(s["form"]), records[0]
     units = [first.units.get(x) for x in first.outputs]
     fits = (
         [first.units.get(x) for x in first.inputs] == ["V"]
         and {"m", "A"} <= set(units) <= set(_UNITS)
         and len(set(units)) == len(units)
     )
-    if asked == "one-axis" and not fits:
+    if requested == "one-axis" and not fits:
         raise EstimationError(
             "nn: form one-axis needs one input in V and outputs in m and A (and m/s); here "
             f"{', '.join(f'{x} [{first.units.get(x)}]' for x in (*first.inputs, *first.outputs))}. Choose form free"
         )
-    s["form"] = "one-axis" if fits and asked != "free" else "free"
+    s["form"] = "one-axis" if fits and requested != "free" else "free"
     fitting = Fitting(structure="nn", records=records, settings=s, seed=seed, whole=data, data=data)
     reason = NO_START
     try:
@@ -142,7 +142,7 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
             reason = _start(fitting, tick)
             if not reason:
                 _train_all(fitting, part_of(tick, *_TRAINING))
-            reason = _rescue(fitting, tick, reason, asked="evaluations" in settings)
+            reason = _rescue(fitting, tick, reason, requested="evaluations" in settings)
             _caution(fitting)
     except KeyboardInterrupt:
         fitting.interrupt()
@@ -168,11 +168,11 @@ def _heads(fitting: Fitting) -> tuple[int, ...]:
 
 def _start(fitting: Fitting, tick: Tick | None) -> str:
     """Find the delay and a first network; return the reason where there is none."""
-    given = fitting.settings.get("delay")
+    requested = fitting.settings.get("delay")
     with fitting.stage("start"):
-        fitting.shift(guess_delay(fitting.whole) if given is None else int(given))
+        fitting.shift(guess_delay(fitting.whole) if requested is None else int(requested))
         reason = _find_first(fitting)
-    if given is not None or fitting.state is None:
+    if requested is not None or fitting.state is None:
         return reason
     with fitting.stage("delay"):
         begun: State | str = fitting.state
@@ -202,13 +202,13 @@ def _find_first(fitting: Fitting) -> str:
     reason, data, s = "", fitting.data, fitting.settings
     for past in (SHORT, *_LONG):
         heads = _heads(fitting) if s["form"] == "one-axis" else ()
-        found = first_network(data, fitting.dt, 3 if heads else s.get("states") or data.n_outputs, heads, past)
-        if isinstance(found, str):
-            reason = reason or found
+        network = first_network(data, fitting.dt, 3 if heads else s.get("states") or data.n_outputs, heads, past)
+        if isinstance(network, str):
+            reason = reason or network
             continue
-        if fitting.state is None or found.score < fitting.state.score:
-            fitting.state = found
-        if found.widen(gain=False).simulates(data):
+        if fitting.state is None or network.score < fitting.state.score:
+            fitting.state = network
+        if network.widen(gain=False).simulates(data):
             break
         reason = reason or NO_START
     return "" if fitting.state is not None else reason
@@ -228,8 +228,8 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
     if fitting.counts_states:
         p = data.n_outputs
         starts = {n: [first_network(data, fitting.dt, n)] for n in range(p, p + _LARGEST + 1)}
-        found = _choose_states(fitting, starts, choice, patience=2, stage="choice of states", iterations=6)
-        fitting.state = found.state if found is not None else fitting.state
+        best = _choose_states(fitting, starts, choice, patience=2, stage="choice of states", iterations=6)
+        fitting.state = best.state if best is not None else fitting.state
     first = fitting.state
     if s["descent"] and descent:
         with fitting.stage("one-step training"):
@@ -300,15 +300,15 @@ def _choose_states(
 # --- a sensor without sign -------------------------------------------------------------------------------------------
 
 
-def _check_magnitude(records: Sequence[IOData], given: Mapping[str, object]) -> None:
-    used = ("output", "starts", "iterations", "states", "neurons")
-    for name, value in given.items():
-        if name not in used and value not in ("auto", _MAGNITUDE[name]):
+def _check_magnitude(records: Sequence[IOData], settings: Mapping[str, object]) -> None:
+    names = ("output", "starts", "iterations", "states", "neurons")
+    for name, value in settings.items():
+        if name not in names and value not in ("auto", _MAGNITUDE[name]):
             raise EstimationError(
-                f"nn: {name} = {value!r} does not apply with output = magnitude; known there: {', '.join(used)}. "
+                f"nn: {name} = {value!r} does not apply with output = magnitude; known there: {', '.join(names)}. "
                 "Omit it"
             )
-    states = given.get("states")
+    states = settings.get("states")
     if isinstance(states, int) and states > MOST_STATES:
         raise EstimationError(f"nn: states = {states} with output = magnitude; at most {MOST_STATES}. Lower it")
     for r, x in enumerate(records):
@@ -353,8 +353,8 @@ def _choose_units(fitting: Fitting, linear: State, tick: Tick | None) -> int:
     for share in _FOLDS:
         cut = [round(share * y.shape[0]) for y, _ in data.parts]
         fewer = _first_samples(data, cut)
-        found = train(linear, fewer, stage="linear part", iterations=int(s["iterations"]))
-        base = linear if found is None else found.state
+        refitted = train(linear, fewer, stage="linear part", iterations=int(s["iterations"]))
+        base = linear if refitted is None else refitted.state
         squares[0] += _error_ahead(base, data, cut) ** 2
         for neurons in range(1, _MOST_UNITS + 1):
             trained = _train_units(s, base, fewer, neurons, [fitting.seed, neurons], next(parts))
@@ -383,22 +383,22 @@ def _error_ahead(at: State, data: Scaled, cut: list[int]) -> float:
 # --- rescue ----------------------------------------------------------------------------------------------------------
 
 
-def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, asked: bool) -> str:
+def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, requested: bool) -> str:
     """Search globally where ordinary starts failed, and train what was found; return what is left of the reason.
 
-    Where the search was `asked` for, errors that are suspect are enough.
+    Where the search was `requested` for, errors that are suspect are enough.
     """
     s, before, why = fitting.settings, fitting.state, reason
     if before is not None:
         left = misfit(before, fitting.data)
-        if left.failed or (asked and left.suspect):
+        if left.failed or (requested and left.suspect):
             why = str(left)
     if not why or s["form"] != "one-axis" or not s["evaluations"]:
         return reason
     second = replace(fitting, state=None, rivals=[], curves=[], details={}, timing_s={})
     try:
         with fitting.stage("global search"):
-            second.state, found = search_start(
+            second.state, result = search_start(
                 fitting.data, fitting.dt, _heads(fitting), seed=fitting.seed, evaluations=int(s["evaluations"]),
                 tick=part_of(tick, *_RESCUE) or silent,
             )  # fmt: skip
@@ -415,19 +415,19 @@ def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, asked: bool) ->
     after = second.state
     better = _is_better(after, before)
     fitting.details["global_search"] = {
-        "why": why, "failed_starts": 1 + len(_LONG), "evaluations": found.evaluations, "seconds": found.seconds,
+        "why": why, "failed_starts": 1 + len(_LONG), "evaluations": result.evaluations, "seconds": result.seconds,
         "log_det_errors_before": None if before is None else before.score,
         "log_det_errors_after": None if after is None else after.score, "taken": better,
     }  # fmt: skip
-    said = (
+    message = (
         f"{1 + len(_LONG)} ordinary starts failed ({why}): a global search (differential evolution, "
-        f"{found.evaluations} evaluations) "
+        f"{result.evaluations} evaluations) "
     )
     if not better or after is None:
-        fitting.warnings.append(said + "found nothing better. Check channels, their signs and units, and the delay")
+        fitting.warnings.append(message + "found nothing better. Check channels, their signs and units, and the delay")
         return reason
     gained = f"improved the errors from {before.size:.3g} to" if before else "found a network whose errors have"
-    fitting.warnings.append(said + f"{gained} {after.size:.3g} of the outputs' standard deviations")
+    fitting.warnings.append(message + f"{gained} {after.size:.3g} of the outputs' standard deviations")
     for name in ("state", "status", "data", "delay", "rivals"):
         setattr(fitting, name, getattr(second, name))
     fitting.curves += second.curves

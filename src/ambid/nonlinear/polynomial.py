@@ -86,7 +86,7 @@ def terms_to_json(terms: Sequence[Sequence[Term]]) -> list[list[list[list[Any]]]
     return [[[[f.kind, f.channel, f.lag] for f in term] for term in own] for own in terms]
 
 
-def terms_from_json(found: Any, n_outputs: int, n_inputs: int) -> tuple[tuple[Term, ...], ...]:
+def terms_from_json(document: Any, n_outputs: int, n_inputs: int) -> tuple[tuple[Term, ...], ...]:
     """Read the terms of each output back."""
     channels = {"y": n_outputs, "u": n_inputs, "e": n_outputs}
 
@@ -99,7 +99,7 @@ def terms_from_json(found: Any, n_outputs: int, n_inputs: int) -> tuple[tuple[Te
             raise ValueError("terms name channels that the model does not have")
         return Factor(kind, channel, lag)
 
-    out = tuple(tuple(tuple(sorted(factor(f) for f in term)) for term in own) for own in found)
+    out = tuple(tuple(tuple(sorted(factor(f) for f in term)) for term in own) for own in document)
     if len(out) != n_outputs:
         raise ValueError("terms are not those of each output")
     return out
@@ -190,8 +190,8 @@ class PolynomialFunction(LaggedFunction):
     def names(self) -> tuple[str, ...]:
         """Of the coefficients: their terms; denominators in the form ``1/(...)``."""
         p, channel = len(self.numerators), channel_names("y", len(self.numerators))
-        named = [(o, below, term_name(x, p, self.m)) for o, below, x in self.owned]
-        return tuple((f"{channel[o]}: " if p > 1 else "") + (f"1/({x})" if below else x) for o, below, x in named)
+        names = [(o, below, term_name(x, p, self.m)) for o, below, x in self.owned]
+        return tuple((f"{channel[o]}: " if p > 1 else "") + (f"1/({x})" if below else x) for o, below, x in names)
 
     @cached_property
     def _linear(self) -> Array:
@@ -222,13 +222,13 @@ class PolynomialFunction(LaggedFunction):
         }
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Self:
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
         """Read it back."""
-        p, m = len(found["numerators"]), int(found["n_inputs"])
-        num, den = (terms_from_json(found[k], p, m) for k in ("numerators", "denominators"))
-        if found["output"] not in OUTPUTS:
+        p, m = len(document["numerators"]), int(document["n_inputs"])
+        num, den = (terms_from_json(document[k], p, m) for k in ("numerators", "denominators"))
+        if document["output"] not in OUTPUTS:
             raise ValueError(f"output is none of {', '.join(OUTPUTS)}")
-        return cls(numerators=num, denominators=den, m=m, folded=found["output"] == "magnitude")
+        return cls(numerators=num, denominators=den, m=m, folded=document["output"] == "magnitude")
 
 
 _BLOCK = 4096  # rows at a time: a block of some hundred candidates stays in the cache of the second level
@@ -300,10 +300,12 @@ def candidates(
     factors = sorted({f for t in terms for f in t})
     parts = []
     for r, (y, u) in enumerate(records):
-        of, n = {"y": y, "u": u}, y.shape[0]
+        kinds, n = {"y": y, "u": u}, y.shape[0]
         if innovations is not None:
-            of["e"] = innovations[r]
-        parts.append({f: np.ascontiguousarray(of[f.kind][lag - f.lag : max(n - f.lag, 0), f.channel]) for f in factors})
+            kinds["e"] = innovations[r]
+        parts.append(
+            {f: np.ascontiguousarray(kinds[f.kind][lag - f.lag : max(n - f.lag, 0), f.channel]) for f in factors}
+        )
     rows = tuple(max(y.shape[0] - lag, 0) for y, _ in records)
     return Candidates(terms=tuple(terms), parts=tuple(parts), rows=rows, weight=weight)
 
@@ -355,7 +357,7 @@ class Selection:
 
 
 def select_terms(
-    found: Candidates | MatrixCandidates,
+    pool: Candidates | MatrixCandidates,
     y: Array,
     *,
     most: int,
@@ -390,8 +392,8 @@ def select_terms(
         If the criterion is not known.
     """
     penalty(criterion, 1, 10, 1)
-    state = _Gram(found, np.ascontiguousarray(y, dtype=np.float64), tick)
-    n, m = state.y.size, len(found.terms)
+    state = _Gram(pool, np.ascontiguousarray(y, dtype=np.float64), tick)
+    n, m = state.y.size, len(pool.terms)
     most = min(max(most, len(first)), m, n - 1)
     err: list[float] = []
     while len(state.order) < most and state.unexplained():
@@ -415,8 +417,8 @@ def select_terms(
 class _Gram:
     """Scalar products of what is left of candidates and output, orthogonal to those chosen so far."""
 
-    def __init__(self, found: Candidates | MatrixCandidates, y: Array, tick: Callable[[float], object] | None) -> None:
-        self.found, self.y, self.tick = found, y, tick
+    def __init__(self, pool: Candidates | MatrixCandidates, y: Array, tick: Callable[[float], object] | None) -> None:
+        self.found, self.y, self.tick = pool, y, tick
         self.order: list[int] = []
         self.path: list[float] = []
         self.passes = 0
@@ -424,7 +426,7 @@ class _Gram:
         self.lengths: Array | None = None
         self.base = 1.0
         self.gram, self.product, self.squared = np.empty((0, 0)), np.empty(0), np.empty(0)
-        self.alive = np.ones(len(found.terms), dtype=bool)
+        self.alive = np.ones(len(pool.terms), dtype=bool)
         self.left = 1.0 if self.energy > 0 else 0.0
         self.rows, self.since = np.empty((8, self.alive.size)), 0
         self._measure()

@@ -195,14 +195,14 @@ class RbfFunction(LaggedFunction):
         return {"sizes": sizes, "unit": "gaussian", "metric": self.metric.tolist()}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back."""
-        sizes = {k: int(v) for k, v in found["sizes"].items()}
+        sizes = {k: int(v) for k, v in document["sizes"].items()}
         p, m, linear = sizes.pop("n_outputs"), sizes.pop("n_inputs"), bool(sizes.pop("linear"))
         width = p * sizes["ny"] + m * sizes["nu"]
-        metric = finite(found["metric"], np.size(found["metric"]), "metric").reshape(-1, width)
-        if found["unit"] != "gaussian":
-            raise ValueError(f"units are {found['unit']!r}, not gaussian")
+        metric = finite(document["metric"], np.size(document["metric"]), "metric").reshape(-1, width)
+        if document["unit"] != "gaussian":
+            raise ValueError(f"units are {document['unit']!r}, not gaussian")
         return cls(p=p, m=m, linear=linear, metric=metric, **sizes)
 
 
@@ -211,11 +211,11 @@ def rbf_problem(
     free: bool = False,
 ) -> LaggedProblem:  # fmt: skip
     """Return the problem with priors for weights (standard deviation `prior`), centres and widths (about `start`)."""
-    n, n_w, of = function.n_theta, function.n_weights, function.units
-    widths = np.exp(of.parts(function.split(start)[1])[2])
+    n, n_w, network = function.n_theta, function.n_weights, function.units
+    widths = np.exp(network.parts(function.split(start)[1])[2])
     precision = np.concatenate(
         [np.full(function.n_line, _OPEN), np.repeat(1.0 / prior, function.neurons),
-         np.repeat(1.0 / widths, of.n_seen), np.ones(function.neurons)]
+         np.repeat(1.0 / widths, network.n_seen), np.ones(function.neurons)]
     )  # fmt: skip
     mean = np.concatenate([np.zeros(n_w), start[n_w:]])
     live = np.arange(n) < (n if all_numbers else n_w)
@@ -271,11 +271,11 @@ def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: T
     return work.failed(reason) if reason else _finish(s, work)
 
 
-def _function(s: RbfSettings, parts: Parts, ny: int, nu: int, neurons: int, seen: str = "all") -> RbfFunction:
+def _function(s: RbfSettings, parts: Parts, ny: int, nu: int, neurons: int, projected: str = "all") -> RbfFunction:
     p, m = parts[0][0].shape[1], parts[0][1].shape[1]
     nu = nu if m else 0
     outputs = np.arange(p * ny + m * nu) < p * ny
-    rows = {"all": np.ones_like(outputs), "outputs": outputs, "inputs": ~outputs}[seen]
+    rows = {"all": np.ones_like(outputs), "outputs": outputs, "inputs": ~outputs}[projected]
     return RbfFunction(
         p=p, m=m, ny=ny, nu=nu, nk=s.nk, linear=bool(s.linear), neurons=neurons, metric=np.eye(outputs.size)[rows],
     )  # fmt: skip
@@ -335,36 +335,36 @@ def _choose(s: RbfSettings, work: _Work, tick: Tick | None) -> tuple[RbfFunction
     tried, counts = list[Size](), _NEURONS if s.neurons is None else (s.neurons,)
 
     @cache
-    def placing(ny: int, nu: int, seen: str) -> tuple[Placing, Parts]:
-        function = _function(s, parts, ny, nu, 0, seen)
-        training, held = split(parts, s.held_out, function.lag)
-        return Placing(s, function, training, seed, most=max(counts)), held
+    def placing(ny: int, nu: int, projected: str) -> tuple[Placing, Parts]:
+        function = _function(s, parts, ny, nu, 0, projected)
+        training, validation = split(parts, s.held_out, function.lag)
+        return Placing(s, function, training, seed, most=max(counts)), validation
 
-    def score(of: Size, tick: Tick | None) -> float:
+    def score(network: Size, tick: Tick | None) -> float:
         del tick
-        at, held = placing(of["ny"], of["nu"], of["seen"])
-        function, start = at.start(of["neurons"], of["width"])
+        at, validation = placing(network["ny"], network["nu"], network["seen"])
+        function, start = at.start(network["neurons"], network["width"])
         theta = solve_weights(function, start, at.x, at.y, s.prior).theta
-        one_step = rms_error(function, theta, held)
-        run = rms_error(function, theta, held, free=True) if s.focus == "simulation" else one_step
+        one_step = rms_error(function, theta, validation)
+        run = rms_error(function, theta, validation, free=True) if s.focus == "simulation" else one_step
         return run if np.isfinite(run) else _FAR * one_step
 
     few = {"neurons": min(max(counts), _FIRST), "width": s.width or _MIDDLE, "seen": "all"}
     sizes = [{**x, **few} for x in lag_sizes(s.ny, s.nu, s.nk, parts, s.held_out)]
     lags_tick, units_tick = portions(tick, (0.2, 0.8))
-    found = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
-    both = found["ny"] > 0 and found["nu"] > 0 and s.held_out > 0
+    best = choose_smallest(sizes, score, tried, _AS_GOOD, lags_tick)
+    both = best["ny"] > 0 and best["nu"] > 0 and s.held_out > 0
     sizes = [
-        {**found, "neurons": h, "seen": seen, "width": width}
+        {**best, "neurons": h, "seen": projected, "width": width}
         for h in counts
-        for seen in (("outputs", "inputs", "all") if both else ("all",))
+        for projected in (("outputs", "inputs", "all") if both else ("all",))
         for width in (_WIDTHS if s.width is None else (s.width,))
     ]
-    found = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
-    work.width = found["width"]
-    work.details.update(seen=found["seen"], tried=tried)
-    function = _function(s, parts, found["ny"], found["nu"], found["neurons"], found["seen"])
-    return Placing(s, function, parts, seed, most=found["neurons"]).start(found["neurons"], found["width"])
+    best = choose_smallest(sizes, score, tried, _AS_GOOD, units_tick)
+    work.width = best["width"]
+    work.details.update(seen=best["seen"], tried=tried)
+    function = _function(s, parts, best["ny"], best["nu"], best["neurons"], best["seen"])
+    return Placing(s, function, parts, seed, most=best["neurons"]).start(best["neurons"], best["width"])
 
 
 class Placing:
@@ -401,14 +401,14 @@ class Placing:
         squares = np.zeros((n, C.shape[0]))
         for j in range(C.shape[1]):
             squares += (self.seen[:, j, None] - C[:, j]) ** 2
-        known = np.hstack([self.x if self.s.linear else self.x[:, :0], np.ones((n, 1))])
-        return C[ols_order(np.exp(-0.5 * squares / (width * self.size) ** 2), known, self.y, self.most)]
+        basis = np.hstack([self.x if self.s.linear else self.x[:, :0], np.ones((n, 1))])
+        return C[ols_order(np.exp(-0.5 * squares / (width * self.size) ** 2), basis, self.y, self.most)]
 
 
 def typical_size(x: Array) -> float:
     """Return the root mean square distance from the middle of the data."""
-    found = float(np.sqrt(np.sum(np.var(x, axis=0))))
-    return found if found > 0 else 1.0
+    best = float(np.sqrt(np.sum(np.var(x, axis=0))))
+    return best if best > 0 else 1.0
 
 
 def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
@@ -421,16 +421,16 @@ def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
         return np.asarray(kmeans2(x, k, iter=50, minit="++", seed=rng)[0])
 
 
-def ols_order(candidates: Array, known: Array, y: Array, most: int) -> list[int]:
+def ols_order(candidates: Array, basis: Array, y: Array, most: int) -> list[int]:
     """Choose regressors by orthogonal least squares, beside some that are in the model in any case.
 
     It takes, again and again, that candidate which explains most of what is left of all outputs (Chen, Cowan and Grant
     1991), by Gram-Schmidt on the candidates themselves: units that overlap are nearly dependent, and their Gram matrix
     has too few digits to tell them apart. Returns their order.
     """
-    free = y.shape[0] - known.shape[1] - 1
-    m, d = candidates.shape[1], known.shape[1]
-    R = triangle_of([np.hstack([known, candidates, y])])  # the same lengths and angles in fewer rows
+    free = y.shape[0] - basis.shape[1] - 1
+    m, d = candidates.shape[1], basis.shape[1]
+    R = triangle_of([np.hstack([basis, candidates, y])])  # the same lengths and angles in fewer rows
     length = np.sum(R[:, d : d + m] ** 2, axis=0)
     left, _ = _beyond(R[:, :d], R[:, d:])
     P, rest = left[:, :m], left[:, m:]
@@ -457,8 +457,8 @@ def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
         return np.full(C.shape[0], otherwise)
     squares = np.sum((C[:, None, :] - C) ** 2, axis=2)
     near = np.sort(squares, axis=1)[:, 1 : 1 + among]
-    found = np.sqrt(np.mean(near, axis=1))
-    return np.where(found > 1e-6 * otherwise, found, otherwise)
+    best = np.sqrt(np.mean(near, axis=1))
+    return np.where(best > 1e-6 * otherwise, best, otherwise)
 
 
 # --- output weights ---------------------------------------------------------------------------------------------------
@@ -507,9 +507,9 @@ def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior
     return Weights(function.with_matrix(theta, np.concatenate([line, w]).T), noise, alpha, effective)
 
 
-def _beyond(known: Array, others: Array) -> tuple[Array, int]:
+def _beyond(basis: Array, others: Array) -> tuple[Array, int]:
     """Return what known columns, some of which may be the same, leave of others, and the rank of the known ones."""
-    U, s, _ = np.linalg.svd(known, full_matrices=False)
+    U, s, _ = np.linalg.svd(basis, full_matrices=False)
     U = U[:, s > _BLIND * max(float(s[0]), 1e-300)]
     for _ in range(2):  # twice is enough
         others = others - U @ (U.T @ others)
@@ -522,8 +522,8 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
 
     def noise(ratio: Array) -> Array:
         left = rest + np.sum(products[:, None] * ratio / (squares[:, None] + ratio), axis=0)
-        found: Array = np.maximum(left / free, _FLOOR)
-        return found
+        best: Array = np.maximum(left / free, _FLOOR)
+        return best
 
     if squares.size == 0:
         sigma2 = float(noise(np.ones(1))[0])
@@ -548,9 +548,9 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
 
 def _train_by_sample(s: RbfSettings, work: _Work, noise: Array, tick: Tick | None) -> None:
     """Train the output weights sample by sample, from zero."""
-    of, rate, parts = work.function, s.rate if s.training == "descent" else None, work.data.parts
-    pull = of.matrix(work.problem(parts, work.theta).precision) * np.sqrt(noise)[:, None]
-    work.theta, curve = train_by_sample(of, work.theta, *_measured(of, parts), pull, rate, tick)
+    network, rate, parts = work.function, s.rate if s.training == "descent" else None, work.data.parts
+    pull = network.matrix(work.problem(parts, work.theta).precision) * np.sqrt(noise)[:, None]
+    work.theta, curve = train_by_sample(network, work.theta, *_measured(network, parts), pull, rate, tick)
     work.curves.append(curve)
     problem = work.problem(parts, work.theta)
     R = problem.triangle(work.theta[problem.live])
@@ -564,7 +564,7 @@ def _train_by_sample(s: RbfSettings, work: _Work, noise: Array, tick: Tick | Non
 
 
 def train_by_sample(
-    of: RbfFunction, theta: Array, x: Array, y: Array, pull: Array, rate: float | None, tick: Tick | None
+    network: RbfFunction, theta: Array, x: Array, y: Array, pull: Array, rate: float | None, tick: Tick | None
 ) -> tuple[Array, LearningCurve]:
     """Train the weights on regressors and outputs, from zero: by steepest descent with a rate, or by Gauss-Newton.
 
@@ -572,8 +572,8 @@ def train_by_sample(
     """
     from ambid.nonlinear.kernels import descent_pass
 
-    F = np.ascontiguousarray(of.features(theta, x))
-    (N, d), W = F.shape, np.zeros((of.p, F.shape[1]))
+    F = np.ascontiguousarray(network.features(theta, x))
+    (N, d), W = F.shape, np.zeros((network.p, F.shape[1]))
     method, passes = ("recursive Gauss-Newton", 1) if rate is None else ("steepest descent, bounded rate", _PASSES)
     edges = np.unique(np.linspace(0, N, _CHUNKS + 1).astype(np.int64)).tolist()
     descent_pass(F[:0], y[:0], 0.0, W)  # loads the compiled loop, which is no part of the training
@@ -585,7 +585,7 @@ def train_by_sample(
             if tick is not None:
                 tick(method, (k + first / N) / passes)
             if rate is None:
-                for o in range(of.p):
+                for o in range(network.p):
                     R[o] = triangle_of([R[o], np.column_stack([F[part], y[part, o]])])
                     W[o] = np.linalg.solve(R[o][:d, :d], R[o][:d, d])
             else:
@@ -595,7 +595,7 @@ def train_by_sample(
             seconds.append(perf_counter() - began)
             errors.append(_rms(y - F @ W.T))
     curve = LearningCurve(method=method, seconds=np.array(seconds), training=np.array(errors))
-    return of.with_matrix(theta, W), curve
+    return network.with_matrix(theta, W), curve
 
 
 def _rms(e: Array) -> float:
@@ -606,35 +606,35 @@ def _rms(e: Array) -> float:
 
 
 def _finish(s: RbfSettings, work: _Work) -> NonlinearFit:
-    of = work.function
-    work.settings |= {"ny": of.ny, "nu": of.nu, "neurons": of.neurons, "width": work.width}
+    network = work.function
+    work.settings |= {"ny": network.ny, "nu": network.nu, "neurons": network.neurons, "width": work.width}
     work.settings["prior"] = float(np.exp(np.mean(np.log(work.prior))))
     work.settings["focus"] = "simulation" if work.free else "prediction"
     problem = work.problem(work.data.parts, work.theta, free=work.free)
     if not np.isfinite(problem.cost(work.theta)):
         return work.failed(NO_WEIGHTS)
-    found = laplace(problem, work.theta)
+    posterior = laplace(problem, work.theta)
     why_not = ""
-    if of.neurons and not work.all_numbers:
+    if network.neurons and not work.all_numbers:
         why_not = (
             "no standard deviations: the choice of the units is not covered, and 95 % intervals without it hold in "
             "half to nine tenths of places. Give trained = all"
         )
     elif not work.at_optimum:
         why_not = "no standard deviations: training has not reached an optimum"
-    if found.covariance is not None and not why_not:  # numbers of the linear part that only the prior holds
-        left = np.diag(found.covariance) * problem.precision[problem.live] ** 2
-        names = [name for name, x in zip(of.names[: of.n_line], left, strict=False) if x > _HELD]
+    if posterior.covariance is not None and not why_not:  # numbers of the linear part that only the prior holds
+        left = np.diag(posterior.covariance) * problem.precision[problem.live] ** 2
+        names = [name for name, x in zip(network.names[: network.n_line], left, strict=False) if x > _HELD]
         if names:
             work.warnings.append(
                 f"the data do not distinguish these parameters, whose values are meaningless: {', '.join(names)}. Use "
                 "fewer lags, or a richer excitation"
             )
     work.details = {
-        "condition": found.condition,
+        "condition": posterior.condition,
         "prior_by_output": work.prior.tolist(),
         "stopped_early": work.stopped_early,
         "held_out_rms": work.held_out,
         **work.details,
     }
-    return finish(work, problem, found, units="units or lags", how=s.uncertainty, why_not=why_not)
+    return finish(work, problem, posterior, units="units or lags", how=s.uncertainty, why_not=why_not)

@@ -67,9 +67,9 @@ class Cloud:
         return {**ellipsoid, **more, "reach": self.reach}
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any], n: int) -> Self:
+    def from_json(cls, fields: Mapping[str, Any], n: int) -> Self:
         """Read the cloud of `n` regressors back."""
-        whole = found if "marks" in found else {**found, "scale": [1.0] * n, "marks": [], "faces": [], "reach": 1.0}
+        whole = fields if "marks" in fields else {**fields, "scale": [1.0] * n, "marks": [], "faces": [], "reach": 1.0}
         shapes = {"mean": (n,), "whitening": (n, n), "scale": (n,), "marks": (-1, n), "faces": (-1, n)}
         arrays = {
             k: np.array(whole[k], dtype=np.float64).reshape(shape if n else (0,) * len(shape))
@@ -112,7 +112,7 @@ def _faces(x: Array, W: Array, scale: Array) -> Array:
     """Normals of the hull, or of a polytope that touches it across many directions."""
     z = x @ W.T
     if z.shape[1] == 1 or not np.all(np.isfinite(z)):
-        found = np.array([[1.0], [-1.0]]) if z.shape[1] == 1 else np.zeros((0, z.shape[1]))
+        normals = np.array([[1.0], [-1.0]]) if z.shape[1] == 1 else np.zeros((0, z.shape[1]))
     else:
         exact = _hull(z) if z.shape[1] <= _EXACT else None
         if exact is not None:
@@ -121,11 +121,11 @@ def _faces(x: Array, W: Array, scale: Array) -> Array:
         axes = (np.eye(d) / scale) @ np.linalg.pinv(W)  # along every regressor as it was given
         length = np.linalg.norm(z, axis=1)
         corners = z[np.argsort(length)[::-1][: max(_DIRECTIONS - 4 * d, 0)]]
-        found = np.concatenate([np.eye(d), -np.eye(d), axes, -axes, corners])
-        found = found / np.maximum(np.linalg.norm(found, axis=1), 1e-300)[:, None]
-    support = np.max(z @ found.T, axis=0, initial=0.0)
+        normals = np.concatenate([np.eye(d), -np.eye(d), axes, -axes, corners])
+        normals = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-300)[:, None]
+    support = np.max(z @ normals.T, axis=0, initial=0.0)
     live = support > 1e-9 * np.max(support, initial=1e-300)
-    return np.asarray((found[live] / support[live, None]) @ W)
+    return np.asarray((normals[live] / support[live, None]) @ W)
 
 
 def _hull(z: Array) -> Array | None:
@@ -138,8 +138,8 @@ def _hull(z: Array) -> Array | None:
         return None
     if equations.shape[0] > _FACES or not np.all(equations[:, -1] < -1e-12):
         return None
-    found = -equations[:, :-1] / equations[:, -1:]
-    return np.asarray(found / max(float(np.max(z @ found.T)), 1.0))
+    normals = -equations[:, :-1] / equations[:, -1:]
+    return np.asarray(normals / max(float(np.max(z @ normals.T)), 1.0))
 
 
 def _spread(x: Array, mean: Array, scale: Array) -> Array:
@@ -282,10 +282,10 @@ class ScaledModel(ABC):
         return {**{k: getattr(self, k).tolist() for k in _NUMBERS}, "cloud": self.cloud.as_json()}
 
 
-def read_numbers(found: Mapping[str, Any], n_theta: int, m: int, p: int, n_cloud: int) -> dict[str, Any]:
+def read_numbers(fields: Mapping[str, Any], n_theta: int, m: int, p: int, n_cloud: int) -> dict[str, Any]:
     """Read back what `ScaledModel.numbers_json` made, of `m` inputs and `p` outputs."""
     sizes = zip(_NUMBERS, (n_theta, m, m, p, p), strict=True)
-    return {**{k: finite(found[k], n, k) for k, n in sizes}, "cloud": Cloud.from_json(found["cloud"], n_cloud)}
+    return {**{k: finite(fields[k], n, k) for k, n in sizes}, "cloud": Cloud.from_json(fields["cloud"], n_cloud)}
 
 
 def scaled(model: ScaledModel, u: Array, y: Array) -> tuple[Array, Array]:

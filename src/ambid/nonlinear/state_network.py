@@ -56,8 +56,8 @@ class Matrices:
     @property
     def B(self) -> Array:
         """Of the sampled linear part, without the constant."""
-        n, known = self.M.shape[0], self.W1.shape[1]
-        return self.M[:, n:known]
+        n, width = self.M.shape[0], self.W1.shape[1]
+        return self.M[:, n:width]
 
     @property
     def K(self) -> Array:
@@ -90,8 +90,8 @@ class Matrices:
         from ambid.nonlinear.kernels import slope_states
 
         out = np.empty((u.shape[0], self.heads.size, s.shape[1]))
-        used = np.any(self.D != 0.0, axis=2).astype(np.int64)
-        slope_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, self.D, used, u, X, E, s, out)
+        changed = np.any(self.D != 0.0, axis=2).astype(np.int64)
+        slope_states(self.M, self.heads, self.W1, self.b1, self.W2, self.rho, self.D, changed, u, X, E, s, out)
         return out
 
 
@@ -290,15 +290,15 @@ class StateProblem:
         """Return states and errors of every record."""
         theta, x0 = self.split(v)
         m = self.layout.matrices(theta)
-        found = [m.run(y, u, x) for (y, u), x in zip(self.parts, x0, strict=True)]
-        return [X for X, _ in found], [E for _, E in found]
+        runs = [m.run(y, u, x) for (y, u), x in zip(self.parts, x0, strict=True)]
+        return [X for X, _ in runs], [E for _, E in runs]
 
     def prior_rows(self, v: Array) -> Array:
         """Return rows -w / prior for each weight w of the hidden layer, with their slopes before them."""
-        kept = np.arange(self.layout.n_directions, self.layout.n_theta) if self.prior else np.arange(0)
-        rows = np.zeros((kept.size, v.size + 1))
-        rows[np.arange(kept.size), kept] = 1.0 / (self.prior or 1.0)
-        rows[:, -1] = -v[kept] / (self.prior or 1.0)
+        hidden = np.arange(self.layout.n_directions, self.layout.n_theta) if self.prior else np.arange(0)
+        rows = np.zeros((hidden.size, v.size + 1))
+        rows[np.arange(hidden.size), hidden] = 1.0 / (self.prior or 1.0)
+        rows[:, -1] = -v[hidden] / (self.prior or 1.0)
         return rows
 
     def cost(self, theta: Array) -> float:
@@ -309,9 +309,9 @@ class StateProblem:
         with np.errstate(over="ignore", invalid="ignore"):
             if np.isfinite(self.farthest) and not largest_pole(self.layout, weights) < self.farthest:
                 return np.inf
-            found = sum(float(np.sum((e @ self.weight) ** 2)) for e in self.errors(theta)[1])
-            found += float(np.sum(self.prior_rows(theta)[:, -1] ** 2))
-        return found if np.isfinite(found) else np.inf
+            total = sum(float(np.sum((e @ self.weight) ** 2)) for e in self.errors(theta)[1])
+            total += float(np.sum(self.prior_rows(theta)[:, -1] ** 2))
+        return total if np.isfinite(total) else np.inf
 
     def triangle(self, theta: Array) -> Array:
         """Return the triangle of [J | r] of all rows."""
@@ -394,15 +394,15 @@ class StateNetwork(ScaledModel):
     def A(self) -> Array:
         """Weights of the states, shape (n, n), SI; continuous in the form ``one-axis``, else of a sample."""
         size = np.array(self.layout.scale)[: self.layout.n]
-        found: Array = self._weights[:, : self.layout.n] * size[:, None] / size
-        return found
+        matrix: Array = self._weights[:, : self.layout.n] * size[:, None] / size
+        return matrix
 
     @property
     def B(self) -> Array:
         """Weights of the inputs, shape (n, n_inputs), SI; continuous in the form ``one-axis``, else of a sample."""
         n, size = self.layout.n, np.array(self.layout.scale)
-        found: Array = self._weights[:, n:-1] * size[:n, None] / size[n:]
-        return found
+        matrix: Array = self._weights[:, n:-1] * size[:n, None] / size[n:]
+        return matrix
 
     @property
     def unit(self) -> Array | float:
@@ -483,10 +483,10 @@ class StateNetwork(ScaledModel):
         return {"dt_s": self.dt, "delay": self.delay, "layout": layout, **self.numbers_json()}
 
     @classmethod
-    def from_json(cls, found: dict[str, Any]) -> Self:
+    def from_json(cls, document: dict[str, Any]) -> Self:
         """Read it back from what `as_json` made."""
-        given = found["layout"]
-        layout = read_as(Layout, {**given, "dt": found["dt_s"], "sensor": not given["anchored"]}, "layout")
+        fields = document["layout"]
+        layout = read_as(Layout, {**fields, "dt": document["dt_s"], "sensor": not fields["anchored"]}, "layout")
         places = [*layout.rows, *(r for r, _ in layout.entries)]
         columns = [c for _, c in layout.entries]
         inside = min((*places, *columns, *layout.heads)) >= 0 and max(places) < layout.n
@@ -494,8 +494,8 @@ class StateNetwork(ScaledModel):
         if layout.form not in ("one-axis", "free") or not inside:
             raise EstimationError("this is not a state network: its states are not those of one. Write the file again")
         n_cloud = layout.width + layout.n_inputs
-        numbers = read_numbers(found, layout.n_theta, layout.n_inputs, layout.p, n_cloud)
-        return cls(layout=layout, delay=int(found["delay"]), **numbers)
+        numbers = read_numbers(document, layout.n_theta, layout.n_inputs, layout.p, n_cloud)
+        return cls(layout=layout, delay=int(document["delay"]), **numbers)
 
 
 def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
@@ -530,9 +530,9 @@ def _search_first_state(layout: Layout, theta: Array, y: Array, u: Array) -> tup
     for sign in _SIGNS:
         x0 = np.zeros(layout.width)
         x0[0], x0[-1] = sign * first, first
-        found = search(problem, np.concatenate([theta, x0]), stage="", most=30, tolerance=1e-10)
-        if best is None or found.cost < best.cost:
-            best = found
+        ended = search(problem, np.concatenate([theta, x0]), stage="", most=30, tolerance=1e-10)
+        if best is None or ended.cost < best.cost:
+            best = ended
     assert best is not None
     J = np.concatenate([r[:, 0] for r in replace(problem, held=slice(0, 0)).sample_rows(best.theta)])
     s = np.zeros((layout.width, P))

@@ -65,10 +65,10 @@ def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), 
         raise EstimationError(
             f"nn: {counted(n, 'state')} for {counted(p, 'output')}; each output is a state. Raise states"
         )
-    found = _subspace(data, n, past)
-    if isinstance(found, str):
-        return found
-    A, B, C, K = found
+    model = _subspace(data, n, past)
+    if isinstance(model, str):
+        return model
+    A, B, C, K = model
     chains, ahead = tuple(n // p + (o < n % p) for o in range(p)), A - np.eye(n)
     first = np.cumsum((0, *chains))[:-1].tolist()
     if heads:
@@ -133,10 +133,10 @@ def _subspace(data: Scaled, n: int, past: int) -> tuple[Array, Array, Array, Arr
         model = pbsid(io, {"n": n}, horizon=past, feedthrough=False).model
     except (EstimationError, np.linalg.LinAlgError) as error:
         return f"no starting model: {error}"
-    found = tuple(np.asarray(getattr(model, k), dtype=np.float64) for k in "ABCK")
-    if not all(np.all(np.isfinite(x)) for x in found):
+    matrices = tuple(np.asarray(getattr(model, k), dtype=np.float64) for k in "ABCK")
+    if not all(np.all(np.isfinite(x)) for x in matrices):
         return "no starting model: its matrices are not finite"
-    return found  # type: ignore[return-value]
+    return matrices  # type: ignore[return-value]
 
 
 def _logarithm(A: Array, B: Array, dt: float) -> tuple[Array, Array] | None:
@@ -149,22 +149,22 @@ def _logarithm(A: Array, B: Array, dt: float) -> tuple[Array, Array] | None:
         return None
     block = np.zeros((n + m, n + m))
     block[:n, :n], block[:n, n:], block[n:, n:] = A, B, np.eye(m)
-    found = np.asarray(logm(block))
-    if np.iscomplexobj(found):
-        if np.max(np.abs(found.imag)) > 1e-6 * np.max(np.abs(found.real)):
+    log = np.asarray(logm(block))
+    if np.iscomplexobj(log):
+        if np.max(np.abs(log.imag)) > 1e-6 * np.max(np.abs(log.real)):
             return None
-        found = found.real
-    return found[:n, :n] / dt, found[:n, n:] / dt
+        log = log.real
+    return log[:n, :n] / dt, log[:n, n:] / dt
 
 
 def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[str, object] | None:
     """Return scaled A and B in SI, made continuous if they are those of a sample; None where there is no logarithm."""
-    found = _logarithm(A, B, layout.dt) if sampled else (A, B)
-    if found is None:
+    pair = _logarithm(A, B, layout.dt) if sampled else (A, B)
+    if pair is None:
         return None
     n, size = layout.n, np.array(layout.scale)
-    by = size[:n, None] / size
-    return {"A": (found[0] * by[:, :n]).tolist(), "B": (found[1] * by[:, n:]).tolist()}
+    unit = size[:n, None] / size
+    return {"A": (pair[0] * unit[:, :n]).tolist(), "B": (pair[1] * unit[:, n:]).tolist()}
 
 
 # --- a grid of poles, where the sensor sees no sign -------------------------------------------------------------------
@@ -239,10 +239,10 @@ def guess_delay(data: Scaled) -> int:
     largest = min(LARGEST, y.shape[0] // 8 - 2 * _HISTORY)
     if largest < 1 or not u.shape[1]:
         return 0
-    found = [
+    delays = [
         delay(u[:, i], y[:, o], max_delay=largest, order=_HISTORY) for i in range(u.shape[1]) for o in range(y.shape[1])
     ]
-    return min((x.samples for x in found if x.samples is not None), default=0)
+    return min((x.samples for x in delays if x.samples is not None), default=0)
 
 
 def find_delay(state: State, whole: Scaled, delay: int, tick: Tick | None, *, rather_late: bool = False) -> int:
@@ -261,10 +261,10 @@ def find_delay(state: State, whole: Scaled, delay: int, tick: Tick | None, *, ra
         if trial not in errors:
             data = shift_inputs(cut, trial)
             start = State.of(state.layout, state.theta, data)
-            found = train(start, data, stage="", iterations=_SHORT, rounds=1, damping=1e-6)
-            errors[trial] = np.inf if found is None else found.state.score
-            if found is not None and errors[trial] <= min(errors.values()):
-                state = found.state
+            trained = train(start, data, stage="", iterations=_SHORT, rounds=1, damping=1e-6)
+            errors[trial] = np.inf if trained is None else trained.state.score
+            if trained is not None and errors[trial] <= min(errors.values()):
+                state = trained.state
             if tick is not None:
                 tick("delay", guessed(len(errors), 3.0))
         return errors[trial]
@@ -298,21 +298,21 @@ def train_one_step(
     n, d = layout.n, layout.n + layout.n_inputs + 1
     N = sum(r.shape[0] for r in rows)
     R = triangle_of(rows)
-    known, target = R[:, :d], R[:, d:]
+    past, target = R[:, :d], R[:, d:]
     seconds = [perf_counter() - began]
 
     def rms(v: Array) -> float:
-        return float(np.sqrt(np.sum((target - known @ v) ** 2) / (N * n)))
+        return float(np.sqrt(np.sum((target - past @ v) ** 2) / (N * n)))
 
-    curvature = float(np.linalg.svd(known, compute_uv=False)[0] ** 2)
+    curvature = float(np.linalg.svd(past, compute_uv=False)[0] ** 2)
     v = np.zeros((d, n))
     errors = [rms(v)]
     for _ in range(iterations):
-        v = v + known.T @ (target - known @ v) / curvature
+        v = v + past.T @ (target - past @ v) / curvature
         seconds.append(perf_counter() - began)
         errors.append(rms(v))
     again = perf_counter()
-    solved: Array = np.asarray(np.linalg.lstsq(known, target, rcond=1e-13)[0], dtype=np.float64)
+    solved: Array = np.asarray(np.linalg.lstsq(past, target, rcond=1e-13)[0], dtype=np.float64)
     last = np.array([seconds[0], seconds[0] + perf_counter() - again]), np.array([errors[0], rms(solved)])
     descent, gauss_newton = (
         LearningCurve(method=f"{name}, one-step errors of the states", seconds=took, training=left)
@@ -321,11 +321,11 @@ def train_one_step(
         )
     )  # fmt: skip
     back = np.concatenate([1.0 / size, np.ones(d - n)])
-    found: dict[str, object] = {}
+    matrices: dict[str, object] = {}
     for name, w in (("steepest descent", v), ("Gauss-Newton", solved)):
         M = (w * back[:, None] * size).T
-        found[name] = matrices_json(layout, M[:, :n], M[:, n:-1], sampled=layout.form == "one-axis")
-    return (descent, gauss_newton), found
+        matrices[name] = matrices_json(layout, M[:, :n], M[:, n:-1], sampled=layout.form == "one-axis")
+    return (descent, gauss_newton), matrices
 
 
 # --- global search ---------------------------------------------------------------------------------------------------
@@ -358,8 +358,8 @@ class ShotCost:
 
     def __call__(self, z: Array) -> float:
         """Return the logarithm of the determinant of the errors' covariance; infinite where numbers overflow."""
-        found = self.solve(z)
-        return np.inf if found is None else found[1]
+        solution = self.solve(z)
+        return np.inf if solution is None else solution[1]
 
     def solve(self, z: Array) -> tuple[Array, float, Array] | None:
         """Return all weights, the cost, and the errors' covariance, all scaled."""
@@ -381,14 +381,14 @@ class ShotCost:
             powers[0] = np.eye(3)
             for t in range(1, N):
                 powers[t] = powers[t - 1] @ sampled[:3, :3]
-            seen = powers[:, list(layout.heads)] / self.noise[:, None]
-            if not np.all(np.isfinite(seen)) or np.max(np.abs(seen)) > 1e100:
+            visible = powers[:, list(layout.heads)] / self.noise[:, None]
+            if not np.all(np.isfinite(visible)) or np.max(np.abs(visible)) > 1e100:
                 return None
-            O = seen.reshape(N * p, 3)  # noqa: E741
+            O = visible.reshape(N * p, 3)  # noqa: E741
             Q = np.linalg.qr(O / np.maximum(np.linalg.norm(O, axis=0), 1e-300))[0]
             columns = []
             for _, r, c in linear:
-                h = np.vstack([np.zeros((1, p)), seen[:-1] @ sampled[:3, 3 + r]])
+                h = np.vstack([np.zeros((1, p)), visible[:-1] @ sampled[:3, 3 + r]])
                 if c == 4:
                     columns.append(np.broadcast_to(np.cumsum(h, axis=0), (S, N, p)))
                 else:
@@ -433,10 +433,10 @@ def search_start(
     """
     cost = shot_cost(data, dt, heads)
     n = len(cost.searched)
-    found = global_search(
+    result = global_search(
         cost, -np.ones(n), np.ones(n), seed=[seed, 5], evaluations=evaluations, tick=tick, stage=STAGE
     )
-    return best_of(_add_kalman_gain(cost, z, data) for z in (found.vector, *found.best[1:_TRIED])), found
+    return best_of(_add_kalman_gain(cost, z, data) for z in (result.vector, *result.best[1:_TRIED])), result
 
 
 def _add_kalman_gain(cost: ShotCost, z: Array, data: Scaled) -> State | None:

@@ -152,13 +152,13 @@ class Fitting(Attempt):
         """Put each output beside the input that acts at its time, `delay` samples late."""
         self.delay, self.data = delay, shift_inputs(self.whole, delay)
 
-    def take(self, found: Training) -> None:
+    def take(self, trained: Training) -> None:
         """Take over a learning curve, and the network if it is better, or has units or a gain that the last had not."""
-        self.curves.append(found.curve)
-        at, now = found.state, self.state
+        self.curves.append(trained.curve)
+        at, now = trained.state, self.state
         kinds = [(x.layout.neurons, x.layout.gain) for x in (at, now) if x is not None]
         if now is None or kinds[0] != kinds[1] or at.score < now.score:
-            self.state, self.status = at, "converged" if found.converged else "stalled"
+            self.state, self.status = at, "converged" if trained.converged else "stalled"
 
 
 def shift_inputs(data: Scaled, delay: int) -> Scaled:
@@ -200,22 +200,22 @@ def train(
         before, problem = at, at.problem(data)
         if at.layout.gain:  # a start that is not stable may stay so
             problem = replace(problem, farthest=max(1.0, largest_pole(at.layout, at.theta) * (1.0 + 1e-9)))
-        found = search(
+        ended = search(
             problem, at.vector, stage=stage, most=iterations, tolerance=0.0, enough=_ENOUGH * 100.0 ** (k == 0),
             damping=damping, tick=part_of(tick, *_SHARES[k : k + 2]), keep_best=True,
         )  # fmt: skip
-        seconds += [seconds[-1] + t for t in found.seconds]
-        errors += [before.size * float(np.sqrt(c / (at.n_rows * at.layout.p))) for c in found.costs]
-        at = at.at(problem, found.theta) or at
+        seconds += [seconds[-1] + t for t in ended.seconds]
+        errors += [before.size * float(np.sqrt(c / (at.n_rows * at.layout.p))) for c in ended.costs]
+        at = at.at(problem, ended.theta) or at
         curve = LearningCurve(
             method=f"Levenberg-Marquardt, {what} errors", seconds=np.array(seconds[1:]), training=np.array(errors)
         )
-        result = Training(state=at, curve=curve, converged=found.converged)
-        if found.interrupted or abs(before.score - at.score) < 0.02:
+        result = Training(state=at, curve=curve, converged=ended.converged)
+        if ended.interrupted or abs(before.score - at.score) < 0.02:
             break
     if fitting is not None:
         fitting.take(result)
-    if found.interrupted:
+    if ended.interrupted:
         raise KeyboardInterrupt
     return result
 
@@ -241,8 +241,8 @@ def _wake_units(start: State, data: Scaled, iterations: int, damping: float, tic
 def train_each(starts: Sequence[State], data: Scaled, tick: Tick | None, **how: Any) -> list[Training]:
     """Train from several starts, one after the other, best first; those that diverge are left out."""
     parts = portions(tick, [1.0] * len(starts))
-    found = [train(start, data, tick=own, **how) for start, own in zip(starts, parts, strict=True)]
-    return sorted((x for x in found if x is not None), key=lambda x: x.state.score)
+    trained = [train(start, data, tick=own, **how) for start, own in zip(starts, parts, strict=True)]
+    return sorted((x for x in trained if x is not None), key=lambda x: x.state.score)
 
 
 def add_gain(state: State, data: Scaled, K: Array) -> State | None:

@@ -107,11 +107,11 @@ def read_record(
 
 
 def _check_layout(kind: str, layout: Mapping[str, str], path: Path) -> None:
-    known = LAYOUTS.get(kind, ())
+    words = LAYOUTS.get(kind, ())
     for word, value in layout.items():
-        if word not in known or not isinstance(value, str) or not value:
-            has = f"the layout of .{kind} files has {', '.join(known)}" if known else f".{kind} files have no layout"
-            raise RecordError(f"{path}: layout {word}={value!r}; {has}.{nearest(word, known)} Correct or omit it")
+        if word not in words or not isinstance(value, str) or not value:
+            has = f"the layout of .{kind} files has {', '.join(words)}" if words else f".{kind} files have no layout"
+            raise RecordError(f"{path}: layout {word}={value!r}; {has}.{nearest(word, words)} Correct or omit it")
 
 
 def read_rows(

@@ -54,10 +54,10 @@ def check_chunks(
     path = Path(path)
     pieces = _counted(chunks, n_samples)
     if path.name.lower().endswith((".csv", ".csv.gz")):
-        found = 0
+        count = 0
         for text in _csv_texts(record, pieces):
-            found = crc32(text, found)
-        _check_csv(path, found)
+            count = crc32(text, count)
+        _check_csv(path, count)
         return
     _check_hdf5_head(path, record, texts)
     sums = [0] * len(record.channels)
@@ -107,10 +107,10 @@ def _check_hdf5(path: Path, n_samples: int, sums: list[int]) -> None:
     try:
         with h5py.File(path, "r") as file:
             for k, wanted in enumerate(sums):
-                dataset, found = file["channels"][str(k)], 0
+                dataset, count = file["channels"][str(k)], 0
                 for at in range(0, n_samples, _PIECE):
-                    found = crc32(dataset[at : at + _PIECE].tobytes(), found)
-                if found != wanted or dataset.shape != (n_samples,):
+                    count = crc32(dataset[at : at + _PIECE].tobytes(), count)
+                if count != wanted or dataset.shape != (n_samples,):
                     raise _unlike(path)
     except (OSError, KeyError, RuntimeError, ValueError) as failure:
         raise _unlike(path) from failure
@@ -123,8 +123,8 @@ def _check_hdf5_head(path: Path, record: Record, texts: Mapping[str, str]) -> No
     try:
         with h5py.File(path, "r") as file:
             channels = [file["channels"][str(k)].attrs for k in range(len(file["channels"]))]
-            found = [(a["name"], a["unit"], a["source_unit"]) for a in channels]
-            same = found == wanted and (file.attrs["rate_hz"], file.attrs["start_s"]) == (
+            heads = [(a["name"], a["unit"], a["source_unit"]) for a in channels]
+            same = heads == wanted and (file.attrs["rate_hz"], file.attrs["start_s"]) == (
                 record.rate_hz,
                 record.start_s,
             )
@@ -139,12 +139,12 @@ def _write_csv(
     record: Record, n_samples: int, chunks: Iterable[Array], path: Path, texts: Mapping[str, str]
 ) -> Callable[[], None]:
     del n_samples, texts
-    found = 0
+    count = 0
     with _text_file(path, "w") as file:
         for data in _csv_texts(record, chunks):
             file.write(data)
-            found = crc32(data, found)
-    return lambda: _check_csv(path, found)
+            count = crc32(data, count)
+    return lambda: _check_csv(path, count)
 
 
 def _csv_texts(record: Record, chunks: Iterable[Array]) -> Iterator[bytes]:
@@ -163,14 +163,14 @@ def _lines(lines: list[str]) -> bytes:
 
 
 def _check_csv(path: Path, wanted: int) -> None:
-    found = 0
+    count = 0
     try:
         with _text_file(path, "r") as file:
             while data := file.read(_PIECE):
-                found = crc32(data, found)
+                count = crc32(data, count)
     except (OSError, EOFError, ZlibError) as failure:
         raise _unlike(path) from failure
-    if found != wanted:
+    if count != wanted:
         raise _unlike(path)
 
 

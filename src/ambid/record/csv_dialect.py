@@ -60,14 +60,14 @@ def decoded(data: bytes, path: Path, layout: Mapping[str, str]) -> tuple[str, st
 
 def words_of(layout: Mapping[str, str], path: Path) -> dict[str, str]:
     """Return a layout in signs: ``comma`` is ``,`` and so on."""
-    found = {}
+    words = {}
     for word, value in layout.items():
         if value.lower() not in _WORDS[word]:
             raise RecordError(f"{path}: layout {word}={value!r}; it is one of {', '.join(_WORDS[word])}. Correct it")
-        found[word] = _WORDS[word][value.lower()]
-    if found.get("decimal", "") == found.get("separator", "."):
+        words[word] = _WORDS[word][value.lower()]
+    if words.get("decimal", "") == words.get("separator", "."):
         raise RecordError(f"{path}: comma cannot be both decimal and separator. Correct the layout")
-    return found
+    return words
 
 
 def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Dialect | None:
@@ -75,9 +75,9 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
 
     `lines`: of the file. Raises where it could be read in two ways.
     """
-    told = words_of(layout, path)
+    words = words_of(layout, path)
     begin = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
-    table = None if begin is None else _table(lines, begin, told.get("separator"))
+    table = None if begin is None else _table(lines, begin, words.get("separator"))
     if begin is None or table is None:
         return None
     at, delimiter, n = table
@@ -85,19 +85,19 @@ def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Diale
     heads = [_cells(lines[k], delimiter) for k in above]
     if not heads or not _is_header(heads[-1], n):
         return None
-    header, units = _names_and_units(heads, above, n, path, told.get("units"))
+    header, units = _names_and_units(heads, above, n, path, words.get("units"))
     cells = heads[above.index(header)]
     settings: dict[str, object] = {}
     if units is not None:
         settings["units"] = "row"
-    elif (found := _in_parentheses(cells, header, path, told.get("units"))) is not None:
-        cells, units = found
+    elif (parsed := _in_parentheses(cells, header, path, words.get("units"))) is not None:
+        cells, units = parsed
         settings["units"] = "parentheses"
     if header != begin:
         settings["preamble"] = above.index(header)
-    body, marks = _plain_numbers(lines, at, delimiter, path, told)
+    body, marks = _plain_numbers(lines, at, delimiter, path, words)
     settings |= marks
-    if not (settings or told):
+    if not (settings or words):
         return None
     comments = [x.lstrip("#").strip() for k, x in enumerate(lines[:at]) if x.strip() and k not in (header, above[-1])]
     return Dialect(
@@ -122,12 +122,12 @@ def _is_header(cells: Sequence[str], n: int) -> bool:
     return texts and len(set(cells)) == n
 
 
-def _table(lines: Sequence[str], begin: int, told: str | None) -> tuple[int, str, int] | None:
+def _table(lines: Sequence[str], begin: int, word: str | None) -> tuple[int, str, int] | None:
     """Find the first rows of numbers of one width: their place, delimiter and width."""
     for k in range(begin + 1, min(len(lines), begin + 1000)):
-        for delimiter in (told,) if told else ("\t", ";", ","):
+        for delimiter in (word,) if word else ("\t", ";", ","):
             cells = _cells(lines[k], delimiter)
-            if (len(cells) > 1 or told) and all(map(_is_number, cells)):
+            if (len(cells) > 1 or word) and all(map(_is_number, cells)):
                 rows = [_cells(line, delimiter) for line in lines[k : k + _FEW]]
                 if len(rows) == _FEW and all(len(row) == len(cells) and any(map(_is_number, row)) for row in rows):
                     return k, delimiter, len(cells)
@@ -135,16 +135,16 @@ def _table(lines: Sequence[str], begin: int, told: str | None) -> tuple[int, str
 
 
 def _names_and_units(
-    heads: Sequence[list[str]], above: Sequence[int], n: int, path: Path, told: str | None
+    heads: Sequence[list[str]], above: Sequence[int], n: int, path: Path, word: str | None
 ) -> tuple[int, list[str | None] | None]:
     """Return the line of the names, counted from 0, and the units of a row below them."""
     texts = [x.strip("[]()") for x in heads[-1]]
     doubtful = len(heads) > 1 and _is_header(heads[-2], n)
-    if told == "row":
+    if word == "row":
         if not doubtful:
             raise RecordError(f"{path}, row {above[-1] + 1}: no names stand above these units. Correct the layout")
         return above[-2], list(texts)
-    if doubtful and told is None:
+    if doubtful and word is None:
         if all(map(_is_unit, texts)) and not any("[" in x for x in heads[-2]):
             return above[-2], list(texts)
         raise RecordError(
@@ -164,39 +164,39 @@ def _is_unit(text: str) -> bool:
 
 
 def _in_parentheses(
-    cells: Sequence[str], header: int, path: Path, told: str | None
+    cells: Sequence[str], header: int, path: Path, word: str | None
 ) -> tuple[list[str], list[str | None]] | None:
     """Return names and units of ``name (unit)``; None where no unit is written so."""
-    found = [None if "[" in x else _PARENTHESES.fullmatch(x.strip('"')) for x in cells]
-    units = [None if x is None else x["unit"].strip() for x in found]
-    known = [_is_unit(x) for x in units if x is not None]
-    if told not in (None, "parentheses") or not any(known) or (told is None and any("[" in x for x in cells)):
+    matches = [None if "[" in x else _PARENTHESES.fullmatch(x.strip('"')) for x in cells]
+    units = [None if x is None else x["unit"].strip() for x in matches]
+    recognised = [_is_unit(x) for x in units if x is not None]
+    if word not in (None, "parentheses") or not any(recognised) or (word is None and any("[" in x for x in cells)):
         return None
-    if told is None and not all(known):
+    if word is None and not all(recognised):
         doubtful = next(x for x in units if x is not None and not _is_unit(x))
         raise RecordError(
             f"{path}, row {header + 1}: ({doubtful}) is no known unit, others in parentheses are. Say whether "
             f"they are units: {setting('layout', 'units=parentheses')}, or {setting('layout', 'units=none')}"
         )
-    return [x if m is None else m["name"] for x, m in zip(cells, found, strict=True)], units
+    return [x if m is None else m["name"] for x, m in zip(cells, matches, strict=True)], units
 
 
 def _plain_numbers(
-    lines: list[str], at: int, delimiter: str, path: Path, told: Mapping[str, str]
+    lines: list[str], at: int, delimiter: str, path: Path, word: Mapping[str, str]
 ) -> tuple[list[str], dict[str, object]]:
     """Return the lines with numbers in the usual form, and the marks that were found in them."""
     quoted = any('"' in line for line in lines[at:])
-    spaced = next((found[1] for line in lines[at:] if (found := _SPACED.search(line))), None)
-    if delimiter == "," and not (quoted or spaced or "thousands" in told):
-        return lines, {"delimiter": delimiter} if "separator" in told else {}
-    decimal, thousands = _marks(lines, at, delimiter, path, told)
+    spaced = next((match[1] for line in lines[at:] if (match := _SPACED.search(line))), None)
+    if delimiter == "," and not (quoted or spaced or "thousands" in word):
+        return lines, {"delimiter": delimiter} if "separator" in word else {}
+    decimal, thousands = _marks(lines, at, delimiter, path, word)
     marks: dict[str, object] = {"delimiter": delimiter} if delimiter != "," else {}
     marks |= {"decimal": decimal} if decimal == "," else {}
     marks |= {"thousands": thousands or spaced} if thousands or spaced else {}
     if decimal == thousands:
         raise RecordError(f"{path}: a comma cannot be both decimal and thousands separator. Correct the layout")
     if not (quoted or spaced or thousands) and decimal == ".":
-        return lines, marks if "separator" in told else {}
+        return lines, marks if "separator" in word else {}
     group = f"[{re.escape(thousands or '')} ']" if thousands else "[ ']"
     form = re.compile(rf"[+-]?(?:[1-9]\d{{0,2}}(?:{group}\d{{3}})+|\d*)(?:{re.escape(decimal)}\d*)?{_POWER}")
     body = [*lines[:at]]
@@ -219,10 +219,10 @@ def _plain_numbers(
 
 
 def _marks(
-    lines: Sequence[str], at: int, delimiter: str, path: Path, told: Mapping[str, str]
+    lines: Sequence[str], at: int, delimiter: str, path: Path, word: Mapping[str, str]
 ) -> tuple[str, str | None]:
     """Return decimal mark and thousands separator, as told or as the first number shows that is not ambiguous."""
-    decimal, thousands, doubt = told.get("decimal"), told.get("thousands"), ""
+    decimal, thousands, doubt = word.get("decimal"), word.get("thousands"), ""
     for row, cell in _marked(lines, at, delimiter):
         text = cell.translate(_MARKS)
         as_decimal, as_thousands = _DECIMAL.fullmatch(text), _THOUSANDS.fullmatch(text)

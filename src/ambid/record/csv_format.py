@@ -73,7 +73,7 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
     elif data[:2] == b"\x1f\x8b":
         raise RecordError(f"record {path} is gzipped although its name does not say so. Rename it to {path.name}.gz")
     plain, encoding = None if layout else read_plain(data, path), "utf-8"
-    found: Mapping[str, object] = {}
+    layout_found: Mapping[str, object] = {}
     if plain is None:
         text, encoding = decoded(data, path, layout)
         lines = text.split("\n")
@@ -87,7 +87,7 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
                 row=dialect.row, delimiter=dialect.delimiter, names=names, comments=dialect.comments,
                 unit_texts=units if dialect.units is None else dialect.units,
             )  # fmt: skip
-            lines, found = dialect.lines, dialect.settings
+            lines, layout_found = dialect.lines, dialect.settings
         values = read_values(data_rows(lines, header.row, path, MIN_SAMPLES), header, path, gaps)
     else:
         header, values = plain
@@ -99,7 +99,7 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
         values[:, time] = seconds(values[:, time], header.names[time], header.unit_texts[time], place)
     settings: dict[str, object] = {"format": "csv", "rows": values.shape[0]}
     settings |= {"delimiter": header.delimiter} if header.delimiter != "," else {}
-    settings |= {**found, **({"encoding": encoding} if encoding != "utf-8" else {})}
+    settings |= {**layout_found, **({"encoding": encoding} if encoding != "utf-8" else {})}
     settings |= {"layout": dict(layout)} if layout else {}
     return Table(
         where=str(path), names=header.names, unit_texts=header.unit_texts, values=values, first_row=header.row + 1,
@@ -169,14 +169,14 @@ def find_header(lines: Sequence[str], path: Path) -> Header:
     line = lines[row - 1]
     comments = [text.lstrip("#").strip() for text in lines[: row - 1] if text.startswith("#")]
     outside = re.sub(r"\[[^\[\]]*\]", "[]", line)
-    found = [d for d in (",", ";", "\t") if d in outside]
-    if len(found) > 1:
+    marks = [d for d in (",", ";", "\t") if d in outside]
+    if len(marks) > 1:
         raise RecordError(
-            f"{path}, row {row}: the header holds both {found[0]!r} and {found[1]!r}; one delimiter only. Use commas"
+            f"{path}, row {row}: the header holds both {marks[0]!r} and {marks[1]!r}; one delimiter only. Use commas"
         )
-    if not found and outside.count("[]") > 1:
+    if not marks and outside.count("[]") > 1:
         raise RecordError(f"{path}, row {row}: the columns are not separated by commas. Write 'time [s],voltage [V],…'")
-    delimiter = found[0] if found else ","
+    delimiter = marks[0] if marks else ","
     cells = [cell.strip().strip('"').strip() for cell in line.split(delimiter)]
     if all(np.isfinite(_number(cell)) for cell in cells):
         raise RecordError(

@@ -71,10 +71,10 @@ def read_table(
     `table`: a DataFrame of pandas or polars, a Dataset of xarray or a mapping; `rate_hz`: sampling rate in Hz, where it
     holds no time; `units`: by column, beside or instead of ``name [unit]``. Returns SI units.
     """
-    found = _table(_parts(table), units)
+    rows = _table(_parts(table), units)
     if gaps == "error":
-        refuse_gaps(found)
-    return uniform_record(found, rate_hz, gaps)
+        refuse_gaps(rows)
+    return uniform_record(rows, rate_hz, gaps)
 
 
 def read_table_rows(table: object, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Rows:
@@ -119,9 +119,9 @@ def label_of(label: str) -> tuple[str, str | None]:
 
 def _class_of(x: object) -> tuple[str, str]:
     """Return the package and the name of the class of something, where the package is one that has tables."""
-    known = {*_TABLES, *_REMEDIES}
-    named = ((c.__module__.partition(".")[0], c.__name__) for c in type(x).__mro__)
-    return next((x for x in named if x in known), ("", ""))
+    libraries = {*_TABLES, *_REMEDIES}
+    classes = ((c.__module__.partition(".")[0], c.__name__) for c in type(x).__mro__)
+    return next((x for x in classes if x in libraries), ("", ""))
 
 
 def _parts(table: Any) -> _Parts:
@@ -251,12 +251,12 @@ def _named(what: str, column: _Column, units: dict[str, str]) -> tuple[str, str 
             f"{what} has a column called {column.label!r}; a name is a text. Rename it, as 'voltage [V]' and so on"
         )
     name, inside = label_of(column.label)
-    said = {text for text in (inside, column.unit) if text is not None}
-    said |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
-    if len(said) > 1:
-        one, other = sorted(said)[:2]
+    texts = {text for text in (inside, column.unit) if text is not None}
+    texts |= {_text_of(name, units.pop(key)) for key in {name, column.label} if key in units}
+    if len(texts) > 1:
+        one, other = sorted(texts)[:2]
         raise RecordError(f"column {name!r} of {what} is declared in [{one}] and in [{other}]. Omit one of them")
-    return name, next(iter(said), None)
+    return name, next(iter(texts), None)
 
 
 def _text_of(name: str, unit: object) -> str:
@@ -278,8 +278,8 @@ def numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
     if kind in "mM":
         if not time:
             raise RecordError(f"{place} holds times; a channel holds numbers. Call it 'time', or omit it")
-        known = values[~np.isnat(values)]
-        begin = known[0] if kind == "M" and known.size else np.timedelta64(0, "s")
+        stamps = values[~np.isnat(values)]
+        begin = stamps[0] if kind == "M" and stamps.size else np.timedelta64(0, "s")
         return np.asarray((values - begin) / np.timedelta64(1, "s"), dtype=np.float64)
     if kind == "c":
         raise RecordError(
@@ -289,12 +289,12 @@ def numbers(what: str, name: str, values: np.ndarray, *, time: bool) -> Array:
         others = [x for x in values.ravel() if not isinstance(x, (int, float))]
         what = f"no numbers (such as {str(others[0])[:20]!r})" if others else f"numbers as {values.dtype}s"
         raise RecordError(f"{place} holds {what}. Convert it with astype(float), or omit it")
-    found = np.asarray(values, dtype=np.float64)
-    if kind in "iu" and found.size and np.abs(found).max() > _EXACT:
+    parsed = np.asarray(values, dtype=np.float64)
+    if kind in "iu" and parsed.size and np.abs(parsed).max() > _EXACT:
         raise RecordError(
-            f"{place} reaches {np.abs(found).max():.4g}; beyond 2^53 whole numbers lose digits. Subtract the first one"
+            f"{place} reaches {np.abs(parsed).max():.4g}; beyond 2^53 whole numbers lose digits. Subtract the first one"
         )
-    return found
+    return parsed
 
 
 def _index(parts: _Parts, index: _Column, units: dict[str, str]) -> tuple[str | None, Array] | None:

@@ -54,13 +54,13 @@ def _no_interrupt(file: _Unfailing) -> Iterator[None]:
         except BaseException as failure:
             file.fail(failure)
 
-    taken = [number for number, handler in usual.items() if callable(handler)]
-    for number in taken:
+    numbers = [number for number, handler in usual.items() if callable(handler)]
+    for number in numbers:
         signal.signal(number, take)
     try:
         yield
     finally:
-        for number in taken:
+        for number in numbers:
             signal.signal(number, usual[number])
 
 
@@ -99,10 +99,10 @@ class _Unfailing:
         at, n = self._at, len(view)
         self._plain.seek(at)
         data = bytearray((self._plain.read(n) or b"").ljust(n, b"\0"))
-        for offset, held in self._held:
-            begin, end = max(offset, at), min(offset + len(held), at + n)
+        for offset, part in self._held:
+            begin, end = max(offset, at), min(offset + len(part), at + n)
             if begin < end:
-                data[begin - at : end - at] = held[begin - offset : end - offset]
+                data[begin - at : end - at] = part[begin - offset : end - offset]
         view[:] = data
         self._at += n
         return n
@@ -173,13 +173,13 @@ def write_head(file: Any, record: Record, history: str | None = None) -> None:
     file.create_group("channels")
 
 
-def add_channel(file: Any, k: int, channel: Channel, **of: object) -> Any:
+def add_channel(file: Any, k: int, channel: Channel, **options: object) -> Any:
     """Make the dataset of a channel.
 
     `file`: with its head; `k`: place of the channel; `channel`: its name and units; `**of`: ``data``, or ``shape`` and
     ``dtype`` where the values are still to come.
     """
-    dataset = file["channels"].create_dataset(str(k), compression="gzip", compression_opts=1, shuffle=True, **of)
+    dataset = file["channels"].create_dataset(str(k), compression="gzip", compression_opts=1, shuffle=True, **options)
     dataset.attrs["name"] = channel.name
     dataset.attrs["unit"] = channel.unit
     dataset.attrs["source_unit"] = channel.source_unit

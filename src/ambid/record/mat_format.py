@@ -131,21 +131,21 @@ def read_mat(
     check_gap_policy(gaps)
     data = file_bytes(path)
     content = _content(path, data)
-    named = [
+    listed = [
         x for name, (x, _) in (variables or {}).items() if name != "time" and (x != name or _is_vector(content.get(x)))
     ]
-    if not named:
+    if not listed:
         refuse_foreign(content, path)
         groups = structures(content, path)
         if groups:
             return read_structures(path, sha256_of(data), groups, layout or {}, rate_hz, gaps)
     if layout:
-        why = f"the rig names the variable {named[0]}" if named else "it has no structure with signals"
+        why = f"the rig names the variable {listed[0]}" if listed else "it has no structure with signals"
         raise RecordError(f"record {path}: a layout is for structures; {why}. Omit the layout")
     mapping = dict(variables) if variables is not None else _every_vector(content, path)
     if "time" not in mapping:
-        found = next((name for name in TIME_NAMES if name in content), None)
-        mapping |= {"time": (found, "s")} if found and rate_hz is None else {}
+        clock = next((name for name in TIME_NAMES if name in content), None)
+        mapping |= {"time": (clock, "s")} if clock and rate_hz is None else {}
     columns = {name: _vector(content, expression, path) for name, (expression, _) in mapping.items()}
     values = _side_by_side(columns, mapping, path)
     names = tuple(columns)
@@ -208,22 +208,22 @@ def _content_v73(path: Path) -> dict[str, Any]:
     size = path.stat().st_size
 
     def text_of(node: Any, name: str) -> str:
-        said = node.attrs.get(name, b"")
-        return said.decode("latin-1") if isinstance(said, bytes) else str(said)
+        text = node.attrs.get(name, b"")
+        return text.decode("latin-1") if isinstance(text, bytes) else str(text)
 
     def taken(node: Any) -> Any:
         kind = text_of(node, "MATLAB_class")
         if "MATLAB_object_decode" in node.attrs and kind not in ("function_handle", "string"):
             return Foreign(kind)
         if isinstance(node, h5py.Group):
-            found = {name: taken(node[name]) for name in node if not name.startswith("#")}
+            fields = {name: taken(node[name]) for name in node if not name.startswith("#")}
             arrays = [
                 isinstance(x, list) and "MATLAB_class" not in node[k].attrs and not isinstance(node[k], h5py.Group)
-                for k, x in found.items()
+                for k, x in fields.items()
             ]
-            if arrays and all(arrays) and len({len(x) for x in found.values()}) == 1:  # an array of structs
-                return [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
-            return found
+            if arrays and all(arrays) and len({len(x) for x in fields.values()}) == 1:  # an array of structs
+                return [dict(zip(fields, row, strict=True)) for row in zip(*fields.values(), strict=True)]
+            return fields
         refuse_claim(path, node.size, node.dtype.itemsize, size)
         if "MATLAB_empty" in node.attrs:
             return "" if kind == "char" else [] if kind == "cell" else np.empty((0, 0))
@@ -256,14 +256,14 @@ def _content_v73(path: Path) -> dict[str, Any]:
 
 def _every_vector(content: Mapping[str, Any], path: Path) -> dict[str, tuple[str, str]]:
     """Map every numeric vector of the file, of unknown unit."""
-    found = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in TIME_NAMES}
-    if not found:
-        held = ", ".join(f"{name} {_shape(value)}" for name, value in list(content.items())[:8]) or "nothing"
+    vectors = {name: (name, UNKNOWN) for name, value in content.items() if _is_vector(value) and name not in TIME_NAMES}
+    if not vectors:
+        shapes = ", ".join(f"{name} {_shape(value)}" for name, value in list(content.items())[:8]) or "nothing"
         raise RecordError(
-            f"record {path} holds no numeric vector at its top ({held}). Say in the rig which one is which channel:"
+            f"record {path} holds no numeric vector at its top ({shapes}). Say in the rig which one is which channel:"
             ' channels.<role>.variable = "data.y" or "y(:,2)"'
         )
-    return found
+    return vectors
 
 
 def _is_vector(value: Any) -> bool:
@@ -280,9 +280,9 @@ def _vector(content: Mapping[str, Any], expression: str, path: Path) -> Array:
     for depth, name in enumerate(match["path"].split(".")):
         if not isinstance(value, Mapping) or name not in value:
             inside = ".".join(match["path"].split(".")[:depth]) or "the file"
-            known = ", ".join(list(value)[:12]) if isinstance(value, Mapping) else "no fields"
+            names = ", ".join(list(value)[:12]) if isinstance(value, Mapping) else "no fields"
             raise RecordError(
-                f"record {path}: {inside} has no {name!r}; it has {known or 'nothing'}. Correct the variable"
+                f"record {path}: {inside} has no {name!r}; it has {names or 'nothing'}. Correct the variable"
             )
         value = value[name]
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiub":

@@ -58,7 +58,7 @@ class _Signal:
 def refuse_foreign(content: Mapping[str, Any], path: Path) -> None:
     """Refuse a file whose data are in objects, and say how they become structs."""
     for name, kind in _foreign(content):
-        remedy = next((text.format(name) for known, text in _REMEDIES.items() if kind.startswith(known)), None)
+        remedy = next((text.format(name) for word, text in _REMEDIES.items() if kind.startswith(word)), None)
         if remedy is not None:
             raise RecordError(
                 f"record {path}: {name} is a MATLAB object of class {kind}, which can be read by MATLAB only. There: "
@@ -81,9 +81,9 @@ def structures(content: Mapping[str, Any], path: Path) -> dict[str, list[_Signal
     """Return the signals of the file by group: by variable, those of variables with one signal each together."""
     groups: dict[str, list[_Signal]] = {}
     for name, node in content.items():
-        found = list(_signals(node, name, path))
-        if found:
-            groups.setdefault(_LONE if len(found) == 1 else name, []).extend(found)
+        signals = list(_signals(node, name, path))
+        if signals:
+            groups.setdefault(_LONE if len(signals) == 1 else name, []).extend(signals)
     loose = {k: v for k, v in content.items() if _vector(v) is not None and k not in _CLOCKS} if groups else {}
     if loose:
         time = next((_vector(content[k]) for k in _CLOCKS if k in content), None)
@@ -126,16 +126,16 @@ def _span(signal: _Signal) -> str:
 
 def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
     """Return a signal with its one unit; several that differ are asked back, and so is a transformation of it."""
-    said = {field: text for field, text in signal.units.items() if text}
+    texts = {field: text for field, text in signal.units.items() if text}
     if "units" in layout:
-        said = {field: text for field, text in said.items() if field == layout["units"]}
-    if len(set(said.values())) > 1:
-        listed = ", ".join(f"{field} says [{text}]" for field, text in said.items())
+        texts = {field: text for field, text in texts.items() if field == layout["units"]}
+    if len(set(texts.values())) > 1:
+        listed = ", ".join(f"{field} says [{text}]" for field, text in texts.items())
         raise RecordError(
             f"record {path}: signal {signal.name!r} has several units ({listed}). Say which field to believe: "
-            f"{setting('layout', f'units={next(iter(said))}')}, or {setting('layout', 'units=none')}"
+            f"{setting('layout', f'units={next(iter(texts))}')}, or {setting('layout', 'units=none')}"
         )
-    values, unit = signal.values, next(iter(said.values()), "")
+    values, unit = signal.values, next(iter(texts.values()), "")
     if signal.factor != (1.0, 0.0):
         if layout.get("values") not in ("si", "label"):
             raise RecordError(
@@ -160,42 +160,42 @@ def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
             yield from _signals(x, f"{name}({k})", path)
     if not isinstance(node, Mapping):
         return
-    known = {key.lower(): x for key, x in node.items()}
-    time = next((v for key in TIME_NAMES if (v := _vector(known.get(key))) is not None), None)
-    if "signals" in known and "time" in known:
-        parts = known["signals"] if isinstance(known["signals"], list) else [known["signals"]]
+    fields = {key.lower(): x for key, x in node.items()}
+    time = next((v for key in TIME_NAMES if (v := _vector(fields.get(key))) is not None), None)
+    if "signals" in fields and "time" in fields:
+        parts = fields["signals"] if isinstance(fields["signals"], list) else [fields["signals"]]
         for k, part in enumerate(parts, 1):
             if isinstance(part, Mapping) and "values" in part:
                 label, inside = label_of(_text(part.get("label")))
                 units = {"label": inside or "", **_units(part)}
                 yield from _columns(part["values"], label or f"signals({k})", path, units, time=time)
-    elif "data" in known and time is not None:
-        unit = _text(_at(known, "timeinfo", "Units")) or _text(known.get("timeunits")) or "s"
-        called = _text(known.get("name")) or name
-        yield from _columns(known["data"], called, path, _units(node), time=time, time_unit=unit)
-    elif "x_values" in known and "y_values" in known:
-        yield from _testlab(known, name, path)
+    elif "data" in fields and time is not None:
+        unit = _text(_at(fields, "timeinfo", "Units")) or _text(fields.get("timeunits")) or "s"
+        called = _text(fields.get("name")) or name
+        yield from _columns(fields["data"], called, path, _units(node), time=time, time_unit=unit)
+    elif "x_values" in fields and "y_values" in fields:
+        yield from _testlab(fields, name, path)
     elif time is not None:
-        told = known.get("units")
+        unit_text = fields.get("units")
         for key, x in node.items():
             vector = None if key.lower() in TIME_NAMES else _vector(x)
             if vector is not None and vector.size == time.size:
-                by_name = {"units": _text(told.get(key)) if isinstance(told, Mapping) else ""}
+                by_name = {"units": _text(unit_text.get(key)) if isinstance(unit_text, Mapping) else ""}
                 yield _Signal(name=key, values=vector, units=by_name, time=time)
     else:
         for key, x in node.items():
-            called = _text(known.get("name")) if key.lower() == "values" else ""
+            called = _text(fields.get("name")) if key.lower() == "values" else ""
             yield from _signals(x, called or (name if key.lower() in ("values", "elements") else key), path)
 
 
-def _testlab(known: Mapping[str, Any], name: str, path: Path) -> Iterator[_Signal]:
-    x, y = known["x_values"], known["y_values"]
+def _testlab(fields: Mapping[str, Any], name: str, path: Path) -> Iterator[_Signal]:
+    x, y = fields["x_values"], fields["y_values"]
     if not (isinstance(x, Mapping) and isinstance(y, Mapping) and "values" in y):
         return
     over = _text(_at(x, "quantity", "label")) or "s"
     if over not in ("s", "ms", "us"):
         raise RecordError(f"record {path}: {name} is over [{over}], not over time. Export the time signals")
-    called = _at(known, "function_record", "name")
+    called = _at(fields, "function_record", "name")
     names = [_text(n) for n in called] if isinstance(called, list) else [_text(called) or name]
     try:
         start, step, count = (float(np.ravel(x[k])[0]) for k in ("start_value", "increment", "number_of_values"))
@@ -257,10 +257,10 @@ def _columns(
 
 def _units(node: Mapping[str, Any]) -> dict[str, str]:
     """Return what a struct says of its unit, by field."""
-    found = {key: _text(node.get(key)) for key in _UNITS}
+    units = {key: _text(node.get(key)) for key in _UNITS}
     info = _at(node, "DataInfo", "Units")
-    found["DataInfo.Units"] = _text(info) or _text(_at(info, "Name"))
-    return {key: text for key, text in found.items() if text}
+    units["DataInfo.Units"] = _text(info) or _text(_at(info, "Name"))
+    return {key: text for key, text in units.items() if text}
 
 
 def _at(node: Any, *keys: str) -> Any:

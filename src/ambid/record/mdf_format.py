@@ -33,14 +33,14 @@ def read_mdf(
         _opened(asammdf, file) as mdf,
     ):
         mdf.configure(read_fragment_size=_FRAGMENT)
-        used = {k: g for k, g in enumerate(mdf.groups) if g.channel_group.cycles_nr}
-        named = {k: getattr(g.channel_group, "acq_name", "") or f"{k}" for k, g in used.items()}
-        called = {k: f"{k}" if list(named.values()).count(name) > 1 else name for k, name in named.items()}
-        listed = {called[k]: [c.name for c in g.channels] for k, g in used.items()}
+        groups = {k: g for k, g in enumerate(mdf.groups) if g.channel_group.cycles_nr}
+        names = {k: getattr(g.channel_group, "acq_name", "") or f"{k}" for k, g in groups.items()}
+        called = {k: f"{k}" if list(names.values()).count(name) > 1 else name for k, name in names.items()}
+        listed = {called[k]: [c.name for c in g.channels] for k, g in groups.items()}
         group = chosen_group(path, listed, layout.get("group"))
         at = next(k for k, name in called.items() if name == group)
         master, streams, left = mdf.masters_db.get(at), list[Stream](), list[str]()
-        for k, channel in enumerate(used[at].channels):
+        for k, channel in enumerate(groups[at].channels):
             first = mdf.get(group=at, index=k, record_count=1, ignore_invalidation_bits=True)
             if first.samples.dtype.kind not in "fiub" or first.samples.ndim != 1:
                 left.append(channel.name)
@@ -48,7 +48,7 @@ def read_mdf(
             unit, time = str(first.unit).strip(), k == master
             streams.append(
                 Stream(
-                    name=channel.name, size=used[at].channel_group.cycles_nr, time=time,
+                    name=channel.name, size=groups[at].channel_group.cycles_nr, time=time,
                     pieces=lambda k=k: _pieces(mdf, at, k),  # type: ignore[misc]
                     units=frozenset({unit} - {""}) or frozenset({"s"} if time else ()),
                     start=(0.0, mdf.header.start_time.isoformat()),

@@ -24,22 +24,22 @@ def read_parquet(
     with library(path, "Parquet or Arrow", (b"PAR1", b"ARROW1")) as digest:
         pyarrow = imported("pyarrow", "a Parquet or Arrow file", "formats")
         schema, rows, pieces, kind = _opened(path)
-        known = [f for f in schema if _is_number(pyarrow, f.type)]
-        dates = [f.name for f in known if pyarrow.types.is_temporal(f.type)]
-        named = [label_of(f.name)[0] for f in known]
+        numeric = [f for f in schema if _is_number(pyarrow, f.type)]
+        dates = [f.name for f in numeric if pyarrow.types.is_temporal(f.type)]
+        names = [label_of(f.name)[0] for f in numeric]
         # dates are time where nothing is called so
-        clock = dates[0] if len(dates) == 1 and not any(map(is_time, named)) else None
+        clock = dates[0] if len(dates) == 1 and not any(map(is_time, names)) else None
         streams = [
             Stream(
                 name=label_of(f.name)[0], size=rows, pieces=lambda name=f.name: pieces(name),  # type: ignore[misc]
                 units=frozenset(_units(f)), time=f.name == clock or is_time(label_of(f.name)[0]),
             )
-            for f in known
+            for f in numeric
         ]  # fmt: skip
-        twice = next((x for k, x in enumerate(named) if x in named[:k]), None)
+        twice = next((x for k, x in enumerate(names) if x in names[:k]), None)
         if twice is not None:
             raise RecordError(f"record {path}: column {twice!r} occurs twice; names must differ. Rename one")
-        left = [f.name for f in schema if f not in known]
+        left = [f.name for f in schema if f not in numeric]
         settings = {"format": kind, **({"left_out": left} if left else {})}
         return record_of(path, digest, streams, settings, layout, rate_hz, gaps)
 

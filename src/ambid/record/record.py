@@ -349,9 +349,9 @@ def cut(record: Record, from_s: float | None = None, to_s: float | None = None) 
         If an end lies outside the record, or nothing would be left.
     """
     begin, end = record.start_s, record.start_s + record.duration_s
-    for label, given in (("from", from_s), ("to", to_s)):
-        if not (given is None or isinstance(given, Real)):
-            raise RecordError(f"cut {label} {given!r}: it must be a time in s. Give a number")
+    for label, bound in (("from", from_s), ("to", to_s)):
+        if not (bound is None or isinstance(bound, Real)):
+            raise RecordError(f"cut {label} {bound!r}: it must be a time in s. Give a number")
     first_s = begin if from_s is None else float(from_s)
     last_s = end if to_s is None else float(to_s)
     slack = _GRID_TOLERANCE / record.rate_hz
@@ -462,9 +462,9 @@ def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, wh
     except UnicodeDecodeError as failure:
         row = data.count(b"\n", 0, failure.start) + 1
         byte = data[failure.start]
-        told = f", or give {setting('layout', 'encoding=latin-1')}" if what == "record" else ""
+        remedy = f", or give {setting('layout', 'encoding=latin-1')}" if what == "record" else ""
         raise error(
-            f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8{told}"
+            f"{what} {path}, row {row}: byte 0x{byte:02x} is not UTF-8 text. Save the file as UTF-8{remedy}"
         ) from None
     if "\0" in text:
         raise error(f"{what} {path} holds binary data (a zero byte); it must be text. Check that it is the right file")

@@ -190,8 +190,8 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
     time = values[:, table.time]
     first_row = table.first_row if gaps == "error" else None
     _check_uniform(time, table.where, table.names[table.time], first_row)
-    found = _agreed(table, (time.size - 1) / (time[-1] - time[0]), rate_hz)
-    return Sampled(values=values, rate_hz=found, start_s=float(time[0]), steps=tuple(steps))
+    rate = _agreed(table, (time.size - 1) / (time[-1] - time[0]), rate_hz)
+    return Sampled(values=values, rate_hz=rate, start_s=float(time[0]), steps=tuple(steps))
 
 
 def usual_rate(table: Table, rate_hz: float | None) -> tuple[float, float]:
@@ -221,13 +221,13 @@ def _check_rate(table: Table, rate_hz: float | None) -> None:
 
 def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
     """Return the rate that the time column says, unless another one was given."""
-    found = float(f"{found_hz:.10g}")  # stamps carry no more than 10 digits of a rate
-    if rate_hz is not None and abs(rate_hz / found - 1) > JITTER:
+    rate = float(f"{found_hz:.10g}")  # stamps carry no more than 10 digits of a rate
+    if rate_hz is not None and abs(rate_hz / rate - 1) > JITTER:
         raise RecordError(
-            f"{table.where}: its time column says {found:g} Hz but {setting('rate_hz')} says {rate_hz:g} Hz; they must "
+            f"{table.where}: its time column says {rate:g} Hz but {setting('rate_hz')} says {rate_hz:g} Hz; they must "
             "agree. Give one of them only"
         )
-    return found
+    return rate
 
 
 def check_gap_policy(gaps: str) -> None:
@@ -295,9 +295,9 @@ def _irregular(time: Array, period: float) -> NDArray[np.bool_]:
 
 def _period_of(time: Array, where: str) -> float:
     """Return the usual interval of a time column that has gaps (NaN)."""
-    known = time[np.isfinite(time)]
-    _enough(known.size, where, "usable row")
-    period = _usual_interval(np.diff(known))
+    stamps = time[np.isfinite(time)]
+    _enough(stamps.size, where, "usable row")
+    period = _usual_interval(np.diff(stamps))
     if not period > 0:
         raise RecordError(f"{where}: time does not increase from row to row; sort the rows, or remove the time column")
     return period

@@ -65,9 +65,9 @@ def library(path: Path, what: str, magic: Sequence[bytes]) -> Iterator[str]:
     except RecordError:
         raise
     except Exception as failure:  # the parsers raise whatever they meet in a damaged file
-        said = " ".join(str(failure).split())[:120]
+        detail = " ".join(str(failure).split())[:120]
         raise RecordError(
-            f"record {path} is damaged, or no {what} file ({type(failure).__name__}: {said}). Copy or export it again"
+            f"record {path} is damaged, or no {what} file ({type(failure).__name__}: {detail}). Copy or export it again"
         ) from None
 
 
@@ -102,13 +102,13 @@ def record_of(
 ) -> Record:  # fmt: skip
     """Read the columns of a file that are wanted, by default all, into a record."""
     streams = _wanted(path, streams, layout)
-    for what, of in (
+    for what, numbers_of in (
         ("length", {s.name: f"{s.size}" for s in streams}),
         ("rate", {s.name: f"{s.rate_hz:.10g} Hz" if s.rate_hz else "none" for s in streams if not s.time}),
         ("start", {s.name: " ".join(map(str, s.start)) for s in streams if not s.time}),
     ):
-        if len(set(of.values())) > 1:
-            listed = ", ".join(f"{name} {text}" for name, text in list(of.items())[:8])
+        if len(set(numbers_of.values())) > 1:
+            listed = ", ".join(f"{name} {text}" for name, text in list(numbers_of.items())[:8])
             raise RecordError(
                 f"record {path}: channels differ in {what} ({listed}); all must have the same. Choose some: "
                 f"{setting('layout', f'channels={streams[0].name},…')}"
@@ -120,14 +120,14 @@ def record_of(
     if not data:
         raise RecordError(f"record {path} has a time column and nothing else; a record needs a channel. Add a column")
     start_s, date = data[0].start
-    found = data[0].rate_hz and agreed_rate(f"record {path}", data[0].rate_hz, rate_hz)
+    rate = data[0].rate_hz and agreed_rate(f"record {path}", data[0].rate_hz, rate_hz)
     for clock in (s for s in streams if s.time):
         stamps, date = _stamps(clock, path)
         table = Table(where=str(path), names=(clock.name,), values=stamps[:, None], first_row=1, time=0)
         if gaps == "error":
             refuse_gaps(table)
-            sampled = sample_uniformly(table, found or rate_hz, gaps)
-            found, start_s = sampled.rate_hz, sampled.start_s
+            sampled = sample_uniformly(table, rate or rate_hz, gaps)
+            rate, start_s = sampled.rate_hz, sampled.start_s
             del stamps, table, sampled  # before the channels take their room
         else:
             data.append(Stream(name=clock.name, units=frozenset("s"), size=n, pieces=lambda x=stamps: (x,), time=True))  # type: ignore[misc]
@@ -142,7 +142,7 @@ def record_of(
     )  # fmt: skip
     if gaps == "error":
         refuse_gaps(table)
-    end = sample_uniformly(table, rate_hz if found is None else found, gaps)
+    end = sample_uniformly(table, rate_hz if rate is None else rate, gaps)
     channels = tuple(
         Channel(name=s.name, unit=unit.si if unit else UNKNOWN, values=end.values[:, j], source_unit=text)
         for j, (s, (unit, text)) in enumerate(zip(data, units, strict=True))
@@ -166,23 +166,23 @@ def refuse_claim(path: Path, n: int, width: int, size: int) -> None:
 def _wanted(path: Path, streams: Sequence[Stream], layout: Mapping[str, str]) -> list[Stream]:
     """Keep the channels that the layout names, and time."""
     if "channels" not in layout:
-        found = list(streams)
+        wanted = list(streams)
     else:
-        names, known = [x.strip() for x in layout["channels"].split(",")], [s.name for s in streams]
+        names, all_names = [x.strip() for x in layout["channels"].split(",")], [s.name for s in streams]
         for name in names:
-            if name not in known:
+            if name not in all_names:
                 raise RecordError(
-                    f"record {path} has no channel {name!r}; it has {', '.join(known)}.{nearest(name, known)} Correct "
-                    "layout channels"
+                    f"record {path} has no channel {name!r}; it has {', '.join(all_names)}.{nearest(name, all_names)} "
+                    "Correct layout channels"
                 )
-        found = [s for s in streams if s.name in names or s.time]
-    clocks = [s.name for s in found if s.time]
-    if not found or len(clocks) > 1:
+        wanted = [s for s in streams if s.name in names or s.time]
+    clocks = [s.name for s in wanted if s.time]
+    if not wanted or len(clocks) > 1:
         what = f"two time columns ({', '.join(clocks)})" if clocks else "no channel of numbers"
         raise RecordError(
             f"record {path} has {what}; it needs one time, and a channel. Choose: {setting('layout', 'channels=…')}"
         )
-    return found
+    return wanted
 
 
 def is_time(name: str) -> bool:
@@ -192,13 +192,13 @@ def is_time(name: str) -> bool:
 
 def _unit_of(stream: Stream, path: Path) -> tuple[Unit | None, str]:
     """Return the unit, None where it is missing or not known, and how the file writes it."""
-    said = {_WORDS.get(text.lower(), text) for text in stream.units}
-    if len(said) > 1:
+    texts = {_WORDS.get(text.lower(), text) for text in stream.units}
+    if len(texts) > 1:
         raise RecordError(
-            f"record {path}: channel {stream.name!r} is in {' and in '.join(f'[{x}]' for x in sorted(said))}; it has "
+            f"record {path}: channel {stream.name!r} is in {' and in '.join(f'[{x}]' for x in sorted(texts))}; it has "
             "one unit. Correct its properties, or export it again"
         )
-    text = next(iter(said), UNKNOWN)
+    text = next(iter(texts), UNKNOWN)
     try:
         unit = parse_unit(text)
     except UnitError:

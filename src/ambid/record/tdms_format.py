@@ -41,14 +41,14 @@ def read_tdms(
 
 
 def _stream(channel: Any) -> Stream:
-    said, time = channel.properties, is_time(channel.name)
-    step = 0.0 if time else said.get("wf_increment", 0.0)
-    date = said.get("wf_start_time")
+    properties, time = channel.properties, is_time(channel.name)
+    step = 0.0 if time else properties.get("wf_increment", 0.0)
+    date = properties.get("wf_start_time")
     return Stream(
         name=channel.name, size=len(channel), time=time, pieces=lambda: _pieces(channel),
-        units=frozenset(str(said[k]).strip() for k in _UNITS if str(said.get(k, "")).strip()),
+        units=frozenset(str(properties[k]).strip() for k in _UNITS if str(properties.get(k, "")).strip()),
         rate_hz=float(f"{1 / step:.10g}") if isinstance(step, float | int) and 0 < step < np.inf else None,
-        start=(float(said.get("wf_start_offset", 0.0)), "" if date is None else f"{date}Z"),
+        start=(float(properties.get("wf_start_offset", 0.0)), "" if date is None else f"{date}Z"),
     )  # fmt: skip
 
 

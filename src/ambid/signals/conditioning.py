@@ -132,16 +132,16 @@ def replace_samples(record: Record, name: str, indices: Sequence[int] | NDArray[
             f"replace sample {outside} of channel {name!r}; samples run from 0 to {old.values.size - 1}. Give "
             f"indices inside"
         )
-    kept = np.setdiff1d(np.arange(old.values.size), which, assume_unique=True)
-    if kept.size == 0:
+    others = np.setdiff1d(np.arange(old.values.size), which, assume_unique=True)
+    if others.size == 0:
         raise RecordError(
             f"all samples of channel {name!r} would be replaced; none is left to interpolate from. Drop it"
         )
-    if not np.isfinite(old.values[kept]).all():
-        bad = int(kept[~np.isfinite(old.values[kept])][0])
+    if not np.isfinite(old.values[others]).all():
+        bad = int(others[~np.isfinite(old.values[others])][0])
         raise RecordError(f"sample {bad} of channel {name!r} is kept but not finite; add it to the samples to replace")
     values = old.values.copy()
-    values[which] = np.interp(which, kept, old.values[kept])
+    values[which] = np.interp(which, others, old.values[others])
     settings = {
         "channel": name,
         "samples": int(which.size),

@@ -78,9 +78,9 @@ def fit_arx(y: Array, inputs: Sequence[Array], na: int, lags: Sequence[int]) -> 
     triangle, rhs = r[:n_columns, :n_columns], r[:n_columns, n_columns]
     # A noise-free record makes lagged columns dependent: the smallest norm among all solutions predicts as well.
     u, s, vt = np.linalg.svd(triangle)
-    kept = s > s[0] * 1e-12
-    inverse = (vt[kept].T / s[kept]) @ u[:, kept].T
-    variance = float(r[n_columns, n_columns] ** 2) / (n_rows - int(kept.sum()))
+    independent = s > s[0] * 1e-12
+    inverse = (vt[independent].T / s[independent]) @ u[:, independent].T
+    variance = float(r[n_columns, n_columns] ** 2) / (n_rows - int(independent.sum()))
     sd = np.sqrt(variance * np.sum(inverse**2, axis=1)) / norms
     return Regression(coefficients=inverse @ rhs / norms, sd=sd, variance=variance, n_rows=n_rows)
 

@@ -416,7 +416,7 @@ def excitation_of_axes(
             "another duration, or other periods"
         )
     period = n_samples // (periods * blocks)
-    found = np.zeros((n_samples, axes))
+    waves = np.zeros((n_samples, axes))
     if name not in AXES_EXCITATIONS:
         if name in ("steps", "chirp", "schroeder") and len(moved) > 1:
             raise AmbidError(
@@ -424,8 +424,8 @@ def excitation_of_axes(
             )
         for j in moved:
             x = excitation(name, period, rate_hz, amplitude=amplitude, band=band, seed=np.random.default_rng([seed, j]))
-            found[:, j] = np.tile(x, periods)
-        return found
+            waves[:, j] = np.tile(x, periods)
+        return waves
     low, high = checked_band(band or (rate_hz / period, rate_hz / 5.0), rate_hz)
     numbers = _line_numbers(period, rate_hz, low, high, "all")
     for k, j in enumerate(moved):
@@ -438,8 +438,8 @@ def excitation_of_axes(
         angle = np.random.default_rng([seed, j]).uniform(0.0, 2.0 * np.pi, own.size)
         turned = [angle + 2.0 * np.pi * b * k / blocks for b in range(blocks)]
         parts = [np.tile(_flattened(period, own, np.ones(own.size), phases, 0), periods) for phases in turned]
-        found[:, j] = scaled(np.concatenate(parts), amplitude, "peak")
-    return found
+        waves[:, j] = scaled(np.concatenate(parts), amplitude, "peak")
+    return waves
 
 
 EXCITATIONS: Mapping[str, Callable[..., Array]] = MappingProxyType(
@@ -504,13 +504,13 @@ def excitation(
     _refuse_unknown(name, tuple(EXCITATIONS))
     checked(n_samples, rate_hz)
     function = prbs if name == "prbs" else EXCITATIONS[name]
-    taken = {"n_samples", "rate_hz", "amplitude", "band", "seed"} | ({"phases"} if name == "schroeder" else set())
-    known = [p for p in signature(function).parameters if p not in taken]
+    own = {"n_samples", "rate_hz", "amplitude", "band", "seed"} | ({"phases"} if name == "schroeder" else set())
+    allowed = [p for p in signature(function).parameters if p not in own]
     for option in options:
-        if option not in known:
-            near = get_close_matches(option, known, n=1, cutoff=0.4)
+        if option not in allowed:
+            near = get_close_matches(option, allowed, n=1, cutoff=0.4)
             hint = f"Did you mean {near[0]!r}?" if near else "Omit it"
-            raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {', '.join(known)}. {hint}")
+            raise AmbidError(f"excitation {name!r} has no option {option!r}; it has {', '.join(allowed)}. {hint}")
     settings: dict[str, object] = {"amplitude": amplitude, **options}
     if name == "steps":
         if band is not None:
@@ -525,8 +525,8 @@ def excitation(
     return EXCITATIONS[name](n_samples, rate_hz, **settings)
 
 
-def _refuse_unknown(name: str, known: Sequence[str]) -> None:
-    if name not in known:
-        near = get_close_matches(name, known, n=1, cutoff=0.4)
+def _refuse_unknown(name: str, allowed: Sequence[str]) -> None:
+    if name not in allowed:
+        near = get_close_matches(name, allowed, n=1, cutoff=0.4)
         hint = f"Did you mean {near[0]!r}?" if near else "Give one of these"
-        raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(known)}. {hint}")
+        raise AmbidError(f"excitation {name!r} is unknown; there are {', '.join(allowed)}. {hint}")

@@ -236,11 +236,11 @@ def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
         ahead, behind = _predictors(clean)
         forward = _errors(x, clean, ahead, spread)
         backward = _errors(x[::-1], clean[::-1], behind, spread)[::-1]
-        found = _stand_out(x, forward, backward, threshold)
-        found[common] = 0.0
-        if np.array_equal(found > 0, sizes > 0):
-            return found
-        sizes = found
+        marks = _stand_out(x, forward, backward, threshold)
+        marks[common] = 0.0
+        if np.array_equal(marks > 0, sizes > 0):
+            return marks
+        sizes = marks
         good = np.flatnonzero(sizes == 0)
         clean = np.interp(np.arange(x.size), good, x[good])
     return sizes
@@ -262,15 +262,15 @@ def _predictors(clean: Array) -> tuple[Array, Array]:
     scaled = clean / size
     windows = [(scaled, lag) for lag in range(_ORDER + 1)]
     triangle = lagged_triangle([*windows, (np.full(clean.size, one), 0)], _ORDER)
-    found = list[Array]()
+    predictors = list[Array]()
     for own, past in ((0, range(1, _ORDER + 1)), (_ORDER, range(_ORDER - 1, -1, -1))):
         # a record without noise makes the samples dependent: the smallest weights among all predict as well
         weights = np.asarray(
             np.linalg.lstsq(triangle[:, [*past, _ORDER + 1]], triangle[:, own], rcond=1e-12)[0], dtype=np.float64
         )
         weights[-1] *= one * size
-        found.append(weights)
-    return found[0], found[1]
+        predictors.append(weights)
+    return predictors[0], predictors[1]
 
 
 def _errors(x: Array, clean: Array, weights: Array, spread: float) -> Array:
@@ -415,8 +415,8 @@ def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
     # Levels that only round-off keeps apart are one, as in a computed sine with a whole number of samples per period.
     apart = np.diff(values) > _ROUND_OFF * (values[-1] - values[0])
     level_of = np.concatenate(([0], np.cumsum(apart)))
-    held = np.bincount(level_of, weights=counts)
-    if held.size < 3 or held[0] < max(_FEWEST, 1 + _PILE * held[1 : 1 + _NEIGHBOURS].max()):
+    samples_at = np.bincount(level_of, weights=counts)
+    if samples_at.size < 3 or samples_at[0] < max(_FEWEST, 1 + _PILE * samples_at[1 : 1 + _NEIGHBOURS].max()):
         return None
     at = x <= values[np.flatnonzero(level_of == 0)[-1]]
     starts, lengths = runs(at)

@@ -117,13 +117,13 @@ def frf_local(
     frequency = np.arange(1, X.shape[0] + 1) * (rate_hz / n)
     wanted = _in_band(frequency, band)
     fitted = _fitted(X, Z, wanted, plan)
-    told = fitted.condition < _WORST
-    if not (told.all() or (leave_out and told.any())):
+    distinct = fitted.condition < _WORST
+    if not (distinct.all() or (leave_out and distinct.any())):
         raise EstimationError(
-            f"{_smooth(~told, frequency[wanted])}. Give a band without them, or excite with noise or a multisine"
+            f"{_smooth(~distinct, frequency[wanted])}. Give a band without them, or excite with noise or a multisine"
         )
-    left = () if told.all() else (_smooth(~told, frequency[wanted]) + "; they are left out",)
-    wanted, fitted = wanted[told], fitted.at(told)
+    left = () if distinct.all() else (_smooth(~distinct, frequency[wanted]) + "; they are left out",)
+    wanted, fitted = wanted[distinct], fitted.at(distinct)
     warnings: tuple[str, ...]
     if r is None:
         G, covariance = fitted.Z, fitted.covariance
@@ -169,7 +169,7 @@ def _in_band(frequency: Array, band: tuple[float, float] | None) -> np.ndarray:
 
 def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
     n_x, n_z, width = X.shape[1], Z.shape[1], 2 * plan.half + 1
-    found = np.empty((wanted.size, n_z, n_x), dtype=complex)
+    responses = np.empty((wanted.size, n_z, n_x), dtype=complex)
     covariance = np.empty((wanted.size, n_z * n_x, n_z * n_x), dtype=complex)
     spread = np.empty((wanted.size, n_x, n_x), dtype=complex)
     condition = np.empty(wanted.size)
@@ -179,7 +179,7 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
         lines = wanted[part]
         # At the ends of the band the window is not centred on its line.
         window = np.clip(lines - plan.half, 0, X.shape[0] - width)[:, None] + np.arange(width)
-        found[part], L, noise, condition[part] = _windows(X[window], Z[window], (window - lines[:, None]), plan)
+        responses[part], L, noise, condition[part] = _windows(X[window], Z[window], (window - lines[:, None]), plan)
         product = np.einsum("faw,fbw->fab", L, L.conj())
         C = noise[:, :, None, :, None] * product[:, None, :, None, :]
         covariance[part] = C.reshape(lines.size, n_z * n_x, n_z * n_x)
@@ -196,7 +196,7 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
             "over the whole band, or give a narrower band"
         ) from None
     return _Fitted(
-        Z=found,
+        Z=responses,
         covariance=np.asarray(0.5 * (covariance + np.conj(np.swapaxes(covariance, 1, 2))), dtype=complex),
         weight=np.asarray(weight, dtype=complex),
         condition=condition,
@@ -215,9 +215,9 @@ def _windows(X: Complex, Z: Complex, q: np.ndarray, plan: _Plan) -> tuple[Comple
     of_x = (X[:, :, None, :] * powers[:, :, :, None]).reshape(*X.shape[:2], -1)
     columns = np.concatenate([of_x, powers], axis=2)
     L, left, condition = _solved(columns, Z, X.shape[2])
-    found = np.einsum("faw,fwi->fia", L, Z)
+    responses = np.einsum("faw,fwi->fia", L, Z)
     noise = np.einsum("fwi,fwj->fij", left, left.conj()) / plan.free
-    return found, L, noise, condition
+    return responses, L, noise, condition
 
 
 def _solved(columns: Complex, Z: Complex, n_x: int) -> tuple[Complex, Complex, Array]:
@@ -285,7 +285,7 @@ def frf_random(
             f"{spectra.n_segments} segments, worth {spectra.n_effective:.1f} averages, with {n_x} inputs or "
             f"references; more than {n_x + 1} averages are needed. Use a longer record, or shorter segments"
         )
-    found, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
+    estimate, warnings = _found(spectra, n_y, n_u, kind, noise_ratio)
     if r is None:
         warnings += () if open_loop else (f"{kind.upper()}: {feedback_caution()}",)
         if kind == "hv" and noise_ratio is None:
@@ -293,8 +293,8 @@ def frf_random(
     length = round(rate_hz / spectra.frequency_hz[1])
     if length % 2 == 0 and length >= _LEAKAGE_FROM:
         half = cross_spectra(z, rate_hz, segment=length // 2)
-        warnings += _leakage(found, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
-    G, covariance, coherence, method = found
+        warnings += _leakage(estimate, _found(half, n_y, n_u, kind, noise_ratio)[0], 2.0 * (spectra.n_effective - n_x))
+    G, covariance, coherence, method = estimate
     return FrequencyResponse(
         frequency_hz=spectra.frequency_hz[_EDGE:-_EDGE],
         G=G,
@@ -330,8 +330,8 @@ def _found(
         Z, covariance, noise = _regressed(S[:, :n_z, :n_z], S[:, :n_z, n_z:], S_rr, n)
         G, C = ratio(Z, covariance, n_y, weight=S_rr)
         coherence = _explained(noise, S, n_y, n, S_rr.shape[1])
-        found = (G, C, coherence, "joint input-output with the reference (Welch)")
-        return found, weak_inputs(Z, covariance, n_y)
+        estimate = (G, C, coherence, "joint input-output with the reference (Welch)")
+        return estimate, weak_inputs(Z, covariance, n_y)
     return _by_kind(S, n_y, n_u, kind, n, noise_ratio), ()
 
 
@@ -498,8 +498,8 @@ def frequency_response(
         )
     if several:
         raise EstimationError(f"method {method!r} takes one record, not several. Give one, or use method 'periodic'")
-    taken = frf_random if method == "random" else frf_local
-    return taken(u, y, rate_hz, r=r, **options)  # type: ignore[arg-type]
+    function = frf_random if method == "random" else frf_local
+    return function(u, y, rate_hz, r=r, **options)  # type: ignore[arg-type]
 
 
 def repeats(x: object) -> bool:

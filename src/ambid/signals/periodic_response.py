@@ -116,13 +116,13 @@ def transient_ratio(periods: Array) -> float:
     S = np.mean(np.abs(noise) ** 2, axis=0) * (count - 1) / (count - 2)
     first = np.fft.rfft(periods[0] - rest.mean(axis=0), axis=0)[1:]
     with np.errstate(divide="ignore", invalid="ignore"):
-        found = np.sum(np.abs(first) ** 2, axis=0) / np.sum(S, axis=0) / (1.0 + 1.0 / (count - 1))
+        share = np.sum(np.abs(first) ** 2, axis=0) / np.sum(S, axis=0) / (1.0 + 1.0 / (count - 1))
         lines = np.sum(S, axis=0) ** 2 / np.sum(S**2, axis=0)
         sd = np.sqrt((1.0 + 1.0 / (count - 2)) / np.maximum(lines, 1.0))
     # Without noise, round-off is not a transient.
     size = np.sqrt(np.mean(np.square(periods), axis=(0, 1)))
     exact = np.sqrt(np.mean(np.square(periods[0] - rest.mean(axis=0)), axis=0)) < 1e-9 * size
-    return float(np.max(np.where(exact | ~np.isfinite(found), 0.0, (found - 1.0) / sd)))
+    return float(np.max(np.where(exact | ~np.isfinite(share), 0.0, (share - 1.0) / sd)))
 
 
 def _differences(x: Array) -> Array:
@@ -219,16 +219,16 @@ def at_excited(detection: Detection, excited: Lines) -> tuple[Complex, float] | 
     negative parts (noise that scatters) at 0. None where there are no such lines.
     """
     odd_only = bool(np.all((excited + 1) % 2 == 1))
-    used = detection.of_parity(True) if odd_only else detection
-    if not used.lines.size:
+    lines = detection.of_parity(True) if odd_only else detection
+    if not lines.lines.size:
         return None
-    pooled = min(_POOLED, used.lines.size)
-    found = used.power if used.noise is None else used.power - used.noise
-    first = np.searchsorted(used.lines, excited) - pooled // 2
-    nearest = np.clip(first, 0, used.lines.size - pooled)[:, None] + np.arange(pooled)
-    level, vectors = np.linalg.eigh(found[nearest].mean(axis=1))
+    pooled = min(_POOLED, lines.lines.size)
+    power = lines.power if lines.noise is None else lines.power - lines.noise
+    first = np.searchsorted(lines.lines, excited) - pooled // 2
+    nearest = np.clip(first, 0, lines.lines.size - pooled)[:, None] + np.arange(pooled)
+    level, vectors = np.linalg.eigh(power[nearest].mean(axis=1))
     covariance = (vectors * np.maximum(level, 0.0)[:, None, :]) @ np.conj(np.swapaxes(vectors, 1, 2))
-    return covariance, 2.0 * pooled * used.n_experiments
+    return covariance, 2.0 * pooled * lines.n_experiments
 
 
 def _rms(power: Complex) -> Array:
@@ -293,12 +293,12 @@ def _ratio_of_means(Z: Complex, C: Complex | None, R: Complex, n_y: int) -> Foun
         by_r = np.eye(n_z)[:, None, :, None] * np.swapaxes(inverse, 2, 3)[:, :, None, :, None, :]
         of_noise = transformed(C, by_r.reshape(M, n_f, n_z * n_u, n_z * n_u)).sum(axis=0) / M**2
     of_all = scatter(responses.reshape(M, n_f, -1)) / M if M > 1 else None
-    known = of_noise if of_all is None else of_all
+    covariance = of_noise if of_all is None else of_all
     return Found(
         G=G,
         noise=None if of_noise is None else transformed(of_noise, T),
         total=None if of_all is None else transformed(of_all, T),
-        warnings=() if known is None else weak_inputs(mean, known, n_y),
+        warnings=() if covariance is None else weak_inputs(mean, covariance, n_y),
     )
 
 
@@ -343,9 +343,9 @@ def frf_periodic(
         period = find_period(experiments[0][0] if experiments[0][2] is None else experiments[0][2])
     spectra = [_spectra(k, *e, period, drop_periods) for k, e in enumerate(experiments)]
     excited, doubts = _lines(spectra, lines, n_y, period)
-    found = over_realisations(spectra, excited, n_y, n_u)
-    warnings = tuple(w for s in spectra for w in s.warnings) + doubts + found.warnings
-    if found.noise is None and r is None and not open_loop:
+    estimate = over_realisations(spectra, excited, n_y, n_u)
+    warnings = tuple(w for s in spectra for w in s.warnings) + doubts + estimate.warnings
+    if estimate.noise is None and r is None and not open_loop:
         warnings += (f"one period cannot reveal noise at the input: {feedback_caution()}",)
     spacing = rate_hz / period
     details: dict[str, object] = {
@@ -355,12 +355,12 @@ def frf_periodic(
         "realisations": len(spectra) // n_u,
         "lines": tuple(int(k) + 1 for k in excited),
     }
-    total, nu, more = _total(spectra, excited, found, spacing, n_u, details)
+    total, nu, more = _total(spectra, excited, estimate, spacing, n_u, details)
     return FrequencyResponse(
         frequency_hz=np.asarray((excited + 1) * spacing, dtype=np.float64),
-        G=found.G,
+        G=estimate.G,
         covariance=total,
-        noise_covariance=found.noise,
+        noise_covariance=estimate.noise,
         method="periodic, joint input-output with the reference" if r is not None else "periodic",
         inputs=labels(inputs, "u", n_u),
         outputs=labels(outputs, "y", n_y),
@@ -385,18 +385,18 @@ def _experiments(
     rs = [None] * len(us) if r is None else [r] if isinstance(r, np.ndarray) else list(r)
     if not us or not len(us) == len(ys) == len(rs):
         raise EstimationError(f"{len(us)} experiments of u, {len(ys)} of y and {len(rs)} of r. Give as many of each")
-    found = [checked(*e, rate_hz, inputs, outputs) for e in zip(us, ys, rs, strict=True)]
-    shapes = {tuple(0 if x is None else x.shape[1] for x in e) for e in found}
+    experiments = [checked(*e, rate_hz, inputs, outputs) for e in zip(us, ys, rs, strict=True)]
+    shapes = {tuple(0 if x is None else x.shape[1] for x in e) for e in experiments}
     if len(shapes) > 1:
         raise EstimationError(f"experiments differ in their channels (u, y, r): {sorted(shapes)}. Use the same in all")
     n_u, _, n_r = shapes.pop()
-    if len(found) % n_u or (n_r and n_r != n_u):
+    if len(experiments) % n_u or (n_r and n_r != n_u):
         raise EstimationError(
-            f"{len(found)} experiments with {n_u} inputs and {n_r} references; each realisation takes {n_u} "
+            f"{len(experiments)} experiments with {n_u} inputs and {n_r} references; each realisation takes {n_u} "
             "experiments, and a reference for each input. Add experiments, or use the local method "
             f"({setting('method', 'local')})"
         )
-    return found
+    return experiments
 
 
 def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int | str) -> Spectra:
@@ -419,15 +419,15 @@ def _spectra(k: int, u: Array, y: Array, r: Array | None, period: int, drop: int
     if drop == "auto" and dropped:
         first = "first period holds" if dropped == 1 else f"first {dropped} periods hold"
         warnings += (f"experiment {k + 1}: the {first} a transient and {'is' if dropped == 1 else 'are'} not used",)
-    used = all_z[dropped:]
-    if used.shape[0] >= 3 and transient_ratio(used[:, :, :n_z]) > _TRANSIENT:
+    periods = all_z[dropped:]
+    if periods.shape[0] >= 3 and transient_ratio(periods[:, :, :n_z]) > _TRANSIENT:
         warnings += (
             f"experiment {k + 1}: the first period differs from the others by more than noise: a transient, which "
             f"biases G and its variance. Cut it off ({setting('from_s')}, or drop_periods)",
         )
-    Z = np.fft.rfft(used, axis=1)[:, 1 : (period + 1) // 2] / period
+    Z = np.fft.rfft(periods, axis=1)[:, 1 : (period + 1) // 2] / period
     mean = Z.mean(axis=0)
-    count = used.shape[0]
+    count = periods.shape[0]
     d = Z[:, :, :n_z] - mean[:, :n_z]
     noise = np.einsum("pfi,pfj->fij", d, d.conj()) / (count * (count - 1)) if count > 1 else None
     return Spectra(
@@ -471,44 +471,44 @@ def _lines(spectra: list[Spectra], lines: Sequence[int] | None, n_y: int, period
 
 
 def _total(
-    spectra: list[Spectra], excited: Lines, found: Found, spacing: float, n_u: int, details: dict[str, object]
+    spectra: list[Spectra], excited: Lines, estimate: Found, spacing: float, n_u: int, details: dict[str, object]
 ) -> tuple[Complex, Array | float, tuple[str, ...]]:
     """Return the total covariance, its degrees of freedom and warnings; enter the distortion levels in `details`."""
     M = len(spectra) // n_u
     of_noise = 2.0 * (sum(s.n_periods for s in spectra) - len(spectra)) / n_u
     details["noise_degrees_of_freedom"] = of_noise
-    n_y = found.G.shape[1]
+    n_y = estimate.G.shape[1]
     detection = None
     if n_u == 1 and excited[-1] - excited[0] >= excited.size:
         Z = np.stack([s.Z for s in spectra])
-        C = np.stack([s.noise for s in spectra if s.noise is not None]) if found.noise is not None else None
-        detection = detected(Z, C, found.G, excited)
+        C = np.stack([s.noise for s in spectra if s.noise is not None]) if estimate.noise is not None else None
+        detection = detected(Z, C, estimate.G, excited)
         details["distortions"] = distortions(detection, spacing, Z[:, excited, :n_y])
-    if found.total is not None:
-        return found.total, 2.0 * (M - 1), ()
-    known = None if detection is None else at_excited(detection, excited)
-    if known is None and found.noise is None:
+    if estimate.total is not None:
+        return estimate.total, 2.0 * (M - 1), ()
+    at_lines = None if detection is None else at_excited(detection, excited)
+    if at_lines is None and estimate.noise is None:
         raise EstimationError(
             "one period of one realisation without free lines gives no variance. Measure more periods or "
             f"realisations, omit lines, or use the local method ({setting('method', 'local')})"
         )
-    if known is None and found.noise is not None:
+    if at_lines is None and estimate.noise is not None:
         return (
-            found.noise,
+            estimate.noise,
             of_noise,
             (
                 "one realisation without free lines like the excited ones: the variance is noise only, without the "
                 "nonlinear distortion",
             ),
         )
-    assert known is not None
+    assert at_lines is not None
     inverse = right_inverse(np.mean([s.Z[excited, n_y:] for s in spectra], axis=0)[:, :, None])
-    distortion = known[0] * np.abs(inverse) ** 2
-    if found.noise is None:
-        return distortion, known[1], ()
-    total = found.noise + distortion
-    a, b = (np.real(np.trace(c, axis1=1, axis2=2)) for c in (found.noise, distortion))
+    distortion = at_lines[0] * np.abs(inverse) ** 2
+    if estimate.noise is None:
+        return distortion, at_lines[1], ()
+    total = estimate.noise + distortion
+    a, b = (np.real(np.trace(c, axis1=1, axis2=2)) for c in (estimate.noise, distortion))
     # Satterthwaite: the degrees of freedom of a sum of two variances
     with np.errstate(divide="ignore", invalid="ignore"):
-        nu = (a + b) ** 2 / (a**2 / of_noise + b**2 / known[1])
+        nu = (a + b) ** 2 / (a**2 / of_noise + b**2 / at_lines[1])
     return total, np.where(np.isfinite(nu), nu, of_noise), ()

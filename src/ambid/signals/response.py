@@ -152,8 +152,8 @@ class FrequencyResponse:
         # The F distribution with 2 and ν degrees of freedom has this closed quantile; -ln(1 - level) is its limit.
         nu = np.broadcast_to(np.asarray(self.degrees_of_freedom, dtype=np.float64), self.frequency_hz.shape)
         quantile = np.full(nu.shape, -np.log1p(-level))
-        known = np.isfinite(nu)
-        quantile[known] = 0.5 * nu[known] * np.expm1(-np.log1p(-level) * 2.0 / nu[known])
+        finite = np.isfinite(nu)
+        quantile[finite] = 0.5 * nu[finite] * np.expm1(-np.log1p(-level) * 2.0 / nu[finite])
         return np.asarray(self.sd * np.sqrt(quantile)[:, None, None])
 
     def between(self, low_hz: float, high_hz: float) -> FrequencyResponse:
@@ -234,8 +234,8 @@ def columns(x: Array, what: str, names: Sequence[str] | None = None) -> Array:
     if np.iscomplexobj(x) or x.ndim not in (1, 2) or x.size == 0:
         raise EstimationError(f"the {what} has shape {x.shape}; it must be real, (n_samples, n). Reshape it")
     x = np.asarray(x[:, None] if x.ndim == 1 else x, dtype=np.float64)
-    named = names is not None and len(names) == x.shape[1]
-    called = [f"{what} {names[k]!r}" if names and named else f"{what} {k + 1}" for k in range(x.shape[1])]
+    complete = names is not None and len(names) == x.shape[1]
+    called = [f"{what} {names[k]!r}" if names and complete else f"{what} {k + 1}" for k in range(x.shape[1])]
     if not np.isfinite(x).all():
         row, column = np.argwhere(~np.isfinite(x))[0]
         raise EstimationError(

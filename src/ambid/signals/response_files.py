@@ -62,8 +62,8 @@ def read_response(
     `rate_hz`: of the plant's converters, for delays in samples and a held input. Returns also file, SHA-256 and what
     was done.
     """
-    told = dict(layout or {})
-    for word in told:
+    words = dict(layout or {})
+    for word in words:
         if word not in WORDS:
             raise RecordError(
                 f"{path}: layout {word!r} of a frequency response; it is one of {', '.join(WORDS)}."
@@ -77,8 +77,8 @@ def read_response(
     data = file_bytes(path)
     uff = path.name.lower().endswith(ENDINGS)
     with np.errstate(over="ignore", invalid="ignore"):  # what is not finite is refused by its line
-        every, left = read_uff(path, data, told) if uff else (_csv(path, told, inputs, outputs), 0)
-    functions, done = _checked(path, every, told)
+        every, left = read_uff(path, data, words) if uff else (_csv(path, words, inputs, outputs), 0)
+    functions, done = _checked(path, every, words)
     first = functions[0]
     ask = list(dict.fromkeys(references or inputs or [f.input for f in functions]))
     give = list(dict.fromkeys([*outputs, *(inputs if references else ())] or [f.output for f in functions]))
@@ -91,7 +91,7 @@ def read_response(
                     f"{path} has no response {i} → {o}; it has {listed}. Choose by {setting('input')}, "
                     f"{setting('output')} and {setting('reference')}"
                 )
-    averages = _averages(path, told)
+    averages = _averages(path, words)
     Z = np.stack([np.stack([table[o, i].values for i in ask], axis=1) for o in give], axis=1)
     variance, freedom, assumed = _variance([table[o, i] for o in give for i in ask], averages)
     covariance = np.asarray(np.eye(len(give) * len(ask))[None] * variance[:, None, :], dtype=np.complex128)
@@ -119,7 +119,7 @@ def read_response(
         done.append(f"no rate: delays count in samples of {rate:.6g} Hz")
     if left:
         done.append(f"{left} other functions left out")
-    found = FrequencyResponse(
+    response = FrequencyResponse(
         frequency_hz=first.frequency_hz, G=Z, covariance=covariance,
         coherence=np.stack(coherent, axis=1) if coherent and all(c is not None for c in coherent) else None,  # type: ignore[arg-type]
         method="file, joint input-output with the reference" if references else "file", inputs=tuple(ask),
@@ -132,7 +132,7 @@ def read_response(
     record: dict[str, object] = {
         "file": path.name, "sha256": sha256_of(data), "rate_hz": rate, "history": done, "units": units,
     }  # fmt: skip
-    return found, record
+    return response, record
 
 
 def _si(text: str) -> str:
@@ -151,24 +151,24 @@ def _units_of(path: Path, functions: Sequence[Function]) -> dict[str, str]:
     return units
 
 
-def _averages(path: Path, told: Mapping[str, str]) -> int | None:
-    if "averages" not in told:
+def _averages(path: Path, words: Mapping[str, str]) -> int | None:
+    if "averages" not in words:
         return None
-    if not told["averages"].isdecimal() or not 2 <= int(told["averages"]) <= 10**6:
+    if not words["averages"].isdecimal() or not 2 <= int(words["averages"]) <= 10**6:
         raise RecordError(
-            f"{path}: layout averages={told['averages']!r}; it is a number of spectra, 2 or more. Correct it"
+            f"{path}: layout averages={words['averages']!r}; it is a number of spectra, 2 or more. Correct it"
         )
-    return int(told["averages"])
+    return int(words["averages"])
 
 
-def _checked(path: Path, functions: Sequence[Function], told: Mapping[str, str]) -> tuple[list[Function], list[str]]:
+def _checked(path: Path, functions: Sequence[Function], words: Mapping[str, str]) -> tuple[list[Function], list[str]]:
     """Return the chosen functions on one grid over 0 Hz, and what was done."""
     chosen, done = list(functions), list[str]()
-    if "functions" in told:
-        numbers = [x.strip() for x in told["functions"].split(",")]
+    if "functions" in words:
+        numbers = [x.strip() for x in words["functions"].split(",")]
         if not all(x.isdecimal() and 1 <= int(x) <= len(chosen) for x in numbers):
             raise RecordError(
-                f"{path} has functions 1 to {len(chosen)}; layout functions={told['functions']!r}. Correct it"
+                f"{path} has functions 1 to {len(chosen)}; layout functions={words['functions']!r}. Correct it"
             )
         chosen = [chosen[int(x) - 1] for x in numbers]
     if not chosen:
@@ -250,10 +250,10 @@ def _scatter(values: Complex) -> Array:
 # ---- CSV
 
 
-def _header(path: Path, told: Mapping[str, str]) -> tuple[list[str], list[str], int, str] | None:
+def _header(path: Path, words: Mapping[str, str]) -> tuple[list[str], list[str], int, str] | None:
     """Return the cells of the header, all lines, where rows begin, and the delimiter; None without a frequency."""
     data = file_bytes(path)
-    text, _ = decoded(gunzipped(data, path) if path.name.lower().endswith(".gz") else data, path, _csv_words(told))
+    text, _ = decoded(gunzipped(data, path) if path.name.lower().endswith(".gz") else data, path, _csv_words(words))
     lines = text.split("\n")
     first = next((k for k, x in enumerate(lines) if x.strip() and not x.startswith("#")), None)
     if first is None:
@@ -262,7 +262,7 @@ def _header(path: Path, told: Mapping[str, str]) -> tuple[list[str], list[str], 
     cells, start = [x.strip() for x in lines[first].split(delimiter)], first + 1
     if not _is_frequency(cells[0]):
         return None
-    dialect = recognised(lines, path, _csv_words(told))
+    dialect = recognised(lines, path, _csv_words(words))
     if dialect is not None:
         units = dialect.units or (None,) * len(dialect.cells)
         cells = [x if u is None else f"{x} [{u}]" for x, u in zip(dialect.cells, units, strict=True)]
@@ -270,8 +270,8 @@ def _header(path: Path, told: Mapping[str, str]) -> tuple[list[str], list[str], 
     return cells, lines, start, delimiter
 
 
-def _csv_words(told: Mapping[str, str]) -> dict[str, str]:
-    return {k: v for k, v in told.items() if k in ("decimal", "separator", "thousands", "encoding", "units")}
+def _csv_words(words: Mapping[str, str]) -> dict[str, str]:
+    return {k: v for k, v in words.items() if k in ("decimal", "separator", "thousands", "encoding", "units")}
 
 
 def _is_frequency(cell: str) -> bool:
@@ -279,10 +279,10 @@ def _is_frequency(cell: str) -> bool:
     return name.lower() in _FREQUENCY and unit in (None, "Hz", "kHz", "rad/s")
 
 
-def _csv(path: Path, told: Mapping[str, str], inputs: Sequence[str], outputs: Sequence[str]) -> list[Function]:
-    found = _header(path, told)
-    assert found is not None
-    cells, lines, start, delimiter = found
+def _csv(path: Path, words: Mapping[str, str], inputs: Sequence[str], outputs: Sequence[str]) -> list[Function]:
+    header = _header(path, words)
+    assert header is not None
+    cells, lines, start, delimiter = header
     rows = []
     for k, line in enumerate(lines[start:], start + 1):
         if line.strip():
@@ -314,12 +314,12 @@ def _csv(path: Path, told: Mapping[str, str], inputs: Sequence[str], outputs: Se
             raise RecordError(f"{path}: {pair} has two columns {part}. Rename one")
         groups[pair.strip()][part] = table[:, j], unit
     return [
-        _of_columns(path, pair, parts, scale * table[:, 0], told, inputs, outputs) for pair, parts in groups.items()
+        _of_columns(path, pair, parts, scale * table[:, 0], words, inputs, outputs) for pair, parts in groups.items()
     ]
 
 
 def _of_columns(
-    path: Path, pair: str, parts: Mapping[str, tuple[Array, str | None]], frequency_hz: Array, told: Mapping[str, str],
+    path: Path, pair: str, parts: Mapping[str, tuple[Array, str | None]], frequency_hz: Array, words: Mapping[str, str],
     inputs: Sequence[str], outputs: Sequence[str],
 ) -> Function:  # fmt: skip
     output, slash, source = (x.strip() for x in pair.partition("/"))
@@ -338,11 +338,11 @@ def _of_columns(
                 f"{path}: {pair} phase is in [{angle or 'no unit'}]; write 'phase [deg]' or 'phase [rad]'"
             )
         if unit == "dB":
-            if "magnitude" not in told:
+            if "magnitude" not in words:
                 raise RecordError(
                     f"{path}: {pair} is in dB of what? Say the unit of 0 dB: {setting('layout', 'magnitude=m/A')}"
                 )
-            size, unit = 10 ** (size / 20), told["magnitude"]
+            size, unit = 10 ** (size / 20), words["magnitude"]
         elif np.any(size < 0):
             raise RecordError(f"{path}: {pair} has a negative magnitude: is it in dB? Write 'magnitude [dB]'")
         values = size * np.exp(1j * (np.deg2rad(phase) if angle == "deg" else phase))
@@ -395,9 +395,9 @@ _QUANTITIES = {8: "m", 9: "N", 11: "m/s", 12: "m/s^2", 13: "N", 15: "Pa"}  # SI 
 _FRF, _COHERENCE = (4, 5), 6  # function types; 5 is transmissibility
 
 
-def read_uff(path: Path, data: bytes, told: Mapping[str, str]) -> tuple[list[Function], int]:
+def read_uff(path: Path, data: bytes, words: Mapping[str, str]) -> tuple[list[Function], int]:
     """Return the responses of datasets 58, with the coherence of each, and how many other functions there are."""
-    found: list[Function] = []
+    functions: list[Function] = []
     coherence: dict[tuple[str, str], Array] = {}
     left, system = 0, 0
     for number, body, binary in _datasets(path, data):
@@ -405,19 +405,19 @@ def read_uff(path: Path, data: bytes, told: Mapping[str, str]) -> tuple[list[Fun
             system = int(body[0][:10])
         if number != 58:
             continue
-        kind, function = _function(path, body, binary, len(found) + left + 1, system, told)
+        kind, function = _function(path, body, binary, len(functions) + left + 1, system, words)
         if kind == _COHERENCE:
             coherence[function.output, function.input] = function.values.real
         elif kind in _FRF:
-            found.append(function)
+            functions.append(function)
         else:
             left += 1
-    return [replace(f, coherence=coherence.get((f.output, f.input))) for f in found], left
+    return [replace(f, coherence=coherence.get((f.output, f.input))) for f in functions], left
 
 
 def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple[str, bytes] | None]]:
     """Yield number, lines and, of a binary one, byte order with the bytes behind its first lines."""
-    at, seen = 0, 0
+    at, count = 0, 0
     while True:
         begin = re.compile(rb"^ {4}-1[ \t]*\r?\n", re.M).search(data, at)
         if begin is None:
@@ -427,7 +427,7 @@ def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple
         if head.strip() == "-1":  # an end too many: this one may be a beginning
             at = begin.end()
             continue
-        seen += 1
+        count += 1
         try:
             number, binary = int(head[:6]), head[6:7].lower() == "b"
             order, form, n_lines, size = (
@@ -435,23 +435,23 @@ def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple
             )
         except ValueError:
             raise RecordError(
-                f"{path}: dataset {seen} begins with {head[:40]!r}, not with its number. It is damaged"
+                f"{path}: dataset {count} begins with {head[:40]!r}, not with its number. It is damaged"
             ) from None
         if binary:
             if order not in (1, 2) or form != 2:
-                raise RecordError(f"{path}: dataset {seen} is binary in a form that is not IEEE. Export it as ASCII")
+                raise RecordError(f"{path}: dataset {count} is binary in a form that is not IEEE. Export it as ASCII")
             cut = end_of_head + 1
             for _ in range(n_lines):
                 cut = data.find(b"\n", cut) + 1
                 if cut == 0:
-                    raise RecordError(f"{path}: dataset {seen} ends within its head: it is cut off. Copy it again")
+                    raise RecordError(f"{path}: dataset {count} ends within its head: it is cut off. Copy it again")
             lines = data[end_of_head + 1 : cut].splitlines()
             # writers announce wrong sizes of complex values: the end that follows decides
             sizes = [size, *_sizes(lines)]
             ends = [k for k in sizes if re.match(rb"[\r\n]*[ ]*-1\s", data[cut + k : cut + k + 12] + b"\n")]
             if not ends:
                 raise RecordError(
-                    f"{path}: dataset {seen} is cut off or damaged: no end after its {size} bytes. Copy it again"
+                    f"{path}: dataset {count} is cut off or damaged: no end after its {size} bytes. Copy it again"
                 )
             block = data[cut : cut + ends[0]]
             at = data.find(b"-1", cut + ends[0]) + 2
@@ -459,10 +459,10 @@ def _datasets(path: Path, data: bytes) -> Iterator[tuple[int, list[bytes], tuple
             continue
         end = re.compile(rb"^ {4}-1[ \t]*\r?$", re.M).search(data, end_of_head + 1)
         if end is None:
-            raise RecordError(f"{path}: dataset {seen} has no end (a line -1): it is cut off. Copy it again")
+            raise RecordError(f"{path}: dataset {count} has no end (a line -1): it is cut off. Copy it again")
         yield number, data[end_of_head + 1 : end.start()].splitlines(), None
         at = end.end()
-    if not seen:
+    if not count:
         raise RecordError(
             f"{path} is no universal file: no line holds -1 alone. Copy it again, or name its real format"
         )
@@ -480,7 +480,7 @@ def _sizes(lines: Sequence[bytes]) -> list[int]:
 
 def _function(
     path: Path, body: Sequence[bytes], binary: tuple[str, bytes] | None, count: int, system: int,
-    told: Mapping[str, str],
+    words: Mapping[str, str],
 ) -> tuple[int, Function]:  # fmt: skip
     """Read a function of dataset 58: records 6 to 12."""
     where = f"{path}: function {count}"
@@ -508,7 +508,7 @@ def _function(
     factor, units = 1.0, [UNKNOWN, UNKNOWN]
     for k, (quantity, text) in enumerate(axes[1:]):
         if text and text != "NONE" and kind in _FRF:
-            if system > 1 and told.get("units") != "labels":
+            if system > 1 and words.get("units") != "labels":
                 raise RecordError(
                     f"{where} is labelled [{text}], and dataset 164 says units of system {system}, not SI. Say that "
                     f"the labels hold: {setting('layout', 'units=labels')}; or export in SI"
@@ -532,8 +532,8 @@ def _dof(text: str) -> str:
     entity, node, direction = text[:10].strip(), int(text[10:20]), int(text[20:24])
     sign = "-" if direction < 0 else ""
     point = f"{node}{sign}{_DIRECTIONS[abs(direction)]}" if abs(direction) in _DIRECTIONS else f"{node}:{direction}"
-    named = "" if entity in ("", "NONE") else entity
-    return named if named and node == 0 and direction == 0 else f"{named} {point}".strip()
+    label = "" if entity in ("", "NONE") else entity
+    return label if label and node == 0 and direction == 0 else f"{label} {point}".strip()
 
 
 def _values(

@@ -81,12 +81,12 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
     RecordError
         If the segment does not fit the record.
     """
-    found = cross_spectra(x[:, None], rate_hz, segment=segment)
+    spectra = cross_spectra(x[:, None], rate_hz, segment=segment)
     return PowerSpectrum(
-        frequency_hz=found.frequency_hz,
-        density=np.ascontiguousarray(found.density[:, 0, 0].real),
-        n_segments=found.n_segments,
-        n_effective=found.n_effective,
+        frequency_hz=spectra.frequency_hz,
+        density=np.ascontiguousarray(spectra.density[:, 0, 0].real),
+        n_segments=spectra.n_segments,
+        n_effective=spectra.n_effective,
     )
 
 
@@ -216,8 +216,8 @@ def snr(
         scaled = [(x - x.mean()) / (x.std() or 1.0) for x in u]
         fit = fit_arx((y - y.mean()) / spread, scaled, order, range(order + 1) if scaled else ())
         noise = fit.variance * spread**2
-    by = f" and inputs {', '.join(driving)}" if driving else ", no inputs: a lower bound"
-    method = f"one-step prediction error, {order} lags of the channel{by}"
+    source = f" and inputs {', '.join(driving)}" if driving else ", no inputs: a lower bound"
+    method = f"one-step prediction error, {order} lags of the channel{source}"
     total = float(np.var(y))
     noise = min(noise, total)
     signal = total - noise

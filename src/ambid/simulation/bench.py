@@ -79,19 +79,21 @@ class Simulation:
     @property
     def warnings(self) -> tuple[str, ...]:
         """One sentence for each thing that a user should know: an unstable loop, each limit that was met."""
-        rate, found = self.record.rate_hz, []
+        rate, warnings = self.record.rate_hz, []
         if self.largest_pole > 1.0 + 1e-9:
-            found.append(f"the loop is unstable: its largest pole has magnitude {self.largest_pole:.6g}")
+            warnings.append(f"the loop is unstable: its largest pole has magnitude {self.largest_pole:.6g}")
         if self.first_contact is not None:
-            found.append(f"the rotor touched a stop at sample {self.first_contact} ({self.first_contact / rate:.6g} s)")
+            warnings.append(
+                f"the rotor touched a stop at sample {self.first_contact} ({self.first_contact / rate:.6g} s)"
+            )
         if self.first_saturated is not None:
-            found.append(
+            warnings.append(
                 f"the command was limited in {self.n_saturated} of {self.record.n_samples} samples, first at sample"
                 f" {self.first_saturated}"
             )
         if self.n_over_current:
-            found.append(f"the current was beyond its limits in {self.n_over_current} samples")
-        return tuple(found)
+            warnings.append(f"the current was beyond its limits in {self.n_over_current} samples")
+        return tuple(warnings)
 
 
 def simulate(
@@ -207,13 +209,13 @@ class VaryingLoop:
         self.loop, self.limits, self.noise = loop or Loop(), limits or Limits(), noise or Noise()
         self.standing, self.rate_hz = Standing.of(plant, operating_point), rate_hz
         self.variation, self._told = variation or Variation(), variation is not None
-        of, period, whole = self.standing.model, 1.0 / rate_hz, math.floor(self.loop.delay)
+        model, period, whole = self.standing.model, 1.0 / rate_hz, math.floor(self.loop.delay)
         fraction = self.loop.delay - whole
         self.tables: Tables | None = None
         if isinstance(plant, LinearPlant):
-            check_variation(self.variation, of)
+            check_variation(self.variation, model)
             v, grid = self.variation, max(1, round(grid_s * rate_hz))
-            self.tables = Tables(of, plant.parameters, v.parameters, v.gains, rate_hz, fraction, grid)
+            self.tables = Tables(model, plant.parameters, v.parameters, v.gains, rate_hz, fraction, grid)
         else:
             if self._told:
                 raise ModelError("a nonlinear plant does not vary. Give a LinearPlant, or omit the variation")
@@ -221,23 +223,26 @@ class VaryingLoop:
         self._run: Callable[..., int] = run
         self._rng, self.current_offset = np.random.default_rng(seed), current_offset
         self._x = self.standing.centre.copy() if start is None else _vector("start", start, self.standing.centre.size)
-        law = law_on(self.loop, of, rate_hz)
+        law = law_on(self.loop, model, rate_hz)
         self._memory, self.counts = np.zeros(3 + (law.order if law else 0)), np.array([0, -1, -1, 0])
         self._line = np.full(whole + 2, self.standing.centre_input)
         self.n_over_current = 0
         force, voltage = self.noise.held_rms(rate_hz)
         sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
-        self._sizes = np.array([sizes[name] for name in (*of.outputs, *of.disturbances)])
-        self._roles = tuple(of.outputs.index(o) if o in of.outputs else -1 for o in ("position", "current"))
-        c, resolution = self.loop, [getattr(self.noise, f"{name}_resolution") for name in (*of.outputs, of.inputs[0])]
+        self._sizes = np.array([sizes[name] for name in (*model.outputs, *model.disturbances)])
+        self._roles = tuple(model.outputs.index(o) if o in model.outputs else -1 for o in ("position", "current"))
+        c, resolution = (
+            self.loop,
+            [getattr(self.noise, f"{name}_resolution") for name in (*model.outputs, model.inputs[0])],
+        )
         self._law = (
-            np.array([of.states.index(o) for o in of.outputs]),
+            np.array([model.states.index(o) for o in model.outputs]),
             self._roles,
             np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
             matrices_of(law),
             current_offset,
             np.array(resolution[:-1]),
-            (*getattr(self.limits, of.inputs[0]), resolution[-1]),
+            (*getattr(self.limits, model.inputs[0]), resolution[-1]),
             self.limits.position,
             self.standing.gap,
         )
@@ -245,9 +250,9 @@ class VaryingLoop:
     @property
     def units(self) -> Mapping[str, str]:
         """SI units of speed, angle, and of everything in `Stretch.truth`."""
-        of = self.standing.model
+        model = self.standing.model
         fixed = {"speed": "rad/s", "angle": "rad", "force": "N", "unbalance": "kg m", "unbalance_phase": "rad"}
-        return {**{s.name: s.unit for s in of.parameters}, **{f"gain_{o}": "1" for o in of.outputs}, **fixed}
+        return {**{s.name: s.unit for s in model.parameters}, **{f"gain_{o}": "1" for o in model.outputs}, **fixed}
 
     @property
     def n_done(self) -> int:
@@ -259,22 +264,22 @@ class VaryingLoop:
 
         `load` (n_samples,): force over each sample in N, beside what varies.
         """
-        of, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
+        model, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
         wanted = _vector("setpoint", standing.point.position if setpoint is None else setpoint, n)
         if self.tables is None:
-            pieces = Pieces(np.array([0, n]), np.ones((1, len(of.outputs))), self._equations, {})
+            pieces = Pieces(np.array([0, n]), np.ones((1, len(model.outputs))), self._equations, {})
         else:
             pieces = self.tables.pieces(first, first + n)
         # All columns are drawn whatever their size, so that one level changed leaves the others' numbers as they were.
         noise = self._rng.standard_normal((n, self._sizes.size)) * self._sizes
         u = np.array(excitation, dtype=np.float64)
-        if self.current_offset and "current" in of.outputs:
+        if self.current_offset and "current" in model.outputs:
             noise[:, self._roles[1]] += self.current_offset
         force, speed, angle, loads = self._loads(first, n)
         if load is not None:
             force = force + load if force.size else np.ascontiguousarray(load, dtype=np.float64)
-        column = of.disturbances.index("force") if "force" in of.disturbances else -1
-        measured, command, states = np.empty((n, len(of.outputs))), np.empty(n), np.empty((n, self._x.size))
+        column = model.disturbances.index("force") if "force" in model.disturbances else -1
+        measured, command, states = np.empty((n, len(model.outputs))), np.empty(n), np.empty((n, self._x.size))
         lost = self._run(
             u, wanted, noise, force, column, pieces.edges, pieces.equations, pieces.gains, self._x, self._memory,
             self._line, self.counts, standing.centre, standing.centre_input, *self._law, measured, command, states,
@@ -290,13 +295,13 @@ class VaryingLoop:
                 f"the simulation leaves the air gap or diverges {at}, and stops in the gap. Give limits.position, "
                 "another loop, or more substeps"
             )
-        if "current" in of.states:
-            i, (low, high) = states[:, of.states.index("current")], self.limits.current
+        if "current" in model.states:
+            i, (low, high) = states[:, model.states.index("current")], self.limits.current
             self.n_over_current += int(np.count_nonzero((i < low) | (i > high)))
         truth = {name: np.repeat(values, np.diff(pieces.edges)) for name, values in pieces.theta.items()}
         truth.update(loads)
         return Stretch(
-            first=first, command=command, measured=measured, states=states[:, : len(of.states)], speed=speed,
+            first=first, command=command, measured=measured, states=states[:, : len(model.states)], speed=speed,
             angle=angle, truth=MappingProxyType(truth),
         )  # fmt: skip
 
@@ -319,9 +324,12 @@ class VaryingLoop:
 def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.random.Generator) -> Simulation:
     """Return all stretches of a run, in order, as one simulation; `seed` is for the record's history."""
     standing, loop, rate_hz = running.standing, running.loop, running.rate_hz
-    of, plant = standing.model, standing.plant
-    named = "a generator" if isinstance(seed, np.random.Generator) else str(seed)
-    made = {"plant": f"{of.name}, {'linear' if isinstance(plant, LinearPlant) else 'nonlinear'}", "seed": named}
+    model, plant = standing.model, standing.plant
+    seed_text = "a generator" if isinstance(seed, np.random.Generator) else str(seed)
+    origin = {
+        "plant": f"{model.name}, {'linear' if isinstance(plant, LinearPlant) else 'nonlinear'}",
+        "seed": seed_text,
+    }
     settings = {name: acting(getattr(running, name)) for name in ("loop", "noise", "limits")}
     begin = {name: float(s.at(np.zeros(1), rate_hz)[0]) for name, s in running.variation.parameters.items()}
     truth = {**standing.parameters(), **begin, "delay": loop.delay}
@@ -332,11 +340,11 @@ def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.rand
         record=Record(
             rate_hz=rate_hz,
             channels=_channels(running, stretches),
-            history=(Step(name="simulate", settings={**made, "rate_hz": rate_hz, **settings}),),
-            provenance=MappingProxyType({"simulator": "ambid.simulation", **made}),
+            history=(Step(name="simulate", settings={**origin, "rate_hz": rate_hz, **settings}),),
+            provenance=MappingProxyType({"simulator": "ambid.simulation", **origin}),
         ),
         states=np.concatenate([s.states for s in stretches]),
-        state_names=of.states,
+        state_names=model.states,
         truth=MappingProxyType(truth),
         first_contact=contact,
         first_saturated=saturated,
@@ -348,42 +356,44 @@ def join(running: VaryingLoop, stretches: Sequence[Stretch], seed: int | np.rand
 
 def _channels(running: VaryingLoop, stretches: Sequence[Stretch]) -> tuple[Channel, ...]:
     """Return input, current and position as far as the model has them, speed and angle, and what varies."""
-    of, units = running.standing.model, running.units
+    model, units = running.standing.model, running.units
     measured = np.concatenate([s.measured for s in stretches])
-    columns = {of.inputs[0]: np.concatenate([s.command for s in stretches])}
-    columns |= {name: measured[:, of.outputs.index(name)] for name in ("current", "position") if name in of.outputs}
+    columns = {model.inputs[0]: np.concatenate([s.command for s in stretches])}
+    columns |= {
+        name: measured[:, model.outputs.index(name)] for name in ("current", "position") if name in model.outputs
+    }
     for name in ("speed", "angle"):
         parts = [x for x in (getattr(s, name) for s in stretches) if x is not None]
         columns |= {name: np.concatenate(parts)} if parts else {}
-    found = [Channel(name=name, unit={**of.units, **units}[name], values=x) for name, x in columns.items()]
+    channels = [Channel(name=name, unit={**model.units, **units}[name], values=x) for name, x in columns.items()]
     for name in stretches[0].truth:
         values = np.concatenate([s.truth[name] for s in stretches])
-        found.append(Channel(name=f"{TRUE}{name}", unit=units[name], values=values))
-    return tuple(found)
+        channels.append(Channel(name=f"{TRUE}{name}", unit=units[name], values=values))
+    return tuple(channels)
 
 
 def acting(values: Loop | Noise | Limits) -> dict[str, object]:
     """Return the settings that act, as JSON-able values: zeros and infinite limits are left out."""
-    found: dict[str, object] = {}
+    settings: dict[str, object] = {}
     for name in values.__slots__:
         value = getattr(values, name)
         if name == "laws":  # the first of them is the law
             continue
         if isinstance(value, StateLaw):
-            found[name] = f"state space of order {value.order}"
+            settings[name] = f"state space of order {value.order}"
         elif isinstance(value, tuple):
             ends = {end: v for end, v in zip(("low", "high"), value, strict=True) if math.isfinite(v)}
             if ends:
-                found[name] = ends
+                settings[name] = ends
         elif value and math.isfinite(value):
-            found[name] = value
-    return found
+            settings[name] = value
+    return settings
 
 
 def _largest_pole(running: VaryingLoop) -> float:
     """Return the largest modulus over the run, looked at wherever a change begins or ends."""
     v, rate, loop = running.variation, running.rate_hz, running.loop
-    of, at = running.standing.model, np.zeros(1)
+    model, at = running.standing.model, np.zeros(1)
     if running.tables is not None and (v.parameters or v.gains):
         corners = running.tables.corners
         corners = corners[corners <= running.n_done][:: max(1, corners.size // 50)].astype(np.float64)
@@ -394,8 +404,8 @@ def _largest_pole(running: VaryingLoop) -> float:
     for k in range(at.size):
         here = {**running.standing.parameters(), **{name: float(x[k]) for name, x in theta.items()}}
         p, c = (float(gains[o][k]) if o in gains else 1.0 for o in ("position", "current"))
-        found = closed_loop_poles(here, loop.scaled(p, c), rate, of=of.name)
-        largest = max(largest, float(np.abs(found[0])))
+        poles = closed_loop_poles(here, loop.scaled(p, c), rate, of=model.name)
+        largest = max(largest, float(np.abs(poles[0])))
     return largest
 
 

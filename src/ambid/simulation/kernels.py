@@ -145,19 +145,19 @@ def multiply(matrix: Array, vector: Array, into: Array) -> None:
 
 
 @compiled(error_model="numpy")
-def ordered(law: Law, z: Array, seen: Array, into: Array) -> None:
+def ordered(law: Law, z: Array, inputs: Array, into: Array) -> None:
     """Write what a `StateLaw` orders; zero without one."""
     into[:] = 0.0
     multiply(law[2], z, into)
-    multiply(law[3], seen, into)
+    multiply(law[3], inputs, into)
 
 
 @compiled(error_model="numpy")
-def carry_law(law: Law, z: Array, seen: Array, lost: Array) -> None:
+def carry_law(law: Law, z: Array, inputs: Array, lost: Array) -> None:
     """Carry the states of a `StateLaw` over one sample in place; `lost`: what was ordered less what was wanted."""
     after = np.zeros(z.size)
     multiply(law[0], z, after)
-    multiply(law[1], seen, after)
+    multiply(law[1], inputs, after)
     multiply(law[4], lost, after)
     z[:] = after
 
@@ -278,7 +278,7 @@ def run(
     roles: tuple[int, int],
     gains: Array,
     law: Law,
-    shown: float,
+    offset: float,
     resolution: Array,
     limits: tuple[float, float, float],
     stops: tuple[float, float],
@@ -292,7 +292,7 @@ def run(
     `noise` (n, n_outputs + n_disturbances); `force` (n,) adds to the disturbance `force_column`, or is empty. `edges`
     (n_pieces + 1) bound the stretches of `sensor_gain` (n_pieces, n_outputs) and of a linear plant's matrices, each
     with one axis more in front. `outputs` are the states that are measured, `roles` the columns among them of position
-    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `shown` what the current's sensor shows without current,
+    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `offset` what the current's sensor shows without current,
     `limits` low, high and resolution of the command, and `gap` the positions between which the equations hold.
 
     Kept between calls: x (n_states,), memory = integral, derivative, last position, law; line = the
@@ -305,7 +305,7 @@ def run(
     integral, derivative, last = memory[0], memory[1], memory[2]
     whole, n_outputs, n = line.size - 2, outputs.size, command.size
     disturbance, room = np.empty(noise.shape[1] - n_outputs), np.empty(x.size)
-    z, seen, wanted, lost = memory[3:], np.zeros(law[3].shape[1]), np.zeros(1), np.zeros(1)
+    z, inputs, wanted, lost = memory[3:], np.zeros(law[3].shape[1]), np.zeros(1), np.zeros(1)
     for piece in range(edges.size - 1):
         gain = sensor_gain[piece]
         if len(equations) == 3:
@@ -327,19 +327,19 @@ def run(
                 moved = y - last if counts[0] > 0 else 0.0
                 last = y
             if current_at >= 0:
-                carried = measured[k, current_at] - centre[outputs[current_at]] - shown
+                carried = measured[k, current_at] - centre[outputs[current_at]] - offset
             feed = centre_input + excitation[k]
-            if seen.size > 0:
-                seen[0] = -error
-                seen[seen.size - 1] = carried if current_at >= 0 else -error
-                ordered(law, z, seen, wanted)
+            if inputs.size > 0:
+                inputs[0] = -error
+                inputs[inputs.size - 1] = carried if current_at >= 0 else -error
+                ordered(law, z, inputs, wanted)
                 feed += wanted[0]
             command[k], integral, derivative, limited = order(
                 feed, error, moved, carried, integral, derivative, gains, limits
             )
-            if seen.size > 0:
+            if inputs.size > 0:
                 lost[0] = command[k] - quantise(feed, limits[2])
-                carry_law(law, z, seen, lost)
+                carry_law(law, z, inputs, lost)
             if limited:
                 counts[3] += 1
                 if counts[2] < 0:
@@ -371,11 +371,18 @@ RotorNonlinear = tuple[Array, Integers, Array, Array, Integers, Array, Array, tu
 
 @compiled(error_model="numpy")
 def rate(
-    x: Array, seen: Array, moving: Array, voltage: Array, force: Array, plant: RotorNonlinear, into: Array, room: Array
+    x: Array,
+    motion: Array,
+    moving: Array,
+    voltage: Array,
+    force: Array,
+    plant: RotorNonlinear,
+    into: Array,
+    room: Array,
 ) -> bool:
     """Write the derivative of the states; tell whether all gaps are open.
 
-    `seen`, `moving` (n_axes,): what each axis sees of the rotor and of its speed; `voltage`, `force` (n_axes,): with
+    `motion`, `moving` (n_axes,): what each axis sees of the rotor and of its speed; `voltage`, `force` (n_axes,): with
     disturbances; `room` (n_axes, n_axes + 2) is to work in: inductances, what drives the currents, force.
     """
     values, places, pushes, poles, axes, resistance, leakage, (flows, acts), _ = plant
@@ -391,12 +398,12 @@ def rate(
     for p in range(poles.shape[0]):
         k, gap, current, sigma, d1, w1, d2, w2 = poles[p]
         a, b = axes[p, 0], axes[p, 1]
-        gap -= d1 * seen[a]
+        gap -= d1 * motion[a]
         acting = current + w1 * x[acts + a]
         current += w1 * x[flows + a]
         closing = d1 * moving[a]
         if b >= 0:
-            gap -= d2 * seen[b]
+            gap -= d2 * motion[b]
             acting += w2 * x[acts + b]
             current += w2 * x[flows + b]
             closing += d2 * moving[b]
@@ -444,7 +451,7 @@ def advance_poles(
     fraction, period, steps = plant[8]
     n, n_coordinates = magnets.shape
     at, total, slope = np.empty(x.size), np.empty(x.size), np.empty(x.size)
-    seen, moving, voltage, room = np.empty(n), np.empty(n), np.empty(n), np.empty((n, n + 2))
+    motion, moving, voltage, room = np.empty(n), np.empty(n), np.empty(n), np.empty((n, n + 2))
     touched = False
     for part in range(2):
         length = period * (fraction if part == 0 else 1.0 - fraction)
@@ -457,11 +464,11 @@ def advance_poles(
             total[:] = x
             at[:] = x
             for stage in range(4):
-                seen[:] = 0.0
+                motion[:] = 0.0
                 moving[:] = 0.0
-                multiply(magnets, at, seen)
+                multiply(magnets, at, motion)
                 multiply(magnets, at[n_coordinates:], moving)
-                if not rate(at, seen, moving, voltage, disturbance, plant, slope, room):
+                if not rate(at, motion, moving, voltage, disturbance, plant, slope, room):
                     return touched, False
                 weight = h / 6.0 if stage in (0, 3) else h / 3.0
                 step = 0.5 * h if stage < 2 else h
@@ -536,16 +543,16 @@ def run_rotor(
     n, n_inputs, n_outputs = command.shape[0], command.shape[1], measured.shape[1]
     n_axes = magnets.shape[0]
     fed, wanted, lost = np.zeros(law[3].shape[1]), np.zeros(n_inputs), np.zeros(n_inputs)
-    disturbance, after, seen = np.empty(noise.shape[1] - n_outputs), np.empty(x.size), np.empty(n_outputs)
+    disturbance, after, inputs = np.empty(noise.shape[1] - n_outputs), np.empty(x.size), np.empty(n_outputs)
     whole = line.shape[0] - 2
     for k in range(n):
-        seen[:] = 0.0
-        multiply(read, x, seen)
+        inputs[:] = 0.0
+        multiply(read, x, inputs)
         for j in range(n_outputs):
-            if not math.isfinite(seen[j]):
+            if not math.isfinite(inputs[j]):
                 return k
             run_out = offsets[k, j] if offsets.shape[0] > 0 else 0.0
-            measured[k, j] = quantise(seen[j] + run_out + noise[k, j], resolution[j])
+            measured[k, j] = quantise(inputs[j] + run_out + noise[k, j], resolution[j])
         truth[k] = 0.0
         multiply(magnets, x, truth[k])
         for j in range(carried.size):

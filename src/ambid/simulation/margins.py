@@ -198,8 +198,8 @@ def _stable_gains(largest: Callable[[float], float], stable: bool) -> Interval |
     holds[middle] = stable
     if not holds.any():
         return None
-    found = np.flatnonzero(holds)
-    inside = int(found[np.argmin(np.abs(found - middle))])
+    places = np.flatnonzero(holds)
+    inside = int(places[np.argmin(np.abs(places - middle))])
     low = high = inside
     while low > 0 and holds[low - 1]:
         low -= 1

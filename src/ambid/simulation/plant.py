@@ -69,19 +69,19 @@ class Standing:
         """Return `plant` at `point`, by default at rest at zero."""
         more: list[float] = []
         if isinstance(plant, LinearPlant):
-            of, point = plant.model, point or OperatingPoint()
+            linear, point = plant.model, point or OperatingPoint()
         else:
-            of, point = model("one-axis"), point or plant.equilibrium(0.0)
+            linear, point = model("one-axis"), point or plant.equilibrium(0.0)
             if math.isfinite(plant.eddy_pole):
                 more = [plant.magnet.coenergy.force(point.position, point.current)]
-        known = {"position": point.position, "velocity": 0.0, "current": point.current, "voltage": point.voltage}
-        known["force"] = 0.0  # behind an eddy pole, from rest
+        values = {"position": point.position, "velocity": 0.0, "current": point.current, "voltage": point.voltage}
+        values["force"] = 0.0  # behind an eddy pole, from rest
         return cls(
             plant=plant,
-            model=of,
+            model=linear,
             point=point,
-            centre=np.array([known[s] for s in of.states] + more),
-            centre_input=known[of.inputs[0]],
+            centre=np.array([values[s] for s in linear.states] + more),
+            centre_input=values[linear.inputs[0]],
         )
 
     def parameters(self) -> Mapping[str, float]:
@@ -124,18 +124,18 @@ def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
     """
     magnet, stage, w = plant.magnet, plant.stage, plant.magnet.coenergy
     if isinstance(magnet, LawMagnet):
-        found = {"L_leak": 0.0, **magnet.values, "x_offset": magnet.x_offset}
-        kept = {*magnet.law.names[:2], "L_leak", "g"}
+        numbers = {"L_leak": 0.0, **magnet.values, "x_offset": magnet.x_offset}
+        always = {*magnet.law.names[:2], "L_leak", "g"}
     elif isinstance(w, CoEnergy) and (w.k_a == 0.0 or w.s_a == w.s_b):
-        found = law_numbers(w)
-        kept = {"k", "s", "L_leak", "g"}
+        numbers = law_numbers(w)
+        always = {"k", "s", "L_leak", "g"}
     else:
         return {}
-    found |= {"a": plant.eddy_pole if math.isfinite(plant.eddy_pole) else 0.0, "v_offset": stage.offset}
-    found |= {"v_drop": stage.v_drop, "i_drop": stage.i_drop if stage.v_drop else 0.0}
-    found["g"] = plant.gravity
-    names = [spec.name for spec in BEARING_NUMBERS if spec.name in found]
-    return {"R": plant.R, **{n: found[n] for n in names if found[n] != 0.0 or n in kept}}
+    numbers |= {"a": plant.eddy_pole if math.isfinite(plant.eddy_pole) else 0.0, "v_offset": stage.offset}
+    numbers |= {"v_drop": stage.v_drop, "i_drop": stage.i_drop if stage.v_drop else 0.0}
+    numbers["g"] = plant.gravity
+    names = [spec.name for spec in BEARING_NUMBERS if spec.name in numbers]
+    return {"R": plant.R, **{n: numbers[n] for n in names if numbers[n] != 0.0 or n in always}}
 
 
 def closed_loop_matrix(
@@ -275,8 +275,8 @@ def closed_loop_poles(
     with np.errstate(all="ignore"):
         z = closed_loop_matrix(parameters, loop, rate_hz, of=of)
     if not np.isfinite(z).all():
-        given = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
-        raise ModelError(f"the loop at {rate_hz:g} Hz diverges ({given}). Correct the parameters")
+        values = ", ".join(f"{name} = {value:g}" for name, value in parameters.items())
+        raise ModelError(f"the loop at {rate_hz:g} Hz diverges ({values}). Correct the parameters")
     if loop.ki == 0.0 and loop.law is None:
         count = len((model(of) if isinstance(of, str) else of).inputs)
         keep = np.r_[: z.shape[0] - 3 * count, z.shape[0] - 2 * count : z.shape[0]]

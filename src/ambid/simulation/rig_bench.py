@@ -42,25 +42,25 @@ def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
 
     Returns `values`: all numbers of ``[magnet.parameters]`` with a value, whatever their role, and m, R and c; SI.
     """
-    known = rig.magnet
-    if known is None:
+    magnet = rig.magnet
+    if magnet is None:
         raise RigError(
             f"rig {rig.name!r} has no [magnet]; a nonlinear simulation needs one. Add it with kind and parameters, "
             "or omit nonlinear"
         )
-    kind = "single" if known.kind == "auto" and known.gap == "exponential" else known.kind
+    kind = "single" if magnet.kind == "auto" and magnet.gap == "exponential" else magnet.kind
     if kind == "auto":
         raise RigError(
             f"rig {rig.name!r}: magnet.kind is 'auto', which a simulation cannot resolve without a record. Give "
             "kind = 'single' or 'pair'"
         )
     law = MagnetLaw(
-        gap=known.gap or "hyperbolic", pair=kind == "pair", saturation=known.saturation,
-        rise=_has(known, known.rise, ("L_rise", "i_knee")),
-        asymmetric=_has(known, known.asymmetric, ("k_asym", "i0_asym")),
+        gap=magnet.gap or "hyperbolic", pair=kind == "pair", saturation=magnet.saturation,
+        rise=_has(magnet, magnet.rise, ("L_rise", "i_knee")),
+        asymmetric=_has(magnet, magnet.asymmetric, ("k_asym", "i0_asym")),
     )  # fmt: skip
-    given = [*(rig.parameter(n) for n in ("m", "R", "c")), *known.parameters]
-    values = {p.name: p.value for p in given if p.value is not None}
+    parameters = [*(rig.parameter(n) for n in ("m", "R", "c")), *magnet.parameters]
+    values = {p.name: p.value for p in parameters if p.value is not None}
     needed = [
         "m",
         "R",
@@ -68,10 +68,10 @@ def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
         *law.names[:2],
         "L_leak",
         *(["i0"] if law.pair else []),
-        *(p.name for p in known.parameters),
+        *(p.name for p in magnet.parameters),
     ]
     needed += [n for n, on in (("sigma", law.saturation), ("L_rise", law.rise), ("i_knee", law.rise)) if on]
-    needed += ["a"] if known.eddy else []
+    needed += ["a"] if magnet.eddy else []
     missing = list(dict.fromkeys(n for n in needed if n not in values))
     if missing:
         where = " and ".join(
@@ -89,9 +89,9 @@ def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
     return law, values
 
 
-def _has(known: RigMagnet, said: bool | None, names: tuple[str, ...]) -> bool:
+def _has(magnet: RigMagnet, setting: bool | None, names: tuple[str, ...]) -> bool:
     """Whether the law has a part that the rig may leave to the records: as it says, else where it names a number."""
-    return any(known.known(n) is not None for n in names) if said is None else said
+    return any(magnet.known(n) is not None for n in names) if setting is None else setting
 
 
 def plant_of_rig(rig: Rig) -> NonlinearPlant:
@@ -145,8 +145,8 @@ def current_offset(rig: Rig) -> float:
 
     Returns in A.
     """
-    known = None if rig.magnet is None else rig.magnet.known("i_offset")
-    return 0.0 if known is None or known.value is None else known.value
+    offset = None if rig.magnet is None else rig.magnet.known("i_offset")
+    return 0.0 if offset is None or offset.value is None else offset.value
 
 
 def rest_of_rig(rig: Rig, plant: NonlinearPlant) -> OperatingPoint:
@@ -319,9 +319,9 @@ class Bench:
                 name=source.name, plant=plant, loop=loop, limits=source.limits, noise=source.noise,
                 point=source.operating_point, rate_hz=source.rate_hz if rate_hz is None else rate_hz,
             )  # fmt: skip
-        plant, found, point = parts_of_rig(source, closed, nonlinear=nonlinear)
+        plant, controller, point = parts_of_rig(source, closed, nonlinear=nonlinear)
         return cls(
-            name=source.name, plant=plant, loop=found or Loop(), limits=source.limits or Limits(),
+            name=source.name, plant=plant, loop=controller or Loop(), limits=source.limits or Limits(),
             noise=source.noise or Noise(), point=point, rate_hz=source.rate_for(rate_hz), rig=source,
         )  # fmt: skip
 
@@ -339,10 +339,10 @@ class Bench:
     def refuse_unstable(self) -> None:
         """Refuse a closed loop that is predicted unstable."""
         if self.loop.closed:
-            of = Standing.of(self.plant, self.point).model.name
-            found = loop_margins(self.parameters, self.loop, self.rate_hz, of=of)
+            model_name = Standing.of(self.plant, self.point).model.name
+            margins = loop_margins(self.parameters, self.loop, self.rate_hz, of=model_name)
             where = f"{self.name!r} at {self.rate_hz:g} Hz with a delay of {self.loop.delay:.2g} samples"
-            found.refuse(where, remedy="Correct [loop] or the parameters")
+            margins.refuse(where, remedy="Correct [loop] or the parameters")
 
     def simulate(
         self,
@@ -371,11 +371,11 @@ class Bench:
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
         """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits."""
-        found = largest_amplitude(
+        amplitude = largest_amplitude(
             lambda u: self.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
             operating_point=self.point, fraction=fraction,
         )  # fmt: skip
-        return float(f"{found:.3g}")
+        return float(f"{amplitude:.3g}")
 
 
 def parts_of_rig(
@@ -429,9 +429,9 @@ def as_columns(record: Record, rig: Rig, setpoint: Array | None = None) -> Recor
         roles["reference"] = Channel(name="reference", unit="m", values=setpoint)
     for name, unit in TURNING.items():
         roles.setdefault(name, Channel(name=name, unit=unit, values=np.zeros(record.n_samples)))
-    of = rig.plant
-    taken = {c.role for c in rig.channels} | set(of.inputs) | set(of.outputs)
-    others = [c for c in record.channels if c.name not in taken]
+    plant = rig.plant
+    occupied = {c.role for c in rig.channels} | set(plant.inputs) | set(plant.outputs)
+    others = [c for c in record.channels if c.name not in occupied]
     channels = tuple(_raw(roles[c.role], c) for c in rig.channels)
     columns = MappingProxyType({c.role: c.column for c in rig.channels})
     return record.with_step(Step(name="uncalibrate", settings=columns), channels=(*channels, *others))

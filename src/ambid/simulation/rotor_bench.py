@@ -66,48 +66,48 @@ class Poles(NamedTuple):
     leakage: Array  # (n_axes,), H
 
 
-def poles_of(rig: Rig, of: RotorModel, theta: Mapping[str, float]) -> Poles:
+def poles_of(rig: Rig, rotor: RotorModel, theta: Mapping[str, float]) -> Poles:
     """Return the pole pairs that have the linear numbers of a rig at its centre.
 
     Raises `RigError` where there is no gap, or no magnet can have these numbers.
     """
-    known, where = rig.magnet, f"rig {rig.name!r}"
-    gap = None if known is None else known.known("s")
-    if known is None or gap is None or not gap.value or gap.value <= 0.0:
+    magnet, where = rig.magnet, f"rig {rig.name!r}"
+    gap = None if magnet is None else magnet.known("s")
+    if magnet is None or gap is None or not gap.value or gap.value <= 0.0:
         raise RigError(
             f"{where}: there is no gap; a nonlinear simulation needs it. Give s = {{ value = …, unit = \"mm\" }} in "
             "[magnet.parameters], or omit nonlinear"
         )  # fmt: skip
-    if len(of.coils) != len(of.axes):
+    if len(rotor.coils) != len(rotor.axes):
         raise RigError(f"{where}: an axis is driven by its current; nonlinear magnets need voltages. Omit nonlinear")
-    sigma = known.known("sigma")
+    sigma = magnet.known("sigma")
     saturation, s = 0.0 if sigma is None or sigma.value is None else sigma.value, gap.value
-    radial = [j for j, (_, plane) in enumerate(of.placed) if plane < 2]
-    axial = [j for j, (_, plane) in enumerate(of.placed) if plane == 2]
-    ends = [b.name for b in of.bearings if not b.axial]
-    if known.cone and (len(axial) != 1 or len(ends) != 2):
+    radial = [j for j, (_, plane) in enumerate(rotor.placed) if plane < 2]
+    axial = [j for j, (_, plane) in enumerate(rotor.placed) if plane == 2]
+    ends = [b.name for b in rotor.bearings if not b.axial]
+    if magnet.cone and (len(axial) != 1 or len(ends) != 2):
         raise RigError(f"{where}: magnet.cone needs two radial bearings and an axial one. Remove it, or add them")
     rows, axes = list[list[float]](), list[tuple[int, int]]()
-    leakage = np.array([theta[f"{axis}.L"] for axis in of.axes])
-    for j in radial if known.cone else range(len(of.axes)):
-        cosine, sine = math.cos(known.cone), math.sin(known.cone)
-        k, bias = _strength(of.axes[j], theta, s, saturation, cosine, where)
-        pull = 1.0 if ends[-1:] == [of.placed[j][0].name] else -1.0  # of its stator along the shaft
-        along = (pull * sine, 0.5 * pull) if known.cone else (0.0, 0.0)
+    leakage = np.array([theta[f"{axis}.L"] for axis in rotor.axes])
+    for j in radial if magnet.cone else range(len(rotor.axes)):
+        cosine, sine = math.cos(magnet.cone), math.sin(magnet.cone)
+        k, bias = _strength(rotor.axes[j], theta, s, saturation, cosine, where)
+        pull = 1.0 if ends[-1:] == [rotor.placed[j][0].name] else -1.0  # of its stator along the shaft
+        along = (pull * sine, 0.5 * pull) if magnet.cone else (0.0, 0.0)
         for side in (1.0, -1.0):
             rows.append([k, s, bias, saturation, side * cosine, side, *along])
-            axes.append((j, axial[0] if known.cone else -1))
-    found = Poles(np.array(rows), np.array(axes, dtype=np.int64), leakage)
-    _take_own(found)
-    if known.cone:
-        _check_axial(found, of.axes[axial[0]], axial[0], theta, where)
-    short = [of.axes[j] for j in range(leakage.size) if leakage[j] < -1e-9 * theta[f"{of.axes[j]}.L"]]
+            axes.append((j, axial[0] if magnet.cone else -1))
+    poles = Poles(np.array(rows), np.array(axes, dtype=np.int64), leakage)
+    _take_own(poles)
+    if magnet.cone:
+        _check_axial(poles, rotor.axes[axial[0]], axial[0], theta, where)
+    short = [rotor.axes[j] for j in range(leakage.size) if leakage[j] < -1e-9 * theta[f"{rotor.axes[j]}.L"]]
     if short:
         raise RigError(
             f"{where}: L of {', '.join(short)} is below k_i^2/abs(k_x), which the magnet's own energy needs. Correct "
             "L, k_i or k_x"
         )
-    return found
+    return poles
 
 
 def _strength(
@@ -127,28 +127,28 @@ def _strength(
     return k_i * s**2 * math.sqrt(1.0 + sigma * bias**2) / (2.0 * cosine * bias), bias
 
 
-def _take_own(found: Poles) -> None:
+def _take_own(poles: Poles) -> None:
     """Leave of the inductances what is not that of the poles."""
-    k, s, bias, sigma, _, winding, _, second = found.numbers.T
+    k, s, bias, sigma, _, winding, _, second = poles.numbers.T
     own = k / s * (1.0 + sigma * bias**2) ** -1.5
-    np.subtract.at(found.leakage, found.axes[:, 0], own * winding**2)
-    coupled = found.axes[:, 1] >= 0
-    np.subtract.at(found.leakage, found.axes[coupled, 1], (own * second**2)[coupled])
+    np.subtract.at(poles.leakage, poles.axes[:, 0], own * winding**2)
+    coupled = poles.axes[:, 1] >= 0
+    np.subtract.at(poles.leakage, poles.axes[coupled, 1], (own * second**2)[coupled])
 
 
-def _check_axial(found: Poles, axis: str, j: int, theta: Mapping[str, float], where: str) -> None:
+def _check_axial(poles: Poles, axis: str, j: int, theta: Mapping[str, float], where: str) -> None:
     """Refuse numbers of the axial axis that are not those of the cones."""
-    k, s, bias, sigma, _, _, along, winding = found.numbers[found.axes[:, 1] == j].T
+    k, s, bias, sigma, _, _, along, winding = poles.numbers[poles.axes[:, 1] == j].T
     r = np.sqrt(1.0 + sigma * bias**2)
     needed = {
         "k_i": float(np.sum(k * bias / r * along * winding / s**2)),
         "k_x": -float(np.sum(2.0 * k * bias**2 / (1.0 + r) * along**2 / s**3)),
     }
     for name, value in needed.items():
-        given = theta[f"{axis}.{name}"]
-        if abs(given - value) > _SAME * abs(value):
+        stated = theta[f"{axis}.{name}"]
+        if abs(stated - value) > _SAME * abs(value):
             raise RigError(
-                f"{where}: {axis}.{name} is {given:g}; with this cone the radial magnets make it {value:.6g}. Correct "
+                f"{where}: {axis}.{name} is {stated:g}; with this cone the radial magnets make it {value:.6g}. Correct "
                 "it, or magnet.cone"
             )
 
@@ -211,8 +211,8 @@ class RotorBench:
         if rig.shaft is not None:  # of a rig that gives its modes, the drawing gives the rigid motion alone
             n, drawn = _drawn(rig, rig.rotor, rig.shaft, values, rate, n)
             numbers = {**drawn, **numbers}
-        of, values = rig.rotor.with_modes(n), {**numbers, **values}
-        missing = [p.name for p in of.parameters if p.name not in values and p.default is None]
+        model, values = rig.rotor.with_modes(n), {**numbers, **values}
+        missing = [p.name for p in model.parameters if p.name not in values and p.default is None]
         if missing:
             raise RigError(
                 f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a simulation needs every parameter. "
@@ -223,8 +223,10 @@ class RotorBench:
             for modes in [range(1, n + 1)]
             for u in rig.unbalance
         }
-        plant = LinearPlant(model=of, parameters={p.name: values[p.name] for p in of.parameters if p.name in values})
-        poles = poles_of(rig, of, plant.parameters) if nonlinear else None
+        plant = LinearPlant(
+            model=model, parameters={p.name: values[p.name] for p in model.parameters if p.name in values}
+        )
+        poles = poles_of(rig, model, plant.parameters) if nonlinear else None
         loop = loop_of_rig(rig, closed) or Loop()
         return cls(rig=rig, plant=plant, loop=loop, rate_hz=rate, shapes=shapes, poles=poles)
 
@@ -247,9 +249,9 @@ class RotorBench:
     @property
     def _currents(self) -> tuple[str, ...]:
         """States that are currents of coils."""
-        of = self.model
-        coils = dict.fromkeys(of.coils, "") | dict.fromkeys(of.amplified, "_amplifier")
-        return tuple(f"{of.axes[j]}{kind}_current" for j, kind in sorted(coils.items()))
+        rotor = self.model
+        coils = dict.fromkeys(rotor.coils, "") | dict.fromkeys(rotor.amplified, "_amplifier")
+        return tuple(f"{rotor.axes[j]}{kind}_current" for j, kind in sorted(coils.items()))
 
     @cached_property
     def largest_pole(self) -> float:
@@ -275,23 +277,23 @@ class RotorBench:
         runs and goes on. Of `settle` samples at the beginning nothing is logged but that limits were met. The record
         holds voltage, current, position and reference of each axis and, of a rotor that turns, its angle.
         """
-        of, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
-        if u.ndim != 2 or u.shape[1] != len(of.inputs) or u.shape[0] <= settle:
+        rotor, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
+        if u.ndim != 2 or u.shape[1] != len(rotor.inputs) or u.shape[0] <= settle:
             raise ModelError(
-                f"the excitation has shape {u.shape}; it must be (n_samples, {len(of.inputs)}), one column an axis, "
+                f"the excitation has shape {u.shape}; it must be (n_samples, {len(rotor.inputs)}), one column an axis, "
                 f"with more samples than the {settle} that settle. Reshape it"
             )
         n = u.shape[0]
-        measured, command, truth = (np.empty((n, m)) for m in (len(of.outputs), u.shape[1], len(of.axes)))
-        truth = np.empty((n, len(of.axes) + len(self._currents)))
+        measured, command, truth = (np.empty((n, m)) for m in (len(rotor.outputs), u.shape[1], len(rotor.axes)))
+        truth = np.empty((n, len(rotor.axes) + len(self._currents)))
         counts = np.array([-1, -1, 0], dtype=np.int64)
-        angle: Array = np.arange(n, dtype=np.float64) * (of.speed / self.rate_hz)
+        angle: Array = np.arange(n, dtype=np.float64) * (rotor.speed / self.rate_hz)
         force, voltage = self.noise.held_rms(self.rate_hz)
         sizes = {"force": force, "voltage": voltage, "position": self.noise.position, "current": self.noise.current}
-        size = np.array([sizes[kind_of(name)] for name in (*of.outputs, *of.disturbances)])
+        size = np.array([sizes[kind_of(name)] for name in (*rotor.outputs, *rotor.disturbances)])
         disturbed = np.random.default_rng(seed).standard_normal((n, size.size)) * size
         if load is not None:
-            disturbed[:, len(of.outputs) : len(of.outputs) + len(of.axes)] += load
+            disturbed[:, len(rotor.outputs) : len(rotor.outputs) + len(rotor.axes)] += load
         lost = self._run(u, disturbed, start, angle, counts, measured, command, truth)
         if lost >= 0:
             at = f"sample {lost - settle} ({(lost - settle) / self.rate_hz:.6g} s)"
@@ -300,32 +302,35 @@ class RotorBench:
                 "limits.position, or another loop"
             )
         names = (
-            *(f"{axis}_position" for axis in of.axes),
+            *(f"{axis}_position" for axis in rotor.axes),
             *(name.replace("_amplifier", "") for name in self._currents),
         )
         low, high = self.limits.current
-        currents = truth[settle:, len(of.axes) :]
-        values = dict(zip(of.inputs, command[settle:].T, strict=True))
-        values |= dict(zip(of.outputs, measured[settle:].T, strict=True))
-        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(of.axes)}
-        units = {**of.units, **dict.fromkeys((f"{axis}_reference" for axis in of.axes), of.units[of.inputs[0]])}
-        order = sorted(values, key=lambda name: of.axes.index(name.split("_")[0]))  # an axis after the other
+        currents = truth[settle:, len(rotor.axes) :]
+        values = dict(zip(rotor.inputs, command[settle:].T, strict=True))
+        values |= dict(zip(rotor.outputs, measured[settle:].T, strict=True))
+        values |= {f"{axis}_reference": u[settle:, j] for j, axis in enumerate(rotor.axes)}
+        units = {
+            **rotor.units,
+            **dict.fromkeys((f"{axis}_reference" for axis in rotor.axes), rotor.units[rotor.inputs[0]]),
+        }
+        order = sorted(values, key=lambda name: rotor.axes.index(name.split("_")[0]))  # an axis after the other
         channels = [Channel(name=name, unit=units[name], values=np.ascontiguousarray(values[name])) for name in order]
         roles = {c.role for c in self.rig.channels}  # of a rotor that turns; speed and tacho where the rig names them
-        if of.speed or "angle" in roles:
+        if rotor.speed or "angle" in roles:
             channels.append(Channel(name="angle", unit="rad", values=angle[settle:]))
         if "speed" in roles:
-            channels.append(Channel(name="speed", unit="rad/s", values=np.full(n - settle, of.speed)))
+            channels.append(Channel(name="speed", unit="rad/s", values=np.full(n - settle, rotor.speed)))
         if "tacho" in roles:  # high in the first tenth of every revolution
             pulses = np.where(angle % (2.0 * np.pi) < 0.2 * np.pi, 5.0, 0.0)
             channels.append(Channel(name="tacho", unit="V", values=pulses[settle:]))
-        made = {"plant": f"{of.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
+        origin = {"plant": f"{rotor.name}, {'nonlinear' if self.poles else 'linear'}", "seed": str(seed)}
         settings = {name: acting(getattr(self, name)) for name in ("loop", "noise", "limits")}
         record = Record(
             rate_hz=self.rate_hz,
             channels=tuple(channels),
-            history=(Step(name="simulate", settings={**made, "rate_hz": self.rate_hz, **settings}),),
-            provenance=MappingProxyType({"simulator": "ambid.simulation", **made}),
+            history=(Step(name="simulate", settings={**origin, "rate_hz": self.rate_hz, **settings}),),
+            provenance=MappingProxyType({"simulator": "ambid.simulation", **origin}),
         )
         first = [None if k < 0 else max(0, int(k) - settle) for k in counts[:2]]
         return Simulation(
@@ -352,11 +357,11 @@ class RotorBench:
         It is that of the linear plant, which is near the nonlinear one in that part of the gap, and fast.
         """
         linear = replace(self, poles=None)
-        found = largest_amplitude(
+        amplitude = largest_amplitude(
             lambda u: linear.simulate(u, seed=seed, columns=False), shape, limits=self.limits,
             operating_point=OperatingPoint(), fraction=fraction,
         )  # fmt: skip
-        return float(f"{found:.3g}")
+        return float(f"{amplitude:.3g}")
 
     def _run(
         self,
@@ -371,15 +376,15 @@ class RotorBench:
     ) -> int:
         from ambid.simulation.kernels import run_rotor
 
-        of, period = self.model, 1.0 / self.rate_hz
-        c, fraction, kinds = self.loop, self.loop.delay % 1.0, [name.rsplit("_", 1)[-1] for name in of.inputs]
+        rotor, period = self.model, 1.0 / self.rate_hz
+        c, fraction, kinds = self.loop, self.loop.delay % 1.0, [name.rsplit("_", 1)[-1] for name in rotor.inputs]
         if len(set(kinds)) > 1:
             raise ModelError(
                 f"axes are driven by {', '.join(sorted(set(kinds)))}; one loop drives all alike. Correct it"
             )
-        steps = [getattr(self.noise, f"{kind_of(name)}_resolution") for name in (*of.outputs, of.inputs[0])]
-        magnets, _ = of.rows(self.plant.parameters)
-        mass, _, _ = of.rotor_matrices(self.plant.parameters)
+        steps = [getattr(self.noise, f"{kind_of(name)}_resolution") for name in (*rotor.outputs, rotor.inputs[0])]
+        magnets, _ = rotor.rows(self.plant.parameters)
+        mass, _, _ = rotor.rotor_matrices(self.plant.parameters)
         pushes = magnets / mass / ((magnets**2 / mass).sum(axis=1))[:, None]
         continuous = self._continuous()
         equations: RotorLinear | RotorNonlinear
@@ -389,17 +394,17 @@ class RotorBench:
             equations = a, b, late, e
         else:
             equations = self._nonlinear(self.poles, fraction)
-        at, law = start if isinstance(start, Running) else self.begun(start), law_on(c, of, self.rate_hz)
+        at, law = start if isinstance(start, Running) else self.begun(start), law_on(c, rotor, self.rate_hz)
         if law is not None and law is not at.law:
-            at.hand_over(law, (continuous.C @ at.x)[signals_fed_back(of)])
-        states = [of.states.index(name) for name in self._currents]
+            at.hand_over(law, (continuous.C @ at.x)[signals_fed_back(rotor)])
+        states = [rotor.states.index(name) for name in self._currents]
         return int(
             run_rotor(
                 u, disturbed, self._runout(angle),
-                equations, np.ascontiguousarray(continuous.C), fed_back(of),
+                equations, np.ascontiguousarray(continuous.C), fed_back(rotor),
                 np.array([c.kp, c.ki * period, c.kd, c.kc, c.filter_s, period]),
                 matrices_of(law), np.array(steps[:-1]),
-                (*getattr(self.limits, kind_of(of.inputs[0])), steps[-1]), at.line,
+                (*getattr(self.limits, kind_of(rotor.inputs[0])), steps[-1]), at.line,
                 self.limits.position, magnets, pushes, np.array(states, dtype=np.int64), at.x, at.z, at.memory, counts,
                 measured, command, truth,
             )
@@ -407,17 +412,17 @@ class RotorBench:
 
     def begun(self, start: Array | None = None) -> Running:
         """Return the loop at its beginning, with some states of the plant, by default at rest."""
-        of, law, n = self.model, law_on(self.loop, self.model, self.rate_hz), len(self.model.inputs)
-        x, memory = np.zeros(len(of.states) + 2), np.zeros((n, 3))
-        x[: len(of.states)] = 0.0 if start is None else start
+        rotor, law, n = self.model, law_on(self.loop, self.model, self.rate_hz), len(self.model.inputs)
+        x, memory = np.zeros(len(rotor.states) + 2), np.zeros((n, 3))
+        x[: len(rotor.states)] = 0.0 if start is None else start
         x[-2], memory[:, 2] = 1.0, np.nan
         line = np.zeros((math.floor(self.loop.delay) + 2, n))
         return Running(x=x, z=np.zeros(0 if law is None else law.order), memory=memory, line=line, law=law)
 
     def _continuous(self, theta: Mapping[str, float] | None = None) -> StateSpace:
         """Return the plant; after its states cos and sin of the angle, from which unbalance pushes."""
-        of, space = self.model, self.plant.model.matrices(theta or self.plant.parameters)
-        n, speed = len(of.states), of.speed
+        rotor, space = self.model, self.plant.model.matrices(theta or self.plant.parameters)
+        n, speed = len(rotor.states), rotor.speed
         A, C = np.zeros((n + 2, n + 2)), np.zeros((space.C.shape[0], n + 2))
         A[:n, :n], C[:, :n] = space.A, space.C
         A[n, n + 1], A[n + 1, n] = -speed, speed
@@ -427,17 +432,17 @@ class RotorBench:
 
     def _nonlinear(self, poles: Poles, fraction: float) -> RotorNonlinear:
         """Return what the compiled loop steps the plant with: all that is linear, and the poles."""
-        of, theta = self.model, self.plant.parameters
-        free = self._continuous({**theta, **{f"{axis}.{q}": 0.0 for axis in of.axes for q in ("k_i", "k_x")}})
-        flows = of.states.index(f"{of.axes[0]}_current")
-        acts = of.states.index(f"{of.axes[0]}_effective_current") if "a" in of.extras else flows
+        rotor, theta = self.model, self.plant.parameters
+        free = self._continuous({**theta, **{f"{axis}.{q}": 0.0 for axis in rotor.axes for q in ("k_i", "k_x")}})
+        flows = rotor.states.index(f"{rotor.axes[0]}_current")
+        acts = rotor.states.index(f"{rotor.axes[0]}_effective_current") if "a" in rotor.extras else flows
         A = free.A.copy()
-        A[flows : flows + len(of.axes)] = 0.0
+        A[flows : flows + len(rotor.axes)] = 0.0
         places = np.argwhere(A)
         largest = float(np.abs(np.linalg.eigvals(self._continuous().A)).max())
         steps = max(1, math.ceil(largest / (FINE * self.rate_hz)))
-        values, push = A[places[:, 0], places[:, 1]], np.ascontiguousarray(free.E[:, : len(of.axes)])
-        resistance = np.array([theta[f"{axis}.R"] for axis in of.axes])
+        values, push = A[places[:, 0], places[:, 1]], np.ascontiguousarray(free.E[:, : len(rotor.axes)])
+        resistance = np.array([theta[f"{axis}.R"] for axis in rotor.axes])
         return (
             values, np.ascontiguousarray(places), push, poles.numbers, poles.axes, resistance, poles.leakage,
             (flows, acts), (fraction, 1.0 / self.rate_hz, steps),
@@ -445,51 +450,51 @@ class RotorBench:
 
     def _unbalance(self, u: Turning) -> Array:
         """Return what cos and sin of the angle do to the states: U W² (cos, sin)(angle + phase) in the planes x, y."""
-        of, found = self.model, np.zeros((len(self.model.states), 2))
-        mass, _, _ = of.rotor_matrices(self.plant.parameters)
-        n, size = len(of.coordinates), u.value * of.speed**2
+        rotor, pushes = self.model, np.zeros((len(self.model.states), 2))
+        mass, _, _ = rotor.rotor_matrices(self.plant.parameters)
+        n, size = len(rotor.coordinates), u.value * rotor.speed**2
         turned = np.array([[math.cos(u.phase), -math.sin(u.phase)], [math.sin(u.phase), math.cos(u.phase)]])
-        for plane in (p for p in (0, 1) if p in of.planes):
-            at = [k for k, q in enumerate(of.coordinates) if q.endswith("xy"[plane])]
-            found[[n + k for k in at]] = size * np.outer(self.shapes[u.name] / mass[at], turned[plane])
-        return found
+        for plane in (p for p in (0, 1) if p in rotor.planes):
+            at = [k for k, q in enumerate(rotor.coordinates) if q.endswith("xy"[plane])]
+            pushes[[n + k for k in at]] = size * np.outer(self.shapes[u.name] / mass[at], turned[plane])
+        return pushes
 
     def _runout(self, angle: Array) -> Array:
         """Return what the sensors see beside the rotor's motion: (n_samples, n_outputs), or (0, n_outputs)."""
-        of, found = self.model, np.zeros((angle.size if self.rig.runout else 0, len(self.model.outputs)))
+        rotor, runout = self.model, np.zeros((angle.size if self.rig.runout else 0, len(self.model.outputs)))
         for r in self.rig.runout:
-            for k, (j, _) in enumerate(of.sensors):
-                bearing, plane = of.placed[j]
+            for k, (j, _) in enumerate(rotor.sensors):
+                bearing, plane = rotor.placed[j]
                 if bearing.name == r.name and plane < 2:
-                    found[:, k] += r.value * np.cos(angle + r.phase - 0.5 * np.pi * plane)
-        return found
+                    runout[:, k] += r.value * np.cos(angle + r.phase - 0.5 * np.pi * plane)
+        return runout
 
 
 def _drawn(
-    rig: Rig, rotor: RotorModel, shaft: Shaft, known: Mapping[str, float], rate_hz: float, given: int
+    rig: Rig, rotor: RotorModel, shaft: Shaft, values: Mapping[str, float], rate_hz: float, numbers: int
 ) -> tuple[int, Mapping[str, float]]:
     """Return how many bending modes a simulation keeps, and what follows from the drawing.
 
-    As many modes as ``modes.count`` says; else those below a quarter of the rate. `given`: modes whose numbers the rig
-    gives; then none come from the drawing.
+    As many modes as ``modes.count`` says; else those below a quarter of the rate. `numbers`: modes whose numbers the
+    rig gives; then none come from the drawing.
     """
-    missing = [place for place in rotor.places if place not in known]
+    missing = [place for place in rotor.places if place not in values]
     if missing:
         raise RigError(f"rig {rig.name!r}: there is no value for {', '.join(missing)}; a shape needs it. Give it")
-    planes = {place: known[place] for place in rotor.places}
-    if given:
-        return given, drawn_numbers(rotor.with_modes(0), shaft, planes)
+    planes = {place: values[place] for place in rotor.places}
+    if numbers:
+        return numbers, drawn_numbers(rotor.with_modes(0), shaft, planes)
     n = rig.modes.count
     if n is None:
         omega = shaft.free_rotor(_MOST_MODES).omega[2:]
         n = int(np.count_nonzero(omega < 0.5 * np.pi * rate_hz))
-    found = drawn_numbers(rotor.with_modes(n), shaft, planes)
+    drawn = drawn_numbers(rotor.with_modes(n), shaft, planes)
     if rig.unbalance:
         at = [u.z for u in rig.unbalance]
         rows = shaft.free_rotor(n, planes=[*planes.values(), *at]).deflection(at)
         for u, row in zip(rig.unbalance, rows, strict=True):
-            found |= {f"mode{r}.unbalance.{u.name}": float(row[r + 1]) for r in range(1, n + 1)}
-    return n, found
+            drawn |= {f"mode{r}.unbalance.{u.name}": float(row[r + 1]) for r in range(1, n + 1)}
+    return n, drawn
 
 
 def kind_of(name: str) -> str:

@@ -170,18 +170,20 @@ class Scenario:
     driven: bool = False
     dropped: bool = False  # whether samples are lost; `size` is their share
 
-    def size_for(self, bench: Bench, given: float | None) -> float:
-        """Return how much happens, in the unit of `size_is`: what was `given`, else its own or the bench's."""
-        if given is not None and not self.size_is:
+    def size_for(self, bench: Bench, requested: float | None) -> float:
+        """Return how much happens, in the unit of `size_is`: what was `requested`, else its own or the bench's."""
+        if requested is not None and not self.size_is:
             raise ModelError(f"scenario {self.name!r} has no size. Omit the size")
-        if given is not None and not math.isfinite(given):
-            raise ModelError(f"the size of scenario {self.name!r} is {given}; it must be finite. Give {self.size_is}")
-        found = self.size if given is None else given
-        if found is None:
-            found = self.own_size(bench) if self.own_size else 0.0
-        if self.dropped and not 0.0 < found <= 0.5:
-            raise ModelError(f"the size of scenario {self.name!r} is {found}; it is a share above 0 and at most 0.5")
-        return found
+        if requested is not None and not math.isfinite(requested):
+            raise ModelError(
+                f"the size of scenario {self.name!r} is {requested}; it must be finite. Give {self.size_is}"
+            )
+        size = self.size if requested is None else requested
+        if size is None:
+            size = self.own_size(bench) if self.own_size else 0.0
+        if self.dropped and not 0.0 < size <= 0.5:
+            raise ModelError(f"the size of scenario {self.name!r} is {size}; it is a share above 0 and at most 0.5")
+        return size
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -192,9 +194,9 @@ def scenario_names() -> tuple[str, ...]:
 def scenario(name: str) -> Scenario:
     """Return the scenario called `name`."""
     if name not in SCENARIOS:
-        known = list(SCENARIOS)
+        names = list(SCENARIOS)
         raise ModelError(
-            f"scenario {name!r} is unknown; known: {', '.join(known)}.{nearest(name, known)} Give one of them"
+            f"scenario {name!r} is unknown; known: {', '.join(names)}.{nearest(name, names)} Give one of them"
         )
     return SCENARIOS[name]
 
@@ -225,13 +227,13 @@ def _load_of(bench: Bench) -> float:
 
 
 def _parameter(bench: Bench, name: str) -> float:
-    of, known = bench.linear.model, bench.linear.parameters
-    if name not in known:
+    model, parameters = bench.linear.model, bench.linear.parameters
+    if name not in parameters:
         raise ModelError(
-            f"the scenario changes {name!r}, which model {of.name!r} of bench {bench.name!r} does not have; it has"
-            f" {', '.join(known)}. Choose another scenario, or a rig with model 'one-axis'"
+            f"the scenario changes {name!r}, which model {model.name!r} of bench {bench.name!r} does not have; it has"
+            f" {', '.join(parameters)}. Choose another scenario, or a rig with model 'one-axis'"
         )
-    return known[name]
+    return parameters[name]
 
 
 _PART = "relative change"
@@ -431,8 +433,8 @@ def truth_columns(record: Record) -> Mapping[str, Channel]:
         The channels whose names begin with ``true_``, by what follows: ``k_i`` for ``true_k_i``. Empty for a record
         without truth.
     """
-    found = {c.name.removeprefix(TRUE): c for c in record.channels if c.name.startswith(TRUE)}
-    return MappingProxyType(found)
+    columns = {c.name.removeprefix(TRUE): c for c in record.channels if c.name.startswith(TRUE)}
+    return MappingProxyType(columns)
 
 
 class _Run:
@@ -512,14 +514,14 @@ class _Run:
 
     def settings(self) -> dict[str, object]:
         """Return what the history says."""
-        found: dict[str, object] = {"name": self.scenario.name, "seed": self.seed, "amplitude": self.amplitude}
+        settings: dict[str, object] = {"name": self.scenario.name, "seed": self.seed, "amplitude": self.amplitude}
         if self.scenario.size_is:
-            found |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
-        return found
+            settings |= {"from_s": self.at_s, "size": self.size, "size_is": self.scenario.size_is}
+        return settings
 
     def blocks(self, block: int) -> Iterator[ScenarioBlock]:
         """Yield the scenario block by block, lost samples NaN."""
-        of, lost = self.bench.linear.model, list[tuple[int, int, int]]()  # first, stop and column, -1: all
+        model, lost = self.bench.linear.model, list[tuple[int, int, int]]()  # first, stop and column, -1: all
         if self.scenario.dropped:
             bursts = losses(self.n_samples, self.size, self.seed, first=self.first_sample)
             lost = [(x.first, x.stop, x.column if x.kind == "cells" else -1) for x in bursts]
@@ -527,8 +529,8 @@ class _Run:
         for first in range(0, self.n_samples, chunk):
             u = self.excitation(first, min(chunk, self.n_samples - first))
             stretch = self.running.advance(u)
-            signals = {of.inputs[0]: stretch.command}
-            signals |= {o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(of.outputs)}
+            signals = {model.inputs[0]: stretch.command}
+            signals |= {o: np.ascontiguousarray(stretch.measured[:, j]) for j, o in enumerate(model.outputs)}
             signals["excitation"] = u
             if stretch.speed is not None and stretch.angle is not None:
                 signals |= {"speed": stretch.speed, "angle": stretch.angle}

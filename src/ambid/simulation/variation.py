@@ -175,12 +175,12 @@ class Schedule:
 
 def _segments(knots: Array, samples: Array, side: Literal["left", "right"]) -> NDArray[np.intp]:
     """Return the knot that ends the segment of each sample, shape (n,), or (1,) where all lie in one segment."""
-    found = np.searchsorted(knots, [samples.min(), samples.max()] if samples.size else samples, side=side)
-    if samples.size and found[0] != found[1]:  # else all lie in one segment: nothing to look up for each sample
-        found = np.searchsorted(knots, samples, side=side)
+    ends = np.searchsorted(knots, [samples.min(), samples.max()] if samples.size else samples, side=side)
+    if samples.size and ends[0] != ends[1]:  # else all lie in one segment: nothing to look up for each sample
+        ends = np.searchsorted(knots, samples, side=side)
     elif samples.size:
-        found = found[:1]
-    return np.asarray(np.clip(found, 1, knots.size - 1), dtype=np.intp)
+        ends = ends[:1]
+    return np.asarray(np.clip(ends, 1, knots.size - 1), dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -231,16 +231,16 @@ class Variation:
     unbalance: Unbalance | None = None
 
 
-def check_variation(variation: Variation, of: LinearModel) -> None:
+def check_variation(variation: Variation, model: LinearModel) -> None:
     """Refuse what a model does not have.
 
-    `variation`: what is to change; `of`: the model that is simulated.
+    `variation`: what is to change; `model`: the model that is simulated.
     """
-    specs = {s.name: s for s in of.parameters}
+    specs = {s.name: s for s in model.parameters}
     for name, schedule in variation.parameters.items():
         if name not in specs:
             raise ModelError(
-                f"model {of.name!r} has no parameter {name!r} that could vary; it has {', '.join(specs)}."
+                f"model {model.name!r} has no parameter {name!r} that could vary; it has {', '.join(specs)}."
                 f"{nearest(name, list(specs))} Correct the variation"
             )
         if specs[name].positive and min(schedule.values) <= 0.0:
@@ -249,13 +249,13 @@ def check_variation(variation: Variation, of: LinearModel) -> None:
                 " Change it less"
             )
     for name in variation.gains:
-        if name not in of.outputs:
+        if name not in model.outputs:
             raise ModelError(
-                f"model {of.name!r} has no sensor of {name!r}; it has {', '.join(of.outputs)}."
-                f"{nearest(name, list(of.outputs))} Correct the variation"
+                f"model {model.name!r} has no sensor of {name!r}; it has {', '.join(model.outputs)}."
+                f"{nearest(name, list(model.outputs))} Correct the variation"
             )
-    if (variation.force is not None or variation.unbalance is not None) and "force" not in of.disturbances:
-        raise ModelError(f"model {of.name!r} has no rotor that a force could act on. Leave force and unbalance out")
+    if (variation.force is not None or variation.unbalance is not None) and "force" not in model.disturbances:
+        raise ModelError(f"model {model.name!r} has no rotor that a force could act on. Leave force and unbalance out")
 
 
 Integers = NDArray[np.int64]
@@ -281,7 +281,7 @@ class Tables:
 
     def __init__(
         self,
-        of: LinearModel,
+        model: LinearModel,
         fixed: Mapping[str, float],
         parameters: Mapping[str, Schedule],
         gains: Mapping[str, Schedule],
@@ -289,7 +289,7 @@ class Tables:
         fraction: float,
         grid: int,
     ) -> None:
-        self._of, self._fixed, self._rate, self._fraction, self._grid = of, dict(fixed), rate_hz, fraction, grid
+        self._of, self._fixed, self._rate, self._fraction, self._grid = model, dict(fixed), rate_hz, fraction, grid
         self._schedules = {**parameters, **{f"gain_{name}": s for name, s in gains.items()}}
         knots = [s.knots(rate_hz) for s in self._schedules.values()]
         inside = np.unique(np.concatenate([np.zeros(1), *knots]))
@@ -396,9 +396,9 @@ def exponentials(stack: Array, halvings: int) -> Array:
     """
     x = stack * 0.5**halvings
     unit = np.eye(x.shape[1])
-    found = unit + x / _DEGREE
+    result = unit + x / _DEGREE
     for k in range(_DEGREE - 1, 0, -1):
-        found = unit + np.matmul(x, found) / k
+        result = unit + np.matmul(x, result) / k
     for _ in range(halvings):
-        found = np.matmul(found, found)
-    return np.asarray(found)
+        result = np.matmul(result, result)
+    return np.asarray(result)
