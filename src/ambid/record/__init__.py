@@ -102,7 +102,7 @@ def read_record(
 
         return checked(read_hdf5(path), f"record {path}", rate_hz, gaps)
     check_gap_policy(gaps)
-    reader: Any = getattr(import_module(f"ambid.record.{kind}_format"), f"read_{kind}")
+    reader: Any = getattr(import_module("ambid.record.library_formats"), f"read_{kind}")
     return reader(path, layout=layout, rate_hz=rate_hz, gaps=gaps)  # type: ignore[no-any-return]
 
 
