@@ -210,7 +210,7 @@ def test_routine_decisions_do_not_bury_a_change(bench, ambid, job, whole):
 
 
 def test_truth_in_the_record_is_drawn(bench, ambid, job, capsys, monkeypatch):
-    from ambid.job.track_truth import truth_beside
+    from ambid.job.following import truth_beside
     from ambid.report import track_figures
 
     rows = "\n".join(f"{k / 100},{k},{1600 + k},5" for k in range(50))

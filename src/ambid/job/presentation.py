@@ -272,7 +272,7 @@ def _track(t: Any, used: Any) -> Document:
     from ambid.report.track import track_document
 
     def truth(units: Mapping[str, str]) -> Any:
-        from ambid.job.track_truth import truth_beside
+        from ambid.job.following import truth_beside
 
         return None if used.record is None else truth_beside(used.record, used.rate_hz, units)
 

@@ -184,10 +184,7 @@ class RingTap:
         self.over, self.fresh = Signal(), Signal()
 
     def take(self, frame: Frame) -> None:
-        """Put a block into the ring.
-
-        `frame`: as it came.
-        """
+        """Put a block into the ring. `frame`: as it came."""
         block = self._seen(frame.block)
         if self._origin is None:
             self._origin = block.first

@@ -431,10 +431,7 @@ class _Window:
         return not at_end
 
     def drop_half(self) -> int:
-        """Make room for as many samples as half of those stored.
-
-        Returns how many were dropped.
-        """
+        """Make room for as many samples as half of those stored. Returns how many were dropped."""
         n = (self.filled + 1) // 2
         keep = self.filled - n
         self.u[:keep], self.y[:keep] = self.u[n : self.filled].copy(), self.y[n : self.filled].copy()

@@ -236,10 +236,7 @@ class Identity:
 
 
 def identity_of(fit: BlackBoxFit) -> Identity:
-    """Return what a fit says of itself.
-
-    `fit`: of a polynomial structure, one output.
-    """
+    """Return what a fit says of itself. `fit`: of a polynomial structure, one output."""
     model = fit.model
     known = any_structure(fit.structure).prediction_error
     if not known or not isinstance(model, PolynomialModel):

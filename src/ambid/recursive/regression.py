@@ -419,8 +419,6 @@ class RecursiveInstrumentalVariables(Recursion):
     estimate : ndarray, shape (p,)
     covariance : ndarray, shape (p, p)
     n_used, n_rejected : int
-    n_singular : int
-        Samples after which the instruments did not determine the coefficients, and the estimate stayed.
     noise_variance : float
         Of v.
 
@@ -486,27 +484,14 @@ class RecursiveInstrumentalVariables(Recursion):
             first += n
         return found
 
-    @property
-    def n_singular(self) -> int:
-        """Samples after which the estimate stayed because the instruments did not determine it."""
-        return int(self._s[self._at.SINGULAR])
-
-    def scale_instruments(self, first: int, factor: float) -> None:
-        """Count what the first instruments have told as if they had been larger; the estimate stays.
-
-        Parameters
-        ----------
-        first : int
-            How many.
-        factor : float
-            By which they are larger.
-        """
-        part, by = self._parts(), np.ones(self._m)
-        by[:first] = factor
-        part["R"][:, : self._m] *= by
-        part["omega"][...] *= np.outer(by, by)
+    def _scale_instruments(self, first: int, factor: float) -> None:
+        """Count what the first instruments have told as if they had been larger; the estimate stays."""
+        part, size = self._parts(), np.ones(self._m)
+        size[:first] = factor
+        part["R"][:, : self._m] *= size
+        part["omega"][...] *= np.outer(size, size)
         for name in ("ring", "total", "size"):
-            part[name][...] *= by
+            part[name][...] *= size
 
     @property
     def covariance(self) -> Array:
@@ -773,7 +758,7 @@ class RecursiveIvArx(_OnSignals):
         if not self._modelled:  # the delay was of the input's unit: what it gave has to count as the output's does
             gain = float(np.sqrt(np.sum(lfilter(B, A, np.eye(1, 1000)[0]) ** 2)))  # rms over that of white noise
             gain = gain if 0 < gain < np.inf else 1.0
-            self._estimator.scale_instruments(self._na, gain)
+            self._estimator._scale_instruments(self._na, gain)
             self._past[:, 2] *= gain
         self._model, self._modelled = theta, True
 

@@ -45,11 +45,10 @@ Table = NDArray[np.int64]
     NOW,  # noise variance of the last look over the unit
     INSTRUMENTS,  # m
     LAGS,
-    SINGULAR,  # samples after which the instruments did not determine the estimate
     SUM_OF_SQUARES,  # of the weights of the samples
     PRIOR_LEFT,  # squared weight that the prior still has
-) = range(25)
-HEAD = 25
+) = range(24)
+HEAD = 24
 
 LEAST_SQUARES, DIRECTIONAL, LMS, NLMS = range(4)
 
@@ -268,7 +267,7 @@ def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
 
 
 @compiled(error_model="numpy")
-def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> bool:
+def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> None:
     """Least squares of the columns of φ on that of y: triangle into T, solution into theta unless it is singular."""
     for i in range(m):
         for j in range(p + 1):
@@ -294,7 +293,7 @@ def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> boo
                     work[i, j] += dot * work[i, k]
         work[k, k] = length
     if not sound:
-        return False
+        return
     for i in range(p):
         for j in range(i, p):
             T[i, j] = work[i, j]
@@ -303,7 +302,6 @@ def _solve(R: Array, T: Array, work: Array, theta: Array, m: int, p: int) -> boo
         for j in range(i + 1, p):
             x -= T[i, j] * theta[j]
         theta[i] = x / T[i, i]
-    return True
 
 
 @compiled(error_model="numpy")
@@ -367,8 +365,7 @@ def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
                 b, x = root * R[i, j], new[j]
                 R[i, j] = c * b + d * x
                 new[j] = c * x - d * b
-        if not _solve(R, T, work, theta, m, p):
-            s[SINGULAR] += 1.0
+        _solve(R, T, work, theta, m, p)
         for j in range(m):
             new[j] = rows[t, p + j]
         _account(s, R, omega, ring, total, new[:m], e, 1.0 / (1.0 + spread), solved)

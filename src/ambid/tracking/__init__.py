@@ -8,6 +8,5 @@ from ambid.lazy import exports
 
 if TYPE_CHECKING:
     from ambid.tracking.lines_file import read_track as read_track
-    from ambid.tracking.rpem import PhysicalRpem as PhysicalRpem
 
 __getattr__, __dir__, __all__ = exports(__name__)

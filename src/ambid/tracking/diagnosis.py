@@ -67,19 +67,13 @@ class Unexplained:
         self._sum = variance if self.blocks <= 2 else self._sum + variance
 
     def close_ears(self, t: float) -> None:
-        """Learn nothing until it is over, or until a search is due.
-
-        `t`: s of record.
-        """
+        """Learn nothing until it is over, or until a search is due. `t`: s of record."""
         self.deaf = True
         self._again = t + self._wait
         self._wait = min(2.0 * self._wait, _LONGEST_WAIT_S)
 
     def search_due(self, t: float) -> bool:
-        """Tell whether it is time to look again for a change that explains it.
-
-        `t`: s of record.
-        """
+        """Tell whether it is time to look again for a change that explains it. `t`: s of record."""
         return self.deaf and t >= self._again
 
     def over(self) -> None:

@@ -38,10 +38,7 @@ class Samples:
 
 
 class RecentSamples:
-    """The last samples of a stream, in memory that does not grow.
-
-    `capacity`: samples kept at least.
-    """
+    """The last samples of a stream, in memory that does not grow. `capacity`: samples kept at least."""
 
     def __init__(self, capacity: int) -> None:
         self._capacity = capacity
@@ -56,10 +53,7 @@ class RecentSamples:
         return self.last - self._filled
 
     def add(self, samples: Samples, last: int) -> None:
-        """Keep more samples.
-
-        `samples`: those that follow the ones before; `last`: number of the sample after them.
-        """
+        """Keep more samples. `samples`: those that follow the ones before; `last`: number of the sample after them."""
         columns = [samples.u, samples.y] + ([] if samples.forcing is None else [samples.forcing])
         if not self._parts:
             self._parts = [np.empty((self._room, c.shape[1])) for c in columns]
@@ -151,17 +145,11 @@ class Evidence:
         return max(self.n_samples * self.n_outputs - self.r.size, 0)
 
     def residual(self, q: Array) -> Array:
-        """Return r + J (q - at), shape (p,), unit covariance if `q` is the truth.
-
-        `q`: (p,). Returns (p,).
-        """
+        """Return r + J (q - at), shape (p,), unit covariance if `q` (p,) is the truth."""
         return np.asarray(self.r + self.J @ (q - self.at))
 
     def loss(self, q: Array) -> float:
-        """Return the sum of squared weighted innovations at `q`, to second order around `at`.
-
-        `q`: (p,).
-        """
+        """Return the sum of squared weighted innovations at `q`, to second order around `at`."""
         left = self.residual(q)
         return float(self.rest + left @ left)
 

@@ -314,10 +314,7 @@ def _squared_length(d: Array, covariance: Array) -> float:
 
 
 class DecisionLog:
-    """Keep the last events and count all.
-
-    `capacity`: events kept.
-    """
+    """Keep the last events and count all. `capacity`: events kept."""
 
     def __init__(self, capacity: int = 1000, listener: Callable[[Event], None] | None = None) -> None:
         if capacity < 1:
@@ -379,10 +376,7 @@ class Operator:
             return self._order
 
     def set(self, flag: str, t: float = 0.0, why: str = "") -> Event:
-        """Set a flag.
-
-        `t`: time of the stream, s; `why`: the operator's reason, for the log. Returns for the log.
-        """
+        """Set a flag. `t`: time of the stream, s; `why`: the operator's reason, for the log."""
         if flag not in _FLAGS:
             raise EstimationError(
                 f"operator flag {flag!r} is unknown; known: {', '.join(_FLAGS)}.{nearest(flag, _FLAGS)}"
@@ -409,10 +403,7 @@ class Operator:
 def published(
     numbers: TrackedNumbers, accepted: Accepted, kind: Kind, fresh: Mapping[str, bool]
 ) -> dict[str, TrackedValue]:
-    """Return the accepted numbers of one kind.
-
-    Returns SI.
-    """
+    """Return the accepted numbers of one kind, SI."""
     sd = np.sqrt(np.diag(accepted.covariance)) * numbers.magnitude
     values = accepted.values * numbers.magnitude
     return {
@@ -489,10 +480,7 @@ class Publication:
         self.gate.restart()
 
     def propose(self, t: float, why: str) -> None:
-        """Offer the working estimate.
-
-        `t`: s of record.
-        """
+        """Offer the working estimate. `t`: s of record."""
         refused = self.gate.propose(self._rpem.filter.q, self._rpem.filter.covariance, t, why)
         if refused is not None and self.unconfirmed:
             self._log.add(refused)
@@ -560,10 +548,7 @@ class Publication:
         return changed
 
     def order(self, flag: str, t: float) -> None:
-        """Take a flag of the operator; of two orders before the next block the first counts.
-
-        `t`: s of record.
-        """
+        """Take a flag of the operator; of two orders before the next block the first counts. `t`: s of record."""
         try:
             self._log.add(self._operator.set(flag, t))
         except EstimationError as waiting:

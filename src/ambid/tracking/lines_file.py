@@ -169,10 +169,7 @@ def _unwritable(path: Path | None, failure: OSError) -> AmbidError:
 
 
 def most_important(events: Sequence[Event]) -> Event:
-    """Return the event that a reader has to know first; of the same kind the first.
-
-    `events`: at least one.
-    """
+    """Return the event that a reader has to know first; of the same kind the first. `events`: at least one."""
     return min(events, key=lambda e: _IMPORTANCE.index(e.kind))
 
 

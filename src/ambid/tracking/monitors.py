@@ -150,10 +150,7 @@ class ExcitationMonitor:
         return MappingProxyType({n: bool(self._fresh[i]) for n, i in zip(self._judged, self._at, strict=True)})
 
     def update(self, evidence: Evidence, t: float) -> tuple[Event, ...]:
-        """Take in a block.
-
-        `t`: its end, s of record. Returns ``frozen`` and ``thawed``, with the reason.
-        """
+        """Take in a block. `t`: its end, s of record. Returns ``frozen`` and ``thawed``, with the reason."""
         J, duration = evidence.J, self.duration_s * self._decay + self._block
         if J.shape != self._R.shape or not math.isfinite(J.sum()):
             raise EstimationError(

@@ -43,10 +43,7 @@ class NoiseNumbers:
 
 
 def rate_of(estimate: Estimate) -> float:
-    """Return the sampling rate of the record behind an estimate.
-
-    Returns hz.
-    """
+    """Return the sampling rate of the record behind an estimate, Hz."""
     return float(str(estimate.record["rate_hz"]))
 
 
@@ -245,24 +242,15 @@ class TrackedNumbers:
         return np.array([name in allowed for name in self.names])
 
     def places(self, *kinds: Kind) -> NDArray[np.int64]:
-        """Return where the numbers of some kinds stand in q.
-
-        Returns (n_places,).
-        """
+        """Return where the numbers of some kinds stand in q, (n_places,)."""
         return np.array([j for j, k in enumerate(self.kinds) if k in kinds], dtype=np.int64)
 
     def values(self, q: Array) -> dict[str, float]:
-        """Return numbers in SI units.
-
-        `q`: (p,).
-        """
+        """Return the numbers q (p,) in SI units."""
         return dict(zip(self.names, (q * self.magnitude).tolist(), strict=True))
 
     def physical(self, q: Array) -> Array:
-        """Return the physical parameters in SI units.
-
-        `q`: (p,). Returns (n_parameters,).
-        """
+        """Return the physical parameters (n_parameters,) of the numbers q (p,), SI."""
         own = self.places("parameter")
         return np.asarray(q[own] * self.magnitude[own])
 
@@ -275,10 +263,7 @@ class TrackedNumbers:
         return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
 
     def vector(self, q: Array) -> Array:
-        """Return q in the layout of `PredictorProblem`, initial state zero.
-
-        `q`: (p,). Returns (problem.size,).
-        """
+        """Return q (p,) in the layout (problem.size,) of `PredictorProblem`, initial state zero."""
         out = np.zeros(self.problem.size)
         n = self.problem.slices["initial"].start
         out[:n] = q[:n]

@@ -57,10 +57,7 @@ class Ledger:
         self.n_given = 0
 
     def reject(self, kind: RejectionKind, samples: int, first: int, why: str) -> None:
-        """Enter a rejection.
-
-        `first`: number of the first of them; `why`: one line for people.
-        """
+        """Enter a rejection. `first`: number of the first of them; `why`: one line for people."""
         self.events[kind] = self.events.get(kind, 0) + 1
         self.samples[kind] = self.samples.get(kind, 0) + samples
         self._entries.append(Rejection(kind=kind, samples=samples, t=first / self._rate, why=why))
@@ -229,10 +226,7 @@ class BlockOrder:
         self._release_all()
 
     def fits(self, part: Part) -> bool:
-        """Tell whether number and stamp of a block agree with the stream.
-
-        Returns false before the stream has begun.
-        """
+        """Tell whether number and stamp of a block agree with the stream. Returns false before the stream has begun."""
         return self._started and self._clock.agrees(part.first, part.time_s)
 
     def pass_over(self, part: Part) -> None:

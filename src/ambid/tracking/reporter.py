@@ -145,10 +145,7 @@ class Reporter:
             s.order(flag)
 
     def summary(self, *, computing_s: float, latency: Latency | None = None, complete: bool = True) -> TrackSummary:
-        """Return the last line.
-
-        `complete`: whether the run came to the end of its record.
-        """
+        """Return the last line. `complete`: whether the run came to the end of its record."""
         s = self.supervisor
         return TrackSummary(
             samples=self.samples,

@@ -200,10 +200,7 @@ class BlockRing:
 
     @classmethod
     def attach(cls, name: str) -> Self:
-        """Open a ring that another process made.
-
-        `name`: of its segment.
-        """
+        """Open a ring that another process made. `name`: of its segment."""
         segment = attached(name)
         fault = _fault(bytes_of(segment))
         if fault:
@@ -291,10 +288,7 @@ class BlockRing:
         return True
 
     def wait_for_room(self, timeout_s: float) -> bool:
-        """Wait until a block would fit: for a source that can wait, such as a file.
-
-        Returns whether there is room.
-        """
+        """Wait until a block would fit: for a source that can wait, such as a file. Returns whether there is room."""
         return self._wait(lambda: self.filled < self.slots, timeout_s)
 
     def read(self, timeout_s: float) -> Frame | None:

@@ -62,10 +62,7 @@ class ParameterFilter:
         return sd
 
     def walk(self, variance: Array, time: float = 1.0) -> None:
-        """Let the active numbers walk.
-
-        `variance`: (p,), of the walks, per second; `time`: s.
-        """
+        """Let the active numbers walk. `variance`: (p,), of the walks, per second; `time`: s."""
         walk(self._F, np.where(self.active, time * variance, 0.0), self._scratch[0])
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
@@ -97,10 +94,7 @@ class ParameterFilter:
         walk(self._F, variance, self._scratch[0])
 
     def set(self, q: Array, covariance: Array) -> None:
-        """Go on from other numbers.
-
-        `q`: (p,); `covariance`: (p, p).
-        """
+        """Go on from other numbers. `q`: (p,); `covariance`: (p, p)."""
         fresh = ParameterFilter(q, covariance)
         self.q, self._F = fresh.q, fresh._F
 
@@ -150,10 +144,7 @@ class DriftRates:
         self._count = self._next = self._since = self._looks = 0
 
     def add(self, evidence: Evidence, before: ParameterFilter) -> None:
-        """Take in a block.
-
-        `before`: the numbers as they were known before this block.
-        """
+        """Take in a block. `before`: the numbers as they were known before this block."""
         if not self.adapts:
             return
         chunk = self._chunk
@@ -236,37 +227,13 @@ _OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of
 class PhysicalRpem:
     """Recursive estimator of a bench's physical parameters, started from an off-line estimate.
 
-    Parameters
-    ----------
-    start : Estimate or TrackedNumbers
-        Where tracking begins.
-    memory : float, "auto" or "all"
-        Time constant with which old data are forgotten, s; found for each number by maximum likelihood; or all data
-        count alike.
-    block : int, optional
-        Samples of one evidence; by default 5 ms, and enough innovations to tell noise from numbers.
+    `memory`: time constant with which old data are forgotten, s; "auto": found for each number by maximum likelihood;
+    "all": all data count alike. `block`: samples of one evidence; by default 5 ms, and enough innovations to tell noise
+    from numbers.
 
-    Attributes
-    ----------
-    numbers : TrackedNumbers
-    filter : ParameterFilter
-    stream : EvidenceStream
-    drift : DriftRates
-    block_samples : int
-    block_s : float
-        Length of one evidence.
-    noise_level : float
-        Variance of the innovations over that at identification, followed through what no number explains.
-    n_used, n_rejected : int
-    n_linearised : int
-        Times that the predictor was assembled again.
-    n_unreached : int
-        Times that there was no predictor at the estimate: the one in use is the nearest that was found on the way.
-
-    Raises
-    ------
-    EstimationError
-        If the start cannot be tracked from, or the memory is not positive.
+    `noise_level`: variance of the innovations over that at identification, followed through what no number explains;
+    `n_linearised`: times that the predictor was assembled again; `n_unreached`: times that there was no predictor at
+    the estimate: the one in use is the nearest that was found on the way.
     """
 
     def __init__(self, start: Estimate | TrackedNumbers, *, memory: Memory = "auto", block: int | None = None) -> None:
@@ -309,24 +276,10 @@ class PhysicalRpem:
         return copy.deepcopy(self, {id(self.numbers): self.numbers})
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
-        """Take in one sample or a block.
+        """Take in one sample or a block, SI; return innovations, NaN for a rejected sample.
 
-        Parameters
-        ----------
-        inputs : array_like, shape (n_inputs,) or (n_samples, n_inputs), SI
-        outputs : array_like, shape (n_outputs,) or (n_samples, n_outputs), SI
-        forcing : array_like, shape (2,) or (n_samples, 2), optional
-            Where the unbalance is tracked: (speed/top speed)^2 times cosine and sine of the angle.
-
-        Returns
-        -------
-        ndarray, shape of `outputs`, SI
-            Innovations; NaN for a rejected sample.
-
-        Raises
-        ------
-        EstimationError
-            If the shapes do not fit.
+        `forcing`: (2,) or (n_samples, 2), where the unbalance is tracked: (speed/top speed)^2 times cosine and sine of
+        the angle.
         """
         samples = checked(self.numbers, inputs, outputs, forcing)
         k, n = 0, samples.y.shape[0]
@@ -359,22 +312,12 @@ class PhysicalRpem:
         return errors
 
     def take(self, evidence: Evidence) -> None:
-        """Take in the evidence of a block.
-
-        Parameters
-        ----------
-        evidence : Evidence
-        """
+        """Take in the evidence of a block."""
         self.predict()
         self.absorb(evidence)
 
     def absorb(self, evidence: Evidence) -> None:
-        """Take in the evidence of a block over which the numbers have already walked.
-
-        Parameters
-        ----------
-        evidence : Evidence
-        """
+        """Take in the evidence of a block over which the numbers have already walked."""
         self.drift.add(evidence, self.filter)
         self.filter.absorb(evidence, self.noise_of(evidence))
         self.drift.adapt(self.filter, self.noise)
@@ -387,11 +330,7 @@ class PhysicalRpem:
             self.filter.walk(self.drift.variance, self.block_s)
 
     def refresh(self) -> None:
-        """Assemble the predictor again where the estimate has moved too far from it.
-
-        Too far is where second-order terms matter, or where its innovations are noticeably larger than those at the
-        estimate.
-        """
+        """Assemble the predictor again where second-order terms matter, or its innovations are noticeably larger."""
         latest = self.stream.latest
         if latest is not None:
             most = _STALE * self.noise_level * latest.n_samples
@@ -402,27 +341,15 @@ class PhysicalRpem:
     def noise_of(self, evidence: Evidence) -> float:
         """Return the variance with which a block's residual is taken.
 
-        Parameters
-        ----------
-        evidence : Evidence
-
-        Returns
-        -------
-        float
-            The usual one; where much more is left unexplained than usual, so much larger: a transient that the model
-            does not know must not move the numbers.
+        The usual one; where much more is left unexplained than usual, so much larger: a transient that the model does
+        not know must not move the numbers.
         """
         own = evidence.rest / evidence.freedom if evidence.freedom else 0.0
         usual = max(self.noise_level, _LOWEST_NOISE)
         return self.numbers.overdispersion * (own if own > _TRANSIENT * usual else usual)
 
     def follow_noise(self, evidence: Evidence) -> None:
-        """Follow the noise level by the part of a block's innovations that no number explains.
-
-        Parameters
-        ----------
-        evidence : Evidence
-        """
+        """Follow the noise level by the part of a block's innovations that no number explains."""
         if evidence.freedom:
             self.noise_level += self._part * (evidence.rest / evidence.freedom - self.noise_level)
 
@@ -432,17 +359,7 @@ class PhysicalRpem:
         return self.numbers.overdispersion * max(self.noise_level, _LOWEST_NOISE)
 
     def move_to(self, q: Array) -> bool:
-        """Linearise at other numbers.
-
-        Parameters
-        ----------
-        q : ndarray, shape (p,)
-
-        Returns
-        -------
-        bool
-            False where there is no predictor: it comes as near as it can, and `n_unreached` counts.
-        """
+        """Linearise at other numbers; False where there is no predictor: it comes as near as it can."""
         near = self.stream.at
         for part in _APPROACH:
             at = linearise(self.numbers, near.at + part * (q - near.at), near.gain)

@@ -99,10 +99,7 @@ class Supervisor:
         return self.level.error if self._spoken else 1.0
 
     def begin(self, first: int) -> None:
-        """Say where the stream begins, before anything of it comes.
-
-        `first`: number of the first sample.
-        """
+        """Say where the stream begins, before anything of it comes. `first`: number of the first sample."""
         self._heard = first
         self.diagnosis.restart(first)
 
