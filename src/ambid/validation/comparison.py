@@ -55,17 +55,17 @@ class Comparison(Result):
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """What speaks against the best, and structures that could not be fitted."""
-        best, found = self.entries[0], list[Reason]()
+        best, reasons = self.entries[0], list[Reason]()
         sound = [x.structure for x in self.entries if x.fit is not None and x.fit.passed]
         if best.one_step is None or not best.one_step > 0:
             text = "no structure predicts better than the mean. Check columns, delay and orders"
-            found.append(Reason(check="one_step", text=text, grave=True))
+            reasons.append(Reason(check="one_step", text=text, grave=True))
         if best.failed:
             remedy = f"{sound[0]} passes all checks" if sound else "none passes all: try others, or other orders"
             text = f"{best.structure}, the best, fails {', '.join(best.failed)}; {remedy}"
-            found.append(Reason(check="best", text=text))
-        found += [Reason(check=x.structure, text=x.refusal) for x in self.entries if x.fit is None]
-        return tuple(found)
+            reasons.append(Reason(check="best", text=text))
+        reasons += [Reason(check=x.structure, text=x.refusal) for x in self.entries if x.fit is None]
+        return tuple(reasons)
 
     def as_dict(self) -> dict[str, object]:
         """Return the table, ready for JSON.
@@ -128,14 +128,14 @@ def compare(
         fitted, other, where = fold.fitted, fold.judged, f"last {100 * holdout:.3g} % of the record"
     else:
         fitted, other, where = data, second, "second record"
-    found = list[Entry]()
+    entries = list[Entry]()
     for name, orders in candidates:
         if tick is not None:
             tick(name)
-        found.append(_entry(name, orders, fitted, other, criterion))
-    if all(x.fit is None for x in found):
-        raise EstimationError(f"none of the structures could be fitted; {found[0].structure}: {found[0].refusal}")
-    ranked = tuple(sorted(found, key=lambda x: -np.inf if x.one_step is None else x.one_step, reverse=True))
+        entries.append(_entry(name, orders, fitted, other, criterion))
+    if all(x.fit is None for x in entries):
+        raise EstimationError(f"none of the structures could be fitted; {entries[0].structure}: {entries[0].refusal}")
+    ranked = tuple(sorted(entries, key=lambda x: -np.inf if x.one_step is None else x.one_step, reverse=True))
     return Comparison(
         used=other,
         entries=ranked,
@@ -154,9 +154,9 @@ def _entry(name: str, orders: Orders | None, fitted: IOData, other: IOData, crit
     try:
         if orders is None:
             orders = select(name, fitted, criterion=criterion).orders
-        found = structure(name).estimator(fitted, orders)
+        result = structure(name).estimator(fitted, orders)
         seconds = time.perf_counter() - start
-        fit = judge(found, fitted, second=other)
+        fit = judge(result, fitted, second=other)
     except EstimationError as error:
         seconds, refusal = time.perf_counter() - start, str(error)
     return Entry(
@@ -174,8 +174,8 @@ def _mean(fit: BlackBoxFit | None, kind: str) -> float | None:
     """Mean over the outputs of a fit on the second record; None where an output has none."""
     values = list[float]()
     judged = None if fit is None else fit.validation
-    for of in (judged or {}).values():
-        part = of.get(kind) if isinstance(of, dict) else None
+    for fits in (judged or {}).values():
+        part = fits.get(kind) if isinstance(fits, dict) else None
         if part is None or not np.isfinite(part["fit"]):
             return None
         values.append(float(part["fit"]))

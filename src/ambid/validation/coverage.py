@@ -105,8 +105,8 @@ class Coverage(Result):
     @property
     def counts(self) -> Mapping[str, int]:
         """Runs by verdict; ``failed``: without a result."""
-        of = Counter("failed" if t.reason else t.verdict for t in self.trials)
-        return {word: of[word] for word in ("usable", "caution", "unusable", "failed")}
+        counter = Counter("failed" if t.reason else t.verdict for t in self.trials)
+        return {word: counter[word] for word in ("usable", "caution", "unusable", "failed")}
 
     def z(self, name: str) -> Array:
         """Return error / standard deviation of each run that may be used.
@@ -146,13 +146,13 @@ class Coverage(Result):
         if n < 2:
             return None
         z = (value - truth) / sd
-        spread, said = float(np.std(value, ddof=1)), float(np.sqrt(np.mean(sd**2)))
+        spread, stated = float(np.std(value, ddof=1)), float(np.sqrt(np.mean(sd**2)))
         low, high = (math.sqrt(float(chi2.ppf(p, n - 1)) / (n - 1)) for p in (0.025, 0.975))
         inside = int(np.sum(np.abs(z) < NORMAL_95))
         return Covered(
             name=name, truth=truth, runs=n, unknown=unknown, bias=float(np.mean(value) - truth),
-            bias_sd=spread / math.sqrt(n), spread=spread, said=said,
-            ratio=(said / spread * low, said / spread * high) if spread else (math.inf, math.inf), inside=inside,
+            bias_sd=spread / math.sqrt(n), spread=spread, said=stated,
+            ratio=(stated / spread * low, stated / spread * high) if spread else (math.inf, math.inf), inside=inside,
             coverage=wilson(inside, n), rms_z=float(np.sqrt(np.mean(z**2))), largest_z=float(np.max(np.abs(z))),
         )  # fmt: skip
 
@@ -162,29 +162,29 @@ class Coverage(Result):
         from scipy.special import ndtri
         from scipy.stats import binom
 
-        found, rows = [], self.rows
+        reasons, rows = [], self.rows
         if self.counts["failed"]:
             text = f"{self.counts['failed']} of {counted(len(self.trials), 'run')} failed; the reasons are below"
-            found.append(Reason(check="failures", text=text, grave=not rows))
+            reasons.append(Reason(check="failures", text=text, grave=not rows))
         if len(self.trials) < self.asked:
             text = f"{len(self.trials)} of {counted(self.asked, 'run')} were done"
-            found.append(Reason(check="interrupted", text=text))
+            reasons.append(Reason(check="interrupted", text=text))
         if not rows or max(row.runs for row in rows) < _FEW:
             text = f"fewer than {_FEW} runs say nothing of coverage. Raise {setting('runs')}"
-            return (*found, Reason(check="runs", text=text))
+            return (*reasons, Reason(check="runs", text=text))
         alone = _SURE / (2 * len(rows))
         seldom = [r for r in rows if r.runs >= _FEW and binom.cdf(r.inside, r.runs, 0.95) < alone]
         if seldom:
             text = ", ".join(f"{r.name} {100 * r.inside / r.runs:.3g} %" for r in seldom)
-            found.append(Reason(check="coverage", text=f"95 % intervals hold the truth too seldom: {text}"))
+            reasons.append(Reason(check="coverage", text=f"95 % intervals hold the truth too seldom: {text}"))
         far = [
             r for r in rows
             if r.runs >= _FEW and abs(r.bias) > max(-float(ndtri(alone / 2)) * r.bias_sd, _BIAS * r.said)
         ]  # fmt: skip
         if far:
             text = ", ".join(f"{r.name} {r.bias / r.said:+.2g} standard deviations" for r in far)
-            found.append(Reason(check="bias", text=f"estimates are biased: {text}"))
-        return tuple(found)
+            reasons.append(Reason(check="bias", text=f"estimates are biased: {text}"))
+        return tuple(reasons)
 
 
 def wilson(inside: int, n: int) -> tuple[float, float]:

@@ -166,28 +166,30 @@ def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dic
     }
 
 
-def second_check(fit: BlackBoxFit | NonlinearFit, found: Mapping[str, Any]) -> Check:
-    """Check that a fit holds on a second record; `found`: by output, as `validation` gives it.
+def second_check(fit: BlackBoxFit | NonlinearFit, result: Mapping[str, Any]) -> Check:
+    """Check that a fit holds on a second record; `result`: by output, as `validation` gives it.
 
     It does where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the record
     lies outside the training data (which a linear fit does not know).
     """
-    said = []
-    for name, sizes in found.items():
+    sentences = []
+    for name, sizes in result.items():
         one, usual = sizes["one_step"], fit.fit[name].innovation_sd
         if one is None or not math.isfinite(one["rmse"]):
-            said.append(f"the one-step prediction of {name} diverges")
+            sentences.append(f"the one-step prediction of {name} diverges")
         elif one["rmse"] > _GROWN * usual:
-            said.append(
+            sentences.append(
                 f"one-step errors of {name} are {one['rmse'] / usual:.3g} times as large as at identification"
                 if usual > 0
                 else f"one-step errors of {name} are not zero, as they were at identification"
             )
-    share = max((float(sizes.get("extrapolated", 0.0)) for sizes in found.values()), default=0.0)
+    share = max((float(sizes.get("extrapolated", 0.0)) for sizes in result.values()), default=0.0)
     if share > _OUTSIDE:
-        said.append(f"{100 * share:.2g} % of it lies outside the training data, where the model extrapolates")
-    detail = "; ".join(said) or f"one-step errors are at most {_GROWN:g} times as large as at identification"
-    return Check(passed=not said, detail=f"it does not hold on the second record: {detail}" if said else detail)
+        sentences.append(f"{100 * share:.2g} % of it lies outside the training data, where the model extrapolates")
+    detail = "; ".join(sentences) or f"one-step errors are at most {_GROWN:g} times as large as at identification"
+    return Check(
+        passed=not sentences, detail=f"it does not hold on the second record: {detail}" if sentences else detail
+    )
 
 
 def _sizes(records: Sequence[IOData], runs: Sequence[Run], *, free: bool) -> Sizes | None:
@@ -238,8 +240,8 @@ class Run:
         return int(np.argmax(bad)) if np.any(bad) else None
 
 
-def _run_of(found: Errors) -> Run:
-    return Run(lag=0, one_step=found.one_step, simulation=found.simulation)
+def _run_of(residuals: Errors) -> Run:
+    return Run(lag=0, one_step=residuals.one_step, simulation=residuals.simulation)
 
 
 def run(fit: NonlinearFit, data: IOData) -> Run:
@@ -284,15 +286,15 @@ def beyond(novelty: Array) -> NDArray[np.bool_]:
     return out
 
 
-def looks_back(data: IOData, found: Run) -> bool:
+def looks_back(data: IOData, run: Run) -> bool:
     """Return whether predictions use measured outputs: if not, the model leaves the colour of the noise open.
 
     Returns false where the one-step prediction is the free run, as for an output-error model.
     """
-    if found.simulation is None or found.diverges_at is not None or not found.finite:
+    if run.simulation is None or run.diverges_at is not None or not run.finite:
         return True
     size = np.max(np.abs(data.y), axis=0)
-    apart = np.abs(found.simulation - found.one_step)[found.lag :]
+    apart = np.abs(run.simulation - run.one_step)[run.lag :]
     return bool(np.any(apart > _SAME * np.maximum(size, 1e-300)))
 
 
@@ -304,14 +306,14 @@ def nonlinear_residuals(
     `runs`: of these records, all finite; `coloured`: whether the model leaves the colour of the noise open. None where
     no record has samples enough.
     """
-    used = [(x, r) for x, r in zip(records, runs, strict=True) if x.n_samples - r.lag >= LEAST]
-    if not used:
+    pairs = [(x, r) for x, r in zip(records, runs, strict=True) if x.n_samples - r.lag >= LEAST]
+    if not pairs:
         return None
     n_y, n_u = len(fit.outputs), len(fit.inputs)
-    width = n_y * max(model_of(fit, used[0][0]).theta.size, 1) + 40 * (n_u + n_y)
-    most = max(int(MOST / width / len(used)), LEAST)
+    width = n_y * max(model_of(fit, pairs[0][0]).theta.size, 1) + 40 * (n_u + n_y)
+    most = max(int(MOST / width / len(pairs)), LEAST)
     e, u, J = list[Array](), list[Array](), list[Array]()
-    for x, r in used:
+    for x, r in pairs:
         first = max(r.lag, skipped(x.n_samples), x.n_samples - most)
         lead = min(first, r.lag + skipped(x.n_samples))  # for derivatives that are recursions to settle
         J.append(model_of(fit, x).jacobian(x.u[first - lead :], x.y[first - lead :])[lead:])
@@ -329,7 +331,7 @@ def nonlinear_residuals(
         J=[[x[:, o] for x in J] for o in range(n_y)],
         colours=[autoregression(x) if coloured else None for x in longest.T],
         source=u,
-        instrumental=coloured and any(looks_back(x, r) for x, r in used),
+        instrumental=coloured and any(looks_back(x, r) for x, r in pairs),
         nonlinear=True,
     )
 
@@ -346,8 +348,8 @@ def _feedback_warnings(
             f"{setting('open_loop')} was given, but inputs depend on past residuals: there is feedback. Omit "
             f"{setting('open_loop')}"
         ]
-    said = any("biased" in x and "open loop" in x for x in fit.warnings)
-    if open_loop or said or not subject.biased:
+    warned = any("biased" in x and "open loop" in x for x in fit.warnings)
+    if open_loop or warned or not subject.biased:
         return []
     return [
         f"{subject.name} has no noise model and is biased by feedback. Use narmax with ne > 0, or give "
@@ -426,30 +428,30 @@ def leaves_colour_open(fit: NonlinearFit, records: Sequence[IOData], runs: Seque
     return not any(looks_back(x, r) for x, r in zip(records, runs, strict=True))
 
 
-def _last(data: IOData, found: Errors) -> tuple[IOData, Errors]:
+def _last(data: IOData, residuals: Errors) -> tuple[IOData, Errors]:
     """Return the last part of a long record: as much as the derivatives of a large model leave room for."""
-    m = found.model
+    m = residuals.model
     width = (m.order + 1) * (m.order + m.n_inputs + m.n_outputs)
     first = data.n_samples - int(MOST / width)
     if first <= 0:
-        return data, found
-    return data.part(first, data.n_samples), replace(found, one_step=found.one_step[first:], simulation=None)
+        return data, residuals
+    return data.part(first, data.n_samples), replace(residuals, one_step=residuals.one_step[first:], simulation=None)
 
 
-def linear_residuals(fit: BlackBoxFit, data: IOData, found: Errors, slopes: Gradient) -> Residuals:
+def linear_residuals(fit: BlackBoxFit, data: IOData, residuals: Errors, slopes: Gradient) -> Residuals:
     """Prepare what the residual tests look at: the data run through the fit, and derivatives of its predictions.
 
     In a loop, a model without noise is tested against the reference, where there is one: inputs hold the noise.
     """
     first = skipped(data.n_samples)
-    loop = not found.claims_noise and structure(fit.structure).feedback == "consistent" and bool(data.references)
+    loop = not residuals.claims_noise and structure(fit.structure).feedback == "consistent" and bool(data.references)
     u = data.u - data.u.mean(axis=0)
     return Residuals(
-        e=[found.one_step - found.one_step.mean(axis=0)],
+        e=[residuals.one_step - residuals.one_step.mean(axis=0)],
         u=[u],
         J=[[rows] for rows in slopes.rows],
         first=first,
-        colours=[None if found.claims_noise else autoregression(e[first:]) for e in found.one_step.T],
+        colours=[None if residuals.claims_noise else autoregression(e[first:]) for e in residuals.one_step.T],
         source=[data.reference - data.reference.mean(axis=0)] if loop else [u],
         instrumental=loop,
         nonlinear=False,
@@ -458,9 +460,9 @@ def linear_residuals(fit: BlackBoxFit, data: IOData, found: Errors, slopes: Grad
     )
 
 
-def _check_predictor(found: Errors) -> Check:
+def _check_predictor(residuals: Errors) -> Check:
     """Check that the one-step errors do not grow by themselves."""
-    m = found.model
+    m = residuals.model
     radius = float(np.max(np.abs(np.linalg.eigvals(m.A - m.K @ m.C)), initial=0.0)) if m.order else 0.0
     ok = radius < 1.0
     return Check(

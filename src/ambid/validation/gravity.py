@@ -34,8 +34,8 @@ def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:
         return False
     low, high = sorted((float(current.min()), float(current.max())), key=abs)
     one_sided = low * high > 0 or abs(low) <= _REVERSED * abs(high)
-    known = magnet.known("g")
-    return (magnet.kind == "single" or one_sided) and (known is None or known.value != 0.0)
+    gravity = magnet.known("g")
+    return (magnet.kind == "single" or one_sided) and (gravity is None or gravity.value != 0.0)
 
 
 def gravity_balance(
@@ -48,23 +48,23 @@ def gravity_balance(
     current's resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
     """
     x, i = record["position"].values, record["current"].values
-    known = {name: magnet.known(name) for name in ("g", "i_offset")}
-    g, g_sd = _value(known["g"], GRAVITY, 0.0)
-    zero, zero_sd = _value(known["i_offset"], 0.0, resolution(record, "current").step / np.sqrt(12.0))
+    numbers = {name: magnet.known(name) for name in ("g", "i_offset")}
+    g, g_sd = _value(numbers["g"], GRAVITY, 0.0)
+    zero, zero_sd = _value(numbers["i_offset"], 0.0, resolution(record, "current").step / np.sqrt(12.0))
     i0, (spread, along) = float(i.mean()) - zero, np.cov(x, i)
-    found, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
+    ratio, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
     slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
-    sd = abs(found) * float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    sd = abs(ratio) * float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
     rise = theta["k_x"] / (theta["m"] * g)  # f_x/f, as f = -m g
     ripple = float(along[1]) / i0**2
     bend = ripple + 2.0 * rise * float(along[0]) / i0 + 0.75 * rise**2 * float(spread[0])
     doubt = abs(expected) * float(np.sqrt((g_sd / g) ** 2 + (zero_sd / i0) ** 2 + bend**2 + ripple**2))
     total = float(np.hypot(sd, doubt))
-    off = found / expected - 1.0
-    passed = abs(found - expected) <= _FAR * total
-    detail = f"k_i/m = {found:.4g} N/(A kg), sd {sd:.2g} if the model is right; the weight at {i0:.4g} A asks for "
+    off = ratio / expected - 1.0
+    passed = abs(ratio - expected) <= _FAR * total
+    detail = f"k_i/m = {ratio:.4g} N/(A kg), sd {sd:.2g} if the model is right; the weight at {i0:.4g} A asks for "
     detail += f"-2 g/i0 = {expected:.4g}, sd {doubt:.2g}"
-    if abs(found + expected) < _MIRROR * abs(expected):
+    if abs(ratio + expected) < _MIRROR * abs(expected):
         detail += (
             ": position is reversed. It has to grow away from the magnet: give channels.position.gain the other sign "
             "(k_i changes its sign with it, no other parameter does), or magnet.parameters.g"
@@ -78,7 +78,7 @@ def gravity_balance(
             "would not). Check these two, and that one magnet alone carries the rotor; else record away from limits, "
             "with more excitation"
         )
-    values = {"k_i_over_m": found, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
+    values = {"k_i_over_m": ratio, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
     return Check(passed=passed, values=values, detail=detail)
 
 
@@ -96,16 +96,16 @@ def loop_agrees(rig: Rig, theta: Mapping[str, float], rate_hz: float) -> Check |
     """
     if rig.loop is None or not rig.loop.closed or rig.open_loop:
         return None
-    found, mirrored = (
+    poles, mirrored = (
         float(np.abs(closed_loop_poles({**theta, "k_i": sign * theta["k_i"]}, rig.loop, rate_hz)).max())
         for sign in (1.0, -1.0)
     )
-    values = {"largest_pole": found, "mirrored": mirrored}
-    if found < 1.0 <= mirrored:
+    values = {"largest_pole": poles, "mirrored": mirrored}
+    if poles < 1.0 <= mirrored:
         return Check(passed=True, values=values, detail="the controller of the rig holds the identified plant")
-    if mirrored < 1.0 <= found:
+    if mirrored < 1.0 <= poles:
         detail = (
-            f"the controller of the rig would not hold the identified plant (largest pole {found:.4g}), but its mirror "
+            f"the controller of the rig would not hold the identified plant (largest pole {poles:.4g}), but its mirror "
             f"image (k_i = {-theta['k_i']:.4g} N/A): position is reversed, or voltage and current both are. Give "
             "channels.position.gain the other sign (k_i changes its sign with it, no other parameter does), or correct "
             "the signs of [loop]"
@@ -113,6 +113,6 @@ def loop_agrees(rig: Rig, theta: Mapping[str, float], rate_hz: float) -> Check |
         return Check(passed=False, values=values, detail=detail)
     detail = "the controller of the rig does not tell the sign of the position: "
     detail += (
-        "it holds both" if found < 1.0 else f"it holds neither this plant (largest pole {found:.4g}) nor its mirror"
+        "it holds both" if poles < 1.0 else f"it holds neither this plant (largest pole {poles:.4g}) nor its mirror"
     )
     return Check(passed=True, values=values, detail=detail)

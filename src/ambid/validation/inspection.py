@@ -57,13 +57,13 @@ class Inspection(Result):
         return self.faults
 
     def __getitem__(self, name: str) -> ChannelLook:
-        found = next((c for c in self.channels if c.name == name), None)
-        if found is None:
+        channel = next((c for c in self.channels if c.name == name), None)
+        if channel is None:
             names = [c.name for c in self.channels]
             raise RecordError(
                 f"the record has no channel {name!r}; it has {', '.join(names)}.{nearest(name, names)} Check the name"
             )
-        return found
+        return channel
 
 
 def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
@@ -82,8 +82,8 @@ def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
         channels=tuple(_look(record, c, inputs) for c in record.channels),
         faults=tuple(fault for c in record.channels for fault in _faults(record, c, grave=bool(inputs))),
         roles={
-            role: tuple(f"{x.channel.name} (score {x.score:.2f}), because {x.why}" for x in found)
-            for role, found in ranked.items()
+            role: tuple(f"{x.channel.name} (score {x.score:.2f}), because {x.why}" for x in candidates)
+            for role, candidates in ranked.items()
         },
         notes=tuple(notes),
     )
@@ -103,28 +103,28 @@ def _ratio(record: Record, c: Channel, inputs: Sequence[str]) -> str:
         return "–"
     driving = [] if c.name in inputs else [name for name in inputs if np.ptp(record[name].values) > 0]
     try:
-        found = snr(record, c.name, inputs=driving)
+        ratio = snr(record, c.name, inputs=driving)
     except AmbidError:
         return "too short"
-    return f"{found.db:.1f} dB" if np.isfinite(found.db) else "no signal" if found.db < 0 else "no noise"
+    return f"{ratio.db:.1f} dB" if np.isfinite(ratio.db) else "no signal" if ratio.db < 0 else "no noise"
 
 
 def _faults(record: Record, c: Channel, *, grave: bool) -> list[Reason]:
     """What is wrong with a channel; one that stands still is `grave` where the rig names it."""
-    found = []
+    faults = []
     if c.unit == UNKNOWN:
         text = f"{c.name}: unknown unit [{c.source_unit}]; a rig can declare it"
-        found.append(Reason(check="unit", text=text))
+        faults.append(Reason(check="unit", text=text))
     for check, look, remedy in _REMEDIES:
         try:
-            seen = look(record, c.name)
+            look_result = look(record, c.name)
         except AmbidError:
             continue
-        if seen.count:
+        if look_result.count:
             advice = remedy.format(gaps=setting("gaps"), from_s=setting("from_s"))
             still = not np.ptp(c.values) > 0
-            found.append(Reason(check=check, text=f"{seen}. {advice}", grave=still and grave))
-    return found
+            faults.append(Reason(check=check, text=f"{look_result}. {advice}", grave=still and grave))
+    return faults
 
 
 def _excitation(record: Record, name: str) -> str:

@@ -45,17 +45,17 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     A lag between current and force (an eddy pole) leaves the innovations white, as the levels of the noise grow over
     it, but not independent of past voltages.
     """
-    found = run(fit.problem, fit.vector, r) if fit.at is None else fit.at.innovations[r]
-    assert found is not None
+    residuals = run(fit.problem, fit.vector, r) if fit.at is None else fit.at.innovations[r]
+    assert residuals is not None
     outputs = (1,) if fit.problem.records[r].held else (0, 1)
-    n, first = found.e.shape[0], fit.problem.skip
-    white = np.nan_to_num(found.e[:, outputs] / np.sqrt(found.s[:, outputs]))
+    n, first = residuals.e.shape[0], fit.problem.skip
+    white = np.nan_to_num(residuals.e[:, outputs] / np.sqrt(residuals.s[:, outputs]))
     begin, u = first + max(*_LAGS, *_INPUT_LAGS), fit.problem.records[r].u[:, None]
     past = [(white, k) for k in _LAGS] + [(u, k) for k in _INPUT_LAGS]
     mean = np.concatenate([x[begin - k : n - k].mean(axis=0) for x, k in past])
     target, n_own = white[begin:], len(outputs) * len(_LAGS)
     triangles: list[list[Array]] = [[] for _ in outputs]
-    for part in sweep(fit.problem, fit.vector, r, found, slopes=True):
+    for part in sweep(fit.problem, fit.vector, r, residuals, slopes=True):
         assert part is not None
         at = max(begin, part.first)
         slopes = part.rows[at - part.first :, [2 * c for c in outputs], :-1]
@@ -71,7 +71,7 @@ def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
     spread = np.std(target, axis=0)
     products = np.vstack([white[begin - k : n - k].T @ target for k in _LAGS])
     correlation = np.abs(products) / target.shape[0] / np.outer(np.tile(spread, len(_LAGS)), spread)
-    rms = [float(np.sqrt(np.nanmean(found.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
+    rms = [float(np.sqrt(np.nanmean(residuals.e[first:, c] ** 2))) if c in outputs else float("nan") for c in (0, 1)]
     return WhitenessTest(
         p=min(1.0, 2.0 * min(own, by_input)), p_own=own, p_input=by_input, largest=float(correlation.max()),
         innovation_sd=(rms[0], rms[1]),
@@ -165,9 +165,9 @@ def _fit(
 
 def _replayed(fit: BearingFit, name: str) -> BearingReplay:
     record, first = fit.problem.records[0], fit.problem.skip
-    found = run(fit.problem, fit.vector, 0)
-    assert found is not None  # its criterion is finite
-    e, s = found.e[first:], found.s[first:]
+    residuals = run(fit.problem, fit.vector, 0)
+    assert residuals is not None  # its criterion is finite
+    e, s = residuals.e[first:], residuals.s[first:]
     return BearingReplay(
         fit=fit,
         noise_of=name,
@@ -188,17 +188,17 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
     estimate has seen) and, for one magnet, carries_its_weight, each with ``passed`` and ``detail``; ``passed``;
     ``samples``; ``outside``, share of the record.
     """
-    found = replay(estimate, record)
-    sound = np.all(np.isfinite(found.innovations), axis=1)
-    errors, measured = found.innovations[sound], found.measured[sound]
+    replayed = replay(estimate, record)
+    sound = np.all(np.isfinite(replayed.innovations), axis=1)
+    errors, measured = replayed.innovations[sound], replayed.measured[sound]
     rms = np.sqrt(np.mean(errors**2, axis=0))
-    before = [estimate.fit[found.noise_of][role].innovation_sd for role in _ROLES]
+    before = [estimate.fit[replayed.noise_of][role].innovation_sd for role in _ROLES]
     one_step, ratio = fit_of(errors, measured), rms / np.array(before)
     outside = 1.0 - float(np.mean(estimate.covers(record.kept)))
     checks = {
-        **whiteness_checks([whiteness(found.fit, 0)]),
+        **whiteness_checks([whiteness(replayed.fit, 0)]),
         "innovations_consistent": consistency_check(
-            dict(zip(_ROLES, ratio.tolist(), strict=True)), f"on {found.noise_of} at identification"
+            dict(zip(_ROLES, ratio.tolist(), strict=True)), f"on {replayed.noise_of} at identification"
         ),
         "inside_range": _inside(estimate, record, outside),
         **_carries(estimate, record),
@@ -215,7 +215,7 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
         },
         **conclude(checks, int(record.u.size)),
         "outside": outside,
-        "noise_of": found.noise_of,
+        "noise_of": replayed.noise_of,
     }
 
 
@@ -224,7 +224,7 @@ def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) 
 
     `names`: of the records, where there are several.
     """
-    found = {}
+    checks = {}
     for check, what, p in (
         ("residuals_white", ("not white", "white"), [t.p_own for t in tests]),
         (
@@ -239,21 +239,21 @@ def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) 
         if check == "residuals_white":
             words.insert(0, f"largest autocorrelation {max(t.largest for t in tests):.3f}")
         detail = f"residuals are {what[passed]} ({', '.join(words)})"
-        found[check] = Check(
+        checks[check] = Check(
             passed=passed, p=p[worst], detail=detail, values=dict(zip(names, p, strict=True)) if names else {}
         )
-    return found
+    return checks
 
 
 def _inside(estimate: NonlinearBearingEstimate, record: BearingRecord, outside: float) -> Check:
     low, high = record.kept.min(axis=0), record.kept.max(axis=0)
-    seen = estimate.range
+    visited = estimate.range
     detail = f"{100 * outside:.2g} % of the record lies outside the positions and currents used for identification"
     if outside > _OUTSIDE:
         detail += (
             f" (here {1e3 * low[0]:.4g} to {1e3 * high[0]:.4g} mm, {low[1]:.3g} to {high[1]:.3g} A; there "
-            f"{1e3 * seen['position'][0]:.4g} to {1e3 * seen['position'][1]:.4g} mm, "
-            f"{seen['current'][0]:.3g} to {seen['current'][1]:.3g} A): the force law extrapolates"
+            f"{1e3 * visited['position'][0]:.4g} to {1e3 * visited['position'][1]:.4g} mm, "
+            f"{visited['current'][0]:.3g} to {visited['current'][1]:.3g} A): the force law extrapolates"
         )
     return Check(passed=outside <= _OUTSIDE, detail=detail, values={"outside": outside})
 

@@ -82,47 +82,51 @@ def select(
     `structure_name`: as in `ambid.blackbox.fit`; `ranges`: least and largest value of an order; `tick`: called
     with the orders before each fit; may raise to interrupt.
     """
-    of = structure(structure_name)
-    by = _criterion(criterion)
+    chosen = structure(structure_name)
+    rule = _criterion(criterion)
     for key in ranges or {}:
-        if key not in (*of.orders, "nk"):
-            raise EstimationError(f"{of.name} has no order {key!r}.{nearest(key, of.orders)} Omit it from the ranges")
+        if key not in (*chosen.orders, "nk"):
+            raise EstimationError(
+                f"{chosen.name} has no order {key!r}.{nearest(key, chosen.orders)} Omit it from the ranges"
+            )
     part = data if data.n_samples <= _LONGEST else data.part(0, _LONGEST)
-    trial = _Trial(of, part, by, tick)
-    start = first_size(of, part, ranges or {})
-    if of.kind == "state space":
+    trial = _Trial(chosen, part, rule, tick)
+    start = first_size(chosen, part, ranges or {})
+    if chosen.kind == "state space":
         for n in range(start.bounds["n"][0], start.bounds["n"][1] + 1):
             trial.score({"n": n})
     else:
-        search_orders(of, start, part.n_inputs, trial.score)
+        search_orders(chosen, start, part.n_inputs, trial.score)
     ranked = trial.ranked()
     if not ranked:
         raise EstimationError(
-            f"{of.name}: no order could be fitted and judged by {by}: {trial.refusal or 'the models are unstable'}. "
-            "Give orders, or use another criterion"
+            f"{chosen.name}: no order could be fitted and judged by {rule}: "
+            f"{trial.refusal or 'the models are unstable'}. Give orders, or use another criterion"
         )
     return Selection(
-        structure=of.name,
-        criterion=by,
+        structure=chosen.name,
+        criterion=rule,
         orders=dict(ranked[0].orders),
         candidates=tuple(ranked),
-        why=_why(ranked, by),
+        why=_why(ranked, rule),
         samples=part.n_samples,
     )
 
 
 def _criterion(name: str) -> Criterion:
-    known = get_args(Criterion)
-    if name not in known:
-        raise EstimationError(f"criterion {name!r} is not one of {', '.join(known)}.{nearest(name, known)}")
+    criteria = get_args(Criterion)
+    if name not in criteria:
+        raise EstimationError(f"criterion {name!r} is not one of {', '.join(criteria)}.{nearest(name, criteria)}")
     return cast(Criterion, name)
 
 
 class _Trial:
     """Fits candidates and scores them; a search by held-out data looks around with AIC first."""
 
-    def __init__(self, of: Structure, data: IOData, criterion: Criterion, tick: Callable[[str], None] | None) -> None:
-        self.of, self.data, self.criterion, self.tick = of, data, criterion, tick
+    def __init__(
+        self, chosen: Structure, data: IOData, criterion: Criterion, tick: Callable[[str], None] | None
+    ) -> None:
+        self.of, self.data, self.criterion, self.tick = chosen, data, criterion, tick
         self.refusal = ""
         self.found = list[Candidate]()
         self.parts: tuple[Fold, ...] = ()
@@ -142,11 +146,11 @@ class _Trial:
         return scores.get("aic" if self.parts else self.criterion, float("inf"))
 
     def _scores(self, fit: BlackBoxFit) -> dict[str, float]:
-        found = errors(fit, self.data)
-        e, size = found.one_step, fit.n_estimated
+        residuals = errors(fit, self.data)
+        e, size = residuals.one_step, fit.n_estimated
         if not np.all(np.isfinite(e)):
             return {}
-        if not found.claims_noise:
+        if not residuals.claims_noise:
             e, more = whiten(e)
             size += more
         return criteria(e, self.data.y, size)
@@ -154,7 +158,7 @@ class _Trial:
     def ranked(self) -> list[Candidate]:
         """Return what could be scored by the criterion, best first."""
         if self.parts:
-            best = [c for by in ("aic", "bic") for c in _ranked(self.found, by)[:_FINALISTS]]
+            best = [c for rule in ("aic", "bic") for c in _ranked(self.found, rule)[:_FINALISTS]]
             unique = [c for k, c in enumerate(best) if c not in best[:k]]
             self.found = [self._held_out(c) for c in unique]
         return _ranked(self.found, self.criterion)
@@ -190,24 +194,24 @@ def whiten(e: Array) -> tuple[Array, int]:
     return np.asarray(out), sum(a.size - 1 for a in filters)
 
 
-def _ranked(candidates: list[Candidate], by: str) -> list[Candidate]:
-    return sorted((c for c in candidates if by in c.scores), key=lambda c: (c.scores[by], c.n_estimated))
+def _ranked(candidates: list[Candidate], rule: str) -> list[Candidate]:
+    return sorted((c for c in candidates if rule in c.scores), key=lambda c: (c.scores[rule], c.n_estimated))
 
 
-def _why(ranked: list[Candidate], by: Criterion) -> str:
+def _why(ranked: list[Candidate], rule: Criterion) -> str:
     best = ranked[0]
     name = ", ".join(f"{k} = {v}" for k, v in best.orders.items())
     if len(ranked) == 1:
         return f"{name}: the only one that could be fitted"
-    gap = ranked[1].scores[by] - best.scores[by]
-    if by in ("holdout", "kfold"):
-        share = 100 * gap / max(ranked[1].scores[by], 1e-300)
-        return f"{name}: smallest error on held-out data ({by}), {share:.2g} % below the next of {len(ranked)}"
-    if by in ("mdl", "fpe"):
-        share = 100 * gap / max(abs(ranked[1].scores[by]), 1e-300)
-        return f"{name}: smallest {by.upper()}, {share:.2g} % below the next of {len(ranked)}"
+    gap = ranked[1].scores[rule] - best.scores[rule]
+    if rule in ("holdout", "kfold"):
+        share = 100 * gap / max(ranked[1].scores[rule], 1e-300)
+        return f"{name}: smallest error on held-out data ({rule}), {share:.2g} % below the next of {len(ranked)}"
+    if rule in ("mdl", "fpe"):
+        share = 100 * gap / max(abs(ranked[1].scores[rule]), 1e-300)
+        return f"{name}: smallest {rule.upper()}, {share:.2g} % below the next of {len(ranked)}"
     how = "clearly better than" if gap > 6 else "better than" if gap > 2 else "about as good as"
-    return f"{name}: smallest {by.upper()}, {how} the next of {len(ranked)} (difference {gap:.3g})"
+    return f"{name}: smallest {rule.upper()}, {how} the next of {len(ranked)} (difference {gap:.3g})"
 
 
 Point = tuple[int, ...]
@@ -228,16 +232,16 @@ class Start:
     arx: tuple[ArxCandidate, ...]  # all ARX models that were compared
 
 
-def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]]) -> Start:
+def first_size(chosen: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]]) -> Start:
     """Compare ARX models of all sizes and delays, as far as the record is long enough for them.
 
     `ranges`: the user's.
     """
     n_u = max(data.n_inputs, 1)
     room = max(data.n_samples // 10, 4)  # coefficients that a record of this length can tell
-    slow = of.instrumental
+    slow = chosen.instrumental
     most = max(1, min(_SLOW if slow else _SIZES, room // (n_u + 1)))
-    taps = max(1, min(_TAPS, room) // n_u) if of.name == "fir" else most
+    taps = max(1, min(_TAPS, room) // n_u) if chosen.name == "fir" else most
     lag = max(1, min(_DELAYS, room // n_u))
     bounds = {
         **dict.fromkeys(("na", "nf", "n"), (1, most)),
@@ -246,30 +250,30 @@ def first_size(of: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]
         "nk": (0 if data.open_loop else 1, lag),
         **ranges,
     }
-    arx_bounds = {**bounds, "na": (0, 0)} if of.name == "fir" else bounds
-    found = arx_candidates(data, arx_bounds)
-    best = min(found, key=lambda c: c.bic)
-    return Start(bounds=bounds, nk=best.nk, arx=found)
+    arx_bounds = {**bounds, "na": (0, 0)} if chosen.name == "fir" else bounds
+    candidates = arx_candidates(data, arx_bounds)
+    best = min(candidates, key=lambda c: c.bic)
+    return Start(bounds=bounds, nk=best.nk, arx=candidates)
 
 
-def search_orders(of: Structure, start: Start, n_inputs: int, score: Callable[[UsedOrders], float]) -> None:
+def search_orders(chosen: Structure, start: Start, n_inputs: int, score: Callable[[UsedOrders], float]) -> None:
     """Fit candidates, each once, until none of those around the best is better or the budget is spent."""
-    if of.name in ("arx", "fir"):
-        for orders in _finalists(of, start):
+    if chosen.name in ("arx", "fir"):
+        for orders in _finalists(chosen, start):
             score(orders)
         return
-    keys = _coordinates(of, n_inputs)
-    known = dict[Point, float]()
+    keys = _coordinates(chosen, n_inputs)
+    scores = dict[Point, float]()
 
     def at(point: Point) -> float:
-        if point not in known:
-            known[point] = score(_orders(keys, point))
-        return known[point]
+        if point not in scores:
+            scores[point] = score(_orders(keys, point))
+        return scores[point]
 
     best = _line(keys, start, at)
-    budget = _BUDGET // 2 if of.instrumental else _BUDGET
-    while len(known) < budget:
-        around = [p for p in _moves(keys, best, start.bounds) if p not in known][: budget - len(known)]
+    budget = _BUDGET // 2 if chosen.instrumental else _BUDGET
+    while len(scores) < budget:
+        around = [p for p in _moves(keys, best, start.bounds) if p not in scores][: budget - len(scores)]
         if not around:
             return
         there = min(around, key=at)
@@ -292,10 +296,10 @@ def _finalists(of: Structure, start: Start) -> Iterator[UsedOrders]:
 Coordinate = tuple[str, int | None]
 
 
-def _coordinates(of: Structure, n_inputs: int) -> tuple[Coordinate, ...]:
+def _coordinates(chosen: Structure, n_inputs: int) -> tuple[Coordinate, ...]:
     """One coordinate for each order; for nb, nk and, where inputs have denominators of their own, nf one an input."""
-    each = ("nb", "nk") if of.kind == "transfer function" else ("nb", "nf", "nk")
-    return tuple((key, i) for key in of.orders for i in (range(n_inputs) if key in each else (None,)))
+    each = ("nb", "nk") if chosen.kind == "transfer function" else ("nb", "nf", "nk")
+    return tuple((key, i) for key in chosen.orders for i in (range(n_inputs) if key in each else (None,)))
 
 
 def _orders(keys: tuple[Coordinate, ...], point: Point) -> UsedOrders:
@@ -343,12 +347,12 @@ def _moves(keys: tuple[Coordinate, ...], point: Point, bounds: Mapping[str, tupl
         if b is not None and k is not None:
             steps += [{k: 1, b: -1}, {k: -1, b: 1}, {k: 1}, {k: -1}]
     steps += [{j: 1} for j in singles]
-    seen = set[Point]()
+    visited = set[Point]()
     for step in steps:
         moved = tuple(v + step.get(j, 0) for j, v in enumerate(point))
         inside = all(bounds[key][0] <= v <= bounds[key][1] for (key, _), v in zip(keys, moved, strict=True))
-        if inside and moved not in seen:
-            seen.add(moved)
+        if inside and moved not in visited:
+            visited.add(moved)
             yield moved
 
 
@@ -406,21 +410,21 @@ def arx_candidates(data: IOData, bounds: Bounds) -> tuple[ArxCandidate, ...]:
             n_rows=n_rows,
         )
 
-    found = list[ArxCandidate]()
+    candidates = list[ArxCandidate]()
     for na in range(na0, na1 + 1):
         if not data.n_inputs:
-            found.append(candidate(na, 0, ()))
+            candidates.append(candidate(na, 0, ()))
             continue
         for nb in range(nb0, nb1 + 1):
-            found += [candidate(na, nb, nk) for nk in _delays(nk0, nk1, data.n_inputs)]
+            candidates += [candidate(na, nb, nk) for nk in _delays(nk0, nk1, data.n_inputs)]
     if data.n_inputs > 1:
         for _ in range(2):
             for i in range(data.n_inputs):
-                best = min(found, key=lambda c: c.bic)
+                best = min(candidates, key=lambda c: c.bic)
                 others = (tuple(d if j == i else k for j, k in enumerate(best.nk)) for d in range(nk0, nk1 + 1))
                 sizes = {nb for nb in (best.nb - 1, best.nb, best.nb + 1) if nb0 <= nb <= nb1}
-                found += [candidate(best.na, nb, nk) for nk, nb in product(others, sorted(sizes))]
-    return tuple(found)
+                candidates += [candidate(best.na, nb, nk) for nk, nb in product(others, sorted(sizes))]
+    return tuple(candidates)
 
 
 def _delays(least: int, most: int, n_inputs: int) -> Iterator[tuple[int, ...]]:
@@ -501,8 +505,8 @@ def held_out_error(parts: Sequence[Fold], fitted: Callable[[IOData], BlackBoxFit
     total, weight = 0.0, 0
     for fold in parts:
         fit = fitted(fold.fitted)
-        found = errors_elsewhere(fit, fold.judged)
-        e = found.one_step if found.claims_noise else found.simulation
+        residuals = errors_elsewhere(fit, fold.judged)
+        e = residuals.one_step if residuals.claims_noise else residuals.simulation
         if e is None or not np.all(np.isfinite(e)):
             return float("inf")
         skip = min(_GAP, e.shape[0] // 10)

@@ -101,10 +101,10 @@ def innovation_products(fit: Fit, e: Array) -> Products:
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input
     own, inputs = _lags(len(e))
     lagged = ((e @ weight.T, own), (u, inputs))
-    found = products(problem, fit.vector, weight, workspace_near(fit, problem), lagged, STRETCHES)
-    if found is None:
+    sums = products(problem, fit.vector, weight, workspace_near(fit, problem), lagged, STRETCHES)
+    if sums is None:
         raise ValueError("the fit has no predictor; it has failed")
-    return found
+    return sums
 
 
 def _lags(n: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -114,43 +114,43 @@ def _lags(n: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     return tuple(k for k in _WHITE_LAGS if k < n // 10), tuple(sorted(inputs))
 
 
-def innovation_checks(fit: Fit, found: Products, known: Uncertainty, moved: Agreement) -> dict[str, Check]:
+def innovation_checks(fit: Fit, sums: Products, spread: Uncertainty, moved: Agreement) -> dict[str, Check]:
     """Check what the innovations say of the model, and with that of its standard deviations.
 
-    `found`: of `innovation_products`; `moved`: estimates from the record used in other ways. Returns
+    `sums`: of `innovation_products`; `moved`: estimates from the record used in other ways. Returns
     ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
     the robust standard deviations are to be used.
     """
-    own, inputs = innovation_tests(fit, found)
+    own, inputs = innovation_tests(fit, sums)
     return {
         "residuals_white": white_check(own),
         "residuals_uncorrelated": uncorrelated_check(inputs),
         "uncertainty_consistent": Check(
-            passed=known.inflation < _INFLATION,
-            values={"inflation": known.inflation},
-            detail=f"robust standard deviations are up to {known.inflation:.2f} times those from the information "
+            passed=spread.inflation < _INFLATION,
+            values={"inflation": spread.inflation},
+            detail=f"robust standard deviations are up to {spread.inflation:.2f} times those from the information "
             f"matrix (limit {_INFLATION:g})",
         ),
         "estimates_agree": _estimates_agree(moved),
     }
 
 
-def innovation_tests(fit: Fit, found: Products) -> tuple[ResidualTest, ResidualTest]:
+def innovation_tests(fit: Fit, sums: Products) -> tuple[ResidualTest, ResidualTest]:
     """Test the innovations for whiteness, and against past inputs, from `innovation_products`."""
     own, inputs = _lags(fit.problem.n_used)
     first = len(own) * fit.problem.y.shape[1]
     return (
-        _test_columns(fit, found, own, slice(0, first)),
-        _test_columns(fit, found, inputs, slice(first, None)),
+        _test_columns(fit, sums, own, slice(0, first)),
+        _test_columns(fit, sums, inputs, slice(first, None)),
     )
 
 
-def _test_columns(fit: Fit, found: Products, lags: tuple[int, ...], which: slice) -> ResidualTest:
+def _test_columns(fit: Fit, sums: Products, lags: tuple[int, ...], which: slice) -> ResidualTest:
     """Score test of some lagged columns, scaled to unit length, as further regressors of every innovation."""
-    size = np.maximum(np.sqrt(np.diag(found.inner)[which]), 1e-300)
-    cross = found.cross[:, :, which] / size
-    statistic, degrees = _explain_columns(fit, found, cross, found.inner[which, which] / np.outer(size, size))
-    correlation = cross[:, -1] / np.sqrt(found.squares)[:, None]
+    size = np.maximum(np.sqrt(np.diag(sums.inner)[which]), 1e-300)
+    cross = sums.cross[:, :, which] / size
+    statistic, degrees = _explain_columns(fit, sums, cross, sums.inner[which, which] / np.outer(size, size))
+    correlation = cross[:, -1] / np.sqrt(sums.squares)[:, None]
     place = np.unravel_index(np.argmax(np.abs(correlation)), correlation.shape)
     return ResidualTest(
         p=chi_squared_tail(max(degrees, 1), statistic),
@@ -161,7 +161,7 @@ def _test_columns(fit: Fit, found: Products, lags: tuple[int, ...], which: slice
     )
 
 
-def _explain_columns(fit: Fit, found: Products, cross: Array, inner: Array) -> tuple[float, int]:
+def _explain_columns(fit: Fit, sums: Products, cross: Array, inner: Array) -> tuple[float, int]:
     """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
 
     `cross`: (n_outputs, size + 1, n_columns), their products with [J, e]; `inner`: (n_columns, n_columns).
@@ -169,20 +169,20 @@ def _explain_columns(fit: Fit, found: Products, cross: Array, inner: Array) -> t
     digits because the Jacobian is nearly orthonormal there.
     """
     p, n_y = fit.problem.size, cross.shape[0]
-    prior = fit.J_prior @ found.turn
-    own = found.rows[:p, :p] + prior.T @ prior
-    pull = found.rows[:p, p] + prior.T @ fit.r_prior
-    beside = np.hstack(list(cross[:, :p]))
+    prior = fit.J_prior @ sums.turn
+    own = sums.rows[:p, :p] + prior.T @ prior
+    pull = sums.rows[:p, p] + prior.T @ fit.r_prior
+    past = np.hstack(list(cross[:, :p]))
     size = column_sizes(np.sqrt(np.diag(own))[None, :])
     values, vectors = np.linalg.eigh(own / np.outer(size, size))
-    seen = values > _BLIND * values[-1]
-    factor = (vectors[:, seen] / np.sqrt(values[seen])).T @ (np.column_stack([beside, pull]) / size[:, None])
+    visible = values > _BLIND * values[-1]
+    factor = (vectors[:, visible] / np.sqrt(values[visible])).T @ (np.column_stack([past, pull]) / size[:, None])
     rest = np.kron(np.eye(n_y), inner) - factor[:, :-1].T @ factor[:, :-1]
     left = cross[:, p].ravel() - factor[:, :-1].T @ factor[:, -1]
     values, vectors = np.linalg.eigh(rest)
-    kept = values > _SAME**2
-    inside = (vectors[:, kept].T @ left) / np.sqrt(values[kept])
-    return float(inside @ inside), int(np.count_nonzero(kept))
+    distinct = values > _SAME**2
+    inside = (vectors[:, distinct].T @ left) / np.sqrt(values[distinct])
+    return float(inside @ inside), int(np.count_nonzero(distinct))
 
 
 def _estimates_agree(moved: Agreement) -> Check:
@@ -235,7 +235,7 @@ def agreement(fit: Fit) -> Agreement:
     )
 
 
-def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
+def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
     """Check what was taken for known.
 
     Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``delay_shown``, ``long_enough``.
@@ -245,7 +245,7 @@ def assumption_checks(fit: Fit, known: Uncertainty, delay_how: Literal["estimate
         "priors_agree": _priors_agree(fit),
         "delay_in_range": _delay_in_range(fit, delay_how),
         "delay_shown": _delay_shown(fit, delay_how),
-        "long_enough": _long_enough(known),
+        "long_enough": _long_enough(spread),
     }
 
 
@@ -316,9 +316,9 @@ def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
         freed = None if rows is None else rows[0]
     if freed is None:
         return Check(passed=False, detail="a fractional delay could not be tested. Give channels.<input>.delay")
-    found = directions(freed).inverse()
-    s, own = float(np.sqrt(found[n, n])), np.diag(found)[:n]
-    along = found[:n, n] / s
+    inverse = directions(freed).inverse()
+    s, own = float(np.sqrt(inverse[n, n])), np.diag(inverse)[:n]
+    along = inverse[:n, n] / s
     t = np.abs(along) / np.sqrt(np.maximum(own - along**2, _BLIND * own))
     worst = int(np.argmax(t))
     unseen = min(s * float(np.sqrt(np.log(problem.n_used))), 1.0)
@@ -335,52 +335,52 @@ def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
     )
 
 
-def _long_enough(known: Uncertainty) -> Check:
-    enough = known.widening == 1.0
+def _long_enough(spread: Uncertainty) -> Check:
+    enough = spread.widening == 1.0
     detail = (
         "the record is long enough to estimate the noise levels"
         if enough
         else "the record is too short to estimate the noise levels: standard deviations are multiplied by up to "
-        f"{known.widening:.2g}. Record longer"
+        f"{spread.widening:.2g}. Record longer"
     )
-    return Check(passed=enough, values={"widening": known.widening}, detail=detail)
+    return Check(passed=enough, values={"widening": spread.widening}, detail=detail)
 
 
-def physical_checks(fit: Fit, known: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
+def physical_checks(fit: Fit, spread: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
     """Check that the parameters are identifiable and possible, and come from signals within their limits.
 
     `record`: channels named by role; `robust`: which standard deviations count. Returns ``identifiable``,
     ``plausible``, ``within_limits``, ``signals_sound``.
     """
     theta = fit.problem.parameters(fit.vector)
-    sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
+    sd = dict(zip(spread.names, spread.standard_deviations(robust=robust).tolist(), strict=True))
     wrong = implausible(fit.problem.model, theta, sd)
     limits = {c.name: find_saturation(record, c.name) for c in record.channels}
     return {
-        "identifiable": _identifiable(fit, known, theta, robust=robust),
+        "identifiable": _identifiable(fit, spread, theta, robust=robust),
         "plausible": Check(passed=not wrong, detail="; ".join(wrong) or "signs are physical; the coil is passive"),
         "within_limits": _within_limits(limits),
         "signals_sound": _signals_sound(record, fit.problem.model.outputs, limits),
     }
 
 
-def _identifiable(fit: Fit, known: Uncertainty, theta: Mapping[str, float], *, robust: bool) -> Check:
-    seen = known.identifiable_at(robust=robust)
+def _identifiable(fit: Fit, spread: Uncertainty, theta: Mapping[str, float], *, robust: bool) -> Check:
+    visible = spread.identifiable_at(robust=robust)
     unseen = [
         f"{name} (sd {100 * r:.0f} %)"
-        for name, ok, r in zip(known.names, seen, known.relative_sd(robust=robust), strict=True)
+        for name, ok, r in zip(spread.names, visible, spread.relative_sd(robust=robust), strict=True)
         if not ok
     ]
-    values = {"condition": float(known.singular_values[0] / known.singular_values[-1])}
+    values = {"condition": float(spread.singular_values[0] / spread.singular_values[-1])}
     if not unseen:
         return Check(passed=True, values=values, detail="every estimated parameter is identifiable")
     what = f"not identifiable from this record: {', '.join(unseen)}"
-    if np.any(np.abs(known.disagreement) > 0.5 * known.standard_deviations(robust=robust)):
+    if np.any(np.abs(spread.disagreement) > 0.5 * spread.standard_deviations(robust=robust)):
         hint = "The cause is not noise but disagreement of the refits: stay away from limits, and excite more"
         return Check(passed=False, values=values, detail=f"{what}. {hint}")
     rate, length = fit.problem.rate_hz, fit.problem.u.shape[0]
     band = (rate / length, lowest_power_hz(fit.problem.u, rate), rate / 2)
-    hint = experiment_hint(known, theta, band, robust=robust) or ""
+    hint = experiment_hint(spread, theta, band, robust=robust) or ""
     return Check(passed=False, values=values, detail=f"{what}. {hint}")
 
 
@@ -403,44 +403,44 @@ def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str
 
     `values`, `sd`: parameters and their standard deviations, SI. Returns one line each; empty where all is well.
     """
-    found = []
+    texts = []
     for spec in model.parameters:
         value, spread = values[spec.name], sd.get(spec.name, 0.0)
         if spec.positive and value <= 0:
-            found.append(f"{spec.name} = {value:.4g} {spec.unit} ({spec.meaning}) must be positive")
+            texts.append(f"{spec.name} = {value:.4g} {spec.unit} ({spec.meaning}) must be positive")
         low, high = _SIZES.get(spec.name, (0.0, float("inf")))
         if not low <= abs(value) <= high:
-            found.append(
+            texts.append(
                 f"{spec.name} = {value:.4g} {spec.unit} is impossible for a bearing: check the units and calibration "
                 "of the columns and the sampling rate"
             )
         if spec.name == "c" and value < -3.3 * spread:
-            found.append(f"c = {value:.4g} {spec.unit} is negative: motion would generate energy")
-    return found
+            texts.append(f"c = {value:.4g} {spec.unit} is negative: motion would generate energy")
+    return texts
 
 
-def _within_limits(found: Mapping[str, Saturation]) -> Check:
-    bad = {name: s for name, s in found.items() if s.fraction > _SATURATED}
+def _within_limits(saturations: Mapping[str, Saturation]) -> Check:
+    bad = {name: s for name, s in saturations.items() if s.fraction > _SATURATED}
     detail = ". ".join(f"{s}{': ' + _MISSING[name] if name in _MISSING else ''}" for name, s in bad.items())
     return Check(
         passed=not bad,
-        values={f"{name}_fraction": s.fraction for name, s in found.items()},
+        values={f"{name}_fraction": s.fraction for name, s in saturations.items()},
         detail=f"{detail}. Reduce the excitation, or cut those parts out" if bad else "no saturation",
     )
 
 
 def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str, Saturation]) -> Check:
     """Outliers and drop-outs of the measured outputs; an input may rightly stand still or kick."""
-    found = [
+    faults = [
         (role, fault)
         for role in outputs
         for fault in (find_outliers(record, role), find_dropouts(record, role, saturation=limits[role]))
     ]
-    some = [f"{role}: {f}" for role, f in found if f.count]
-    few = max(f.count for _, f in found) <= _ERRONEOUS * record.n_samples
+    some = [f"{role}: {f}" for role, f in faults if f.count]
+    few = max(f.count for _, f in faults) <= _ERRONEOUS * record.n_samples
     return Check(
         passed=few,
-        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in found},
+        values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in faults},
         detail=f"{'; '.join(some)}. They were used unchanged; replace them (signals.replace_samples) or cut them out"
         if some
         else "no outliers or drop-outs in the measured outputs",

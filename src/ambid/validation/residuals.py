@@ -204,8 +204,8 @@ def _project(rows: Array, n_base: int) -> tuple[Array, Array, int]:
     """Regressors of unit length and residual (the last column), each less what the base columns explain; their rank."""
     base = rows[:, :n_base]
     Q, R = np.linalg.qr(base / column_sizes(base))
-    found = directions(np.asarray(R))
-    Q = Q @ found.U[:, found.s > _DEPENDENT * max(found.s[0], 1e-300)] if found.s.size else Q
+    factor = directions(np.asarray(R))
+    Q = Q @ factor.U[:, factor.s > _DEPENDENT * max(factor.s[0], 1e-300)] if factor.s.size else Q
     L, e = rows[:, n_base:-1], rows[:, -1]
     L = L / column_sizes(L)
     for _ in range(2):  # twice is enough (Kahan): the first pass loses what cancels
@@ -329,28 +329,38 @@ class Correlation:
     band: Array
 
 
-def residual_tests(of: Residuals, *, open_loop: bool) -> ResidualTests:
+def residual_tests(residuals: Residuals, *, open_loop: bool) -> ResidualTests:
     """Test the residuals; in open loop the present input may explain the present residual, too."""
-    white, products = (tuple(k for k in x if k < of.shortest // 10) or (1,) for x in (_WHITE_LAGS, _PRODUCT_LAGS))
-    tests = ResidualTests(white=_worst([_score(of, o, of.e, white) for o in _outputs(of)], white, of.outputs))
-    if not of.u[0].shape[1]:
+    white, products = (
+        tuple(k for k in x if k < residuals.shortest // 10) or (1,) for x in (_WHITE_LAGS, _PRODUCT_LAGS)
+    )
+    tests = ResidualTests(
+        white=_worst([_score(residuals, o, residuals.e, white) for o in _outputs(residuals)], white, residuals.outputs)
+    )
+    if not residuals.u[0].shape[1]:
         return tests
-    loop = _feedback(of)
+    loop = _feedback(residuals)
     # under feedback the present input may depend on the present residual, whatever the user says of the loop
-    lags = input_lags(of.shortest, with_now=open_loop and loop.passed)
-    tests = replace(tests, feedback=loop, uncorrelated=_against(of, of.source, lags))
-    if not of.nonlinear:
+    lags = input_lags(residuals.shortest, with_now=open_loop and loop.passed)
+    tests = replace(tests, feedback=loop, uncorrelated=_against(residuals, residuals.source, lags))
+    if not residuals.nonlinear:
         return tests
-    squares = of.squares
+    squares = residuals.squares
     # as instruments, squares alone are too few for most models
-    instruments = [np.hstack([a, b]) for a, b in zip(of.u, squares, strict=True)] if of.instrumental else squares
-    variance = [_variance(of, o, squares, products) for o in _outputs(of)]
-    mixed = [_score(of, o, _times(of, o), products) for o in _outputs(of) if of.colours[o] is None]
+    instruments = (
+        [np.hstack([a, b]) for a, b in zip(residuals.u, squares, strict=True)] if residuals.instrumental else squares
+    )
+    variance = [_variance(residuals, o, squares, products) for o in _outputs(residuals)]
+    mixed = [
+        _score(residuals, o, _times(residuals, o), products)
+        for o in _outputs(residuals)
+        if residuals.colours[o] is None
+    ]
     return replace(
         tests,
-        squares=_against(of, instruments, products),
-        variance=_worst(variance, products, of.outputs),
-        products=_worst(mixed, products, of.outputs) if mixed else None,
+        squares=_against(residuals, instruments, products),
+        variance=_worst(variance, products, residuals.outputs),
+        products=_worst(mixed, products, residuals.outputs) if mixed else None,
     )
 
 
@@ -366,36 +376,36 @@ def input_lags(n_samples: int, *, with_now: bool) -> tuple[int, ...]:
 
 
 def correlations(
-    of: Residuals, inputs: Sequence[str], outputs: Sequence[str], *, n_lags: int = 20
+    residuals: Residuals, inputs: Sequence[str], outputs: Sequence[str], *, n_lags: int = 20
 ) -> list[Correlation]:
     """Correlate the errors of each output with what the tests look at, lag by lag.
 
     Output by output: with its own past, then with each input; for a nonlinear model also with u^2 and e u, and e^2 with
     u^2.
     """
-    lags = tuple(range(1, min(n_lags, of.shortest // 4) + 1))
-    found, squares = list[Correlation](), of.squares
+    lags = tuple(range(1, min(n_lags, residuals.shortest // 4) + 1))
+    results, squares = list[Correlation](), residuals.squares
     for o, output in enumerate(outputs):
-        one = [(f"e of {output}, its past", _score(of, o, [x[:, [o]] for x in of.e], lags))]
+        one = [(f"e of {output}, its past", _score(residuals, o, [x[:, [o]] for x in residuals.e], lags))]
         for i, name in enumerate(inputs):
-            u, u2 = [x[:, [i]] for x in of.u], [x[:, [i]] for x in squares]
-            one.append((f"e of {output}, {name}", _score(of, o, u, lags, against_inputs=True)))
-            if not of.nonlinear:
+            u, u2 = [x[:, [i]] for x in residuals.u], [x[:, [i]] for x in squares]
+            one.append((f"e of {output}, {name}", _score(residuals, o, u, lags, against_inputs=True)))
+            if not residuals.nonlinear:
                 continue
-            one.append((f"e of {output}, {name}²", _score(of, o, u2, lags, against_inputs=True)))
-            if of.colours[o] is None:
-                mixed = [x[:, [i]] for x in _times(of, o)]
-                one.append((f"e of {output}, e × {name}", _score(of, o, mixed, lags)))
-            one.append((f"e² of {output}, {name}²", _variance(of, o, u2, lags)))
-        found += [
+            one.append((f"e of {output}, {name}²", _score(residuals, o, u2, lags, against_inputs=True)))
+            if residuals.colours[o] is None:
+                mixed = [x[:, [i]] for x in _times(residuals, o)]
+                one.append((f"e of {output}, e × {name}", _score(residuals, o, mixed, lags)))
+            one.append((f"e² of {output}, {name}²", _variance(residuals, o, u2, lags)))
+        results += [
             Correlation(output=output, title=t, lags=np.array(lags), values=s.correlation, band=NORMAL_95 * s.sd)
             for t, s in one
         ]
-    return found
+    return results
 
 
-def _outputs(of: Residuals) -> range:
-    return range(of.e[0].shape[1])
+def _outputs(residuals: Residuals) -> range:
+    return range(residuals.e[0].shape[1])
 
 
 def _rows(x: Array, lags: Sequence[int], first: int) -> Array:
@@ -404,49 +414,51 @@ def _rows(x: Array, lags: Sequence[int], first: int) -> Array:
 
 
 def _score(
-    of: Residuals, o: int, signals: Sequence[Array], lags: tuple[int, ...], *, against_inputs: bool = False
+    residuals: Residuals, o: int, signals: Sequence[Array], lags: tuple[int, ...], *, against_inputs: bool = False
 ) -> Score:
     """Score test of lagged signals as regressors of the errors of one output."""
-    width = max(1, of.J[o][0].shape[1] + len(lags) * signals[0].shape[1])
-    start = [max(of.first, *lags, x.shape[0] - int(MOST / width / len(of.e))) for x in of.e]
-    e = np.concatenate([x[k:, o] for x, k in zip(of.e, start, strict=True)])
-    J = np.concatenate([x[k:] for x, k in zip(of.J[o], start, strict=True)])
+    width = max(1, residuals.J[o][0].shape[1] + len(lags) * signals[0].shape[1])
+    start = [max(residuals.first, *lags, x.shape[0] - int(MOST / width / len(residuals.e))) for x in residuals.e]
+    e = np.concatenate([x[k:, o] for x, k in zip(residuals.e, start, strict=True)])
+    J = np.concatenate([x[k:] for x, k in zip(residuals.J[o], start, strict=True)])
     lagged = np.concatenate([_rows(s, lags, k) for s, k in zip(signals, start, strict=True)])
-    colour = of.colours[o] if against_inputs else None
-    if against_inputs and of.instrumental:
+    colour = residuals.colours[o] if against_inputs else None
+    if against_inputs and residuals.instrumental:
         return instrumental_score(e, J, lagged, colour=colour)
     return score(e, J, lagged, colour=colour)
 
 
-def _times(of: Residuals, o: int) -> list[Array]:
+def _times(residuals: Residuals, o: int) -> list[Array]:
     """One output's error times the inputs."""
-    return [e[:, [o]] * u for e, u in zip(of.e, of.u, strict=True)]
+    return [e[:, [o]] * u for e, u in zip(residuals.e, residuals.u, strict=True)]
 
 
-def _against(of: Residuals, signals: Sequence[Array], lags: tuple[int, ...]) -> ResidualTest | None:
+def _against(residuals: Residuals, signals: Sequence[Array], lags: tuple[int, ...]) -> ResidualTest | None:
     """Test errors against inputs; None where no instrument is left over."""
-    worst = _worst([_score(of, o, signals, lags, against_inputs=True) for o in _outputs(of)], lags, of.outputs)
-    return None if of.instrumental and not worst.degrees else worst
+    worst = _worst(
+        [_score(residuals, o, signals, lags, against_inputs=True) for o in _outputs(residuals)], lags, residuals.outputs
+    )
+    return None if residuals.instrumental and not worst.degrees else worst
 
 
-def _variance(of: Residuals, o: int, squares: Sequence[Array], lags: tuple[int, ...]) -> Score:
+def _variance(residuals: Residuals, o: int, squares: Sequence[Array], lags: tuple[int, ...]) -> Score:
     """Test e^2 against past u^2; the estimated numbers shift e^2 in second order only, and need no account."""
-    first = max(of.first, *lags)
-    power = np.concatenate([x[first:, o] ** 2 for x in of.e])
-    colour = None if of.colours[o] is None else autoregression(power)
+    first = max(residuals.first, *lags)
+    power = np.concatenate([x[first:, o] ** 2 for x in residuals.e])
+    colour = None if residuals.colours[o] is None else autoregression(power)
     lagged = np.concatenate([_rows(x, lags, first) for x in squares])
     return score(power, np.zeros((power.size, 0)), lagged, colour=colour)
 
 
-def _feedback(of: Residuals) -> ResidualTest:
+def _feedback(residuals: Residuals) -> ResidualTest:
     """Granger's test of errors -> inputs: do past errors say more of an input than its own past (Caines 1975)?"""
-    own, loop = (tuple(range(1, max(1, min(k, of.shortest // 20)) + 1)) for k in (_OWN_LAGS, _LOOP_LAGS))
-    width = len(own) * of.u[0].shape[1] + len(loop) * of.e[0].shape[1]
-    start = [max(of.first, *own, x.shape[0] - int(MOST / width / len(of.e))) for x in of.e]
-    past = np.concatenate([_rows(u, own, k) for u, k in zip(of.u, start, strict=True)])
-    errors = np.concatenate([_rows(e, loop, k) for e, k in zip(of.e, start, strict=True)])
-    now = np.concatenate([u[k:] for u, k in zip(of.u, start, strict=True)])
-    return _worst([score(x, past, errors) for x in now.T], loop, of.inputs)
+    own, loop = (tuple(range(1, max(1, min(k, residuals.shortest // 20)) + 1)) for k in (_OWN_LAGS, _LOOP_LAGS))
+    width = len(own) * residuals.u[0].shape[1] + len(loop) * residuals.e[0].shape[1]
+    start = [max(residuals.first, *own, x.shape[0] - int(MOST / width / len(residuals.e))) for x in residuals.e]
+    past = np.concatenate([_rows(u, own, k) for u, k in zip(residuals.u, start, strict=True)])
+    errors = np.concatenate([_rows(e, loop, k) for e, k in zip(residuals.e, start, strict=True)])
+    now = np.concatenate([u[k:] for u, k in zip(residuals.u, start, strict=True)])
+    return _worst([score(x, past, errors) for x in now.T], loop, residuals.inputs)
 
 
 def _worst(tests: Sequence[Score], lags: tuple[int, ...], channels: Sequence[str]) -> ResidualTest:
@@ -482,7 +494,7 @@ def uncorrelated_check(test: ResidualTest) -> Check:
     return _residual_check(test, "past inputs")
 
 
-def _residual_check(test: ResidualTest, against: str = "", *, of: str = "residuals") -> Check:
+def _residual_check(test: ResidualTest, against: str = "", *, subject: str = "residuals") -> Check:
     """State whether residuals are white or, with `against`, uncorrelated with another signal."""
     whose = f" of {test.channel}" if test.channel else ""
     words = ("white", "not white") if not against else (f"uncorrelated with {against}", f"correlated with {against}")
@@ -496,7 +508,7 @@ def _residual_check(test: ResidualTest, against: str = "", *, of: str = "residua
             "largest_correlation": test.largest,
             "largest_lag": float(test.largest_lag),
         },
-        detail=f"{of}{whose} are {words[not test.passed]} "
+        detail=f"{subject}{whose} are {words[not test.passed]} "
         f"(largest {measure} {test.largest:.3f} at lag {test.largest_lag}, {p_text(test.p)})",
     )
 
@@ -537,7 +549,7 @@ def _check_nonlinear(squares: ResidualTest, products: ResidualTest | None) -> Ch
 
 
 def _check_variance(test: ResidualTest) -> Check:
-    check = _residual_check(test, "squares of past inputs", of="squared residuals")
+    check = _residual_check(test, "squares of past inputs", subject="squared residuals")
     if check.passed:
         return check
     detail = f"{check.detail}: the noise level varies, or a nonlinearity is missing; standard deviations assume neither"
@@ -550,8 +562,8 @@ def describe_feedback(test: ResidualTest) -> str:
 
 
 def _check_feedback(tests: ResidualTests, test: ResidualTest, subject: Subject) -> Check:
-    seen, evidence = tests.feedback_seen, describe_feedback(test)
-    if not seen:
+    visible, evidence = tests.feedback_seen, describe_feedback(test)
+    if not visible:
         detail = "no sign of feedback (no proof of an open loop): inputs do not depend on past residuals"
     elif tests.explained_by_inputs:
         detail = f"{evidence}, but residuals also on past inputs: feedback, or an incomplete model"
@@ -560,8 +572,8 @@ def _check_feedback(tests: ResidualTests, test: ResidualTest, subject: Subject) 
     else:
         detail = f"{evidence}: there is feedback; {subject.name} is consistent in closed loop"
     return Check(
-        passed=not (seen and subject.biased),
+        passed=not (visible and subject.biased),
         p=test.p,
-        values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(seen)},
+        values={"largest_correlation": test.largest, "largest_lag": float(test.largest_lag), "seen": float(visible)},
         detail=f"{detail} ({p_text(test.p)})",
     )

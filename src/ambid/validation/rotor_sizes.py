@@ -42,11 +42,11 @@ def _signs(
     plant: RotorModel, numbers: Mapping[str, float], sd: Mapping[str, float], parameters: Sequence[Parameter]
 ) -> str:
     """Name the axes whose force factor is negative though the rig does not say so."""
-    said = {p.name for p in parameters if p.role != "free" and (p.value or 0.0) < 0.0}
+    negative = {p.name for p in parameters if p.role != "free" and (p.value or 0.0) < 0.0}
     wrong = [
         axis
         for axis in plant.axes
-        if (name := f"{axis}.k_i") not in said and numbers[name] < -_SURE * sd.get(name, 0.0)
+        if (name := f"{axis}.k_i") not in negative and numbers[name] < -_SURE * sd.get(name, 0.0)
     ]
     if not wrong:
         return ""

@@ -92,7 +92,7 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
                 f"channel {role!r} is constant in the whole record, which cannot test an estimate. Check it"
             )
     scales = scales_for(plant, estimate.values, np.std(u, axis=0), noise_floor(y), signals.rate_hz)
-    kept = PredictorProblem(
+    problem = PredictorProblem(
         model=plant,
         rate_hz=signals.rate_hz,
         u=u,
@@ -109,7 +109,7 @@ def _fit(estimate: Estimate, signals: Signals) -> Fit:
         noise="given",
         gain=estimate.noise.gain * scales.output / scales.state[:, None],
     )
-    fit = search(kept, np.zeros(kept.size))
+    fit = search(problem, np.zeros(problem.size))
     if fit.status == "failed":
         raise EstimationError(_NO_PREDICTOR)
     return _with_covariance(fit, estimate)

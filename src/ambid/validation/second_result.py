@@ -27,8 +27,8 @@ class Validation(Result):
     def reasons(self) -> tuple[Reason, ...]:
         """Each check that failed; grave where an output is predicted worse than by its mean."""
         failed = [Reason(check=k, text=c.detail) for k, c in self.checks.items() if not c.passed]
-        for output, found in self.fit.items():
-            one = found["one_step"]
+        for output, fit in self.fit.items():
+            one = fit["one_step"]
             size = one.get("fit") if isinstance(one, Mapping) else one
             if size is None or not size > 0:
                 text = f"{output} is predicted worse than by its mean. Check that both are of the same bench"

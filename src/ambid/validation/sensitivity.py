@@ -101,8 +101,8 @@ def _analysis(
     sd = np.sqrt(np.diag(covariance))
     correlation = covariance / np.outer(sd, sd)
     values, vectors = np.linalg.eigh(correlation)
-    seen = values > _DEPENDENT * values[-1]
-    inverse = (vectors[:, seen] / values[seen]) @ vectors[:, seen].T
+    visible = values > _DEPENDENT * values[-1]
+    inverse = (vectors[:, visible] / values[visible]) @ vectors[:, visible].T
     information = np.diag(inverse)  # times sd^2: I_jj covariance_jj
     influences = [
         Influence(
@@ -119,8 +119,8 @@ def _analysis(
     ]
     return SensitivityAnalysis(
         influences=tuple(sorted(influences, key=lambda x: -x.fit_alone)),
-        collinearity=_collinearity(inverse) if np.all(seen) else float("inf"),
-        dependent=int(np.count_nonzero(~seen)),
+        collinearity=_collinearity(inverse) if np.all(visible) else float("inf"),
+        dependent=int(np.count_nonzero(~visible)),
         pairs=_pairs(names, correlation),
         weakest=_weakest(names, theta, sd, vectors[:, -1]),
         pole_sd=pole_sd,
@@ -134,13 +134,13 @@ def _collinearity(inverse: Array) -> float:
 
 
 def _pairs(names: Sequence[str], correlation: Array) -> tuple[tuple[str, str, float], ...]:
-    found = [
+    pairs = [
         (names[j], names[k], float(correlation[j, k]))
         for j in range(len(names))
         for k in range(j)
         if abs(correlation[j, k]) > _PAIR
     ]
-    return tuple(sorted(found, key=lambda x: -abs(x[2])))
+    return tuple(sorted(pairs, key=lambda x: -abs(x[2])))
 
 
 def _weakest(names: Sequence[str], theta: Array, sd: Array, direction: Array) -> tuple[tuple[str, float], ...]:

@@ -45,18 +45,18 @@ def stabilisation(
 
     `method`: all but pbsid are biased under feedback; `tick`: called between steps; may raise to interrupt.
     """
-    known = get_args(Method)
-    if method not in known:
-        raise EstimationError(f"method {method!r} is not one of {', '.join(known)}.{nearest(method, known)}")
+    methods = get_args(Method)
+    if method not in methods:
+        raise EstimationError(f"method {method!r} is not one of {', '.join(methods)}.{nearest(method, methods)}")
     models = subspace_models(data, cast(Method, method), n_max, tick=tick)
     near = Tolerance()
     rows = [_poles(m.order, m.model.A, m.model.C, data) for m in models]
-    found = followed(rows, near)
+    poles = followed(rows, near)
     return Stabilisation(
         method=cast(Method, method),
         orders=tuple(m.order for m in models),
-        poles=tuple(found),
-        modes=clusters(found, [m.order for m in models], near),
+        poles=tuple(poles),
+        modes=clusters(poles, [m.order for m in models], near),
         singular_values=tuple(m.singular_value for m in models),
         criteria=tuple(m.criterion for m in models),
     )
