@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox.data import IOData
-from ambid.blackbox.fit import STRUCTURES, BlackBoxFit, Structure
-from ambid.blackbox.fit_file import fit_from_json, fit_text
+from ambid.blackbox.fit import STRUCTURES, BlackBoxFit, Structure, fit_from_json, fit_text
 from ambid.blackbox.model import response_covariance
 from ambid.blackbox.prediction import innovations_form
 from ambid.errors import EstimationError

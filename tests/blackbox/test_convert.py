@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ambid.blackbox.convert import to_control
 from ambid.blackbox.model import PolynomialModel, Polynomials, StateSpaceModel, TransferModel
+from ambid.blackbox.prediction import to_control
 from ambid.errors import ModelError
 
 control = pytest.importorskip("control", reason="python-control is an optional dependency (ambid[control])")

@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
-from ambid.blackbox.words import settings_of
+from ambid.blackbox.data import settings_of
 from ambid.cli import fit as verb
 from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
 

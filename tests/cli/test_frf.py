@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from ambid import load
-from ambid.blackbox.fit_file import NO_INNOVATIONS, fit_from_json
+from ambid.blackbox.fit import NO_INNOVATIONS, fit_from_json
 from ambid.physics.presets import preset
 from ambid.record import read_record
 from tests.blackbox import sweeps

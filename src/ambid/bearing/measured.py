@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.bearing.frequency import Channels, FrequencyEstimate, response
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.fit_file import fit_from_json, fit_to_json
+from ambid.blackbox.fit import BlackBoxFit, fit_from_json, fit_to_json
 from ambid.blackbox.frequency import check_lines
 from ambid.blackbox.model import StateSpaceModel
 from ambid.errors import EstimationError

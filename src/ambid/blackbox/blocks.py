@@ -17,9 +17,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, single_order
+from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instruments import reference_part, solve, span
+from ambid.blackbox.instrumental import reference_part, solve, span
 from ambid.blackbox.model import Offsets, TransferModel
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
@@ -46,7 +46,7 @@ def blocks(data: IOData, orders: Orders) -> BlackBoxFit:
     TransferModel from voltage to both; ``coefficients`` of the blocks and physical ``parameters`` in its details.
     """
     check_order_names("blocks", orders, ("nk",))
-    nk, n = single_order("blocks", {"nk": 0, **orders}, "nk", 0), data.n_samples
+    (nk,), n = order_per_input("blocks", {"nk": 0, **orders}, "nk", 0, 1), data.n_samples
     if (data.n_inputs, data.n_outputs) != (1, 2):
         raise EstimationError(
             f"blocks: {data.n_inputs} inputs and {data.n_outputs} outputs; it takes one input, the voltage, and two "
@@ -279,7 +279,19 @@ def _gains(measured: Array, clean: Array, a: float, b: float, dt: float) -> Arra
 def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equation | None, bool]:
     found: Equation | None = None
     for _ in range(_STEPS):
-        now = _electric_at(measured, clean, theta, dt)
+        ka, a, kb, b = theta
+        n = measured.shape[0]
+        basis = span(_nuisance(n, (a, b), dt))
+        columns = []
+        for s in (clean, measured):
+            va, xb = _lag(a, dt, s[:, 0], hold=True), _lag(b, dt, s[:, 2], hold=False)
+            columns.append(
+                np.stack([va, -ka * _lag(a, dt, va, hold=False), xb, -kb * _lag(b, dt, xb, hold=False)], axis=1)
+            )
+        Z, Phi = (_off(basis, c) for c in columns)
+        error = _off(basis, (measured[:, 1] - ka * columns[1][:, 0] - kb * columns[1][:, 2])[:, None])[:, 0]
+        fit = 1 - float(np.linalg.norm(error) / np.linalg.norm(measured[:, 1]))
+        now = Equation(theta=theta, error=error, Z=Z, Phi=Phi, basis=basis, fit=fit)
         try:
             change = solve(now.Z, now.Phi, now.error, who="blocks").theta
         except EstimationError:
@@ -293,20 +305,6 @@ def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equ
         if max(theta[1], theta[3]) * dt > 20:
             return found, False
     return found, False
-
-
-def _electric_at(measured: Array, clean: Array, theta: Array, dt: float) -> Equation:
-    ka, a, kb, b = theta
-    n = measured.shape[0]
-    basis = span(_nuisance(n, (a, b), dt))
-    columns = []
-    for s in (clean, measured):
-        va, xb = _lag(a, dt, s[:, 0], hold=True), _lag(b, dt, s[:, 2], hold=False)
-        columns.append(np.stack([va, -ka * _lag(a, dt, va, hold=False), xb, -kb * _lag(b, dt, xb, hold=False)], axis=1))
-    Z, Phi = (_off(basis, c) for c in columns)
-    error = _off(basis, (measured[:, 1] - ka * columns[1][:, 0] - kb * columns[1][:, 2])[:, None])[:, 0]
-    fit = 1 - float(np.linalg.norm(error) / np.linalg.norm(measured[:, 1]))
-    return Equation(theta=theta, error=error, Z=Z, Phi=Phi, basis=basis, fit=fit)
 
 
 def mechanic(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:

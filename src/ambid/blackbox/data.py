@@ -1,17 +1,20 @@
-"""Inputs, outputs and orders as every black-box estimator takes them."""
+"""Inputs, outputs and orders as every black-box estimator takes them, and orders as they are written."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import combinations
 from types import MappingProxyType
+from typing import Any
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError, counted, nearest
 from ambid.record import Record
-from ambid.settings.caller import setting
+from ambid.settings.caller import by_name, setting
 
 _LARGEST = 1e60  # squares of ratios of channels have to stay inside the range of floating-point numbers
 _SMALLEST = 1e-60
@@ -75,7 +78,13 @@ class IOData:
             raise EstimationError(
                 f"channel {twice[0]!r} is named twice; inputs, outputs and references must differ. Omit one"
             )
-        _no_copies(np.hstack([self.u, self.y]), (*self.inputs, *self.outputs))
+        values, names = np.hstack([self.u, self.y]), (*self.inputs, *self.outputs)
+        for i, k in combinations(range(len(names)), 2):  # channels that stand still are left to the estimators
+            if np.array_equal(values[:, i], values[:, k]) and np.ptp(values[:, i]) > 0:
+                raise EstimationError(
+                    f"channels {names[i]!r} and {names[k]!r} hold the same values; a model cannot distinguish "
+                    "them. Omit one"
+                )
 
     @property
     def n_samples(self) -> int:
@@ -94,14 +103,6 @@ class IOData:
 
     def part(self, first: int, last: int) -> IOData:
         """Return samples `first` to `last` (not included).
-
-        Parameters
-        ----------
-        first, last : int
-
-        Returns
-        -------
-        IOData
 
         Raises
         ------
@@ -173,28 +174,7 @@ def _columns(values: Array, what: str, names: tuple[str, ...], n: int) -> Array:
             f"{what} {names[column]!r} is not finite at sample {row}; every value must be a number. "
             "Cut the part out, or replace it (signals.replace_samples)"
         )
-    _check_size(array, what, names)
-    array.flags.writeable = False
-    return array
-
-
-def _no_copies(values: Array, names: tuple[str, ...]) -> None:
-    """Refuse two inputs or outputs that hold the same numbers: no method can say which of them does what.
-
-    Channels that stand still are left to the estimators, which say so.
-    """
-    for i in range(values.shape[1]):
-        for k in range(i):
-            if np.array_equal(values[:, i], values[:, k]) and np.ptp(values[:, i]) > 0:
-                raise EstimationError(
-                    f"channels {names[k]!r} and {names[i]!r} hold the same values; a model cannot distinguish "
-                    "them. Omit one"
-                )
-
-
-def _check_size(array: Array, what: str, names: tuple[str, ...]) -> None:
-    """Refuse values whose squares leave the range of floating-point numbers; a channel that stands still may pass."""
-    for name, column in zip(names, array.T, strict=True):
+    for name, column in zip(names, array.T, strict=True):  # squares have to be numbers; what stands still may pass
         low, high = float(column.min()), float(column.max())
         peak, span = max(-low, high), high / 2 - low / 2
         if peak > _LARGEST or 0.0 < span < _SMALLEST:
@@ -203,6 +183,8 @@ def _check_size(array: Array, what: str, names: tuple[str, ...]) -> None:
                 f"{what} {name!r} {size} in SI units; the computable range is {_SMALLEST:g} to {_LARGEST:g}. Check "
                 "its unit, or scale it"
             )
+    array.flags.writeable = False
+    return array
 
 
 Orders = Mapping[str, int | str | tuple[int, ...]]
@@ -305,3 +287,87 @@ def _whole_number(who: str, name: str, value: object, least: int, remedy: str) -
 
 def _count(n: int, noun: str) -> str:
     return f"{n} {noun}" if n == 1 else f"{n} {noun}s"
+
+
+Candidate = str | tuple[str, Orders | str | None]
+"""A structure to compare: ``"arx:na=2,nb=2"``, ``"n4sid"``, or its name beside its orders."""
+
+
+def orders_of(given: Mapping[str, Any] | str | None) -> Orders | None:
+    """Return orders by name; None where all are to be chosen."""
+    if not isinstance(given, str):
+        return given and by_name(given, "orders")
+    if given.strip() == "auto":
+        return None
+    where, remedy = f"{setting('orders')} {given!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
+    pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
+    found: dict[str, int | str | tuple[int, ...]] = {}
+    for name, value in pairs.items():
+        if value != "auto" and not all(n.strip().isdecimal() and len(n) < 7 for n in value.split("/")):
+            raise EstimationError(f"{where}: {f'{name}={value}'!r} is not NAME=NUMBER. {remedy}")
+        found[name] = _read_first(value, int, _whole_numbers)
+    return found
+
+
+def candidates_of(given: Sequence[Candidate]) -> list[tuple[str, Orders | None]]:
+    """Return structures with their orders."""
+    found = list[tuple[str, Orders | None]]()
+    for x in given:
+        if isinstance(x, str):
+            name, _, orders = x.partition(":")
+            found.append((name.strip(), orders_of(orders or "auto")))
+        else:
+            found.append((x[0], orders_of(x[1])))
+    return found
+
+
+def settings_of(given: Mapping[str, Any] | str | None) -> dict[str, Any]:
+    """Return the orders of a nonlinear structure by name; what is ``auto`` is left to the method."""
+    if given is None or not isinstance(given, str):
+        return dict(by_name(given, "orders"))
+    if given.strip() in ("auto", ""):
+        return {}
+    where = f"{setting('orders')} {given!r}"
+    pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
+    return {name: _read_first(x, _whole_numbers, int, float) for name, x in pairs.items() if x != "auto"}
+
+
+def fixed_of(given: Mapping[str, float] | Sequence[str] | str | None) -> dict[str, float]:
+    """Return known coefficients by name, from ``a1=-1.5`` and so on."""
+    if isinstance(given, Mapping):
+        return dict(given)
+    said, remedy = f"{setting('fix')} {{}} is not NAME=NUMBER", f"Give {setting('fix', 'a1=-1')}, for example"
+    pairs = _pairs(given.split(",") if isinstance(given, str) else given or (), setting("fix"), said, remedy)
+    found = {name: _read_first(value, float) for name, value in pairs.items()}
+    for name, number in found.items():
+        if isinstance(number, str):
+            raise EstimationError(f"{said.format(repr(f'{name}={number}'))}. {remedy}")
+    return found
+
+
+def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str, str]:
+    """Read NAME=VALUE, each name once; ``{}`` in `said` stands for a part that is not of that form."""
+    found: dict[str, str] = {}
+    for part in parts:
+        name, _, value = (x.strip() for x in part.partition("="))
+        if not (name and value):
+            raise EstimationError(f"{said.format(repr(part.strip()))}. {remedy}")
+        if name in found:
+            raise EstimationError(f"{where}: {name} is given twice. Omit one")
+        found[name] = value
+    return found
+
+
+def _read_first(text: str, *kinds: Callable[[str], Any]) -> Any:
+    """Read a text as the first kind that takes it; as it is where none does."""
+    for kind in kinds:
+        with suppress(ValueError):
+            return kind(text)
+    return text
+
+
+def _whole_numbers(text: str) -> tuple[int, ...]:
+    parts = [x.strip() for x in text.split("/")]
+    if len(parts) < 2 or not all(x.isdecimal() for x in parts):
+        raise ValueError(text)
+    return tuple(map(int, parts))

@@ -328,29 +328,10 @@ def frf_ml(
 ) -> BlackBoxFit:
     """Fit transfer functions to a frequency response by maximum likelihood.
 
-    Parameters
-    ----------
-    frf : FrequencyResponse
-    orders : Mapping[str, int or tuple of int]
-        ``nf``, degree of the common denominator, and ``nb``, number of numerator coefficients (a tuple, row by row,
-        where entries differ): at most nf + 1.
-    domain : {"s", "z"}, optional
-        Default z where the input is held over a sample, where such a model is exact, else s. With s and a held input
-        the hold's own response is taken out; what it folds down from above half the rate stays, and the check sees it.
-    delay : float or "auto", s
-        Of all inputs; "auto" estimates it (in whole samples for z).
-
-    Returns
-    -------
-    BlackBoxFit
-        Structure ``frf-ml``, a TransferModel with covariance (that of an estimated delay included), the check ``cost``
-        (see `Lines.verdict`), and in `details` ``cost``, ``expected_cost``, ``cost_sd``, ``delay_s``, ``delay_sd_s``
-        and ``condition`` (of the scaled Jacobian).
-
-    Raises
-    ------
-    EstimationError
-        If orders or lines break a rule.
+    `orders`: ``nf``, degree of the common denominator, ``nb``, number of numerator coefficients (a tuple, row by row,
+    where entries differ), at most nf + 1; `domain`: z by default where the input is held, where such a model is exact,
+    else s; with s and a held input the hold's own response is taken out, what it folds down stays, and the check sees
+    it; `delay`: of all inputs in s, "auto" estimates it (in whole samples for z).
     """
     domain = domain or ("z" if frf.hold == "zoh" else "s")
     if domain not in ("s", "z"):
@@ -363,29 +344,18 @@ def frf_ml(
     period = form.lines.dt
     if domain == "z" and delay != "auto" and abs(delay / period - round(delay / period)) > 1e-9:
         raise EstimationError(f"a delay of {delay} s is not a whole number of samples of {period} s. Use domain 's'")
-    with one_thread():
-        best = _best_fit(form, delay, domain)
-    return _result(frf, best, domain)
-
-
-def _best_fit(
-    form: _Form, delay: float | Literal["auto"], domain: Literal["s", "z"]
-) -> tuple[float, _Form, Array, float, bool]:
-    """Cost, form, vector, delay and whether it converged: the best of the searches from the best starts."""
-    period = form.lines.dt
     lags = period * np.arange(MAX_DELAY + 1.0) if delay == "auto" else np.array([delay])
-    found = sorted((start for lag in lags for start in _starts(form, float(lag))), key=lambda c: c[0])
-    if not found:
-        raise EstimationError("no starting values fit these lines; lower the orders, or check G and its covariance")
-    best: tuple[float, _Form, Array, float, bool] | None = None
-    for _, at, vector, lag in found[:_RACE]:
-        free = replace(at, delay_free=delay == "auto" and domain == "s")
-        begin = np.append(vector, lag / period) if free.delay_free else vector
-        cost, end, converged = _search(free, begin, lag)
-        if best is None or cost < best[0]:
-            best = (cost, free, end, lag, converged)
-    assert best is not None
-    return best
+    ends = list[tuple[float, _Form, Array, float, bool]]()  # cost, form, vector, delay and whether it converged
+    with one_thread():
+        starts = sorted((start for lag in lags for start in _starts(form, float(lag))), key=lambda c: c[0])
+        if not starts:
+            raise EstimationError("no starting values fit these lines; lower the orders, or check G and its covariance")
+        for _, at, vector, lag in starts[:_RACE]:
+            free = replace(at, delay_free=delay == "auto" and domain == "s")
+            begin = np.append(vector, lag / period) if free.delay_free else vector
+            cost, end, converged = _search(free, begin, lag)
+            ends.append((cost, free, end, lag, converged))
+    return _result(frf, min(ends, key=lambda e: e[0]), domain)
 
 
 def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"]) -> _Form:
@@ -507,11 +477,7 @@ def _search(at: _Form, vector: Array, lag: float) -> tuple[float, Array, bool]:
     return search_lines(lambda v: _residual(at, v, lag)[0], lambda v: _residual(at, v, lag, slope=True)[1], vector)
 
 
-def _result(
-    frf: FrequencyResponse,
-    best: tuple[float, _Form, Array, float, bool],
-    domain: Literal["s", "z"],
-) -> BlackBoxFit:
+def _result(frf: FrequencyResponse, best: tuple[float, _Form, Array, float, bool], domain: str) -> BlackBoxFit:
     """Coefficients of powers, their covariance and what goes with them."""
     cost, at, vector, lag, converged = best
     J = _residual(at, vector, lag, slope=True)[1]
@@ -530,17 +496,14 @@ def _result(
         n_estimated=at.n_estimated,
         converged=converged,
         details={"domain": domain, "delay_s": delay, "delay_sd_s": spread, "condition": condition},
-        warnings=_hold_warning(at),
+        warnings=[_ALIASED] if at.dt is None and at.lines.held else [],
     )
 
 
-def _hold_warning(at: _Form) -> list[str]:
-    if at.dt is not None or not at.lines.held:
-        return []
-    return [
-        "the input is held over a sample: a model in s neglects the aliasing of the hold; a model in z, or the "
-        "grey box, is exact"
-    ]
+_ALIASED = (
+    "the input is held over a sample: a model in s neglects the aliasing of the hold; a model in z, or the grey box, "
+    "is exact"
+)
 
 
 def _powers(at: _Form, vector: Array, lag: float) -> tuple[TransferModel, Array]:

@@ -45,24 +45,8 @@ def laguerre_operator(omega: Array, p: float) -> Complex:
 def block_rows_condition(omega: Array, order: int, p: float | None = None) -> float:
     """Return the condition number of the rows 1, v, v^2 ... v^order that a subspace method works on.
 
-    Parameters
-    ----------
-    omega : ndarray, shape (n_frequencies,), rad/s
-    order : int
-        Highest power.
-    p : float, optional, rad/s
-        v is the Laguerre operator with this p; without, v = j omega over the median of omega, so that it is not the
-        unit of time that makes the number large.
-
-    Returns
-    -------
-    float
-        Of the real matrix of real and imaginary parts, shape (order + 1, 2 n_frequencies).
-
-    Raises
-    ------
-    EstimationError
-        If there are fewer lines than rows need.
+    `omega`: (n_frequencies,), rad/s; `p`: rad/s, of the Laguerre operator v; without, v = j omega over the median of
+    omega, so that it is not the unit of time that makes the number large.
     """
     if not 1 <= order < 2 * omega.size:
         raise EstimationError(f"powers up to {order} on {omega.size} lines; give an order from 1 to twice the lines")
@@ -73,18 +57,7 @@ def block_rows_condition(omega: Array, order: int, p: float | None = None) -> fl
 
 
 def best_conditioned(omega: Array, order: int) -> float:
-    """Return the p for which the powers of the operator are best conditioned, in rad/s.
-
-    Parameters
-    ----------
-    omega : ndarray, shape (n_frequencies,), rad/s
-    order : int
-
-    Returns
-    -------
-    float
-        Within 1 % of the best between the slowest and ten times the fastest line.
-    """
+    """Return the p in rad/s for which the powers of the operator are best conditioned, within 1 %."""
     from scipy.optimize import minimize_scalar
 
     low, high = np.log(np.min(omega[omega > 0])), np.log(np.max(omega)) + np.log(10.0)
@@ -105,7 +78,13 @@ def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tup
 
     `feedthrough`: whether D is free.
     """
-    here = _balance(model)
+    # states of which inputs and outputs speak alike: rows of B and columns of C of equal size, A balanced.
+    from scipy.linalg import matrix_balance
+
+    _, T = matrix_balance(model.A)
+    model = model.in_states(np.asarray(T))
+    b, c = np.linalg.norm(model.B), np.linalg.norm(model.C)
+    here = model.in_states(np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
     free = _free(here, feedthrough)
 
     def at(v: Array) -> StateSpaceModel:
@@ -170,16 +149,6 @@ def _free(model: StateSpaceModel, feedthrough: bool) -> NDArray[np.bool_]:
     return free
 
 
-def _balance(model: StateSpaceModel) -> StateSpaceModel:
-    """States of which inputs and outputs speak alike: rows of B and columns of C of equal size, A balanced."""
-    from scipy.linalg import matrix_balance
-
-    _, T = matrix_balance(model.A)
-    model = model.in_states(np.asarray(T))
-    b, c = np.linalg.norm(model.B), np.linalg.norm(model.C)
-    return model.in_states(np.eye(model.order) * np.sqrt(b / c)) if b > 0 and c > 0 else model
-
-
 _GRID = 9  # values of p that are tried
 _HIGHEST = 8  # order tried where it is to be chosen
 
@@ -213,38 +182,26 @@ def frf_subspace(
 ) -> BlackBoxFit:
     """Identify a state space from a frequency response.
 
-    Parameters
-    ----------
-    frf : FrequencyResponse
-    orders : Mapping[str, int or "auto"], or "auto"
-        ``n``. "auto", or left out: the lowest order whose refined cost noise explains; the one of least BIC where
-        none does.
-    p : float, optional, rad/s
-        Of the Laguerre operator; default the one of least mean square error on a grid over the band.
-    delay : float, s
-        Of all inputs, known; it is taken out, and stands in the details.
-    feedthrough : bool
-        Whether D is estimated; else 0. In z it is the direct path within a sample.
-    domain : {"s", "z"}
-        Of the result. z is for held inputs only.
-
-    Returns
-    -------
-    BlackBoxFit
-        Structure ``frf-subspace``, a StateSpaceModel with K = 0; ``singular_values`` (noise alone: about 1), ``p``,
-        ``condition`` (of the operator's rows) and ``condition_without`` (of powers of s) in the details.
-
-    Raises
-    ------
-    EstimationError
-        If orders, options or lines break a rule.
+    `orders`: ``n``; "auto", or left out: the lowest order whose refined cost noise explains, the one of least BIC where
+    none does; `p`: rad/s, of the Laguerre operator, default the one of least mean square error on a grid over the band;
+    `delay`: of all inputs in s, known; `feedthrough`: whether D is estimated; `domain`: z is for held inputs only.
     """
-    n = _order(frf, orders, delay, domain)
+    if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
+        raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
+    if not (np.isfinite(delay) and delay >= 0):
+        raise EstimationError(f"a delay of {delay} s; it must be zero or positive. Correct it")
+    samples = delay * frf.rate_hz
+    if frf.hold == "zoh" and abs(samples - round(samples)) > 1e-9 * max(samples, 1.0):
+        raise EstimationError(
+            f"a delay of {delay} s is {samples:.4g} samples; under a hold a part of a sample is no common phase of the "
+            "lines. Give whole samples, or estimate it with greybox_frf or frf_ml in domain 's'"
+        )
+    wanted: Orders = {} if isinstance(orders, str) else orders
+    check_order_names("frf-subspace", wanted, ("n",))
+    n = None if left_open(wanted, "n") else single_order("frf-subspace", wanted, "n", 1)
     asked = _Asked(p=p, delay=delay, feedthrough=feedthrough, domain=domain)
     with one_thread():
-        if n is None:
-            return _choose_order(frf, asked)
-        return _of_order(frf, n, asked)
+        return _choose_order(frf, asked) if n is None else _of_order(frf, n, asked)
 
 
 def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
@@ -287,30 +244,6 @@ def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
     )
 
 
-def _order(
-    frf: FrequencyResponse,
-    orders: Orders | Literal["auto"],
-    delay: float,
-    domain: str,
-) -> int | None:
-    """Return the order, None where it is to be chosen; refuse what breaks a rule."""
-    if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
-        raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")
-    if not (np.isfinite(delay) and delay >= 0):
-        raise EstimationError(f"a delay of {delay} s; it must be zero or positive. Correct it")
-    samples = delay * frf.rate_hz
-    if frf.hold == "zoh" and abs(samples - round(samples)) > 1e-9 * max(samples, 1.0):
-        raise EstimationError(
-            f"a delay of {delay} s is {samples:.4g} samples; under a hold a part of a sample is no common phase of the "
-            "lines. Give whole samples, or estimate it with greybox_frf or frf_ml in domain 's'"
-        )
-    asked = {} if isinstance(orders, str) and orders == "auto" else orders
-    check_order_names("frf-subspace", asked, ("n",))
-    if not left_open(asked, "n"):
-        return single_order("frf-subspace", asked, "n", 1)
-    return None
-
-
 def _choose_order(frf: FrequencyResponse, asked: _Asked) -> BlackBoxFit:
     """The lowest order that noise explains, else the one of least BIC."""
     m, tried, bic = 2 * frf.G.size, list[tuple[float, int]](), dict[str, float]()
@@ -336,26 +269,17 @@ def _start(frf: FrequencyResponse, n: int, asked: _Asked) -> tuple[Lines, int, _
     """Lines, block rows, subspace estimate of one order, and how many numbers are estimated."""
     n_y, n_u = frf.n_outputs, frf.n_inputs
     n_estimated = n * (n_y + n_u) + (n_y * n_u if asked.feedthrough else 0)
-    ln = _remove_delay(check_lines(frf, n_estimated), asked.delay)
-    rows = _block_rows(ln, n)
-    return ln, rows, _best_operator(ln, n, rows, asked.feedthrough, asked.p), n_estimated
-
-
-def _remove_delay(ln: Lines, delay: float) -> Lines:
-    """Turn the known delay out of G; a common phase leaves its covariance as it is."""
-    return replace(ln, G=ln.G * np.exp(1j * ln.omega * delay)[:, None, None]) if delay else ln
-
-
-def _block_rows(ln: Lines, n: int) -> int:
-    """Rows enough for the order, 2 n + 2 of them where the lines can tell so many apart."""
-    n_y, n_u = ln.G.shape[1:]
+    ln = check_lines(frf, n_estimated)
+    if asked.delay:  # a common phase leaves the covariance as it is
+        ln = replace(ln, G=ln.G * np.exp(1j * ln.omega * asked.delay)[:, None, None])
     least, most = n // n_y + 2, int(2 * ln.n_lines * n_u) // (n_y + n_u)
     if least > most:
         raise EstimationError(
             f"order {n} needs {least} block rows, and {ln.n_lines} lines distinguish {most}. Lower the order, or "
             "measure more lines"
         )
-    return int(max(least, min(2 * n + 2, most // 2)))
+    rows = int(max(least, min(2 * n + 2, most // 2)))  # 2 n + 2 where the lines can tell so many apart
+    return ln, rows, _best_operator(ln, n, rows, asked.feedthrough, asked.p), n_estimated
 
 
 def _points(ln: Lines) -> Complex:

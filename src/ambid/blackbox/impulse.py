@@ -18,7 +18,7 @@ from scipy.linalg import block_diag
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders, check_length, check_order_names, compact_order, order_per_input
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instruments import autoregression
+from ambid.blackbox.instrumental import autoregression
 from ambid.blackbox.model import Offsets, PolynomialModel
 from ambid.blackbox.polynomial_predictor import arx_layout
 from ambid.estimation.linear import one_thread

@@ -32,10 +32,14 @@ from ambid.blackbox.data import (
     single_order,
 )
 from ambid.blackbox.fit import BlackBoxFit, build_fit
-from ambid.blackbox.instrumental import ArxEstimate, Signals, centre, estimate_output, operating_point
-from ambid.blackbox.instruments import (
+from ambid.blackbox.instrumental import (
+    ArxEstimate,
+    Signals,
     Solution,
     autoregression,
+    centre,
+    estimate_output,
+    operating_point,
     reference_part,
     require_reference,
     score_covariance,
@@ -154,7 +158,10 @@ def refine(setting: Setting, theta: Array, steps: int) -> Found:
             small = float(np.linalg.norm(at.Z @ change)) / np.sqrt(at.loss)
             if small <= _SETTLED:
                 return Found(setting=setting, theta=theta, at=at, settled=True, steps=k)
-            better = _shorten(setting, theta, at, change)
+            # the longest of the step, its half, quarter ... that makes the error smaller
+            moved = (_mirror_poles(theta + 0.5**j * change, setting.orders.n) for j in range(_HALVINGS))
+            trials = ((trial, linearise(setting, trial)) for trial in moved)
+            better = next((trial for trial in trials if trial[1].loss < at.loss), None)
             if better is not None:
                 break
         if better is None:
@@ -169,7 +176,9 @@ def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found
     `y`: (n_samples,); `u`: (n_samples, n_inputs), delays taken off. Returns w0 in rad/s.
     """
     rough = list[tuple[Found, float]]()
-    for w0 in _time_scales(y.size, dt):
+    # corner frequencies of the start filters, from the record's length to half the sampling rate, middle first
+    grid = np.geomspace(max(20.0 / (y.size * dt), 1e-4 / dt), 1.5 / dt, 9)
+    for w0 in grid[[4, 6, 2, 5, 3, 7, 1, 8, 0]]:
         setting = Setting(y=y, u=u, step=w0 * dt, orders=orders)
         try:
             rough.append((refine(setting, _start(setting), _ROUGH), w0))
@@ -185,12 +194,6 @@ def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found
         )
     fine = [(found if found.settled else refine(found.setting, found.theta, _FINE), w0) for found, w0 in rough[:2]]
     return min(fine, key=lambda r: r[0].at.loss)
-
-
-def _time_scales(n: int, dt: float) -> Array:
-    """Corner frequencies of the start filters, from the record's length to half the sampling rate, middle first."""
-    grid = np.geomspace(max(20.0 / (n * dt), 1e-4 / dt), 1.5 / dt, 9)
-    return grid[[4, 6, 2, 5, 3, 7, 1, 8, 0]]
 
 
 def _start(setting: Setting) -> Array:
@@ -220,16 +223,6 @@ def _nuisance(setting: Setting, den: Array) -> Array:
     return np.hstack([np.ones((n, 1)), free_response(den, setting.step, n)])
 
 
-def _shorten(setting: Setting, theta: Array, at: Linearised, change: Array) -> tuple[Array, Linearised] | None:
-    """The longest of the step, its half, quarter ... that makes the error smaller; None if none does."""
-    for k in range(_HALVINGS):
-        moved = _mirror_poles(theta + 0.5**k * change, setting.orders.n)
-        new = linearise(setting, moved)
-        if new.loss < at.loss:
-            return moved, new
-    return None
-
-
 def _mirror_poles(theta: Array, n: int) -> Array:
     """Mirror poles of the right half plane: a simulated output must not run away. The error decides if it stays."""
     roots = np.roots(np.append(1.0, theta[:n][::-1]))
@@ -245,24 +238,9 @@ _DELAYS = tuple(range(6))  # scanned where nk is not given
 def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate continuous-time transfer functions by refined instrumental variables; every output by itself.
 
-    Parameters
-    ----------
-    data : IOData
-        Without feedback; inputs held over a sample.
-    orders : Mapping[str, int or tuple of int]
-        ``nb``: numerator coefficients (1: a constant), one or one for each input. ``nf``: degree of the denominator,
-        which all inputs share. ``nk``: delay in samples, one or one for each input; left out: the one up to 5, common
-        to all inputs, that fits best.
-
-    Returns
-    -------
-    BlackBoxFit
-        TransferModel with ``dt`` None.
-
-    Raises
-    ------
-    EstimationError
-        If an order breaks a rule, the record is too short or does not excite the plant, or no stable model fits.
+    `data`: without feedback, inputs held over a sample; `orders`: ``nb`` numerator coefficients (1: a constant) and
+    ``nk`` samples of delay, one or one for each input, ``nf`` degree of the denominator, which all inputs share.
+    Without ``nk`` the delay up to 5, common to all inputs, that fits best is taken.
     """
     used = transfer_orders("srivc", data, orders)
     deviations, means, _ = centre(data)
@@ -270,8 +248,13 @@ def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
     first = max(max(k) for k in settings)
     check_length("srivc", data, data.n_samples - first, used.size + 1)
     with one_thread():
-        tried = [(_all_outputs(deviations, used, nk, first), nk) for nk in settings]
-        found, nk = min(tried, key=lambda t: _loss(t[0], deviations))
+        tried = list[tuple[float, int, list[tuple[Found, float]]]]()
+        for k, nk in enumerate(settings):
+            u = np.stack([deviations.u[first - d : data.n_samples - d, i] for i, d in enumerate(nk)], axis=1)
+            ends = [search(y / y.std(), u / u.std(axis=0), data.dt, used) for y in deviations.y[first:].T]
+            tried.append((float(sum(np.log(f.at.loss / data.n_samples + 1e-300) for f, _ in ends)), k, ends))
+        _, best, found = min(tried, key=lambda t: t[:2])
+        nk = settings[best]
         return _srivc_fit(data, used, nk, found, means)
 
 
@@ -329,16 +312,6 @@ def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]
     )
     slopes = zip(outputs, found, strict=True)
     return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])
-
-
-def _all_outputs(data: IOData, orders: TransferOrders, nk: tuple[int, ...], first: int) -> list[tuple[Found, float]]:
-    n = data.n_samples
-    u = np.stack([data.u[first - k : n - k, i] for i, k in enumerate(nk)], axis=1)
-    return [search(y / y.std(), u / u.std(axis=0), data.dt, orders) for y in data.y[first:].T]
-
-
-def _loss(found: list[tuple[Found, float]], data: IOData) -> float:
-    return float(sum(np.log(f.at.loss / data.n_samples + 1e-300) for f, _ in found))
 
 
 def _srivc_fit(
@@ -402,23 +375,8 @@ class _Continuous:
 def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate continuous-time transfer functions of a plant in a loop; every output by itself.
 
-    Parameters
-    ----------
-    data : IOData
-        With a reference that the noise does not reach; inputs held over a sample.
-    orders : Mapping[str, int or tuple of int]
-        ``nb``: numerator coefficients (1: a constant), one or one for each input. ``nf``: degree of the denominator,
-        which all inputs share. ``nk`` (default 0): delay in samples, one or one for each input.
-
-    Returns
-    -------
-    BlackBoxFit
-        TransferModel with ``dt`` None.
-
-    Raises
-    ------
-    EstimationError
-        If there is no reference, an order breaks a rule, or the record is too short or does not excite the plant.
+    `data`: with a reference that the noise does not reach, inputs held over a sample; `orders`: as `srivc`, ``nk`` 0
+    where it is left out.
     """
     who = "clsrivc"
     require_reference(who, data)
@@ -490,10 +448,17 @@ def _logarithms(A: Array) -> NDArray[np.complex128]:
 
 def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Continuous:
     """Continuous coefficients nearest to a sampled estimate in the metric of its information."""
+    from scipy.linalg import solve_triangular
     from scipy.optimize import least_squares
 
     n, nb = orders.n, orders.nb
-    root, eta = _information(found)
+    # square root of the information of a_1 ..., b ..., the constant eliminated, and the estimate itself
+
+    s = found.solution
+    spread = np.linalg.cholesky(score_covariance(s.Q, autoregression(found.innovations, 10)))
+    whole = solve_triangular(spread, np.linalg.inv(s.inverse), lower=True)
+    R = np.asarray(np.linalg.qr(whole[:, [-1, *range(whole.shape[1] - 1)]], mode="r"))
+    root, eta = R[1:, 1:], s.theta[:-1]
 
     def error(theta: Array) -> Array:
         return np.asarray(root @ (sampled_coefficients(theta, n, nb, step) - eta))
@@ -519,17 +484,6 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
         freedom=root.shape[1] - start.size,
         settled=done.status > 0,
     )
-
-
-def _information(found: ArxEstimate) -> tuple[Array, Array]:
-    """Square root of the information of a_1 ..., b ..., the constant eliminated, and the estimate itself."""
-    from scipy.linalg import solve_triangular
-
-    s = found.solution
-    spread = np.linalg.cholesky(score_covariance(s.Q, autoregression(found.innovations, 10)))
-    whole = solve_triangular(spread, np.linalg.inv(s.inverse), lower=True)
-    R = np.asarray(np.linalg.qr(whole[:, [-1, *range(whole.shape[1] - 1)]], mode="r"))
-    return R[1:, 1:], s.theta[:-1]
 
 
 def _clsrivc_fit(

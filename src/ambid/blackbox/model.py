@@ -56,15 +56,42 @@ class BlackBoxModel(ABC):
 
     @abstractmethod
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G at `omega` in rad/s, shape (n_frequencies, n_outputs, n_inputs)."""
+        """Return G.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
 
     @abstractmethod
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return dG/dtheta at `omega` in rad/s, shape (n_frequencies, n_outputs, n_inputs, n_theta)."""
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
 
     @abstractmethod
     def noise_response(self, omega: Array) -> Complex:
-        """Return H at `omega` in rad/s, shape (n_frequencies, n_outputs, n_outputs)."""
+        """Return H.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
 
     @abstractmethod
     def state_space(self) -> StateSpaceModel:
@@ -96,7 +123,7 @@ class BlackBoxModel(ABC):
         """Return G alone, without the states of the noise, as a state space with K = 0."""
         return self.state_space().plant()
 
-    def points(self, omega: Array) -> Complex:
+    def _points(self, omega: Array) -> Complex:
         """Return z, or s for a continuous model, at `omega` in rad/s, shape (n_frequencies,)."""
         return np.asarray(1j * omega if self.dt is None else np.exp(1j * omega * self.dt), dtype=np.complex128)
 
@@ -104,6 +131,8 @@ class BlackBoxModel(ABC):
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateSpaceModel(BlackBoxModel):
     """Innovations form; with `dt` None the first line is x' = A x + B u + K e.
+
+    An `ambid.blackbox.model.BlackBoxModel`.
 
     Attributes
     ----------
@@ -197,13 +226,7 @@ class StateSpaceModel(BlackBoxModel):
         return self
 
     def plant(self) -> StateSpaceModel:
-        """Return G alone.
-
-        Returns
-        -------
-        StateSpaceModel
-            With K = 0.
-        """
+        """Return G alone, with K = 0."""
         return StateSpaceModel(A=self.A, B=self.B, C=self.C, D=self.D, K=np.zeros_like(self.K), dt=self.dt)
 
     def _poles(self) -> tuple[Complex, Complex]:
@@ -233,43 +256,16 @@ class StateSpaceModel(BlackBoxModel):
         return zeros, out
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G = D + C (sI - A)^-1 B.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
-        """
+        """As `BlackBoxModel.frequency_response`."""
         return np.asarray(self.D + self.C @ np.linalg.solve(self._pencil(omega), self._wide(self.B, omega)))
 
     def noise_response(self, omega: Array) -> Complex:
-        """Return H = I + C (sI - A)^-1 K.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
-        """
+        """As `BlackBoxModel.noise_response`."""
         inner = np.linalg.solve(self._pencil(omega), self._wide(self.K, omega))
         return np.asarray(np.eye(self.n_outputs) + self.C @ inner)
 
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return dG/dtheta.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
-        """
+        """As `BlackBoxModel.frequency_response_derivative`."""
         pencil = self._pencil(omega)
         right = np.linalg.solve(pencil, self._wide(self.B, omega))  # (f, n, u)
         left = np.swapaxes(np.linalg.solve(np.swapaxes(pencil, 1, 2), self._wide(self.C.T, omega)), 1, 2)  # (f, y, n)
@@ -283,7 +279,7 @@ class StateSpaceModel(BlackBoxModel):
         return np.concatenate([by_a, by_b, by_c, by_d, np.zeros((f, n_y, n_u, n * n_y))], axis=3)
 
     def _pencil(self, omega: Array) -> Complex:
-        return np.asarray(self.points(omega)[:, None, None] * np.eye(self.order) - self.A)
+        return np.asarray(self._points(omega)[:, None, None] * np.eye(self.order) - self.A)
 
     @staticmethod
     def _wide(matrix: Array, omega: Array) -> Complex:
@@ -531,6 +527,8 @@ class Polynomials:
 class PolynomialModel(RationalModel):
     """One set of polynomials for each output; discrete time.
 
+    An `ambid.blackbox.model.BlackBoxModel`.
+
     Attributes
     ----------
     outputs : tuple of Polynomials
@@ -598,49 +596,22 @@ class PolynomialModel(RationalModel):
         return PolynomialModel(outputs=tuple(p.with_theta(part) for p, part in split), dt=self.dt)
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G = B/(A F).
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
-        """
-        z = 1.0 / self.points(omega)
+        """As `BlackBoxModel.frequency_response`."""
+        z = 1.0 / self._points(omega)
         g = [[_at(b, z) / (_at(p.A, z) * _at(f, z)) for b, f in zip(p.B, p.F, strict=True)] for p in self.outputs]
         return np.moveaxis(np.array(g, dtype=np.complex128).reshape(self.n_outputs, self.n_inputs, z.size), 2, 0)
 
     def noise_response(self, omega: Array) -> Complex:
-        """Return H = C/(A D), diagonal.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
-        """
-        z = 1.0 / self.points(omega)
+        """As `BlackBoxModel.noise_response`."""
+        z = 1.0 / self._points(omega)
         h = np.zeros((z.size, self.n_outputs, self.n_outputs), dtype=np.complex128)
         for o, p in enumerate(self.outputs):
             h[:, o, o] = _at(p.C, z) / (_at(p.A, z) * _at(p.D, z))
         return h
 
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return dG/dtheta.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
-        """
-        z, g = 1.0 / self.points(omega), self.frequency_response(omega)
+        """As `BlackBoxModel.frequency_response_derivative`."""
+        z, g = 1.0 / self._points(omega), self.frequency_response(omega)
         out = np.zeros((*g.shape, self.theta.size), dtype=np.complex128)
         for o, letter, i, place in self.blocks():
             p = self.outputs[o]
@@ -669,13 +640,7 @@ class PolynomialModel(RationalModel):
         return StateSpaceModel(A=A, B=B, C=C, D=D, K=K, dt=self.dt)
 
     def plant(self) -> StateSpaceModel:
-        """Return G alone, without the states of the noise.
-
-        Returns
-        -------
-        StateSpaceModel
-            With K = 0.
-        """
+        """Return G alone, without the states of the noise, with K = 0."""
         silent = PolynomialModel(
             outputs=tuple(Polynomials(A=p.A, B=p.B, C=[1.0], D=[1.0], F=p.F) for p in self.outputs),  # type: ignore[arg-type]
             dt=self.dt,
@@ -743,6 +708,8 @@ def _padded(p: Array, size: int) -> Array:
 class TransferModel(RationalModel):
     """G[o][i] = num[o][i] / den[o][i] * exp(-s delay[i]), output noise white (H = I).
 
+    An `ambid.blackbox.model.BlackBoxModel`.
+
     Attributes
     ----------
     num, den : tuple of tuple of ndarray, shape (degree + 1,) each
@@ -805,47 +772,20 @@ class TransferModel(RationalModel):
         return np.concatenate([*pairs, self.delay if self.delay_estimated else ()])
 
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
-        """
-        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
+        """As `BlackBoxModel.frequency_response`."""
+        s, lag = self._points(omega), np.exp(-1j * np.outer(omega, self.delay))
         g = np.empty((omega.size, self.n_outputs, self.n_inputs), dtype=np.complex128)
         for o, i in np.ndindex(self.n_outputs, self.n_inputs):
             g[:, o, i] = np.polyval(self.num[o][i], s) / np.polyval(self.den[o][i], s) * lag[:, i]
         return g
 
     def noise_response(self, omega: Array) -> Complex:
-        """Return the identity.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
-        """
+        """As `BlackBoxModel.noise_response`."""
         return np.broadcast_to(np.eye(self.n_outputs, dtype=np.complex128), (omega.size,) + (self.n_outputs,) * 2)
 
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return dG/dtheta.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
-        """
-        s, lag = self.points(omega), np.exp(-1j * np.outer(omega, self.delay))
+        """As `BlackBoxModel.frequency_response_derivative`."""
+        s, lag = self._points(omega), np.exp(-1j * np.outer(omega, self.delay))
         out = np.zeros((omega.size, self.n_outputs, self.n_inputs, self.theta.size), dtype=np.complex128)
         for o, which, i, place in self.blocks():
             powers = s[:, None] ** np.arange(place.stop - place.start - 1, -1, -1)
@@ -866,10 +806,6 @@ class TransferModel(RationalModel):
 
     def state_space(self) -> StateSpaceModel:
         """Return an innovations form with K = 0; delays of a discrete model become states.
-
-        Returns
-        -------
-        StateSpaceModel
 
         Raises
         ------

@@ -21,13 +21,11 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.blackbox.data import IOData
-from ambid.blackbox.mode_starts import MOST_DAMPED, excited_band, overlapping_bands
-from ambid.errors import EstimationError
+from ambid.blackbox.modes import MOST_DAMPED, light_poles, lines_in_band, overlapping_bands
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import (
     Modal,
-    Mode,
     PoleCluster,
     Tolerance,
     TrialPole,
@@ -36,7 +34,6 @@ from ambid.estimation.modes import (
     mode_of,
     modes_checks,
     student,
-    trial_poles,
 )
 from ambid.settings.caller import setting
 
@@ -101,16 +98,8 @@ def operational_modes(
     where the band has too few lines.
     """
     n, rate = data.y.shape[0], 1.0 / data.dt
-    Y = np.fft.rfft(data.y - data.y.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n)
-    f = np.arange(1, Y.shape[0] + 1) * (rate / n)
-    low, high = excited_band(Y, f) if band is None else band
-    keep = (f >= low) & (f <= high)
-    if np.count_nonzero(keep) < _LEAST_LINES:
-        raise EstimationError(
-            f"{np.count_nonzero(keep)} lines of the record between {low:g} and {high:g} Hz; operational modes want "
-            f"{_LEAST_LINES}. Use a longer record or a wider {setting('band')}"
-        )
-    Y, omega = Y[keep], 2 * np.pi * f[keep]
+    f, _, (Y,) = lines_in_band(data, (data.y,), band, _LEAST_LINES, "operational modes")
+    omega = 2 * np.pi * f
     size = np.sqrt(np.mean(np.abs(Y) ** 2, axis=0))
     found, tried = list[_Found](), list[TrialPole]()
     with one_thread():
@@ -128,14 +117,21 @@ def operational_modes(
     if count != "auto":
         best = sorted(found, key=lambda x: (x.harmonic, np.trace(x.covariance) / x.pole.real**2))[:count]
         found = sorted(best, key=lambda x: x.pole.imag)
-    limits = float(f[keep][0]), float(f[keep][-1])
-    modes = tuple(_mode(x, data.outputs) for x in found)
+    limits = float(f[0]), float(f[-1])
+    interval = student(_STRETCHES - 1)
+    modes = tuple(
+        mode_of(x.pole, [(x.covariance, interval)], data.outputs, x.shape, x.variance, shown=not x.harmonic)
+        for x in found
+    )
+    steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in found if x.harmonic)
+    remedy = f"{steady}: the envelope is steady, as a harmonic's is. Take it for no mode, or record at another speed"
+    random = Check(passed=not steady, detail=remedy if steady else "no mode is a harmonic")
     checks = modes_checks(modes, count, limits, f"Record longer, or give {setting('band')}")
     return Modal(
         status="converged" if found else "failed",
         method="covariance-driven stochastic subspace, broadband excitation not measured",
         modes=modes,
-        checks={**checks, "modes_random": _random_check(found)},
+        checks={**checks, "modes_random": random},
         inputs=(),
         outputs=data.outputs,
         units={x: data.units[x] for x in data.outputs},
@@ -151,11 +147,8 @@ def _of_band(Y: Complex, omega: Array, inside: tuple[float, float]) -> tuple[lis
     band = _shifted(Y, omega)
     R = band.covariances()
     models = list(range(1, _ORDERS + 1))
-    rows = []
-    for order, (p, shapes) in zip(models, _poles(R, band, models), strict=True):
-        lightly = (p.real < 0) & (-p.real < 2 * MOST_DAMPED * np.abs(p))
-        use = lightly & (p.imag >= inside[0]) & (p.imag < inside[1])
-        rows.append(trial_poles(order, p[use], shapes[use]))
+    trials = zip(models, _poles(R, band, models), strict=True)
+    rows = [light_poles(order, p, shapes, *inside) for order, (p, shapes) in trials]
     poles = followed(rows, _NEAR)
     stable = clusters(poles, models, _NEAR)
     return _known(stable, poles, band, Y, omega), poles
@@ -218,11 +211,16 @@ def _known(
         spread = np.array(moved) - np.mean(moved, axis=0)
         factor = (_STRETCHES - 1) / _STRETCHES
         variance = np.sum(spread[:, 2:] ** 2, axis=0) * factor
+        # steadiness: fourth moment over squared second of the envelope of the mode's lines, along its shape.
+        step = omega[1] - omega[0]
+        near = np.abs(omega - trial.pole.imag) <= max(3 * abs(trial.pole.real), 4 * step)
+        along = Y[near] @ np.conj(np.array(trial.shape))
+        power = np.abs(np.fft.ifft(along, 4 * along.size)) ** 2
         out.append(
             _Found(
                 pole=trial.pole, shape=own / own[largest], covariance=spread[:, :2].T @ spread[:, :2] * factor,
                 variance=variance[: own.size] + variance[own.size :],
-                steadiness=_steadiness(Y, omega, trial),
+                steadiness=float(np.mean(power**2) / np.mean(power) ** 2),
             )
         )  # fmt: skip
     return out
@@ -241,15 +239,6 @@ def _stands_out(Y: Complex, omega: Array, p: TrialPole) -> bool:
     return bool(np.mean(power[near]) > _PEAK * (1 + 2 / np.sqrt(np.count_nonzero(near))) * level)
 
 
-def _steadiness(Y: Complex, omega: Array, p: TrialPole) -> float:
-    """Fourth moment over squared second of the envelope of the mode's lines, along its shape."""
-    step = omega[1] - omega[0]
-    near = np.abs(omega - p.pole.imag) <= max(3 * abs(p.pole.real), 4 * step)
-    along = Y[near] @ np.conj(np.array(p.shape))
-    power = np.abs(np.fft.ifft(along, 4 * along.size)) ** 2
-    return float(np.mean(power**2) / np.mean(power) ** 2)
-
-
 def _separate(found: list[_Found]) -> list[_Found]:
     """Modes that are damped, known, and not twice, in order of frequency."""
     kept = list[_Found]()
@@ -260,15 +249,3 @@ def _separate(found: list[_Found]) -> list[_Found]:
         if damped and known and not near:
             kept.append(x)
     return sorted(kept, key=lambda x: x.pole.imag)
-
-
-def _mode(x: _Found, outputs: tuple[str, ...]) -> Mode:
-    spreads = [(x.covariance, student(_STRETCHES - 1))]
-    return mode_of(x.pole, spreads, outputs, x.shape, x.variance, shown=not x.harmonic)
-
-
-def _random_check(found: list[_Found]) -> Check:
-    """Whether a mode is a harmonic of a machine or the mains."""
-    steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in found if x.harmonic)
-    said = f"{steady}: the envelope is steady, as a harmonic's is. Take it for no mode, or record at another speed"
-    return Check(passed=not steady, detail=said if steady else "no mode is a harmonic")

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.special import fdtrc
 
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData, Orders
-from ambid.blackbox.fit import BlackBoxFit, build_fit, structure
+from ambid.blackbox.fit import BlackBoxFit, build_fit
 from ambid.blackbox.model import Offsets, PolynomialModel, roots_at
 from ambid.blackbox.polynomial_predictor import (
     Layout,
@@ -95,16 +96,6 @@ def polynomial_fit(
     )
 
 
-def _spread(fit: Minimum, variance: float) -> Array:
-    """Covariance; as large as the coefficients themselves along directions that the data do not see."""
-    s, sides = fit.directions.s, fit.directions.root(_LEAST_SEEN) * np.sqrt(variance)
-    blind = s * BLIND < (s[0] if s.size else 0.0)
-    if blind.any():
-        whole, length = max(1.0, float(np.linalg.norm(fit.theta[fit.free]))), np.linalg.norm(sides[:, blind], axis=0)
-        sides[:, blind] *= np.maximum(whole / length, 1.0)
-    return np.asarray(sides @ sides.T)
-
-
 def _inverse(R: Array) -> Array:
     """R^-1, zero along directions that the data do not see."""
     return directions(R).solve(np.eye(R.shape[0]))
@@ -119,7 +110,13 @@ def _covariances(scaled: ScaledData, layouts: Sequence[Layout], fits: Sequence[M
     places = [int(first) + x.free for first, x in zip(firsts, layouts, strict=False)]
     covariance = np.zeros((n, n))
     for o, fit in enumerate(fits):
-        covariance[places[o][:, None], places[o]] = _spread(fit, noise[o, o])
+        # as large as the coefficients themselves along directions that the data do not see.
+        s, sides = fit.directions.s, fit.directions.root(_LEAST_SEEN) * np.sqrt(noise[o, o])
+        blind = s * BLIND < (s[0] if s.size else 0.0)
+        if blind.any():
+            whole = max(1.0, float(np.linalg.norm(fit.theta[fit.free])))
+            sides[:, blind] *= np.maximum(whole / np.linalg.norm(sides[:, blind], axis=0), 1.0)
+        covariance[places[o][:, None], places[o]] = sides @ sides.T
     for o in range(len(fits)):
         for k in range(o):
             products, errors = _shared(scaled, layouts, fits, o, k)
@@ -187,15 +184,34 @@ _OUTER = 0.9  # roots inside are not at the border, however vague
 
 
 def cautions(model: PolynomialModel, covariance: Array, fits: Sequence[Minimum]) -> list[str]:
-    """Return warnings that follow from the roots and their spread.
+    """Return warnings of directions that the data do not see, and of roots of C and F not surely inside the circle.
 
     `covariance`: (n_theta, n_theta); `fits`: one for each output.
     """
-    found = []
+    warnings = list[str]()
     for o, fit in enumerate(fits):
-        where = f"output {o}: " if len(fits) > 1 else ""
-        found += [where + x for x in (*_blind(model, o, fit), *_at_border(model, o, covariance, fit))]
-    return found
+        where, s, weights = f"output {o}: " if len(fits) > 1 else "", fit.directions.s, np.abs(fit.directions.Vt[-1:])
+        blocks = [(letter, i, place) for output, letter, i, place in model.blocks() if output == o]
+        if s.size and s[-1] * BLIND < s[0]:
+            places = [k for _, _, place in blocks for k in range(place.start, place.stop)]
+            large = weights[0] > 0.3 * np.max(weights)
+            which = ", ".join(model.names[places[int(k)]] for k, big in zip(fit.free, large, strict=True) if big)
+            warnings.append(
+                f"{where}the data do not distinguish {which} (condition number {s[0] / max(s[-1], 1e-300):.1e}): their "
+                "values are arbitrary along one direction. Lower the orders, or excite more"
+            )
+        for letter, i, place in blocks:
+            if letter not in "CF" or place.stop - place.start < 2:
+                continue
+            size, sd = _outermost(model.theta, place, covariance)
+            if (size > _OUTER and size + _SDS * sd >= 1.0) or (fit.at_border and size > 0.999):
+                name = f"F.{i}" if letter == "F" and model.n_inputs > 1 else letter
+                warnings.append(
+                    f"{where}a root of {name} of magnitude {size:.6g} (sd {sd:.1g}) is at the stability limit: its "
+                    "standard deviation is unreliable. "
+                    + ("Lower nc" if letter == "C" else "If the plant integrates or is unstable, use armax or arx")
+                )
+    return warnings
 
 
 def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
@@ -218,41 +234,6 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
                 "and this structure would give an unstable predictor. Use armax, arx or ararmax"
             )
     return found
-
-
-def _blind(model: PolynomialModel, o: int, fit: Minimum) -> Iterator[str]:
-    s, Vt = fit.directions.s, fit.directions.Vt
-    if not s.size or s[-1] * BLIND >= s[0]:
-        return
-    names = [name for name, place in _free_names(model, o, fit)]
-    large = np.abs(Vt[-1]) > 0.3 * np.max(np.abs(Vt[-1]))
-    which = ", ".join(x for x, big in zip(names, large, strict=True) if big)
-    yield (
-        f"the data do not distinguish {which} (condition number {s[0] / max(s[-1], 1e-300):.1e}): their values are "
-        "arbitrary along one direction. Lower the orders, or excite more"
-    )
-
-
-def _free_names(model: PolynomialModel, o: int, fit: Minimum) -> Iterator[tuple[str, int]]:
-    places = [k for output, _, _, place in model.blocks() if output == o for k in range(place.start, place.stop)]
-    for k in fit.free:
-        yield model.names[places[int(k)]], places[int(k)]
-
-
-def _at_border(model: PolynomialModel, o: int, covariance: Array, fit: Minimum) -> Iterator[str]:
-    """Name roots of C and F that are not surely inside the unit circle."""
-    theta, several = model.theta, model.n_inputs > 1
-    for output, letter, i, place in model.blocks():
-        if output != o or letter not in "CF" or place.stop - place.start < 2:
-            continue
-        size, sd = _outermost(theta, place, covariance)
-        if (size > _OUTER and size + _SDS * sd >= 1.0) or (fit.at_border and size > 0.999):
-            name = f"F.{i}" if letter == "F" and several else letter
-            yield (
-                f"a root of {name} of magnitude {size:.6g} (sd {sd:.1g}) is at the stability limit: its standard "
-                "deviation is unreliable. "
-                + ("Lower nc" if letter == "C" else "If the plant integrates or is unstable, use armax or arx")
-            )
 
 
 def _outermost(theta: Array, place: slice, covariance: Array) -> tuple[float, float]:
@@ -350,70 +331,21 @@ def _longer_model(layout: Layout, fit: Minimum, y: Array, u: Array) -> tuple[flo
     return float(fdtrc(longer.free.size - bare.free.size, freedom, ratio)), 1.0 - after / before
 
 
-_CONTRACT = """{summary} (Ljung 1999, sec. 4.2), by prediction error, each output by itself.
-
-Parameters
-----------
-data : IOData
-orders : Mapping[str, int or tuple of int]
-    {orders}; nb, nf and nk one number, or one for each input; nk left out or "auto" is estimated.
-fixed : Mapping[str, float], optional
-    Known coefficients, by name (``a1``), SI.
-at_rest : bool, optional
-    Say that the record begins at rest at zero: no initial states and no constant are estimated, all samples count,
-    and a score test warns where the data disagree.
-tick : callable, optional
-    Called before each look at the data.
-
-Returns
--------
-BlackBoxFit
-    PolynomialModel with covariance, offsets and innovations.
-
-Raises
-------
-EstimationError
-    If an order breaks a rule, the record is too short, or a channel does not move.
-"""
-
 _EXACT = 1e-24  # squared residual, in units of the output's variance
 _LONG, _SHORT = 100, 40  # evaluations of a search; those after which a further start has to be ahead
 _EQUAL = 0.5  # of squared residual, in units of the noise variance: minima that are equally likely
-
-
-def _estimator(name: str) -> Callable[..., BlackBoxFit]:
-    """Return the public function of one structure, documented from the register."""
-
-    def fit(
-        data: IOData,
-        orders: Orders,
-        *,
-        fixed: Mapping[str, float] | None = None,
-        at_rest: bool = False,
-        tick: Callable[[], None] | None = None,
-    ) -> BlackBoxFit:
-        return estimate(name, data, orders, fixed, tick, at_rest=at_rest)
-
-    known = structure(name)
-    fit.__name__ = fit.__qualname__ = name
-    fit.__doc__ = _CONTRACT.format(summary=f"Fit {known.summary}", orders=", ".join(known.orders))
-    return fit
-
-
-fir, arx, armax, arma = (_estimator(name) for name in ("fir", "arx", "armax", "arma"))
-ararx, ararmax, oe, bj = (_estimator(name) for name in ("ararx", "ararmax", "oe", "bj"))
 
 
 def estimate(
     name: str,
     data: IOData,
     orders: Orders,
-    fixed: Mapping[str, float] | None,
-    tick: Callable[[], None] | None,
     *,
+    fixed: Mapping[str, float] | None = None,
     at_rest: bool = False,
+    tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
-    """Fit one of the eight structures.
+    """Fit one of the eight structures, each output by itself (Ljung 1999, sec. 4.2); an nk left out is estimated.
 
     `fixed`: known coefficients, by the names of `PolynomialModel.names`, in SI; `tick`: called before each look at the
     data; `at_rest`: the record begins at rest at zero.
@@ -428,6 +360,10 @@ def estimate(
         layouts = [replace(x, fixed=tuple(k)) if k else x for x, k in zip(layouts, known, strict=True)]
         fits = [fit_output(name, x, scaled, o, known[o], tick) for o, x in enumerate(layouts)]
         return polynomial_fit(name, data, scaled, layouts, fits, estimated_delay=free_delay)
+
+
+fir, arx, armax, arma = (partial(estimate, name) for name in ("fir", "arx", "armax", "arma"))
+ararx, ararmax, oe, bj = (partial(estimate, name) for name in ("ararx", "ararmax", "oe", "bj"))
 
 
 def _layouts(name: str, given: Layout, scaled: ScaledData, least: int, tick: Callable[[], None] | None) -> list[Layout]:
@@ -493,34 +429,23 @@ def fit_output(
             if not ordinary and not end.converged and found and end.cost < min(x.cost for x in found):
                 end = search(p, y, scaled.u, end.theta, tick=tick)
             found.append(end)
-            if _agreed(found) if ordinary and shared else _smooth(found):
+            agreed = sum(x.converged and x.cost <= _lowest(found) for x in found) > 1
+            if agreed if ordinary and shared else _smooth(found):
                 break
         if _smooth(found) and not shared:
             break
-    best = _best(found)
-    if best is None:
+    if not found:
         raise EstimationError(f"{name}: no stable predictor to start from. Change the fixed coefficients of C or F")
-    return best
-
-
-def _best(found: list[Minimum]) -> Minimum | None:
-    """The lowest minimum; one that converged, where a lower one that did not is not told from it by the data."""
-    best = min(found, key=lambda x: x.cost, default=None)
-    if best is None or best.converged:
-        return best
+    best = min(found, key=lambda x: x.cost)
+    # one that converged, where a lower one that did not is not told from it by the data
     near = [x for x in found if x.converged and x.cost <= best.cost * (1 + _EQUAL / best.n_rows)]
-    return min(near, key=lambda x: x.cost, default=best)
+    return best if best.converged else min(near, key=lambda x: x.cost, default=best)
 
 
 def _smooth(found: list[Minimum]) -> bool:
     """Whether the last search went straight to the lowest minimum; a long way hints at a second one."""
     last = found[-1] if found else None
     return last is not None and last.converged and last.iterations <= SMOOTH and last.cost <= _lowest(found)
-
-
-def _agreed(found: list[Minimum]) -> bool:
-    """Whether two starts led to the lowest minimum."""
-    return sum(x.converged and x.cost <= _lowest(found) for x in found) > 1
 
 
 def _lowest(found: list[Minimum]) -> float:

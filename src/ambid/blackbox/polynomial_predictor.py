@@ -54,7 +54,15 @@ class Layout:
     free: NDArray[np.int64] = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "places", _places(self))
+        sizes: list[tuple[Key, int]] = [(("A", None), self.na + 1)]
+        sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(self.nb, self.nk, strict=True))]
+        sizes += [(("C", None), self.nc + 1), (("D", None), self.nd + 1)]
+        sizes += [(("F", i), f + 1) for i, f in enumerate(self.nf)]
+        first, out = 0, {}
+        for key, size in sizes:
+            out[key] = slice(first, first + size)
+            first += size
+        object.__setattr__(self, "places", out)
         object.__setattr__(self, "free", _free(self))
 
     @property
@@ -129,18 +137,6 @@ def arx_layout(na: int, nb: tuple[int, ...], nk: tuple[int, ...], *, at_rest: bo
     return Layout(na=na, nb=nb, nc=0, nd=0, nf=(0,) * len(nb), nk=nk, at_rest=at_rest)
 
 
-def _places(layout: Layout) -> dict[Key, slice]:
-    sizes: list[tuple[Key, int]] = [(("A", None), layout.na + 1)]
-    sizes += [(("B", i), b + k) for i, (b, k) in enumerate(zip(layout.nb, layout.nk, strict=True))]
-    sizes += [(("C", None), layout.nc + 1), (("D", None), layout.nd + 1)]
-    sizes += [(("F", i), f + 1) for i, f in enumerate(layout.nf)]
-    first, out = 0, {}
-    for key, size in sizes:
-        out[key] = slice(first, first + size)
-        first += size
-    return out
-
-
 def _free(layout: Layout) -> NDArray[np.int64]:
     lags = [p.start + k for key, p in layout.places.items() for k in layout.free_lags(key)]
     out = np.array(lags, dtype=np.int64)
@@ -154,7 +150,14 @@ def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = Fals
     `name`: structure.
     """
     known, n_u = structure(name).orders, data.n_inputs
-    _check_inputs(name, data)
+    wants = structure(name).inputs
+    if wants and not data.n_inputs:
+        raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
+    if not wants and data.n_inputs:
+        raise EstimationError(
+            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Omit them, or "
+            "use armax"
+        )
     check_order_names(name, orders, known, [key for key in known if key != "nk"])
     free_delay = "nk" in known and left_open(orders, "nk")
 
@@ -213,17 +216,6 @@ def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, flo
         o, place = free[key]
         found[o][place] = float(value)
     return found
-
-
-def _check_inputs(name: str, data: IOData) -> None:
-    wants = structure(name).inputs
-    if wants and not data.n_inputs:
-        raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
-    if not wants and data.n_inputs:
-        raise EstimationError(
-            f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Omit them, or "
-            "use armax"
-        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

@@ -108,7 +108,12 @@ def search(
         if left <= _ENOUGH * spread or at.cost <= floor or _linear(predictor):
             theta = _moved(at.theta, free, step)
             if _linear(predictor) or stable_predictor(predictor.layout, theta):
-                at = _finished(at, theta, step, linear=_linear(predictor))
+                # take the last step, too small (or the problem too linear) to need another look at the data.
+                R = at.R
+                if _linear(predictor):
+                    R = R.copy()
+                    R[at.n : -1, -1] += R[at.n : -1, at.n : -1] @ step
+                at = _Point(theta=theta, nuisance=at.nuisance + _nuisance_step(at, step), R=R, n=at.n)
             converged = True
             break
         if count >= most or damping > 1e12:
@@ -168,15 +173,6 @@ def _kept_stable(predictor: Predictor, theta: Array, free: NDArray[np.int64], st
             return step, cut
         step, cut = 0.5 * step, True
     return 0.0 * step, True
-
-
-def _finished(at: _Point, theta: Array, step: Array, *, linear: bool) -> _Point:
-    """Take the last step, too small (or the problem too linear) to need another look at the data."""
-    R = at.R
-    if linear:
-        R = R.copy()
-        R[at.n : -1, -1] += R[at.n : -1, at.n : -1] @ step
-    return _Point(theta=theta, nuisance=at.nuisance + _nuisance_step(at, step), R=R, n=at.n)
 
 
 def stable_predictor(layout: Layout, theta: Array) -> bool:
@@ -275,13 +271,9 @@ def _least_squares(layout: Layout, y: Array, u: Array) -> Array:
     return layout.coefficients(A=found.A[: layout.na + 1], B=found.B, F=F)
 
 
-def _long_order(layout: Layout, n_samples: int) -> int:
-    most = max([layout.na + layout.nd, layout.nc + layout.nd, *layout.nf, *layout.nb])
-    return max(1, min(8 + 2 * most, n_samples // (6 * (1 + layout.n_inputs))))
-
-
 def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
-    n = _long_order(layout, y.size)
+    most = max([layout.na + layout.nd, layout.nc + layout.nd, *layout.nf, *layout.nb])
+    n = max(1, min(8 + 2 * most, y.size // (6 * (1 + layout.n_inputs))))
     arx = arx_layout(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
     theta, R = _regression(arx, y, u, _ROWS)
     found = arx.polynomials(theta)
@@ -336,17 +328,12 @@ def _shifts(c: Array, n_columns: int, lag: int) -> Array:
     return out
 
 
-def _long_innovations(layout: Layout, y: Array, u: Array) -> Array:
+def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
+    """ARMAX and ARMA: the long model's innovations as one more input."""
     long = _long_model(layout, y, u)
     e = filter_signal(long.P, np.ones(1), y)
     for q, x in zip(long.Q, u, strict=True):
         e -= filter_signal(q, np.ones(1), x)
-    return e
-
-
-def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """ARMAX and ARMA: the long model's innovations as one more input."""
-    e = _long_innovations(layout, y, u)
     arx = arx_layout(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
     found = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
     C = reflect(np.concatenate([[1.0], found.B[-1][1:]]))

@@ -8,6 +8,9 @@ the estimate out of the residuals, whatever the estimator was. Polynomial models
 ch. 3 (theory.md, 2.5; Ljung 1999, eq. 10.54). A transfer function is an output-error polynomial model once it is
 discretised. A full state space moves along every entry of A, B, D and K; C moves nothing more where it has full row
 rank, because states can be exchanged.
+
+Models become objects of python-control too. What has no place there is refused or named, never dropped silently: its
+objects know neither noise models nor operating points, and its transfer functions no delay in continuous time.
 """
 
 from __future__ import annotations
@@ -21,8 +24,8 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.blackbox.data import IOData
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.model import Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
-from ambid.errors import EstimationError
+from ambid.blackbox.model import BlackBoxModel, Offsets, PolynomialModel, Polynomials, StateSpaceModel, TransferModel
+from ambid.errors import EstimationError, ModelError
 from ambid.estimation.likelihood import run
 from ambid.physics.linear_model import zero_order_hold
 
@@ -39,7 +42,8 @@ def one_step(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Ar
     SI, not a number throughout where an unstable predictor (A - K C) runs away over the record.
     """
     F = model.A - model.K @ model.C
-    if _runs_away(F, y.shape[0]):
+    growth = np.max(np.abs(np.linalg.eigvals(F)), initial=0.0) if F.size else 0.0
+    if growth > 1 and y.shape[0] * np.log(growth) > _RUNAWAY:  # beyond all digits
         return np.full(y.shape, np.nan)
     G = np.hstack([model.B - model.K @ model.D, model.K])
     return _response(F, G, model, u, y, offsets)
@@ -68,12 +72,6 @@ def stable(model: StateSpaceModel) -> bool:
         return True
     values = np.linalg.eigvals(model.A)
     return bool(np.max(np.abs(values)) < 1.0 if model.dt is not None else np.max(values.real) < 0.0)
-
-
-def _runs_away(F: Array, n_samples: int) -> bool:
-    """Whether x+ = F x grows beyond all digits."""
-    radius = float(np.max(np.abs(np.linalg.eigvals(F)), initial=0.0)) if F.size else 0.0
-    return radius > 1 and n_samples * np.log(radius) > _RUNAWAY
 
 
 def _response(F: Array, G: Array, model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
@@ -458,16 +456,11 @@ def polynomial_gradient(p: Polynomials, u: Array, y: Array, e: Array) -> Array:
             base = -lfilter([1.0], p.C, v)
         else:
             base = -lfilter(p.B[i or 0], p.F[i or 0], whitened[i or 0])
-        blocks.append(_delayed(base, c.size))
+        out = np.zeros((base.size, c.size))
+        for k in range(min(c.size, base.size)):
+            out[k:, k] = base[: base.size - k]
+        blocks.append(out)
     return np.hstack(blocks)
-
-
-def _delayed(x: Array, count: int) -> Array:
-    """Columns of x, x one sample later and so on."""
-    out = np.zeros((x.size, count))
-    for k in range(min(count, x.size)):
-        out[k:, k] = x[: x.size - k]
-    return out
 
 
 def _free(fit: BlackBoxFit, model: PolynomialModel) -> NDArray[np.bool_]:
@@ -516,3 +509,73 @@ def _state_space_tangent(fit: BlackBoxFit, found: Errors, u: Array, y: Array) ->
     signals = np.hstack([x, u, found.one_step])
     blocks = [along.block(signals[k : k + _BLOCK]) for k in range(0, u.shape[0], _BLOCK)]
     return tuple(np.concatenate(blocks, axis=1))
+
+
+def to_control(model: BlackBoxModel) -> Any:
+    """Return the input-output part of a model as an object of python-control.
+
+    Parameters
+    ----------
+    model : BlackBoxModel
+
+    Returns
+    -------
+    control.StateSpace or control.TransferFunction
+        A transfer function for transfer and polynomial models, a state space for state-space models.
+
+    Raises
+    ------
+    ModelError
+        If python-control is not installed, the model has no inputs, or a delay in continuous time.
+    """
+    control = _control()
+    if not model.n_inputs:
+        raise ModelError("a time series has no transfer function from inputs. Use its state_space() with the gain K")
+    dt = 0 if model.dt is None else model.dt
+    if isinstance(model, StateSpaceModel):
+        return control.ss(model.A, model.B, model.C, model.D, dt)
+    if isinstance(model, PolynomialModel):
+        pairs = [[_entry(p, i) for i in range(model.n_inputs)] for p in model.outputs]
+    else:
+        assert isinstance(model, TransferModel)
+        pairs = [[_with_delay(model, o, i) for i in range(model.n_inputs)] for o in range(model.n_outputs)]
+    return control.tf([[n for n, _ in row] for row in pairs], [[d for _, d in row] for row in pairs], dt)
+
+
+def state_space_to_control(A: Array, B: Array, C: Array) -> Any:
+    """Return a continuous plant without direct path as a control.StateSpace."""
+    return _control().ss(A, B, C, [[0.0] * B.shape[1]] * C.shape[0])
+
+
+def discrete_to_control(A: Array, B: Array, C: Array, D: Array, dt: float) -> Any:
+    """Return a discrete-time system as a control.StateSpace."""
+    return _control().ss(A, B, C, D, dt)
+
+
+def _control() -> Any:
+    try:
+        import control
+    except ImportError:
+        raise ModelError("python-control is not installed. Install ambid[control]") from None
+    return control
+
+
+def _entry(p: Polynomials, i: int) -> tuple[Array, Array]:
+    """B/(A F) of one input with powers of z, highest first."""
+    den = np.convolve(p.A, p.F[i])
+    size = max(den.size, p.B[i].size)
+    num = np.pad(p.B[i], (0, size - p.B[i].size))
+    used = np.nonzero(num)[0]
+    return np.asarray(num[used[0] :] if used.size else num[-1:]), np.pad(den, (0, size - den.size))
+
+
+def _with_delay(model: TransferModel, o: int, i: int) -> tuple[Array, Array]:
+    later = 0
+    if model.delay[i]:
+        if model.dt is None:
+            raise ModelError(
+                f"the continuous model has a delay of {model.delay[i]:g} s, which a rational transfer function "
+                "cannot hold. Remove the delay, or use a discrete structure"
+            )
+        later = round(model.delay[i] / model.dt)
+    return model.num[o][i], np.concatenate([model.den[o][i], np.zeros(later)])

@@ -23,7 +23,6 @@ from ambid.blackbox.fit import BlackBoxFit
 from ambid.blackbox.model import StateSpaceModel
 from ambid.blackbox.prediction import Sensitivities
 from ambid.blackbox.subspace import (
-    Asked,
     FirstModel,
     Method,
     Tick,
@@ -234,11 +233,7 @@ def _settle(rough: Point, ways: Array, u: Array, y: Array) -> Point | None:
         return None
     change = least_squares(factor[:-1, :-1], factor[:-1, -1])
     model = rough.model.with_theta(rough.model.theta + ways @ change[k:])
-    return _evaluate(model, rough.x0 + change[:n], rough.constant + change[n:k], u, y)
-
-
-def _evaluate(model: StateSpaceModel, x0: Array, constant: Array, u: Array, y: Array) -> Point | None:
-    """Run the record through; None where the errors are not finite, or some outputs' alone are rounding."""
+    x0, constant = rough.x0 + change[:n], rough.constant + change[n:k]
     triangle = np.zeros((y.shape[1], y.shape[1]))
     for _, e in _blocks(model, x0, u, y):
         if not np.all(np.isfinite(e)):
@@ -295,27 +290,11 @@ _LOOSE = 1e6  # condition of the scaled information's root from which states are
 def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
     """Identify a state-space model by prediction error (local coordinates: McKelvey et al. 2004, Automatica 40, 1629).
 
-    Parameters
-    ----------
-    data : IOData
-    orders : Mapping
-        ``n``: number of states, ``"auto"`` or missing to choose it. A delay of the input counts as states.
-    tick : callable, optional
-        Called between steps.
-
-    Returns
-    -------
-    BlackBoxFit
-        Consistent under feedback as long as n states hold plant and noise.
-
-    Raises
-    ------
-    EstimationError
-        If orders or horizons break a rule, a channel is constant, the record is too short, or no subspace estimate has
-        a stable predictor.
+    `orders`: ``n`` states, ``"auto"`` or missing to choose it; a delay of the input counts as states. Consistent under
+    feedback as long as n states hold plant and noise.
     """
     with one_thread():
-        first = first_model("pbsid", data, orders, Asked(tick=tick))
+        first = first_model("pbsid", data, orders, None, None, tick)
         n, given = first.full.model.order, first.plan.channels
         u, y = (given.u - given.mean_u) / given.scale_u, (given.y - given.mean_y) / given.scale_y
         numbers = n * (u.shape[1] + 2 * y.shape[1] + 1) + y.shape[1] * (1 + first.plan.feedthrough * u.shape[1])
@@ -338,8 +317,8 @@ def _start(data: IOData, first: FirstModel, orders: Orders, u: Array, y: Array, 
     tried: list[tuple[Method, Realisation]] = [("pbsid", first.full)]
     if data.open_loop or not data.n_inputs:
         try:
-            asked = Asked(feedthrough=first.plan.feedthrough, tick=tick)
-            tried.append(("cva", first_model("cva", data, {**orders, "n": n}, asked).full))
+            other = first_model("cva", data, {**orders, "n": n}, None, first.plan.feedthrough, tick)
+            tried.append(("cva", other.full))
         except EstimationError:  # a record too short for cva may still do for pbsid
             pass
     points = list[tuple[Method, Point]]()

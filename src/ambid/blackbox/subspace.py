@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -57,15 +58,6 @@ _WIDEST = {"n4sid": 100, "moesp": 100, "cva": 100, "pbsid": 240}  # columns of p
 Tick = Callable[[], None] | None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Asked:
-    """What was asked for beside the order."""
-
-    horizon: int | None = None  # samples of future and of past; chosen if missing
-    feedthrough: bool | None = None  # whether to estimate D
-    tick: Tick = None  # called between steps
-
-
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Plan:
     """All that an estimate needs."""
@@ -83,12 +75,15 @@ class Plan:
     past_limited: bool  # whether the criterion wanted a longer past than was tried
 
 
-def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_max: int | None = None) -> Plan:
-    """Check what was asked for, compress the record and choose what was left open.
+def plan_estimate(
+    method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick,
+    n_max: int | None = None,
+) -> Plan:  # fmt: skip
+    """Check orders and options, compress the record and choose what was left open.
 
+    `horizon`: samples of future and of past; `feedthrough`: whether to estimate D; `tick`: called between steps;
     `n_max`: largest order to try.
     """
-    horizon, feedthrough = asked.horizon, asked.feedthrough
     check_order_names(method, orders, ("n",))
     n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or give 'auto'")
     given = channels(data)
@@ -96,8 +91,8 @@ def plan_estimate(method: Method, data: IOData, orders: Orders, asked: Asked, n_
     longest = _longest(method, data, given.n_samples, largest, horizon)
     length = longest + 1 if method == "pbsid" else 2 * longest
     factors = compress(given, length, _GROUPS)
-    if asked.tick is not None:
-        asked.tick()
+    if tick is not None:
+        tick()
     total = merge_factors(factors.groups)
     check_inputs_differ(factors, total, data.inputs, 1)
     criterion = autoregression_criterion(factors, total)
@@ -259,25 +254,35 @@ class FirstModel:
     criterion: Array | None  # (n_states + 1,), or None, by which the order was chosen; None where it was given
 
 
-def estimate(method: Method, data: IOData, orders: Orders, asked: Asked) -> BlackBoxFit:
-    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance."""
+def estimate(
+    method: Method, data: IOData, orders: Orders, *, horizon: int | None = None, feedthrough: bool | None = None,
+    tick: Tick = None,
+) -> BlackBoxFit:  # fmt: skip
+    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance.
+
+    `orders`: ``n`` states, ``"auto"`` or missing to choose it; a delay of the input counts as states; `feedthrough`:
+    where left open, only where the record is declared open loop and shows one, because a controller that acts within
+    the sample cannot be told from a feedthrough.
+    """
     with one_thread():
-        first = first_model(method, data, orders, asked)
+        first = first_model(method, data, orders, horizon, feedthrough, tick)
         plan, others = first.plan, []
         for factor in leave_each_out(plan.factors.arranged(_columns(plan))):
-            if asked.tick is not None:
-                asked.tick()
+            if tick is not None:
+                tick()
             others.append(model_of(plan, _decompose(plan, factor, first.given), first.full.model.order))
         covariance = jackknife(first.full, others, plan.future, with_bias=method != "pbsid")
     return _result(method, data, first, covariance)
 
 
-def first_model(method: Method, data: IOData, orders: Orders, asked: Asked) -> FirstModel:
+def first_model(
+    method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick
+) -> FirstModel:
     """Compress, decompose, choose the order, regress."""
-    plan = plan_estimate(method, data, orders, asked)
+    plan = plan_estimate(method, data, orders, horizon, feedthrough, tick)
     criterion = None if plan.n else order_criterion(plan)
     n = plan.n or max(1, int(np.argmin(criterion)) if criterion is not None else 1)
-    if method != "pbsid" and asked.horizon is None:
+    if method != "pbsid" and horizon is None:
         plan = _choose_horizons(plan, n)
     check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
     given, found = decomposition(plan)
@@ -290,7 +295,9 @@ def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
     Returns `given`: of the autoregression, where there is one; `found`: states of all orders.
     """
     total = triangular_factor(plan.total[:, [0, *_columns(plan)]])
-    given = _prior(plan, total)
+    given = None  # the prior of the autoregression, from all data: it stays when groups are left out
+    if plan.method == "pbsid":
+        given = fit_prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
     return given, _decompose(plan, total, given)
 
 
@@ -324,13 +331,6 @@ def _columns(plan: Plan) -> list[int]:
     if plan.method == "pbsid":
         return predictor_columns(plan.factors, plan.past)
     return classical_columns(plan.factors, plan.past, plan.future)
-
-
-def _prior(plan: Plan, total: Array) -> Prior | None:
-    """Return the prior of the autoregression, from all data: it stays when groups are left out."""
-    if plan.method != "pbsid":
-        return None
-    return fit_prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
 
 
 def _decompose(plan: Plan, factor: Array, given: Prior | None) -> Projection | Prediction:
@@ -379,6 +379,8 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
         warnings.append("no standard deviations: parts of the record do not identify the same states. Lower n")
     if not full.stable_predictor:
         warnings.append("no gain gives a stable predictor: its predictions diverge. Change n")
+    columns = _columns(plan)[: -n_y if plan.method == "pbsid" else -n_y * plan.future]  # the regressors, scaled
+    sizes = np.linalg.svd(triangular_factor(plan.total[:, [0, *columns]])[1:, 1:], compute_uv=False)
     related = input_relation(plan.factors, plan.total, data.inputs, plan.past) if method == "pbsid" else None
     if related is not None:  # its long autoregression has no unique solution, and the prior shares the effect out
         warnings.append(f"{related}: pbsid may attribute their effects wrongly. Use cva or n4sid, or omit one")
@@ -395,21 +397,13 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
         details={
             "singular_values": first.found.values.tolist(),
             "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
-            "condition_number": _condition(plan),
+            "condition_number": float(sizes[0] / max(sizes[-1], 1e-18 * sizes[0])),  # at most: beyond is rounding
             "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
             "Q": full.Q.tolist(),
             "S": (full.S * y).tolist(),
             "R": (full.R * np.outer(y, y)).tolist(),
         },
     )
-
-
-def _condition(plan: Plan) -> float:
-    """Return the condition number of the scaled regressors, at most 1e18: beyond is rounding."""
-    n_y = plan.factors.n_outputs
-    columns = _columns(plan)[: -n_y if plan.method == "pbsid" else -n_y * plan.future]
-    values = np.linalg.svd(triangular_factor(plan.total[:, [0, *columns]])[1:, 1:], compute_uv=False)
-    return float(values[0] / max(values[-1], 1e-18 * values[0]))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -432,30 +426,12 @@ def subspace_models(
 ) -> tuple[OrderModel, ...]:
     """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram needs them.
 
-    Parameters
-    ----------
-    data : IOData
-    method : {"n4sid", "moesp", "cva", "pbsid"}
-    n_max : int
-        Largest order.
-    tick : callable, optional
-        Called between steps.
-
-    Returns
-    -------
-    tuple of OrderModel
-        Orders 1, 2 ... n_max; fewer where horizons or data show fewer states. Without covariance: `n4sid` and its
-        kin give that for one order.
-
-    Raises
-    ------
-    EstimationError
-        As for `n4sid`.
+    Returns orders 1, 2 ... n_max, fewer where horizons or data show fewer states; without covariance.
     """
     if n_max < 1:
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
     with one_thread():
-        plan = plan_estimate(method, data, {}, Asked(tick=tick), n_max)
+        plan = plan_estimate(method, data, {}, None, None, tick, n_max)
         _, found = decomposition(plan)
         criterion = order_criterion(plan)
         out = []
@@ -477,67 +453,9 @@ def subspace_models(
     return tuple(out)
 
 
-_CONTRACT = """{summary}.
-
-Parameters
-----------
-data : IOData
-orders : Mapping
-    ``n``: number of states, ``"auto"`` or missing to choose it. A delay of the input counts as states.
-horizon : int, optional
-    Samples of future and of past; chosen by an autoregression if missing.
-feedthrough : bool, optional
-    Whether to estimate D. Missing: only where the record is declared open loop and shows one, because a
-    controller that acts within the sample cannot be told from a feedthrough.
-tick : callable, optional
-    Called between steps.
-
-Returns
--------
-BlackBoxFit
-    StateSpaceModel with the covariance of its coefficients and, in `details`, the noise covariances Q, S and R.
-
-Raises
-------
-EstimationError
-    If orders or horizons break a rule, a channel is constant, or the record is too short.
-"""
-
-
-def _estimator(method: Method, summary: str) -> Callable[..., BlackBoxFit]:
-    """Return the public function of one method."""
-
-    def fit(
-        data: IOData,
-        orders: Orders,
-        *,
-        horizon: int | None = None,
-        feedthrough: bool | None = None,
-        tick: Tick = None,
-    ) -> BlackBoxFit:
-        return estimate(method, data, orders, Asked(horizon=horizon, feedthrough=feedthrough, tick=tick))
-
-    fit.__name__ = fit.__qualname__ = method
-    fit.__doc__ = _CONTRACT.format(summary=summary)
-    return fit
-
-
-n4sid = _estimator(
-    "n4sid",
-    "Identify a state-space model by N4SID (Van Overschee and De Moor 1996, fig. 4.8; thesis eq. 1.1-1.3)",
-)
-moesp = _estimator(
-    "moesp",
-    "Identify a state-space model by PO-MOESP (Verhaegen 1994; Van Overschee and De Moor 1996, sec. 4.3.2)",
-)
-cva = _estimator(
-    "cva",
-    "Identify a state-space model by canonical variates (Larimore 1990; Van Overschee and De Moor 1996, sec. 4.3.3)",
-)
-pbsid = _estimator(
-    "pbsid",
-    """Identify a state-space model by PBSID-opt, consistent under feedback (Chiuso 2007, Automatica 43, 1034).
-
-The controller has to hold a delay of a sample; where it does not, D stays zero (the default) and the estimate
-stays consistent, but D itself cannot be identified""",
-)
+n4sid = partial(estimate, "n4sid")  # Van Overschee and De Moor 1996, fig. 4.8
+moesp = partial(estimate, "moesp")  # Verhaegen 1994; Van Overschee and De Moor 1996, sec. 4.3.2
+cva = partial(estimate, "cva")  # Larimore 1990; Van Overschee and De Moor 1996, sec. 4.3.3
+# Chiuso 2007, Automatica 43, 1034. The controller has to hold a delay of a sample; where it does not, D stays zero (the
+# default) and the estimate stays consistent, but D itself cannot be identified.
+pbsid = partial(estimate, "pbsid")

@@ -206,7 +206,8 @@ def autoregression_criterion(factors: Factors, factor: Array) -> Array:
     newest_first = [c for k in range(now - 1, -1, -1) for c in factors.columns("z", k, k + 1)]
     columns = [0, *newest_first, *factors.columns("y", now, now + 1)]
     y = triangular_factor(factor[:, columns])[1:, -n_y:]
-    left = np.array([_log_det(y[k * n_z :], factors.n_rows) for k in range(now + 1)])
+    rest = [y[k * n_z :] for k in range(now + 1)]
+    left = np.array([_log_det_of(e.T @ e / factors.n_rows) for e in rest])
     return np.asarray(factors.n_rows * left + 2.0 * n_y * n_z * np.arange(now + 1))
 
 
@@ -231,10 +232,6 @@ def state_criterion(states: Array, y: Array, n_inputs: int, n_rows: int) -> Arra
     log_det = np.array([_log_det_of(v / n_rows) for v in left])
     n = np.arange(log_det.size)
     return np.asarray(n_rows * log_det + n * (2 * n_y + n_inputs) * np.log(n_rows))
-
-
-def _log_det(rows: Array, n_rows: int) -> float:
-    return _log_det_of(rows.T @ rows / n_rows)
 
 
 def _log_det_of(covariance: Array) -> float:
@@ -361,8 +358,10 @@ def project(factor: Array, weighting: Weighting, *, past: int, future: int, like
     if weighting == "n4sid":
         target = least_squares(r[k1:k2, k1:k2], perpendicular.T).T @ r[:k2, k1:k2].T
     elif weighting == "cva":
-        weight, undo = _canonical(outputs[k1:])
-        target = weight @ perpendicular
+        # whitened; directions that are not there are left out
+        _, size, vectors = np.linalg.svd(outputs[k1:], full_matrices=False)
+        keep = size > 1e-10 * size[0]
+        target, undo = (vectors[keep] / size[keep, None]) @ perpendicular, vectors[keep].T * size[keep]
     left, values, _ = np.linalg.svd(target, full_matrices=False)
     unit = np.sqrt(like.n_rows)
     return Projection(
@@ -375,13 +374,6 @@ def project(factor: Array, weighting: Weighting, *, past: int, future: int, like
         n_inputs=n_u,
         n_outputs=n_y,
     )
-
-
-def _canonical(future: Array) -> tuple[Array, Array]:
-    """Return the weight that makes the future white, and its inverse; directions that are not there are left out."""
-    _, size, vectors = np.linalg.svd(future, full_matrices=False)
-    keep = size > 1e-10 * size[0]
-    return vectors[keep] / size[keep, None], vectors[keep].T * size[keep]
 
 
 def realise(projection: Projection, n: int, *, feedthrough: bool) -> Realisation:

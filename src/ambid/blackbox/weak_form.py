@@ -42,33 +42,16 @@ _CONTRADICTED = 1.3  # ratio of noise from which a support is too long
 _SHORTEST, _LONGEST = 10, 2560  # half supports tried, samples
 
 
-def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None) -> BlackBoxFit:
+def weakform(data: IOData, orders: Orders) -> BlackBoxFit:
     """Estimate a transfer function in continuous time for every output; its inputs share a denominator.
 
-    Parameters
-    ----------
-    data : IOData
-        Inputs held over a sample.
-    orders : Mapping[str, int or tuple of int]
-        ``nf``: degree of the denominator. ``nb``: numerator coefficients, at most nf, and ``nk`` (default 0): delay in
-        samples, one or one for each input.
-    half_width_s : float, optional
-        Half the support of the test functions; by default the one that predicts the least variance.
-
-    Returns
-    -------
-    BlackBoxFit
-        TransferModel with ``dt`` None. `details` tells the supports tried.
-
-    Raises
-    ------
-    EstimationError
-        If an order breaks a rule, the record is too short or does not excite the plant.
+    `data`: inputs held over a sample; `orders`: ``nf``, degree of the denominator, ``nb`` numerator coefficients, at
+    most nf, and ``nk`` (default 0) samples of delay, one or one for each input. `details` tells the supports tried.
     """
     used = transfer_orders("weakform", data, {"nk": 0, **orders}, more=0)
     n, nb, nk = used.n, used.nb, used.nk or ()
     check_length("weakform", data, data.n_samples - max(nk) - 4 * _SHORTEST, n + sum(nb) + 1)
-    halves = supports(data.n_samples - max(nk), half_width_s, data.dt)
+    halves = supports(data.n_samples - max(nk))
     u_mean, y_mean = data.u.mean(axis=0), data.y.mean(axis=0)
     u_sd, y_sd = data.u.std(axis=0), data.y.std(axis=0)
     u = (data.u - u_mean) / u_sd
@@ -83,6 +66,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
         ScaledTransfer(theta=s.theta[:size], covariance=s.covariance[:size, :size], orders=used, w0=1.0, gain=sd / u_sd)
         for s, sd in zip(solutions, y_sd, strict=True)
     ]
+    worst = max(s.contradiction for s in solutions)
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))
     return build_fit(
         "weakform",
@@ -94,7 +78,7 @@ def weakform(data: IOData, orders: Orders, *, half_width_s: float | None = None)
         offsets=_offsets(solutions, n, u_mean, y_mean, u_sd, y_sd),
         noise_covariance=np.diag([(s.scale * sd) ** 2 for s, sd in zip(solutions, y_sd, strict=True)]),
         status="converged" if all(s.converged for s in solutions) else "stalled",
-        warnings=_contradictions([s.contradiction for s in solutions]),
+        warnings=[] if worst < _CONTRADICTED else [_CONTRADICTS.format(worst)],
         details={
             "half_width_s": [s.half * data.dt for s in solutions],
             "rows": [s.rows for s in solutions],
@@ -240,7 +224,10 @@ class Rows:
 
         a = np.append(theta[: self.equation.n], 1.0)
         v = np.sum([x * kernel for x, kernel in zip(a, self.kernels, strict=True)], axis=0)
-        band = self._band(v)
+        # lower band of V V^T: every row has the same kernel, so each lag is one number.
+        hop, length = self.bump.hop, v.size
+        lags = [float(v[: length - k] @ v[k:]) for k in range(0, length, hop)]
+        band = np.repeat(np.array(lags)[:, None], self.centres.size, axis=1)
         scale = np.sqrt(band[0, 0])
         if not (scale > 0 and np.isfinite(scale)):
             raise EstimationError("the equation holds no noisy signal")
@@ -271,12 +258,6 @@ class Rows:
         """Return the triangle of their slope and, its sign turned, the rows."""
         state = self.at(theta)
         return triangle_of([np.column_stack([state.Z, -state.r])])
-
-    def _band(self, v: Array) -> Array:
-        """Lower band of V V^T: every row has the same kernel, so each lag is one number."""
-        hop, length = self.bump.hop, v.size
-        lags = [float(v[: length - k] @ v[k:]) for k in range(0, length, hop)]
-        return np.repeat(np.array(lags)[:, None], self.centres.size, axis=1)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -315,16 +296,8 @@ def solve(equation: Equation, bump: Bump, start: Array | None = None) -> Solutio
     )
 
 
-def supports(n_samples: int, half_width_s: float | None, dt: float) -> list[int]:
-    """Return the half supports to try, in samples, or the one that was asked for."""
-    if half_width_s is not None:
-        half = round(half_width_s / dt)
-        if not _SHORTEST // 2 <= half <= n_samples // 4:
-            raise EstimationError(
-                f"weakform: half_width_s = {half_width_s:g} is {half} samples; it must be {_SHORTEST // 2} to a "
-                f"quarter of the record ({n_samples // 4}). Give another"
-            )
-        return [half]
+def supports(n_samples: int) -> list[int]:
+    """Return the half supports to try, in samples."""
     halves = [_SHORTEST * 2**k for k in range(12) if _SHORTEST * 2**k <= min(_LONGEST, n_samples // 8)]
     return halves or [_SHORTEST // 2]
 
@@ -367,15 +340,10 @@ def best_support(equation: Equation, halves: Sequence[int]) -> tuple[Solution, l
     return replace(chosen, contradiction=chosen.contradiction / max(chosen.scale, 1e-300)), tried
 
 
-def _contradictions(found: Sequence[float]) -> list[str]:
-    """Return a warning where test functions with the shortest support contradict the result."""
-    worst = max(found)
-    if worst < _CONTRADICTED:
-        return []
-    return [
-        f"over the whole band the weak form leaves {worst:.2g} times the noise of its own test functions: they are "
-        "too long for the plant, or the model or the whiteness of the noise is wrong. Give a shorter half_width_s"
-    ]
+_CONTRADICTS = (
+    "over the whole band the weak form leaves {:.2g} times the noise of its own test functions: they are too long for "
+    "the plant, or the model or the whiteness of the noise is wrong. Use srivc"
+)
 
 
 def _offsets(found: list[Solution], n: int, u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:

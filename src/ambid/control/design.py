@@ -19,7 +19,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.convert import discrete_to_control
+from ambid.blackbox.prediction import discrete_to_control
 from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.drawn import Drawn

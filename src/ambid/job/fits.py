@@ -11,9 +11,9 @@ from itertools import count
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, get_args
 
+from ambid.blackbox.data import Candidate, candidates_of, fixed_of, orders_of, settings_of
 from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES, Structure
 from ambid.blackbox.fit import structure as structure_named
-from ambid.blackbox.words import Candidate, candidates_of, fixed_of, orders_of, settings_of
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, guessed, part_of, silent

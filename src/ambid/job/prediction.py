@@ -9,10 +9,9 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, linearised
-from ambid.blackbox.convert import state_space_to_control
-from ambid.blackbox.convert import to_control as black_box_to_control
 from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form, run_states
+from ambid.blackbox.prediction import errors_ahead, errors_elsewhere, plant_form, run_states, state_space_to_control
+from ambid.blackbox.prediction import to_control as black_box_to_control
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import Reading, signals_of

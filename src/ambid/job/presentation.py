@@ -349,7 +349,7 @@ _KINDS: Mapping[str, Kind] = {
     "Estimate": Kind(describe=_estimate, write=_dumps),
     "NonlinearBearingEstimate": Kind(describe=_bearing, write=_dumps),
     "RotorEstimate": Kind(describe=_rotor, write=_dumps),
-    "BlackBoxFit": Kind(describe=_FIT, write=_written("blackbox.fit_file.fit_text")),
+    "BlackBoxFit": Kind(describe=_FIT, write=_written("blackbox.fit.fit_text")),
     "NonlinearFit": Kind(describe=_FIT, write=_written("nonlinear.fit.nonlinear_fit_text")),
     "Measured": Kind(
         describe=_declared("response.response_document"), write=_written("bearing.measured.measured_text")

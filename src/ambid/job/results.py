@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any, Unpack
 
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_json
-from ambid.blackbox.fit import BlackBoxFit
-from ambid.blackbox.fit_file import fit_from_json
+from ambid.blackbox.fit import BlackBoxFit, fit_from_json
 from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole

@@ -15,8 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.blackbox.data import IOData, Orders, check_order_names, io_data, order_per_input, single_order
-from ambid.blackbox.words import orders_of
+from ambid.blackbox.data import IOData, Orders, check_order_names, io_data, order_per_input, orders_of, single_order
 from ambid.errors import EstimationError, nearest
 from ambid.estimation.estimate import Estimate
 from ambid.job.data import WHOLE, Reading, names_of

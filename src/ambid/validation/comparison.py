@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from ambid.blackbox.data import IOData, Orders
-from ambid.blackbox.fit import BlackBoxFit, structure
-from ambid.blackbox.fit_file import fit_from_json, fit_to_json
+from ambid.blackbox.fit import BlackBoxFit, fit_from_json, fit_to_json, structure
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import fields_json, read_as, read_whole
 from ambid.estimation.result import Reason, Result

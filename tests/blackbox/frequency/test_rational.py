@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ambid.blackbox import frequency as rational
-from ambid.blackbox.fit_file import fit_from_json, fit_text
+from ambid.blackbox.fit import fit_from_json, fit_text
 from ambid.blackbox.frequency import frf_ml, orthogonal_polynomials
 from ambid.blackbox.model import pole_covariance, response_covariance
 from ambid.errors import EstimationError

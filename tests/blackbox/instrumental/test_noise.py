@@ -6,7 +6,7 @@ from scipy.linalg import toeplitz
 from scipy.signal import lfilter
 
 from ambid.blackbox.blocks import score_covariance_of
-from ambid.blackbox.instruments import Autoregression, autoregression, noise_covariance, score_covariance
+from ambid.blackbox.instrumental import Autoregression, autoregression, noise_covariance, score_covariance
 
 D = np.array([1.0, -1.2, 0.5])
 

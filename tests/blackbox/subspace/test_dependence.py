@@ -12,7 +12,7 @@ from ambid.blackbox.state_space_search import sspem
 from ambid.blackbox.subspace import cva, moesp, n4sid, pbsid, subspace_models
 from ambid.errors import EstimationError
 
-METHODS = {f.__name__: f for f in (n4sid, moesp, cva, pbsid, sspem)}
+METHODS = {"n4sid": n4sid, "moesp": moesp, "cva": cva, "pbsid": pbsid, "sspem": sspem}
 
 
 @pytest.fixture(params=METHODS, name="method")

@@ -18,7 +18,7 @@ from ambid.physics.linear_model import discretise
 from tests.bearing.benches import run
 from tests.blackbox.subspace.systems import COLOURED, DT, SERIES, UNSTABLE, modal, record
 
-METHODS = {f.__name__: f for f in (n4sid, moesp, cva, pbsid)}
+METHODS = {"n4sid": n4sid, "moesp": moesp, "cva": cva, "pbsid": pbsid}
 OMEGA = np.linspace(2.0, 300.0, 12)
 
 
