@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 import ambid
-from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.closed import ClosedLoop, Plant, measured_sensitivity
 from ambid.control.controller import controller_of_loop, identify_controller
-from ambid.control.measured import measured_sensitivity
 from ambid.errors import EstimationError
 from ambid.rotor.spectra import find_excitation, period_spectra
 from ambid.simulation.plant import fed_back

@@ -8,10 +8,8 @@ from scipy.optimize import minimize
 
 import ambid
 from ambid.control.closed import Plant
-from ambid.control.excited import ExcitedLoop
-from ambid.control.experiment import reached
+from ambid.control.experiment import BROADBAND, ExcitedLoop, Limited, joint_design, reached
 from ambid.control.information import Information, Innovation, informed_lines, power_design
-from ambid.control.waves import BROADBAND, Limited, joint_design
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.likelihood import linearise, weight_of
 from ambid.estimation.predictor import PredictorProblem, scales_for

@@ -8,8 +8,7 @@ import pytest
 
 from ambid.acquisition.devices._kernels import law_tick
 from ambid.acquisition.law_words import BEGIN, LawWords
-from ambid.control.fixed_point import Counts, fixed_point
-from ambid.control.knobs import Family
+from ambid.control.knobs import Counts, Family, fixed_point
 from ambid.control.lqg import SampledPlant, lqg
 from ambid.errors import RigError
 from ambid.physics.law import l1_norms

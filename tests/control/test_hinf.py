@@ -7,9 +7,18 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from ambid.control.hinf import Generalised, central, generalised, hinf, least_bound, to_continuous, to_discrete
 from ambid.control.knobs import Family
-from ambid.control.lqg import SampledPlant, lqg
+from ambid.control.lqg import (
+    Generalised,
+    SampledPlant,
+    central,
+    generalised,
+    hinf,
+    least_bound,
+    lqg,
+    to_continuous,
+    to_discrete,
+)
 from ambid.errors import EstimationError
 from tests.control.test_lqg import of_preset, weights_of
 

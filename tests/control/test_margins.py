@@ -145,7 +145,7 @@ def test_vibration_by_unbalance_and_run_out_is_that_of_the_truth():
     """The loop of the independent simulator at the speed of its record, and what it says of the synchronous motion."""
     from ambid.control.closed import ClosedLoop
     from ambid.control.controller import controller_of_loop
-    from ambid.control.room import synchronous
+    from ambid.control.margins import synchronous
     from ambid.rotor.balance import Machine
     from ambid.rotor.likelihood import Point
     from tests.control.test_closed import plant_of
@@ -217,7 +217,7 @@ def test_a_reference_without_periods_serves_too(axis):
 
 
 def test_a_noisy_measured_sensitivity_has_no_peak():
-    from ambid.control.measured import MeasuredSensitivity
+    from ambid.control.closed import MeasuredSensitivity
 
     rng, f = np.random.default_rng(1), np.linspace(1.0, 100.0, 200)
     noisy = MeasuredSensitivity(
@@ -231,7 +231,7 @@ def test_a_noisy_measured_sensitivity_has_no_peak():
 
 
 def test_a_peak_in_noise_is_not_taken_for_a_lower_one_beside_it():
-    from ambid.control.measured import MeasuredSensitivity
+    from ambid.control.closed import MeasuredSensitivity
 
     rng, f = np.random.default_rng(3), np.arange(1.0, 101.0)
     S, noise = 1.0 + 2.0 / (1.0 + ((f - 30.0) / 20.0) ** 2), np.where(f < 60.0, 0.2, 0.04)
@@ -246,7 +246,7 @@ def test_a_measured_peak_is_that_of_many_lines():
 
     Three widths over the spacing of the lines: the narrow ones are no parabola within their scatter.
     """
-    from ambid.control.measured import MeasuredSensitivity
+    from ambid.control.closed import MeasuredSensitivity
 
     rng, f = np.random.default_rng(2), np.arange(2.0, 200.0, 2.0)
     dense = np.linspace(10.0, 100.0, 20_000)

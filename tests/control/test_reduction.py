@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from ambid.control.knobs import Family
-from ambid.control.lqg import lqg
-from ambid.control.reduction import reduced
+from ambid.control.lqg import lqg, reduced
 from ambid.errors import ModelError
 from tests.control.test_lqg import of_preset, weights_of
 

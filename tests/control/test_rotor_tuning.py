@@ -11,8 +11,7 @@ from ambid.control.closed import Plant
 from ambid.control.controller import controller_of_loop
 from ambid.control.design import GOALS, Goals, examine, noise_of, worst_of
 from ambid.control.drawn import draw_plants, over_speeds
-from ambid.control.gain_sets import FORMS, GainSets, form_of
-from ambid.control.rotor_loops import RotorLoops
+from ambid.control.gain_sets import FORMS, GainSets, RotorLoops, form_of
 from ambid.control.tuning import tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent

@@ -13,7 +13,7 @@ import ambid
 from ambid.bearing.magnet_problem import UNITS
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Delay, EstimatedParameter
-from ambid.job.fmu import binaries
+from ambid.job.plant_source import binaries
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.rig import rig_from_text

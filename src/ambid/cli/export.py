@@ -50,7 +50,7 @@ def _what(out: Path) -> str:
         return {".mat": "matrices for MATLAB", ".py": "Python script", ".c": "C source"}.get(
             out.suffix.lower(), "C header"
         )
-    from ambid.job.fmu import binaries
+    from ambid.job.plant_source import binaries
 
     made = ", ".join(binaries(out))
     return f"FMU, FMI 2.0, co-simulation, source and {f'binary for {made}' if made else 'no binary (no C compiler)'}"

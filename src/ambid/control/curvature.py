@@ -17,9 +17,8 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
 from ambid.control.drawn import Law, laws_of
-from ambid.control.experiment import Task
+from ambid.control.experiment import Lines, Task
 from ambid.control.information import Information
-from ambid.control.waves import Lines
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, products, run, weight_of, workspace_near
 from ambid.estimation.predictor import assemble

@@ -1,4 +1,11 @@
-"""The excitation that shows the parameters of a model best within limits; file schema ``ambid.experiment/1``."""
+"""The excitation that shows the parameters of a model best within limits; file schema ``ambid.experiment/1``.
+
+An excitation Re Σ c_k exp(jω_k t) moves signal s as Re Σ T_sk c_k exp(jω_k t). Its use of the limits is the largest
+part of the way to any of them; a criterion that falls with the squared amplitude is best where the use is 1, so that
+ln criterion + 2 ln use is minimised over amplitudes and phases at once, the use as a p-norm whose p rises (Guillaume,
+Schoukens, Pintelon and Kollar 1991 for phases alone), by L-BFGS with exact gradients. A part of the power is spread
+evenly: few lines would blind the tests of delay and residuals.
+"""
 
 from __future__ import annotations
 
@@ -8,20 +15,251 @@ from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ambid.acquisition.device import Program
 from ambid.acquisition.program import FULL, expected
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
-from ambid.control.excited import ExcitedLoop, begin_at, from_rest
+from ambid.control.controller import controller_of_loop
 from ambid.control.information import Information, Innovation, informed_lines, power_design
-from ambid.control.waves import Limited, Lines, joint_design, spread_power
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Check, Estimate, Judged
+from ambid.physics.loop import Loop
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.spectra import beside_harmonics
 from ambid.settings.caller import check_positive, check_whole, setting
 from ambid.signals.excitations import schroeder_phases
+from ambid.simulation.plant import closed_loop_poles, excited_loop
+
+Lines = NDArray[np.int64]
+"""Numbers of lines, or of what belongs to each."""
+
+BROADBAND = 0.2
+"""Part of the power that is spread evenly over the lines."""
+_NORMS = (6.0, 20.0, 60.0, 200.0)  # p
+_STEPS = (80, 60, 60, 80)  # of the search at each p
+_LEAST = 1e-12  # share of power of a line that the search begins with
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Limited:
+    """Signals that an excitation moves, of one plant or of several."""
+
+    lines: Lines  # (n_lines,), whole periods in `period` samples
+    period: int
+    T: Complex  # (n_lines, n_signals)
+    low: Array  # (n_signals,), negative; -inf: no limit
+    high: Array
+
+    def waves(self, c: Complex) -> Array:
+        """Return the signals over one period, (period, n_signals)."""
+        X = np.zeros((self.period // 2 + 1, self.T.shape[1]), dtype=complex)
+        X[self.lines] = 0.5 * self.period * c[:, None] * self.T
+        return np.asarray(np.fft.irfft(X, self.period, axis=0), dtype=np.float64)
+
+    def part(self, waves: Array) -> Array:
+        """Return the part of the way to their limits that waves use, as `waves`."""
+        return np.asarray(np.maximum(waves / self.high, waves / self.low))
+
+    def use(self, c: Complex) -> Array:
+        """Return the largest part of each signal, (n_signals,)."""
+        return np.asarray(self.part(self.waves(c)).max(axis=0))
+
+    def norm(self, c: Complex, p: float) -> tuple[float, Complex]:
+        """Return the logarithm of the p-norm of the parts, and its slope G: Re Σ G_k dc_k is the change."""
+        waves = self.waves(c)
+        part = self.part(waves)
+        top = float(part.max())
+        powers = (part / top) ** (p - 1.0)
+        total = float(np.sum(powers * part / top))
+        pull = powers / (top * total) / np.where(waves > 0.0, self.high, self.low)
+        back = np.conj(np.fft.rfft(pull, axis=0))[self.lines]
+        return float(np.log(top) + np.log(total / waves.shape[0]) / p), np.asarray(np.sum(self.T * back, axis=1))
+
+    def among(self, keep: Sequence[int]) -> Limited:
+        """Return some of the signals."""
+        k = list(keep)
+        return Limited(lines=self.lines, period=self.period, T=self.T[:, k], low=self.low[k], high=self.high[k])
+
+
+def spread_power(share: Array) -> Array:
+    """Return shares of the power of which a part is spread evenly."""
+    return np.asarray((1.0 - BROADBAND) * share / share.sum() + BROADBAND / share.size)
+
+
+def joint_design(
+    information: Information, limited: Limited, starts: Sequence[Complex], samples: float,
+    *, tick: Callable[[], object] = lambda: None,
+) -> Complex:  # fmt: skip
+    """Return amplitudes and phases with the least criterion at a largest use of 1, (n_lines,)."""
+
+    def judged(c: Complex) -> float:
+        return information.judge(information.total(np.abs(c / np.max(limited.use(c))) ** 2, samples))[0]
+
+    tried = list(starts)
+    for p, steps in zip(_NORMS, _STEPS, strict=True):
+        tried = [_search(information, limited, c, samples, p, steps) for c in tried]
+        tried = [min(tried, key=judged)]  # the best start alone goes on
+        tick()
+    return tried[0] / np.max(limited.use(tried[0]))
+
+
+def _search(
+    information: Information, limited: Limited, start: Complex, samples: float, p: float, steps: int
+) -> Complex:
+    """Return the amplitudes of least criterion, the use taken as a p-norm."""
+    from scipy.optimize import minimize
+
+    n = start.size
+    share = np.abs(start) ** 2 / np.sum(np.abs(start) ** 2)
+    own = np.maximum((share - BROADBAND / n) / (1.0 - BROADBAND), _LEAST)
+
+    def unpack(v: Array) -> tuple[Array, Array, Complex]:
+        q = np.exp(2.0 * (v[:n] - v[:n].max()))
+        q = q / q.sum()
+        power = spread_power(q)
+        return q, power, np.asarray(np.sqrt(power) * np.exp(1j * v[n:]))
+
+    def value(v: Array) -> tuple[float, Array]:
+        q, power, c = unpack(v)
+        size, G = limited.norm(c, p)
+        scaled = samples * np.exp(-2.0 * size)
+        M = information.total(power, scaled)
+        judged, slope = information.judge(M)
+        by_power = scaled * np.einsum("pkij,pij->k", information.lines, slope) / judged
+        by_size = -2.0 * float(np.sum(slope * (M - information.prior))) / judged
+        turned = G * c
+        by_power = by_power + by_size * np.real(turned) / (2.0 * power)
+        by_share = 2.0 * (1.0 - BROADBAND) * q * (by_power - q @ by_power)
+        return float(np.log(judged)), np.concatenate([by_share, -by_size * np.imag(turned)])
+
+    found = minimize(
+        value, np.concatenate([0.5 * np.log(own), np.angle(start)]), jac=True, method="L-BFGS-B",
+        options={"maxiter": steps, "maxcor": 20},
+    )  # fmt: skip
+    return unpack(found.x)[2]
+
+
+# A plant in its loop with an excitation added to the commands: what moves, in steady state and from rest.
+#
+# The state of plant, delay and controller goes by z+ = Z z + e r, the signals are rows z + through r (`excited_loop`).
+# From rest the signals are those of the steady state less rows Zᵏ z(0), z(0) the state of the steady state where the
+# period begins: where that is small, the transient is.
+
+SLEW = ".slew"
+"""What follows the name of an input in that of its rate of change."""
+_NOISE_LINES = 2048
+_STARTS = 24  # beginnings of the period that are simulated
+_PERIODS = 2  # in which a transient is looked at
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class ExcitedLoop:
+    """A plant in its loop; signals: outputs, inputs, rates of change of the inputs."""
+
+    plant: Plant
+    loop: Loop
+    Z: Array  # (n, n)
+    e: Array  # (n, n_inputs)
+    rows: Array  # (n_outputs + n_inputs, n)
+
+    @classmethod
+    def of(cls, plant: Plant, loop: Loop) -> ExcitedLoop:
+        """Return the loop around a plant."""
+        Z, command, e = excited_loop(plant.theta, loop, plant.rate_hz, of=plant.model)
+        C = plant.space.C
+        outputs = np.hstack([C, np.zeros((C.shape[0], Z.shape[0] - C.shape[1]))])
+        return cls(
+            plant=plant, loop=loop, Z=Z, e=e.reshape(Z.shape[0], -1),
+            rows=np.vstack([outputs, command.reshape(-1, Z.shape[0])]),
+        )  # fmt: skip
+
+    @property
+    def signals(self) -> tuple[str, ...]:
+        """Names of the signals."""
+        of = self.plant.model
+        return (*of.outputs, *of.inputs, *(f"{name}{SLEW}" for name in of.inputs))
+
+    @property
+    def pole(self) -> float:
+        """Largest modulus of the poles."""
+        return float(np.abs(closed_loop_poles(self.plant.theta, self.loop, self.plant.rate_hz, of=self.plant.model)[0]))
+
+    def states(self, lines: Lines, period: int, inputs: Lines) -> Complex:
+        """Return the states by unit excitation of each line's input, (n_lines, n)."""
+        z = np.exp(2j * np.pi * lines / period)[:, None, None]
+        right = self.e.T[inputs][:, :, None].astype(complex)
+        return np.asarray(np.linalg.solve(z * np.eye(self.Z.shape[0]) - self.Z, right)[:, :, 0])
+
+    def response(self, lines: Lines, period: int, inputs: Lines) -> Complex:
+        """Return the signals by unit excitation of each line's input, (n_lines, n_signals)."""
+        T = self.states(lines, period, inputs) @ self.rows.T
+        n_u = self.e.shape[1]
+        T[:, -n_u:] += np.eye(n_u)[inputs]
+        back = (1.0 - np.exp(-2j * np.pi * lines / period)) * self.plant.rate_hz
+        return np.hstack([T, T[:, -n_u:] * back[:, None]])
+
+    def decay(self, samples: int) -> Array:
+        """Return what is left of a state, (samples, n_signals, n), by doubling."""
+        found, power = self.rows[None], self.Z
+        while found.shape[0] < samples:
+            found = np.concatenate([found, found @ power])
+            power = power @ power
+        found, n_u = found[:samples], self.e.shape[1]
+        inputs = found[:, -n_u:]
+        slew = np.diff(inputs, axis=0, prepend=np.zeros((1, *inputs.shape[1:]))) * self.plant.rate_hz
+        slew[0] = 0.0
+        return np.concatenate([found, slew], axis=1)
+
+    def noise_sd(self, noise: Innovation) -> Array:
+        """Return the standard deviation that noise gives the signals as they are logged, (n_signals,)."""
+        of, rate = self.plant.model, self.plant.rate_hz
+        f = np.asarray((np.arange(_NOISE_LINES) + 0.5) * (0.5 * rate / _NOISE_LINES), dtype=np.float64)
+        H, K = self.plant.sampled(f).transfer(), controller_of_loop(self.loop, of, rate).response(f)[0]
+        V = np.asarray(np.linalg.inv(np.asarray(noise.whiten(self.plant, 2.0 * np.pi * f))))
+        answer = -np.linalg.solve(np.eye(H.shape[2]) + K @ H, K @ V)
+        slew = answer * (rate * np.abs(1.0 - np.exp(-2j * np.pi * f / rate)))[:, None, None]
+        power = [np.mean(np.sum(np.abs(x) ** 2, axis=2), axis=0) for x in (H @ answer + V, answer, slew)]
+        return np.asarray(np.sqrt(np.concatenate(power)))
+
+
+def begin_at(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> tuple[int, Array]:
+    """Return the sample at which the period best begins from rest, and the largest part of each signal from there."""
+    starts = _candidates(excited, limited, c, inputs)
+    found = from_rest(excited, limited, c, inputs, starts)
+    best = int(np.argmin(found.max(axis=1)))
+    return int(starts[best]), found[best]
+
+
+def from_rest(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines, starts: Lines) -> Array:
+    """Return the largest part of each signal from rest, the period begun at some samples, (n_starts, n_signals)."""
+    waves, n, n_u = limited.waves(c), limited.period, excited.e.shape[1]
+    z, decay, found = _steady(excited, limited, c, inputs), excited.decay(_PERIODS * n), []
+    for start in starts:
+        moved = np.tile(np.roll(waves, -start, axis=0), (_PERIODS, 1)) - decay @ z[start]
+        moved[0, -n_u:] = moved[0, -2 * n_u : -n_u] * excited.plant.rate_hz  # from 0
+        found.append(limited.part(moved).max(axis=0))
+    return np.array(found)
+
+
+def _steady(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> Array:
+    """Return the states of the steady state, (period, n)."""
+    X = excited.states(limited.lines, limited.period, inputs)
+    unlimited = np.full(X.shape[1], np.inf)
+    return Limited(lines=limited.lines, period=limited.period, T=X, low=-unlimited, high=unlimited).waves(c)
+
+
+def _candidates(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> Lines:
+    """Return the beginnings whose states move the signals least over a period, by their squares over the limits."""
+    size = np.minimum(-limited.low, limited.high)
+    left = excited.decay(limited.period) / size[:, None]
+    gram = np.einsum("tsi,tsj->ij", left, left)
+    z = _steady(excited, limited, c, inputs)
+    score = np.einsum("ti,ij,tj->t", z, gram, z)
+    least = np.flatnonzero((score <= np.roll(score, 1)) & (score <= np.roll(score, -1)))
+    return np.asarray(least[np.argsort(score[least])][:_STARTS])
+
 
 SCHEMA = "ambid.experiment/1"
 _CANDIDATES = 3000  # lines from which those of the design are taken

@@ -13,7 +13,7 @@ knobs, effort and how strong disturbances are taken, are set by the worst of man
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -207,3 +207,264 @@ def _filter(
     P, residual = _riccati(A.T, seen.T, driven @ driven.T, np.eye(sd.size))
     M = np.linalg.solve(seen @ P @ seen.T + np.eye(sd.size), seen @ P).T
     return M * (level / sd), residual
+
+
+# H-infinity mixed sensitivity with integral action, in discrete time: a `StateLaw` from the weights and noise of LQG.
+#
+# The largest gain, over frequencies and directions, from disturbances and noise of the sensors (each in its size) to
+# positions, currents, integral of position and command (each in its weight) is made least: S, T, K S and the compliance
+# together. The sampled plant goes through z = (1 + s)/(1 - s), which keeps that gain exactly; there the central
+# controller follows from two Riccati equations (Doyle, Glover, Khargonekar and Francis 1989; with all D's: Glover and
+# Doyle 1988; Zhou, Doyle and Glover 1996, ch. 17), and goes back through the same map. The least bound is found by
+# bisection, and the law for one somewhat larger is taken, which is better conditioned.
+
+_OVER = 1.05  # bound that is taken, over the least one
+_CLOSE = 1.01  # relative step at which the bisection ends
+_FIRST, _MOST = 1.0, 2.0**24  # bounds that are tried
+_FEW = 1e-6  # of its weight: by what the integral, which is known, seems to change and to be uncertain
+_ROUNDING = 1e-9  # of what drives the states, which moves all of them
+_FASTER = 1e4  # by which the integrals may be tracked back faster
+_SEEN = 0.1  # of the largest command, to which a law is tracked back
+_POSITIVE = -1e-7  # of the largest eigenvalue of a solution: rounding of zero
+
+System = tuple[Array, Array, Array, Array]
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class Generalised:
+    """A plant from (w, u) to (z, y): x' = A x + B1 w + B2 u and so on, in the order of `matrices`."""
+
+    matrices: System  # of all inputs and outputs
+    n_u: int
+    n_y: int
+
+    def parts(self) -> tuple[Array, ...]:
+        """Return B1, B2, C1, C2, D11, D12, D21, D22."""
+        _, B, C, D = self.matrices
+        m, p = B.shape[1] - self.n_u, C.shape[0] - self.n_y
+        return B[:, :m], B[:, m:], C[:p], C[p:], D[:p, :m], D[:p, m:], D[p:, :m], D[p:, m:]
+
+
+def to_continuous(of: System) -> System:
+    """Return a discrete system through z = (1 + s)/(1 - s)."""
+    A, B, C, D = of
+    inverse = np.linalg.inv(np.eye(A.shape[0]) + A)
+    root = np.sqrt(2.0)
+    return inverse @ (A - np.eye(A.shape[0])), root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
+
+
+def to_discrete(of: System) -> System:
+    """Return a system through s = (z - 1)/(z + 1)."""
+    A, B, C, D = of
+    inverse = np.linalg.inv(np.eye(A.shape[0]) - A)
+    root = np.sqrt(2.0)
+    return inverse @ (A + np.eye(A.shape[0])), root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
+
+
+def central(of: Generalised, gamma: float) -> System | None:
+    """Return the central controller for a bound on a continuous plant, u = K y; None where there is none."""
+    A = of.matrices[0]
+    B1, B2, C1, C2, D11, D12, D21, D22 = of.parts()
+    # D12 -> [0; 1] and D21 -> [0 1] by rotations of z and w and units of u and y
+    U, s, V = np.linalg.svd(D12)
+    m2, p2 = D12.shape[1], D21.shape[0]
+    left, units = np.hstack([U[:, m2:], U[:, :m2]]).T, V.T / s
+    U, s, V = np.linalg.svd(D21)
+    right, scale = np.vstack([V[p2:], V[:p2]]).T, (U / s).T
+    B1, B2, C1, C2, D11 = B1 @ right, B2 @ units, left @ C1, scale @ C2, left @ D11 @ right
+    p1, m1 = D11.shape
+    p, m = p1 - m2, m1 - p2
+    one = np.vstack([np.zeros((p, m2)), np.eye(m2)]), np.hstack([np.zeros((p2, m)), np.eye(p2)])
+    row, column = np.hstack([D11, one[0]]), np.vstack([D11, one[1]])
+    B, C = np.hstack([B1, B2]), np.vstack([C1, C2])
+    g = gamma**2
+    R = row.T @ row - np.diag(np.r_[np.full(m1, g), np.zeros(m2)])
+    Q = column @ column.T - np.diag(np.r_[np.full(p1, g), np.zeros(p2)])
+    X, Y = _stabilising(A, B, C1.T @ C1, R, C1.T @ row), _stabilising(A.T, C.T, B1 @ B1.T, Q, B1 @ column.T)
+    if X is None or Y is None or np.max(np.abs(np.linalg.eigvals(X @ Y))) >= g:
+        return None
+    F, L = -np.linalg.solve(R, row.T @ C1 + B.T @ X), -np.linalg.solve(Q, column @ B1.T + C @ Y).T
+    a, b, c, d = D11[:p, :m], D11[:p, m:], D11[p:, :m], D11[p:, m:]
+    over_w, over_z = np.linalg.inv(g * np.eye(m) - a.T @ a), np.linalg.inv(g * np.eye(p) - a @ a.T)
+    direct = -c @ a.T @ over_z @ b - d
+    try:
+        first = np.linalg.cholesky(np.eye(m2) - c @ over_w @ c.T)
+        second = np.linalg.cholesky(np.eye(p2) - b.T @ over_z @ b).T
+    except np.linalg.LinAlgError:  # the direct path alone is beyond the bound
+        return None
+    Z = np.linalg.inv(np.eye(A.shape[0]) - Y @ X / g)
+    out, seen = (B2 + L[:, p:p1]) @ first, -second @ (C2 + F[m:m1]) @ Z
+    entered = -L[:, p1:] + out @ np.linalg.solve(first, direct)
+    ordered = F[m1:] @ Z + direct @ np.linalg.solve(second, seen)
+    K = A + L @ C + out @ np.linalg.solve(first, ordered), entered @ scale, units @ ordered, units @ direct @ scale
+    return _without(K, D22)
+
+
+def _stabilising(A: Array, B: Array, Q: Array, R: Array, S: Array) -> Array | None:
+    """Return the positive semidefinite stabilising solution; None where there is none."""
+    from scipy.linalg import solve_continuous_are
+
+    try:
+        X: Array = solve_continuous_are(A, B, Q, R, s=S)
+    except (np.linalg.LinAlgError, ValueError):
+        return None
+    values = np.linalg.eigvalsh((X + X.T) / 2.0)
+    return X if values[0] >= _POSITIVE * max(values[-1], 0.0) else None
+
+
+def _without(K: System, D22: Array) -> System:
+    """Return the controller of a plant with direct path from that of the plant without."""
+    A, B, C, D = K
+    loop = np.linalg.inv(np.eye(D.shape[0]) + D @ D22)
+    through = np.linalg.inv(np.eye(D22.shape[0]) + D22 @ D)
+    return A - B @ D22 @ loop @ C, B @ through, loop @ C, loop @ D
+
+
+def least_bound(of: Generalised) -> tuple[float, System]:
+    """Return the least bound of a continuous plant, and the central controller for one a little larger."""
+    low, high = 0.0, _FIRST
+    while central(of, high) is None:
+        low, high = high, 2.0 * high
+        if high > _MOST:
+            raise EstimationError("no H-infinity law holds the estimated plant. Check its numbers and noise")
+    if low == 0.0:
+        low = high / 1024.0
+    while high / low > _CLOSE:
+        middle = float(np.sqrt(low * high))
+        low, high = (low, middle) if central(of, middle) is not None else (middle, high)
+    for gamma in (_OVER * high, _OVER**2 * high, high):
+        found = central(of, gamma)
+        if found is not None:
+            return gamma, found
+    raise EstimationError("the Riccati equations of the H-infinity law have no sound solution. Change the weights")
+
+
+def generalised(of: SampledPlant, weights: Weights, noise: Noise, effort: float, disturbance: float) -> Generalised:
+    """Return the weighted discrete plant; the controller sees its outputs and the integral of the positions."""
+    scale = scales_of(of, weights)
+    A, B, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.C * scale
+    driven, sd = filter_noise(of, weights, noise, disturbance)
+    driven = driven / scale[:, None]
+    (position, current), n, n_y, n_u = of.kinds, A.shape[0], C.shape[0], B.shape[1]
+    axes, step = position.size, 1.0 / (of.plant.rate_hz * weights.integral_s * weights.position)
+    n_w = driven.shape[1]
+    picked = np.zeros((axes, n_y))
+    picked[np.arange(axes), position] = 1.0
+    whole = np.block([[A, np.zeros((n, axes))], [step * picked @ C, np.eye(axes)]])
+    inputs = np.zeros((n + axes, n_w + n_y + 2 * axes + n_u))
+    inputs[:n, :n_w], inputs[n:, n_w : n_w + n_y], inputs[:n, -n_u:] = driven, step * picked * sd, B * weights.command
+    n_z = axes + current.size + axes + n_u
+    inputs[n:, n_w + n_y + axes : -n_u] = _FEW * np.eye(axes)
+    outputs = np.zeros((n_z + n_y + axes, n + axes))
+    outputs[:axes, :n] = C[position] / weights.position
+    outputs[axes : axes + current.size, :n] = C[current] / weights.current
+    outputs[axes + current.size : n_z - n_u, n:] = np.eye(axes)
+    outputs[n_z : n_z + n_y, :n], outputs[n_z + n_y :, n:] = C / sd[:, None], np.eye(axes) / _FEW
+    direct = np.zeros((outputs.shape[0], inputs.shape[1]))
+    direct[n_z - n_u : n_z, -n_u:] = effort * np.eye(n_u)
+    direct[n_z:, n_w : n_w + n_y + axes] = np.eye(n_y + axes)
+    return Generalised(matrices=(whole, inputs, outputs, direct), n_u=n_u, n_y=n_y + axes)
+
+
+def hinf(
+    plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, disturbance: float = 1.0
+) -> tuple[StateLaw, float]:
+    """Return the law for a plant, and the bound on the weighted gain that it keeps; arguments as of `lqg`."""
+    of = SampledPlant.of(plant)
+    P = generalised(of, weights, noise, effort, disturbance)
+    gamma, found = least_bound(replace(P, matrices=to_continuous(P.matrices)))
+    A, B, C, D = to_discrete(found)
+    sd = filter_noise(of, weights, noise, disturbance)[1]
+    n, axes, n_y = A.shape[0], of.kinds[0].size, of.C.shape[0]
+    step = 1.0 / (plant.rate_hz * weights.integral_s * weights.position)
+    picked = np.zeros((axes, n_y))
+    picked[np.arange(axes), of.kinds[0]] = step
+    seen, summed = B[:, :n_y] / sd, B[:, n_y:] / _FEW
+    direct, through = weights.command * D[:, :n_y] / sd, weights.command * D[:, n_y:] / _FEW
+    law = StateLaw(
+        A=np.block([[A, summed], [np.zeros((axes, n)), np.eye(axes)]]), B=np.vstack([seen, picked]),
+        C=np.hstack([weights.command * C, through]), D=direct, rate_hz=plant.rate_hz,
+    )  # fmt: skip
+    largest = np.zeros(n_y)
+    for rows, x in zip(of.kinds, (weights.position, weights.current), strict=True):
+        largest[rows] = x if np.isfinite(x) else sd[rows]
+    law = _quicker(tracked(law, law.B * largest, weights.command), axes)
+    if of.largest_pole(law) >= 1.0:
+        raise EstimationError("the H-infinity law does not hold its own plant: the equations are too ill-conditioned")
+    return law, gamma
+
+
+def tracked(law: StateLaw, driven: Array, command: float) -> StateLaw:
+    """Return a law with G, which tracks its states back where the command is limited, from a dual Riccati equation.
+
+    `driven`: what moves its states in a sample, (n, ...); `command`: the largest that it gives.
+    """
+    from scipy.linalg import solve_discrete_are
+
+    small = _ROUNDING * np.trace(driven @ driven.T) / max(law.order, 1)
+    R = (_SEEN * command) ** 2 * np.eye(law.D.shape[0])
+    try:
+        P = solve_discrete_are(law.A.T, law.C.T, driven @ driven.T + small * np.eye(law.order), R)
+    except (np.linalg.LinAlgError, ValueError) as error:
+        raise EstimationError(f"no G tracks the states of the law back ({error}). Change the design") from None
+    return replace(law, G=np.linalg.solve(R + law.C @ P @ law.C.T, law.C @ P @ law.A.T).T)
+
+
+def _quicker(law: StateLaw, axes: int) -> StateLaw:
+    """Return a law whose integrals, its last states, are tracked back so fast that the slowest pole is fastest."""
+    found = []
+    for factor in np.geomspace(1.0, _FASTER, 25):
+        G = law.windup.copy()
+        G[-axes:] *= factor
+        found.append((float(np.max(np.abs(np.linalg.eigvals(law.A - G @ law.C)))), G))
+    return replace(law, G=min(found, key=lambda x: x[0])[1])
+
+
+# Order reduction of a law: balanced truncation of its stable part; integrals and growing modes are kept apart.
+#
+# With the gramians P = A P A' + B B' and Q = A'Q A + C'C of the stable part, states are ordered by the Hankel singular
+# values σ, and the response changes by no more than 2 Σ σ of those left out (Moore 1981; Al-Saggaf and Franklin 1987).
+
+_STABLE = 1e-6  # distance from the unit circle of a mode that is balanced
+
+
+def reduced(law: StateLaw, order: int, largest: Array, command: float = 1.0) -> tuple[StateLaw, float]:
+    """Return a law of lower order, and the largest change of its response, from `largest` to `command`.
+
+    `largest`: of each signal it sees, in whose sizes errors count; ModelError where the kept modes alone are more.
+    """
+    from scipy.linalg import schur, solve_discrete_lyapunov, solve_sylvester, svd
+
+    inside = 1.0 - _STABLE
+    T, Z, n = schur(law.A, sort=lambda re, im: np.hypot(re, im) < inside)
+    kept = law.order - n
+    if order >= law.order:
+        return law, 0.0
+    if order < kept:
+        raise ModelError(
+            f"the law has {kept} integrals and growing modes, which cannot be left out; its order cannot become {order}"
+        )
+    S = np.eye(law.order)
+    S[:n, n:] = solve_sylvester(T[:n, :n], -T[n:, n:], -T[:n, n:])  # T S = S diag: no coupling of the two parts
+    to = Z @ S
+    back = np.linalg.inv(to)
+    A, B, G, C = back @ law.A @ to, back @ law.B, back @ law.windup, law.C @ to
+    inputs = np.hstack([B[:n] * largest, G[:n] * command])
+    P = solve_discrete_lyapunov(A[:n, :n], inputs @ inputs.T)
+    Q = solve_discrete_lyapunov(A[:n, :n].T, C[:, :n].T @ C[:, :n] / command**2)
+    left, right = _root(P), _root(Q)
+    U, sigma, V = svd(right.T @ left)
+    r = order - kept
+    size = np.sqrt(np.maximum(sigma[:r], 1e-300))
+    down, up = (U[:, :r] / size).T @ right.T, left @ V[:r].T / size
+    rows, columns = np.zeros((order, law.order)), np.zeros((law.order, order))
+    rows[:r, :n], columns[:n, :r] = down, up
+    rows[r:, n:] = columns[n:, r:] = np.eye(kept)
+    small = replace(law, A=rows @ A @ columns, B=rows @ B, C=C @ columns, G=rows @ G)
+    return small, 2.0 * float(np.sum(sigma[r:]))
+
+
+def _root(P: Array) -> Array:
+    """Return L with P = L L', also where P is singular."""
+    values, vectors = np.linalg.eigh((P + P.T) / 2.0)
+    return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))

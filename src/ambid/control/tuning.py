@@ -37,8 +37,7 @@ from ambid.control.design import (
     on,
     worst_of,
 )  # fmt: skip
-from ambid.control.gain_sets import GainSets, Pid, form_of
-from ambid.control.rotor_loops import RotorLoops
+from ambid.control.gain_sets import GainSets, Pid, RotorLoops, form_of
 from ambid.errors import EstimationError, ModelError
 from ambid.estimation.progress import Tick
 from ambid.physics.linear_model import OneAxis

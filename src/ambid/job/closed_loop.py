@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from ambid.arrays import Array, Complex
-from ambid.control.closed import ClosedLoop, Plant
+from ambid.control.closed import ClosedLoop, MeasuredSensitivity, Plant, measured_locally, measured_sensitivity
 from ambid.control.controller import Controller, controller_of_loop, identify_controller
 from ambid.control.margins import MISFIT, sensitivity_by_axis
-from ambid.control.measured import MeasuredSensitivity, measured_locally, measured_sensitivity
 from ambid.errors import EstimationError
 from ambid.estimation.estimate import Estimate, plain_json
 from ambid.physics.linear_model import LinearModel, model

@@ -83,8 +83,7 @@ def write_plant(result: Any, path: Path, name: str, to: str | None = None, *, an
 
 
 def _write_source(result: Any, path: Path, name: str, about: list[str]) -> None:
-    from ambid.job.fmu import write_fmu
-    from ambid.job.plant_source import c_source, declarations, prefixed, source_of
+    from ambid.job.plant_source import c_source, declarations, prefixed, source_of, write_fmu
 
     try:
         limits = None if isinstance(result, BlackBoxFit) else rig_of(result, "the estimate").limits

@@ -16,11 +16,13 @@ from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.control.curvature import advised, expected_shift, judge_shift
 from ambid.control.drawn import Spread, draw_plants, laws_of
-from ambid.control.excited import SLEW, ExcitedLoop
 from ambid.control.experiment import (
+    SLEW,
     Design,
+    ExcitedLoop,
     Expected,
     Experiment,
+    Lines,
     Shown,
     SignalUse,
     Task,
@@ -31,7 +33,6 @@ from ambid.control.experiment import (
     uses,
 )
 from ambid.control.information import Information, Innovation, reported
-from ambid.control.waves import Lines
 from ambid.errors import AmbidError, nearest
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread

@@ -15,15 +15,20 @@ import numpy as np
 
 from ambid.control.closed import ClosedLoop
 from ambid.control.margins import (
+    QUANTITIES,
     Disk,
     Margins,
+    Vibration,
     checks_of,
     compliance_by_axis,
     curves_of,
     margins_by_axis,
+    role_of,
+    room_by_axis,
     sensitivity_by_axis,
+    speeds_of,
+    synchronous,
 )
-from ambid.control.room import QUANTITIES, Vibration, role_of, room_by_axis, speeds_of, synchronous
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Check, Estimate
 from ambid.estimation.linear import one_thread

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.control.margins import AxisSensitivity, Margins, Opening
-from ambid.control.room import QUANTITIES, Demand, Vibration
+from ambid.control.margins import QUANTITIES, AxisSensitivity, Demand, Margins, Opening, Vibration
 from ambid.estimation.result import RecordEntry
 from ambid.report.document import Document, Lines, Section, ending, grid, numbers_of
 from ambid.report.drawing import BOUND, MEASURED, PREDICTED, Block, head, log_axis, panel, stacked
