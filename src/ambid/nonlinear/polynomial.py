@@ -369,7 +369,7 @@ def select_terms(
 
     Parameters
     ----------
-    found : Candidates or MatrixCandidates
+    pool : Candidates or MatrixCandidates
         The regressors.
     y : ndarray, shape (n_rows,)
         What they have to explain.
