@@ -198,8 +198,22 @@ class BlockOrder:
 
     def take(self, part: Part) -> None:
         """Take in a block: place it, hold it, or refuse it."""
-        if not self._started:
-            self._begin(part)
+        if not self._started:  # until another block confirms the first: a damaged number must not number the stream
+            doubtful = self._doubtful
+            if doubtful is None:
+                self._doubtful = part
+            elif self._confirms(doubtful, part):
+                self._doubtful = None
+                low, high = sorted((doubtful, part), key=lambda each: each.first)
+                self._start(low)
+                self.n_reordered += low is part
+                self._line_up(low)
+                self._line_up(high)
+            elif doubtful.first == part.first and doubtful.size == part.size:
+                self._reject("repeated", part, "came again")
+            else:
+                self._dismiss()
+                self._doubtful = part
         elif part.end <= self.next:
             before = self._old
             follows = before is not None and part.first == before.end and self._confirms(before, part)
@@ -242,24 +256,6 @@ class BlockOrder:
     def _runs_on(self, part: Part) -> bool:
         """Tell whether a block is stamped as the next one should be, whatever its number."""
         return self._clock.agrees(self.next, part.time_s)
-
-    def _begin(self, part: Part) -> None:
-        """Hold the first block until another confirms it: a damaged number must not number the stream."""
-        doubtful = self._doubtful
-        if doubtful is None:
-            self._doubtful = part
-        elif self._confirms(doubtful, part):
-            self._doubtful = None
-            low, high = sorted((doubtful, part), key=lambda each: each.first)
-            self._start(low)
-            self.n_reordered += low is part
-            self._line_up(low)
-            self._line_up(high)
-        elif doubtful.first == part.first and doubtful.size == part.size:
-            self._reject("repeated", part, "came again")
-        else:
-            self._dismiss()
-            self._doubtful = part
 
     def _start(self, part: Part) -> None:
         """Begin to count at a block."""

@@ -182,7 +182,12 @@ class Supervisor:
         rpem.predict()
         usable = self.diagnosis.look(evidence, t)
         if usable:
-            self._absorb(evidence, t)
+            rpem.absorb(evidence)
+            accepted = self.publication.accepted
+            confirmed = self.publication.judge(evidence, t)
+            if confirmed or (self.diagnosis.settling and self.publication.accepted is not accepted):
+                self.diagnosis.settling = False
+                self.level.restart()
         if self.diagnosis.renewed:
             self._activate()
         if usable or self.diagnosis.doubted:  # a knock that is set aside is no error of the model
@@ -193,15 +198,6 @@ class Supervisor:
                 why = f"the error is {error:.2f} times that at identification, above the limit of {self.level.limit:g}"
                 self.log.add(Event(kind="disturbed", t=t, why=why, values={"error": error, "detected": t}))
         self._obey(t)
-
-    def _absorb(self, evidence: Evidence, t: float) -> None:
-        rpem = self.rpem
-        rpem.absorb(evidence)
-        before = self.publication.accepted
-        confirmed = self.publication.judge(evidence, t)
-        if confirmed or (self.diagnosis.settling and self.publication.accepted is not before):
-            self.diagnosis.settling = False
-            self.level.restart()
 
     def _obey(self, t: float) -> None:
         if self.operator.waiting and self.publication.obey(t, searching=self.diagnosis.searching):
