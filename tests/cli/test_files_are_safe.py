@@ -75,6 +75,7 @@ def test_a_record_behind_a_link_or_under_another_name_is_not_drawn_over(made, am
         name.unlink()
 
 
+@pytest.mark.drawn
 def test_a_figure_behind_a_link_of_another_ending_is_drawn_again(made, ambid, monkeypatch):
     monkeypatch.chdir(made)
     (made / "old").write_bytes(b"\x89PNG of a moment ago")

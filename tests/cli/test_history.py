@@ -21,6 +21,7 @@ def demo(tmp_path_factory):
 WORDS = ("identify", "demo.csv.gz", "--rig", "demo.toml", "--ledger", "l.db", "--bearing", "pump 1")
 
 
+@pytest.mark.drawn
 def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monkeypatch):
     monkeypatch.chdir(demo)
     first = ambid(*WORDS, "--taken-at", "2026-03-01T14:30")

@@ -55,6 +55,7 @@ def test_what_was_acknowledged_comes_back(left, ambid):
     assert ambid("identify", "run.h5").code == 2  # a record like any other: its columns are no bearing
 
 
+@pytest.mark.drawn
 def test_figure_page_and_json_are_of_the_record_and_the_json_reads_back(left, ambid):
     damaged(left)
     words = ("--plot", "run.png", "--report", "run.html", "--json", "run.json", "--strict")

@@ -48,6 +48,7 @@ def job(monkeypatch, whole):
     return seen
 
 
+@pytest.mark.drawn
 def test_a_track_is_printed_written_and_drawn(bench, ambid, job, whole):
     words = ("--rig", "rig.toml", "--json", "track.jsonl", "--plot", "track.png", "--strict")
     found = ambid("track", "record.csv", *words)
@@ -126,6 +127,7 @@ def test_strict_ends_with_3_where_something_is_left_open(bench, ambid, job, whol
         assert said in " ".join(strict.out.split())
 
 
+@pytest.mark.drawn
 def test_ctrl_c_keeps_the_track_and_says_so(bench, ambid, job, whole):
     job.update(at=100, do=lambda: os.kill(os.getpid(), signal.SIGINT))
     before = signal.getsignal(signal.SIGINT)

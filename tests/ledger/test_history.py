@@ -71,6 +71,7 @@ def test_the_verdict_is_that_of_the_latest_estimate(place, history):
 
 
 @pytest.mark.drawn
+@pytest.mark.drawn
 def test_it_is_told_with_dates_and_comes_back_from_its_file(history, tmp_path):
     text = history.summary()
     assert text.startswith("verdict: usable\n\nA: 10 estimates, 2026-01-01 00:00 to 2026-09-28 00:00 UTC")

@@ -91,7 +91,7 @@ def test_coloured_noise_goes_into_a_network_alone_and_not_into_the_hybrid() -> N
 
 def test_standard_deviations_are_those_of_repeated_records() -> None:
     scores, exact = [], 0
-    n = runs(40, short=12)
+    n = runs(40, short=20)
     for seed in range(n):
         values = readable(hybrid([record(*bent(500, 100 + seed))], {"neurons": 1}))
         exact += set(values) == set(TRUTH)
