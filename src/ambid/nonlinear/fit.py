@@ -513,27 +513,24 @@ def nonlinear_fit_to_json(fit: NonlinearFit) -> dict[str, Any]:
 
 def nonlinear_fit_from_json(document: Mapping[str, Any], where: str) -> NonlinearFit:
     """Read a nonlinear fit back; `where` is the name of its file, for messages."""
-    return read_fit(_from_json, document, where)
 
-
-def _from_json(d: Mapping[str, Any]) -> NonlinearFit:
-    nonlinear_structure(d["structure"])
-    model, spread = None if d["model"] is None else model_from_json(d["model"]), d["covariance"]
-    settings = {k: tuple(v) if isinstance(v, list) else v for k, v in d["settings"].items()}
-    fit = read_as(
-        NonlinearFit,
-        {
+    def read(d: Mapping[str, Any]) -> NonlinearFit:
+        nonlinear_structure(d["structure"])
+        spread = {"matrix": None, "from": ""} if d["covariance"] is None else d["covariance"]
+        fields = {
             **only_outputs(d, tuple(d["outputs"])),
-            "model": model,
-            "settings": settings,
-            "covariance": None if spread is None else spread["matrix"],
-            "covariance_from": "" if spread is None else spread["from"],
+            "model": None if d["model"] is None else model_from_json(d["model"]),
+            "settings": {k: tuple(v) if isinstance(v, list) else v for k, v in d["settings"].items()},
+            "covariance": spread["matrix"],
+            "covariance_from": spread["from"],
             "dt": d["dt_s"],
-        },
-    )
-    if (fit.model is None) != (fit.status == "failed"):
-        raise ValueError("a failed fit has no model, every other has one")
-    return fit
+        }
+        fit = read_as(NonlinearFit, fields)
+        if (fit.model is None) != (fit.status == "failed"):
+            raise ValueError("a failed fit has no model, every other has one")
+        return fit
+
+    return read_fit(read, document, where)
 
 
 MODEL_KINDS: Mapping[str, str] = MappingProxyType(

@@ -283,7 +283,12 @@ def add_noise_terms(s: NarmaxSettings, process: Choice, parts: Parts, tick: Tick
     own, last, best = process.function.numerators, process.theta, process
     chosen: list[tuple[Term, ...]] = [()] * p
     targets = [np.concatenate([y[s.lag :, o] for y, _ in parts]) for o in range(p)]
-    over = [_over_denominator(s, process, parts, o) for o in range(p)]
+    over: list[tuple[Array, ...] | None] = [None] * p  # one over the denominators in each record, where there are any
+    for o, below in enumerate(process.function.denominators):
+        if below:
+            rows = candidates(below, parts, s.lag)
+            values = 1.0 + rows.columns(range(len(below))) @ process.coefficients(o, 1)
+            over[o] = tuple(np.split(1.0 / values, np.cumsum(rows.rows)[:-1]))
     for rounds in range(_ROUNDS):
         if tick is not None:
             tick("extended least squares", guessed(rounds, _USUAL_ROUNDS))
@@ -330,16 +335,6 @@ def _innovations_of_long_model(process: Choice, parts: Parts, errors: list[Array
         return errors
     size = [np.mean(np.concatenate([x[most:] for x in e]) ** 2, axis=0) for e in (errors, improved)]
     return improved if np.any(size[1] < _LESS * size[0]) else errors
-
-
-def _over_denominator(s: NarmaxSettings, process: Choice, parts: Parts, output: int) -> tuple[Array, ...] | None:
-    """One over the values of an output's denominator in each record; None where it has none."""
-    below = process.function.denominators[output]
-    if not below:
-        return None
-    rows = candidates(below, parts, s.lag)
-    values = 1.0 + rows.columns(range(len(below))) @ process.coefficients(output, 1)
-    return tuple(np.split(1.0 / values, np.cumsum(rows.rows)[:-1]))
 
 
 def add_all_noise(s: NarmaxSettings, model: Choice) -> Choice:

@@ -264,9 +264,10 @@ class Candidates:
         for r, (n, signals) in enumerate(zip(self.rows, self.parts, strict=True)):
             for first in range(0, n, size):
                 last = min(first + size, n)
-                out = np.empty((len(terms), last - first))
-                for k, term in enumerate(terms):
-                    _product(term, signals, first, last, out[k])
+                out = np.ones((len(terms), last - first))
+                for product, term in zip(out, terms, strict=True):
+                    for f in term:
+                        product *= signals[f][first:last]
                 if self.weight is not None:
                     out *= self.weight[r][first:last]
                 yield slice(start + first, start + last), out
@@ -278,15 +279,6 @@ class Candidates:
         for rows, values in self.blocks(which):
             out[:, rows] = values
         return out.T
-
-
-def _product(term: Term, signals: dict[Factor, Array], first: int, last: int, out: Array) -> None:
-    if not term:
-        out[:] = 1.0
-        return
-    out[:] = signals[term[0]][first:last]
-    for f in term[1:]:
-        out *= signals[f][first:last]
 
 
 def candidates(

@@ -407,8 +407,8 @@ class Placing:
 
 def typical_size(x: Array) -> float:
     """Return the root mean square distance from the middle of the data."""
-    best = float(np.sqrt(np.sum(np.var(x, axis=0))))
-    return best if best > 0 else 1.0
+    size = float(np.sqrt(np.sum(np.var(x, axis=0))))
+    return size if size > 0 else 1.0
 
 
 def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
@@ -457,8 +457,8 @@ def neighbour_widths(C: Array, among: int, otherwise: float) -> Array:
         return np.full(C.shape[0], otherwise)
     squares = np.sum((C[:, None, :] - C) ** 2, axis=2)
     near = np.sort(squares, axis=1)[:, 1 : 1 + among]
-    best = np.sqrt(np.mean(near, axis=1))
-    return np.where(best > 1e-6 * otherwise, best, otherwise)
+    widths = np.sqrt(np.mean(near, axis=1))
+    return np.where(widths > 1e-6 * otherwise, widths, otherwise)
 
 
 # --- output weights ---------------------------------------------------------------------------------------------------
@@ -522,8 +522,8 @@ def _ratio(squares: Array, products: Array, rest: float, free: int, prior: float
 
     def noise(ratio: Array) -> Array:
         left = rest + np.sum(products[:, None] * ratio / (squares[:, None] + ratio), axis=0)
-        best: Array = np.maximum(left / free, _FLOOR)
-        return best
+        variance: Array = np.maximum(left / free, _FLOOR)
+        return variance
 
     if squares.size == 0:
         sigma2 = float(noise(np.ones(1))[0])
