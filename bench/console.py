@@ -27,7 +27,7 @@ from ambid.console.runs import Run, Runs
 from ambid.physics.presets import preset
 from ambid.record import read_record, write_record
 from ambid.rig import write_rig
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.tracking.blocks import Block, Frame
 from tests.console.pages import Started, console, prototype_rig
 from tracking_benches import RATE, preset_bench, record_of

@@ -18,7 +18,7 @@ from scipy.linalg import expm
 
 from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.named_bench import Turning
+from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record, read_record
 from ambid.rig import Rig

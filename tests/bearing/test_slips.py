@@ -6,8 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.bearing.columns import refuse_silent
-from ambid.bearing.lag import check_lag, lag_of, without_lag
+from ambid.bearing.columns import check_lag, lag_of, refuse_silent, without_lag
 from ambid.bearing.linear import Signals, greybox
 from ambid.bearing.sizes import SIZES, check_units
 from ambid.errors import EstimationError

@@ -11,7 +11,7 @@ from ambid.control.controller import controller_of_loop
 from ambid.control.drawn import Spread, draw_plants
 from ambid.errors import ModelError
 from ambid.physics.presets import preset_names
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.rotor_bench import RotorBench
 
 NONE = Spread(covariance=0, delay=0, position=0, current=0, eddy=0, warm_k=(0, 0), frequency=0, damping=0)

@@ -17,7 +17,7 @@ from ambid.errors import EstimationError, ModelError
 from ambid.estimation.progress import silent
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.plant import closed_loop_poles, excited_loop
 from ambid.simulation.rotor_bench import RotorBench
 

@@ -8,7 +8,7 @@ import pytest
 
 import ambid
 from ambid.errors import EstimationError
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.margins import loop_margins
 from tests.control.test_closed import free_rig, peaks_of, record_of
 from tests.rotor_benches import needs_simulator, rig_of

@@ -16,7 +16,7 @@ from ambid.control.tuning import tune_pid
 from ambid.errors import EstimationError
 from ambid.estimation.progress import silent
 from ambid.physics.loop import Limits, Loop
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.rotor_bench import RotorBench
 
 

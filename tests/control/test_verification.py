@@ -12,7 +12,7 @@ from ambid.control.drawn import Spread, draw_plants
 from ambid.control.verification import Trials, _Trying, checks_of_verifications, verify
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.rig_bench import Bench
 from ambid.simulation.rotor_bench import RotorBench
 

@@ -10,7 +10,7 @@ from ambid.acquisition.devices.benches import plant_text
 from ambid.acquisition.scales import scale_of
 from ambid.errors import DeviceError, RigError
 from ambid.physics.loop import Limits
-from ambid.physics.power_stage import PowerStage
+from ambid.physics.nonlinear import PowerStage
 from ambid.physics.presets import preset, preset_names
 from ambid.record.calibration import Calibration
 from ambid.rig.load import load_rig

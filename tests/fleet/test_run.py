@@ -11,7 +11,7 @@ from ambid.fleet.run import job_of, run_fleet
 from ambid.fleet.sources import items
 from ambid.ledger import open_ledger
 from ambid.rig import default_rig, write_rig
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from tests.fleet.jobs import count, judge
 
 

@@ -12,7 +12,7 @@ from ambid.errors import EstimationError
 from ambid.job import controller_design as room
 from ambid.job.controller_design import _refuse_worse, design_controller
 from ambid.physics.loop import Loop
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from tests.job.benches import prototype
 
 

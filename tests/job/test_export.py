@@ -17,7 +17,7 @@ from ambid.job.plant_source import binaries
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.rig import rig_from_text
-from ambid.rig.preset_rig import preset_text
+from ambid.rig.draft import preset_text
 from tests.bearing.magnet.estimates import by_hand, seen
 from tests.job.exported import CC, FLAGS, InC, InFmpy, needs_compiler
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 
 import ambid
-from ambid.physics.drawn_rotor import drawn_numbers
 from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
+from ambid.physics.whirl import drawn_numbers
 from ambid.rig import rig_of_preset
 from ambid.rig.rig import RigModes
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.physics import Support, campbell
-from ambid.physics.drawn_rotor import drawn_numbers, free_rotor_of, whirl_sd
 from ambid.physics.rotor_model import Bearing, RotorModel
+from ambid.physics.whirl import drawn_numbers, free_rotor_of, whirl_sd
 from tests.physics.test_shaft import TWO_SLEEVES
 
 PLANES = {"A.z": 0.10, "A.z_sensor": 0.13, "B.z": 0.65, "B.z_sensor": 0.62}

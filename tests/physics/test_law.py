@@ -19,7 +19,7 @@ from ambid.physics.law import StateLaw, beside
 from ambid.physics.loop import Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.rig import Rig, load_rig, rig_text
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.plant import closed_loop_poles, law_on
 
 

@@ -15,7 +15,7 @@ from ambid.report.drawing import save, single
 from ambid.report.estimate_figures import figures, measured_beside, overview, responses, unsampled, validation_figure
 from ambid.report.response_panels import Pole, poles_panel
 from ambid.report.signals import autocorrelation, whiteness_panel
-from ambid.validation.second_result import Validation
+from ambid.validation.second_record import Validation
 
 
 @pytest.fixture(scope="module")

@@ -4,7 +4,7 @@ import pytest
 
 from ambid.bearing.magnet_problem import UNITS
 from ambid.errors import RigError
-from ambid.physics.bearing_numbers import BEARING_NUMBERS
+from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import Parameter
 from ambid.rig import RigMagnet, load_rig, rig_from_text, rig_text
 

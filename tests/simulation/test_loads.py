@@ -7,7 +7,7 @@ import pytest
 
 from ambid.physics.loop import Limits, Noise
 from ambid.physics.presets import preset
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation.bench import VaryingLoop
 from ambid.simulation.rig_bench import Bench
 from ambid.simulation.rotor_bench import RotorBench

@@ -9,7 +9,7 @@ import pytest
 from ambid.errors import ModelError
 from ambid.physics.loop import Loop
 from ambid.physics.presets import preset
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 from ambid.simulation import closed_loop_poles, simulate_rig
 from ambid.simulation.margins import OpenLoop, loop_margins
 

@@ -9,8 +9,7 @@ from ambid.errors import ModelError
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
-from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
-from ambid.physics.power_stage import PowerStage
+from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint, PowerStage
 from ambid.physics.presets import Preset, preset
 from ambid.simulation import LinearPlant, simulate, simulate_preset
 

@@ -12,9 +12,8 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Noise
-from ambid.physics.named_bench import Preset
 from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.presets import preset, preset_names
+from ambid.physics.presets import Preset, preset, preset_names
 from ambid.rig import RigChannel, preset_text, rig_from_text, rig_of_preset
 from ambid.signals import excitation_of_axes, multisine
 from ambid.simulation import LinearPlant

@@ -9,7 +9,7 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.record import Channel, Record
 from ambid.rig import RigMagnet, rig_of_preset
-from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
+from ambid.validation.physical import carries_weight, gravity_balance, loop_agrees
 
 BALL = preset("levitated-ball")
 THETA = dict(BALL.parameters)

@@ -10,7 +10,7 @@ import pytest
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Channel, Record
-from ambid.validation.rotor_sizes import plausible_checks
+from ambid.validation.rotor import plausible_checks
 
 _MODEL = RotorModel(
     bearings=(

@@ -9,7 +9,7 @@ from ambid.blackbox.prediction import run_states
 from ambid.errors import EstimationError
 from ambid.estimation.modes import assurance
 from ambid.report.response import stabilisation_figure
-from ambid.validation.stabilisation import stabilisation
+from ambid.validation.orders import stabilisation
 from tests.validation.blackbox.fits import DT, io
 
 MODES_HZ, DAMPING = np.array([6.0, 15.0]), np.array([0.03, 0.02])

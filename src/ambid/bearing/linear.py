@@ -16,8 +16,7 @@ from typing import Literal
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.columns import POOR, refuse_mistaken, refuse_silent
-from ambid.bearing.lag import late
+from ambid.bearing.columns import POOR, late, refuse_mistaken, refuse_silent
 from ambid.bearing.multistart import MAX_DELAY, Candidate, Delay, Signals, starts
 from ambid.bearing.rescue import EVALUATIONS, Rescue, rescue
 from ambid.errors import EstimationError

@@ -152,7 +152,7 @@ def _check_second(records: Sequence[Path], part: Part, second: Path | None, seco
 
 def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
     from ambid.report.response import stabilisation_figure
-    from ambid.validation.stabilisation import stabilisation
+    from ambid.validation.orders import stabilisation
 
     method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
     return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))

@@ -39,7 +39,7 @@ def models() -> None:
     """List models with their parameters and units, black-box structures, excitations, scenarios and preset benches."""
     from ambid.blackbox.fit import RESPONSE_STRUCTURES, STRUCTURES
     from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
-    from ambid.physics.bearing_numbers import BEARING_NUMBERS
+    from ambid.physics.law_magnet import BEARING_NUMBERS
     from ambid.physics.linear_model import model, model_names
     from ambid.physics.presets import preset, preset_names
     from ambid.physics.rotor_model import Bearing, RotorModel

@@ -23,8 +23,7 @@ from ambid.fleet.pool import LIMIT_S, Done, cores, work
 from ambid.fleet.sources import Item, Rigs, items
 from ambid.job.results import result_of
 from ambid.ledger.entry import Entry, entry_of, key_of, rig_sha_of, settings_text, sha_of
-from ambid.ledger.fleet_run import FleetRow, FleetRun
-from ambid.ledger.store import Failure, Ledger, open_ledger
+from ambid.ledger.store import Failure, FleetRow, FleetRun, Ledger, open_ledger
 from ambid.record import Source
 from ambid.settings.caller import check_positive, check_whole, setting
 

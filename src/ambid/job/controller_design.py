@@ -153,7 +153,7 @@ def design_controller(
     Examples
     --------
     >>> import ambid
-    >>> from ambid.rig.preset_rig import rig_of_preset
+    >>> from ambid.rig.draft import rig_of_preset
     >>> rig = rig_of_preset(ambid.preset("rmit-axis"))
     >>> found = ambid.identify(ambid.simulate("rmit-axis", duration=0.5, seed=1), rig)
     >>> design = ambid.design_controller(found, plants=8, judges=8)

@@ -193,7 +193,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
 
     `bench`: the record it came from, channels named by role.
     """
-    from ambid.bearing.lag import check_lag
+    from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.likelihood import innovations, simulation_error
     from ambid.validation import physical
@@ -218,7 +218,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     if problem.model.name == "one-axis":
         checks["in_time"] = check_lag(signals)
         if rig.loop is not None or rig.magnet is not None:
-            from ambid.validation.gravity import carries_weight, gravity_balance, loop_agrees
+            from ambid.validation.physical import carries_weight, gravity_balance, loop_agrees
 
             theta = problem.parameters(fit.vector)
             loop = loop_agrees(rig, theta, bench.rate_hz)

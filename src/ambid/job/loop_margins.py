@@ -95,7 +95,7 @@ def margins(
     Examples
     --------
     >>> import ambid
-    >>> from ambid.rig.preset_rig import rig_of_preset
+    >>> from ambid.rig.draft import rig_of_preset
     >>> rig = rig_of_preset(ambid.preset("rmit-axis"))
     >>> found = ambid.margins(ambid.simulate("rmit-axis", duration=0.5, seed=1), rig)
     >>> found.sensitivity["x"].zone, found.verdict.word

@@ -31,10 +31,10 @@ from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.control.law_files import comment_text
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import Estimate
-from ambid.physics.bearing_numbers import BEARING_NUMBERS
+from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import MASS, UNITS, C, ParameterSpec, R, model
 from ambid.physics.loop import UNLIMITED, Interval
-from ambid.physics.power_stage import IDEAL
+from ambid.physics.nonlinear import IDEAL
 from ambid.rotor.estimate import RotorEstimate
 from ambid.simulation.rig_bench import enough_steps, plant_of_law
 

@@ -27,8 +27,7 @@ from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
 from ambid.validation.fits import validation as fit_validation
 from ambid.validation.inspection import Inspection, inspect
-from ambid.validation.second_record import validation
-from ambid.validation.second_result import Validation
+from ambid.validation.second_record import Validation, validation
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate | RotorEstimate
@@ -139,10 +138,10 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
     "ambid.alarms/1": _whole("ledger.monitor", "Watched", "alarms"),
     "ambid.margins/1": _whole("control.margins", "Margins", "margins"),
     "ambid.modes/1": _whole("estimation.modes", "Modal", "frf"),
-    "ambid.validation/1": _whole("validation.second_result", "Validation", "validate"),
+    "ambid.validation/1": _whole("validation.second_record", "Validation", "validate"),
     "ambid.inspection/1": _whole("validation.inspection", "Inspection", "info"),
     "ambid.acquisition/1": _whole("acquisition.session", "Acquired", "acquire"),
-    "ambid.fleet/1": _whole("ledger.fleet_run", "FleetRun", "fleet_run"),
+    "ambid.fleet/1": _whole("ledger.store", "FleetRun", "fleet_run"),
     "ambid.recovery/1": _whole("acquisition.recorder", "Recorded", "recover"),
 }
 

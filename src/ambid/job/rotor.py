@@ -314,7 +314,7 @@ def _check_speeds(taken: Sequence[RotorRecord], speeds: Sequence[float]) -> None
 
 def _plausible(estimate: RotorEstimate, rig: Rig, bench: Record) -> Mapping[str, Check]:
     """Judge signs and sizes of an estimate."""
-    from ambid.validation.rotor_sizes import plausible_checks
+    from ambid.validation.rotor import plausible_checks
 
     sd = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
     return plausible_checks(estimate.plant, estimate.numbers, sd, rig.parameters, bench)

@@ -9,7 +9,6 @@ from ambid.lazy import exports
 if TYPE_CHECKING:
     from ambid.ledger.entry import Entry as Entry
     from ambid.ledger.entry import entry_of as entry_of
-    from ambid.ledger.fleet_run import FleetRun as FleetRun
     from ambid.ledger.history import History as History
     from ambid.ledger.history import Series as Series
     from ambid.ledger.monitor import Alarm as Alarm
@@ -18,6 +17,7 @@ if TYPE_CHECKING:
     from ambid.ledger.monitor import Watched as Watched
     from ambid.ledger.monitor import read_rules as read_rules
     from ambid.ledger.monitor import watch as watch
+    from ambid.ledger.store import FleetRun as FleetRun
     from ambid.ledger.store import Ledger as Ledger
     from ambid.ledger.store import open_ledger as open_ledger
     from ambid.ledger.telling import publish as publish

@@ -1,4 +1,4 @@
-"""The ledger itself: opened, written in whole batches, and asked; SQLite or PostgreSQL.
+"""The ledger itself: opened, written in whole batches, asked, and written to Parquet; SQLite or PostgreSQL.
 
 One batch is one transaction: a writer that is killed, a full disk or a lost server leaves nothing of it. Two writers
 may write at once; an estimate that both have counts once.
@@ -6,19 +6,29 @@ may write at once; an estimate that both have counts once.
 
 from __future__ import annotations
 
+import zlib
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+from ambid.errors import AmbidError, counted
+from ambid.estimation.result import Reason, Result
+from ambid.ledger import schema
+from ambid.settings.caller import setting
+
+if TYPE_CHECKING:
+    from sqlalchemy import Connection
+
 import json
 import math
 import sys
 import time
-import zlib
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Self
 
-from ambid.errors import AmbidError
-from ambid.ledger import schema
 from ambid.ledger.entry import Entry, key_of
 
 if TYPE_CHECKING:
@@ -261,7 +271,7 @@ class Ledger:
         AmbidError
             If pyarrow is not installed, or the folder cannot be written.
         """
-        from ambid.ledger.parquet import export
+        from ambid.ledger.store import export
 
         with self._reading() as c:
             return export(c, Path(folder))
@@ -583,3 +593,161 @@ def _told(shown: str) -> Iterator[None]:
         if "locked" in said:
             said = f"another program has been writing to it for {PATIENCE_S:.0f} s"
         raise AmbidError(f"ledger {shown}: {said}. Nothing of this was stored; check disk, rights and server") from None
+
+
+_TABLES = ("bearing", "rig", "estimate", "value", "event", "failure")
+_TIMES = ("taken_at", "added_at", "at", "failed_at")
+_ROWS = 50_000  # at once
+_MADE = b"ambid.ledger"
+
+
+def export(c: Connection, folder: Path) -> tuple[str, ...]:
+    """Write the tables; times as timestamps of UTC, names of bearings beside their numbers; documents are left out."""
+    try:
+        import pyarrow.parquet as parquet
+    except ImportError:
+        raise AmbidError("pyarrow is not installed, and Parquet needs it. Install ambid[formats]") from None
+    try:
+        folder.mkdir(exist_ok=True)
+        files = [folder / f"{name}.parquet" for name in _TABLES]
+        for path in files:
+            if path.exists() and _MADE not in (parquet.read_schema(path).metadata or {}):
+                raise AmbidError(f"{setting('export', path)} exists, and is not of a ledger. Choose another folder")
+        for name, path in zip(_TABLES, files, strict=True):
+            _write(c, name, path)
+    except (OSError, ValueError) as failure:
+        words = getattr(failure, "strerror", None) or failure
+        raise AmbidError(f"{setting('export', folder)} cannot be written: {words}. Give another folder") from None
+    return tuple(path.name for path in files)
+
+
+def _write(c: Connection, name: str, path: Path) -> None:
+    """Write a table, some rows at a time, under another name until it is whole."""
+    import pyarrow as pa
+    import pyarrow.parquet as parquet
+    from sqlalchemy import select
+
+    table = schema.tables().tables[name]
+    kinds = [pa.field(x.name, _kind(pa, name, x)) for x in table.columns]
+    whole = pa.schema(kinds, metadata={_MADE: schema.SCHEMA.encode()})
+    beside = path.with_name(f".{path.name}")
+    try:
+        with parquet.ParquetWriter(beside, whole) as writer:
+            found = c.execute(select(table)).mappings()
+            for rows in found.partitions(_ROWS):
+                writer.write_table(pa.Table.from_pylist([_row(row) for row in rows], schema=whole))
+        beside.replace(path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def _kind(pa: Any, table: str, column: Any) -> Any:
+    """Return the type of a column."""
+    if column.name in _TIMES:
+        return pa.timestamp("us", tz="UTC")
+    if (table, column.name) == ("rig", "text"):
+        return pa.string()
+    python = column.type.python_type
+    return {int: pa.int64(), float: pa.float64(), bool: pa.bool_(), str: pa.string()}[python]
+
+
+def _row(row: Any) -> dict[str, Any]:
+    found = dict(row)
+    for name in _TIMES:
+        if name in found:
+            found[name] = round(1e6 * found[name])
+    if isinstance(found.get("text"), bytes):
+        found["text"] = zlib.decompress(found["text"]).decode()
+    return found
+
+
+SCHEMA = "ambid.fleet/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FleetRow:
+    """One record of a fleet."""
+
+    record: str
+    bearing: str
+    rig: str
+    taken_at: float | None  # s since 1970, UTC
+    state: Literal["done", "failed", "known"]  # "known": its result was in the ledger before
+    status: str = ""  # of the search
+    verdict: str = ""
+    checks: tuple[str, ...] = ()  # that speak against the result
+    reason: str = ""  # why there is none
+    seconds: float = 0.0
+    # value and standard deviation by name, SI; None where the record does not show it
+    values: Mapping[str, tuple[float | None, float | None]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class FleetRun(Result):
+    """A job on many records.
+
+    Attributes
+    ----------
+    job : str
+        Its name.
+    settings : str
+        What was asked for beside records and rigs, JSON.
+    ledger : str or None
+        Where estimates were stored.
+    workers : int
+        Processes at work.
+    seconds : float
+        Of the whole, s.
+    records : int
+        That were to be done.
+    units : Mapping of str to str
+        Of the values, by name.
+    rows : tuple of FleetRow
+        One for each record that was come to, in their order.
+    """
+
+    job: str
+    settings: str
+    ledger: str | None
+    workers: int
+    seconds: float
+    records: int
+    units: Mapping[str, str]
+    rows: tuple[FleetRow, ...]
+
+    @property
+    def counts(self) -> Mapping[str, int]:
+        """Number of records by state: done, failed, known, left."""
+        of = Counter(row.state for row in self.rows)
+        return {s: of[s] for s in ("done", "failed", "known")} | {"left": self.records - len(self.rows)}
+
+    @property
+    def failures(self) -> Mapping[str, tuple[str, ...]]:
+        """Records by the reason why there is no result of them, the commonest first."""
+        found: dict[str, list[str]] = {}
+        for row in self.rows:
+            if row.state == "failed":
+                name = row.record.rpartition("/")[2]
+                reason = row.reason.replace(row.record, "…").replace(name, "…")
+                found.setdefault(reason, []).append(row.record)
+        return {reason: tuple(r) for reason, r in sorted(found.items(), key=lambda x: -len(x[1]))}
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """What stands against the run as a whole: failures, results in doubt, records that it did not come to."""
+        found, n = [], self.counts
+        if n["failed"]:
+            text = f"{n['failed']} of {counted(self.records, 'record')} failed"
+            found.append(
+                Reason(check="failures", text=f"{text}; the reasons are below", grave=not n["done"] + n["known"])
+            )
+        doubtful = {word: sum(r.verdict == word for r in self.rows) for word in ("unusable", "caution")}
+        for word, m in doubtful.items():
+            if m:
+                found.append(
+                    Reason(check="verdicts", text=f"{counted(m, 'result')} {'is' if m == 1 else 'are'} {word}")
+                )
+        if n["left"]:
+            text = f"{counted(n['left'], 'record')} left: run again to go on"
+            found.append(Reason(check="interrupted", text=text))
+        return tuple(found)

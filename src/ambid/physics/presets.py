@@ -5,14 +5,66 @@ What a source prints is given with its source; everything else is chosen, and `P
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
 
 from ambid.errors import ModelError, nearest
-from ambid.physics.loop import Limits, Noise, placed_loop
+from ambid.physics.loop import Limits, Loop, Noise, placed_loop
 from ambid.physics.magnet import DifferentialPair, SingleMagnet
-from ambid.physics.named_bench import Preset as Preset
-from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.rotor_presets import ROTOR_MAKERS
+from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
+from ambid.physics.rotor_model import Bearing, RotorModel
+from ambid.physics.shaft import Disc, Material, Shaft, Step
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Turning:
+    """What turns with a rotor: unbalance in a plane in kg m, or run-out of sensors in m."""
+
+    name: str  # of the unbalance, or of the bearing whose sensors run out
+    value: float
+    phase: float = 0.0  # rad against the mark of the angle
+    z: float = 0.0  # plane of an unbalance from the datum, m
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RotorBody:
+    """What a bench with a rotor on many axes has beside the numbers of its model."""
+
+    model: RotorModel  # bearings, planes, speed; its bending modes are those of `shaft`
+    shaft: Shaft | None = None  # the drawing that mass, inertia and bending modes follow from; None: rigid, as given
+    unbalance: tuple[Turning, ...] = ()
+    runout: tuple[Turning, ...] = ()
+    gap: float = 0.0  # of the magnets at the centre, m, for the nonlinear law
+    sigma: float = 0.0  # saturation of their iron, 1/A^2
+    cone: float = 0.0  # angle of the pole faces in rad, by which radial magnets act along the shaft too
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Preset:
+    """A named bench."""
+
+    name: str  # name for the command line, and one line that describes it
+    summary: str
+    parameters: Mapping[str, float]  # truth of the linear model `model` in SI units: m, k_x, k_i, R, L, c
+    loop: Loop  # controller and delay; stable on the linear plant at `rate_hz`
+    usually_closed: bool  # whether a record is taken in closed loop unless told otherwise
+    noise: Noise  # sensor and process noise
+    limits: Limits  # voltage, current and stops
+    rate_hz: float  # sampling rate in Hz that the loop is designed for
+    sources: Mapping[str, str]  # where each number comes from, or that it is chosen
+    model: str = "one-axis"  # name of the linear model
+    plant: NonlinearPlant | None = None  # the nonlinear plant whose linearisation `parameters` is, where there is one
+    operating_point: OperatingPoint = field(default_factory=OperatingPoint)  # where the bench rests: m, A, V
+    # gains of sensors and amplifiers with their units, where the source gives them
+    instruments: Mapping[str, tuple[float, str]] = field(default_factory=dict)
+    rotor: RotorBody | None = None  # of a rotor on many axes; loop, limits and noise are those of every axis
+
+    def __post_init__(self) -> None:
+        for name in ("parameters", "sources", "instruments"):  # nobody changes what a name stands for
+            object.__setattr__(self, name, MappingProxyType(dict(getattr(self, name))))
 
 
 def _thesis() -> Preset:
@@ -156,13 +208,218 @@ def _prototype() -> Preset:
     )
 
 
+_STEEL = Material(E=2.11e11, rho=7850.0, nu=0.3)
+_RPM = 2.0 * math.pi / 60.0
+_CHOSEN = "loop, noise, limits, rate_hz"
+
+
+def _radial(name: str, axes: tuple[str, str], z: float, z_sensor: float) -> Bearing:
+    return Bearing(name=name, axes=axes, z=z, z_sensors=(z_sensor,))
+
+
+def _of_pair(axes: tuple[str, ...], magnet: DifferentialPair, resistance: float) -> dict[str, float]:
+    """Return k_i, k_x, R and L at the centre of a pair on each axis."""
+    w = magnet.coenergy
+    numbers = {"k_i": w.force_per_current(0.0, 0.0), "k_x": w.displacement_coefficient(0.0, 0.0)}
+    numbers |= {"R": resistance, "L": w.inductance(0.0)}
+    return {f"{axis}.{name}": value for axis in axes for name, value in numbers.items()}
+
+
+def _utrc() -> Preset:
+    axes = ("ax", "ay", "bx", "by")
+    magnet = DifferentialPair(turns=100, area=600e-6, bias=2.0, gap=0.5e-3, half_angle=0.392, leakage=2e-3)
+    steps = ((0.06, 0.030), (0.08, 0.045), (0.23, 0.030), (0.06, 0.050), (0.23, 0.030), (0.08, 0.045), (0.06, 0.030))
+    shaft = Shaft(
+        material=_STEEL,
+        steps=tuple(Step(length=length, diameter=diameter) for length, diameter in steps),
+        discs=(Disc(z=0.40, m=2.5, Id=4.0e-3, Ip=7.5e-3), Disc(z=0.76, m=0.7, Id=6.0e-4, Ip=1.1e-3)),
+        zeta=(0.01, 0.01, 0.01),
+    )
+    model = RotorModel(
+        bearings=(_radial("A", ("ax", "ay"), 0.085, 0.060), _radial("B", ("bx", "by"), 0.690, 0.665)),
+        speed=15_000.0 * _RPM, polar=True, n_modes=3,
+        extras=("a", *(f"{axis}.sensor_pole" for axis in axes)),
+    )  # fmt: skip
+    sensors = {f"{axis}.sensor_pole": 2.0 * math.pi * 8000.0 for axis in axes}
+    return Preset(
+        name="utrc",
+        summary="the UTRC facility: flexible rotor at 15 000 rpm above its first bending mode, four axes, eddy pole",
+        model="rotor",
+        parameters={**_of_pair(axes, magnet, 1.2), **sensors, "a": 2.0 * math.pi * 1200.0},
+        rotor=RotorBody(
+            model=model, shaft=shaft, gap=magnet.gap, sigma=0.01,
+            unbalance=(Turning(name="disc", value=8e-6, phase=0.7, z=0.40),),
+            runout=(Turning(name="A", value=0.5e-6, phase=1.1), Turning(name="B", value=0.4e-6, phase=-0.6)),
+        ),
+        loop=Loop(kp=3.8e5, ki=3.0e6, kd=850.0, kc=60.0, derivative_cutoff_hz=3000.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=0.2e-6, current=3e-3, force=0.5, voltage=0.05),
+        limits=Limits(voltage=(-200.0, 200.0), current=(-2.0, 2.0), position=(-0.25e-3, 0.25e-3)),
+        rate_hz=20_000.0,
+        sources={
+                "speed": "thesis sec. 1.3: 15 000 rpm, above the first bending critical speed",
+                "modes": "thesis sec. 1.3: three bending modes, damping 1 %; the shaft is chosen",
+                "a": "thesis eq. 1.4; its value is chosen",
+                "loop.kc": "the amplifier of thesis eq. 1.5, K H = kc with H = 1; its value is chosen",
+                "sensor_pole": "thesis sec. 1.3: sensors as low-pass filters; the value is chosen",
+                "magnets, planes, unbalance, runout": "chosen",
+                _CHOSEN: "chosen",
+            },
+    )  # fmt: skip
+
+
+def _rmit() -> Preset:
+    axes = ("xL", "yL", "xR", "yR")
+    numbers = {"k_i": 61.0, "k_x": -150_000.0, "R": 2.0, "L": 30e-3}
+    rigid = {"m": 4.0, "Id": 0.0365, "z_cg": 0.20}
+    source = "thesis sec. 1.4"
+    return Preset(
+        name="rmit",
+        summary="the RMIT rotor on four axes: 61 N/A, -150 000 N/m, air gap 0.35 mm",
+        model="rotor",
+        parameters={**rigid, **{f"{axis}.{name}": x for axis in axes for name, x in numbers.items()}},
+        rotor=RotorBody(
+            model=RotorModel(bearings=(_radial("L", axes[:2], 0.07, 0.04), _radial("R", axes[2:], 0.33, 0.36))),
+            gap=0.40e-3,
+        ),
+        loop=Loop(kp=1.7e5, ki=1.5e6, kd=330.0, kc=40.0, derivative_cutoff_hz=1500.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.5, voltage=0.05),
+        limits=Limits(voltage=(-60.0, 60.0), current=(-0.9, 0.9), position=(-350e-6, 350e-6)),
+        rate_hz=20_000.0,
+        sources={
+            "k_i": f"{source}, eq. 1.6",
+            "k_x": f"{source}, eq. 1.6: 150 000 N/m, there F = k_x x + k_i i",
+            "limits.position": f"{source}: clearance of the actuators",
+            "position_sensor, amplifier": source,
+            "m, Id, planes, R": "chosen",
+            "L": "chosen, above k_i^2/abs(k_x) = 24.8 mH that the magnet's own energy needs",
+            "gap": "chosen: the clearance and 0.05 mm of iron and cover",
+            _CHOSEN: "chosen",
+        },
+        instruments={"position_sensor": (4000.0, "V/m"), "amplifier": (-0.2, "A/V")},
+    )
+
+
+def _camb() -> Preset:
+    """Each pole pair has W' = k i^2/(2 d) (thesis eq. 1.9); an axis current moves its coils by a unit combination.
+
+    Stator A pulls to -z, B to +z. With the cone angle c a radial axis has k_i = 2 k i0 cos(c)/s^2, the axial one, whose
+    current adds half of itself to every coil of B and takes it from every coil of A, k_i = 4 k i0 sin(c)/s^2.
+    """
+    axes, cone, gap, bias = ("ax", "ay", "bx", "by"), math.atan(0.5), 0.4e-3, 1.5
+    pair = DifferentialPair(turns=90, area=500e-6, bias=bias, gap=gap, leakage=1e-3)
+    k, numbers = pair.coenergy.k_a, dict[str, float]()
+    for axis in (*axes, "az"):
+        along = 2.0 * math.sin(cone) if axis == "az" else math.cos(cone)
+        force = {"k_i": 2.0 * k * bias * along / gap**2, "k_x": -2.0 * k * (bias * along) ** 2 / gap**3}
+        coil = {"R": 1.0, "L": pair.coenergy.inductance(0.0)}
+        numbers |= {f"{axis}.{name}": x for name, x in {**force, **coil}.items()}
+    rigid = {"m": 3.0, "Id": 0.012, "Ip": 0.0026, "z_cg": 0.10}
+    return Preset(
+        name="camb",
+        summary="conical bearings: two claw stators of four pole pairs; five axes, the axial one by the cone angle",
+        model="rotor",
+        parameters={**rigid, **numbers},
+        rotor=RotorBody(
+            model=RotorModel(
+                bearings=(
+                    _radial("A", ("ax", "ay"), 0.03, 0.05), _radial("B", ("bx", "by"), 0.17, 0.15),
+                    Bearing(name="T", axes=("az",), axial=True),
+                ),
+                speed=6000.0 * _RPM, polar=True,
+            ),
+            unbalance=(Turning(name="rotor", value=3e-6, phase=0.3, z=0.10),),
+            gap=gap, sigma=0.01, cone=cone,
+        ),
+        loop=Loop(kp=2.0e5, ki=1.8e6, kd=450.0, kc=25.0, derivative_cutoff_hz=2500.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=1e-3, force=0.3, voltage=0.05),
+        limits=Limits(voltage=(-60.0, 60.0), current=(-1.4, 1.4), position=(-0.2e-3, 0.2e-3)),
+        rate_hz=20_000.0,
+        sources={
+                "force law": "thesis eq. 1.9",
+                "pole pairs, differential drive": "thesis sec. 1.5: eight teeth in four pairs a stator",
+                "turns, area, bias, gap, cone angle": "chosen",
+                "m, Id, Ip, planes, R, leakage, speed, unbalance": "chosen",
+                _CHOSEN: "chosen",
+            },
+    )  # fmt: skip
+
+
+def _central_mass() -> Preset:
+    axes = ("ax", "ay", "bx", "by")
+    magnet = DifferentialPair(turns=110, area=300e-6, bias=1.5, gap=0.45e-3, half_angle=0.392, leakage=1.5e-3)
+    steps = ((0.05, 0.016), (0.06, 0.036), (0.17, 0.020), (0.04, 0.030), (0.17, 0.020), (0.06, 0.036), (0.08, 0.016))
+    shaft = Shaft(
+        material=_STEEL,
+        steps=tuple(Step(length=length, diameter=diameter) for length, diameter in steps),
+        discs=(Disc(z=0.30, m=2.0, Id=2.0e-3, Ip=3.8e-3),),
+        zeta=(0.005, 0.005),
+    )
+    return Preset(
+        name="central-mass",
+        summary="the thesis's proposal: two bearings, a central mass between them; two bending modes, 3000 rpm",
+        model="rotor",
+        parameters=_of_pair(axes, magnet, 1.0),
+        rotor=RotorBody(
+            model=RotorModel(
+                bearings=(_radial("A", axes[:2], 0.075, 0.100), _radial("B", axes[2:], 0.525, 0.500)),
+                speed=3000.0 * _RPM, polar=True, n_modes=2,
+            ),
+            shaft=shaft, gap=magnet.gap, sigma=0.01,
+            unbalance=(Turning(name="mass", value=20e-6, phase=1.0, z=0.30),),
+        ),
+        loop=Loop(kp=1.8e5, ki=1.8e6, kd=450.0, kc=25.0, derivative_cutoff_hz=2500.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=0.2e-6, current=2e-3, force=0.3, voltage=0.05),
+        limits=Limits(voltage=(-100.0, 100.0), current=(-1.5, 1.5), position=(-0.2e-3, 0.2e-3)),
+        rate_hz=20_000.0,
+        sources={
+                "two bearings, central mass": "thesis ch. 6, fig. 6.1",
+                "shaft, mass, magnets, planes, speed, unbalance": "chosen; the thesis prints none",
+                _CHOSEN: "chosen",
+            },
+    )  # fmt: skip
+
+
+def _spindle() -> Preset:
+    axes = ("ax", "ay", "bx", "by", "az")
+    magnet = DifferentialPair(turns=80, area=250e-6, bias=2.0, gap=0.4e-3, half_angle=0.392, leakage=1e-3)
+    rigid = {"m": 2.2, "Id": 0.0072, "Ip": 0.0011, "z_cg": 0.11}
+    return Preset(
+        name="spindle",
+        summary="a rigid spindle on five axes at 30 000 rpm",
+        model="rotor",
+        parameters={**rigid, **_of_pair(axes, magnet, 0.8)},
+        rotor=RotorBody(
+            model=RotorModel(
+                bearings=(
+                    _radial("A", axes[:2], 0.04, 0.02), _radial("B", axes[2:4], 0.17, 0.19),
+                    Bearing(name="T", axes=("az",), axial=True),
+                ),
+                speed=30_000.0 * _RPM, polar=True,
+            ),
+            gap=magnet.gap, sigma=0.01,
+            unbalance=(Turning(name="nose", value=0.5e-6, phase=-0.4, z=0.19),),
+        ),
+        loop=Loop(kp=2.1e5, ki=1.8e6, kd=400.0, kc=20.0, derivative_cutoff_hz=3000.0, delay=1.0),
+        usually_closed=True,
+        noise=Noise.held(rate_hz=20_000.0, position=1e-7, current=2e-3, force=0.2, voltage=0.05),
+        limits=Limits(voltage=(-80.0, 80.0), current=(-2.0, 2.0), position=(-0.2e-3, 0.2e-3)),
+        rate_hz=20_000.0,
+        sources={"numbers": "chosen", _CHOSEN: "chosen"},
+    )  # fmt: skip
+
+
+_ROTORS = {"utrc": _utrc, "rmit": _rmit, "camb": _camb, "central-mass": _central_mass, "spindle": _spindle}
 _MAKERS = {
     "thesis": _thesis,
     "unstable-bearing": _unstable_bearing,
     "rmit-axis": _rmit_axis,
     "levitated-ball": _levitated_ball,
     "prototype": _prototype,
-    **ROTOR_MAKERS,
+    **_ROTORS,
 }
 
 
@@ -179,7 +436,7 @@ def preset_names(*, rotors: bool | None = None) -> tuple[str, ...]:
     tuple of str
         Names for the command line.
     """
-    return tuple(name for name in _MAKERS if rotors in (None, name in ROTOR_MAKERS))
+    return tuple(name for name in _MAKERS if rotors in (None, name in _ROTORS))
 
 
 def preset(name: str) -> Preset:

@@ -14,7 +14,7 @@ from ambid.bearing.magnet_result import Curve, NonlinearBearingEstimate
 from ambid.errors import counted
 from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.estimation.result import RecordEntry
-from ambid.physics.bearing_numbers import BEARING_NUMBERS
+from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import model
 from ambid.report.document import (
     Checks,
@@ -52,7 +52,7 @@ if TYPE_CHECKING:
     from ambid.report.estimate_figures import BearingEvidence, Evidence
     from ambid.report.signals import Traces
     from ambid.rotor.replay import RotorReplay
-    from ambid.validation.second_result import Validation
+    from ambid.validation.second_record import Validation
 
 AnyEstimate = Estimate | NonlinearBearingEstimate
 

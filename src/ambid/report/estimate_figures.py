@@ -50,7 +50,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ambid.validation.second_result import Validation
+    from ambid.validation.second_record import Validation
 
 AHEAD = (10, 100)  # samples ahead for which predictions are drawn
 _LOWEST_HZ = 0.1

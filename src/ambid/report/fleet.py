@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from ambid.ledger.fleet_run import FleetRun
+    from ambid.ledger.store import FleetRun
 
 
 _SHOWN = 3  # records of one reason

@@ -52,7 +52,7 @@ from ambid.report.response_panels import Complex, Pair, angle_ticks, magnitude_a
 from ambid.report.text import Cell, Line, other_warnings, plain, status_words, title_line, wrapped
 from ambid.settings.caller import setting
 from ambid.units import UNKNOWN
-from ambid.validation.stabilisation import Stabilisation
+from ambid.validation.orders import Stabilisation
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,10 +11,9 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.bearing.measured import ModelResponse, with_spread
 from ambid.blackbox.model import complex_covariance
-from ambid.physics.drawn_rotor import free_rotor_of, whirl_sd
 from ambid.physics.rotor_model import RotorModel, position_role
 from ambid.physics.shaft import Shaft
-from ambid.physics.whirl import campbell
+from ambid.physics.whirl import campbell, free_rotor_of, whirl_sd
 from ambid.record import Record
 from ambid.report.drawing import (
     MEASURED,

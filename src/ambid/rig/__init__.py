@@ -1,8 +1,7 @@
 """The rig file: what is known of a bench, and its records seen through that."""
 
-from ambid.rig.draft import draft_rig
+from ambid.rig.draft import draft_rig, preset_text, rig_of_preset
 from ambid.rig.load import bench_record, default_rig, load_rig, mat_variables, read_bench, rig_from_text
-from ambid.rig.preset_rig import preset_text, rig_of_preset
 from ambid.rig.rig import Daq, RecordSettings, Rig, RigChannel, RigMagnet, rig_text, write_rig
 
 __all__ = [

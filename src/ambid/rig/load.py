@@ -14,14 +14,13 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
 from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
-from ambid.physics.bearing_numbers import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.law import StateLaw
+from ambid.physics.law_magnet import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
 from ambid.record.calibration import Calibration, read_calibration_table
-from ambid.rig.quantity import si_of, unit_of
 from ambid.rig.rig import (
     DAQ_RATE_HZ,
     Daq,
@@ -33,7 +32,7 @@ from ambid.rig.rig import (
     role_units,
 )
 from ambid.rig.rotor import modes_of, planes_of, rotor_of, speed_of, turning_of
-from ambid.rig.shaft import shaft_of
+from ambid.rig.shaft import shaft_of, si_of, unit_of
 from ambid.settings.caller import path_of
 from ambid.units import UNKNOWN, parse_unit
 

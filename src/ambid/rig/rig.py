@@ -15,7 +15,7 @@ from ambid.errors import RigError, nearest
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import LinearModel, Parameter, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
-from ambid.physics.named_bench import Turning
+from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Shaft
 from ambid.record.calibration import Calibration

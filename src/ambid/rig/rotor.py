@@ -8,10 +8,10 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from ambid.errors import RigError, nearest
-from ambid.physics.named_bench import Turning
+from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import Bearing, Drive, RotorModel
-from ambid.rig.quantity import si_of, unit_of
 from ambid.rig.rig import RigModes
+from ambid.rig.shaft import si_of, unit_of
 
 if TYPE_CHECKING:
     from ambid.physics.linear_model import LinearModel

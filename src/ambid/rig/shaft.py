@@ -1,14 +1,21 @@
-"""``[shaft]`` of a rig file: from its tables to the drawing of a rotor, and back."""
+"""Numbers with a unit in a rig file, in SI, and its ``[shaft]``: from tables to the drawing of a rotor, and back."""
 
 from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from ambid.errors import RigError, UnitError
+from ambid.units import Unit, parse_unit
+
+if TYPE_CHECKING:
+    from ambid.rig.schema import PlaneEntry, QuantityEntry, TurningEntry
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from ambid.errors import ModelError, RigError
+from ambid.errors import ModelError
 from ambid.physics.linear_model import Parameter
 from ambid.physics.shaft import Disc, Material, Shaft, Step
-from ambid.rig.quantity import si_of
 
 if TYPE_CHECKING:
     from ambid.rig.schema import DiscEntry, MaterialEntry, ShaftEntry, StepEntry
@@ -93,3 +100,21 @@ def _quantity(value: float, unit: str) -> str:
 def _material_text(material: Material) -> str:
     E, rho = _quantity(material.E, "Pa"), _quantity(material.rho, "kg/m^3")
     return f"{{ E = {E}, rho = {rho}, nu = {material.nu!r} }}"
+
+
+def unit_of(text: str, place: str) -> Unit:
+    """Read a unit of a rig file; `place` is where it stands, for messages."""
+    try:
+        return parse_unit(text)
+    except UnitError as error:
+        raise RigError(f"{place}.unit: {error}") from None
+
+
+def si_of(given: QuantityEntry | PlaneEntry | TurningEntry | None, si: str, place: str) -> float:
+    """Return a quantity in its SI unit, 0 where none is given."""
+    if given is None or given.value is None:
+        return 0.0
+    unit = unit_of(given.unit, place)
+    if unit.si != parse_unit(si).si:
+        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{si}]. Correct unit")
+    return unit.to_si(given.value)

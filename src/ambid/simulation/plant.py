@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError
-from ambid.physics.bearing_numbers import BEARING_NUMBERS
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.law import StateLaw
-from ambid.physics.law_magnet import LawMagnet
+from ambid.physics.law_magnet import BEARING_NUMBERS, LawMagnet
 from ambid.physics.linear_model import LinearModel, discretise, model
 from ambid.physics.loop import Loop
 from ambid.physics.magnet import CoEnergy

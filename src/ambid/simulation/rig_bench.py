@@ -20,9 +20,8 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import model
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.named_bench import Preset, RotorBody
-from ambid.physics.nonlinear import NonlinearPlant, OperatingPoint
-from ambid.physics.power_stage import IDEAL, PowerStage
+from ambid.physics.nonlinear import IDEAL, NonlinearPlant, OperatingPoint, PowerStage
+from ambid.physics.presets import Preset, RotorBody
 from ambid.record.record import Channel, Record, Step
 from ambid.settings.caller import setting
 from ambid.simulation.bench import Simulation, largest_amplitude, simulate

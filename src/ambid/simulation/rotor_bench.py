@@ -29,14 +29,14 @@ from numpy.typing import ArrayLike, NDArray
 
 from ambid.arrays import Array
 from ambid.errors import ModelError, RigError
-from ambid.physics.drawn_rotor import drawn_numbers
 from ambid.physics.law import StateLaw
 from ambid.physics.linear_model import StateSpace, discretise
 from ambid.physics.loop import Limits, Loop, Noise
-from ambid.physics.named_bench import Turning
 from ambid.physics.nonlinear import OperatingPoint
+from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Shaft
+from ambid.physics.whirl import drawn_numbers
 from ambid.record.record import Channel, Record, Step
 from ambid.rig.rig import Rig
 from ambid.settings.caller import setting

@@ -1,13 +1,25 @@
-"""What the innovations of a rotor's predictor say of its model."""
+"""What speaks for and against an estimate of a rotor: the innovations of its predictor, and its numbers.
+
+A record fits fully with a sign that both sensors of a plane share, or with a wrong unit of one kind of column: only
+the numbers tell. A force factor is positive where sensor, current and voltage count in one direction, and the sizes of
+each axis are those of a bench.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 
+from ambid.bearing.multistart import Signals
+from ambid.bearing.sizes import check_units
 from ambid.bearing.uncertainty import noise_levels
-from ambid.estimation.estimate import OutputFit
+from ambid.estimation.estimate import Check, OutputFit
 from ambid.estimation.likelihood import innovations
 from ambid.estimation.predictor import assemble
+from ambid.physics.linear_model import Parameter, model
+from ambid.physics.rotor_model import RotorModel
+from ambid.record import Record
 from ambid.rotor.conclusion import Evidence
 from ambid.rotor.prediction import PredictorFit
 from ambid.validation.physical import innovation_products, innovation_tests
@@ -33,3 +45,67 @@ def of_predictor(found: PredictorFit) -> Evidence:
         },
         checks={"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)},
     )
+
+
+_LONGEST = 30.0  # m between planes: shafts of turbine sets
+_SURE = 3.0  # standard deviations from which a sign is known
+
+
+def plausible_checks(
+    plant: RotorModel,
+    numbers: Mapping[str, float],
+    sd: Mapping[str, float],
+    parameters: Sequence[Parameter],
+    bench: Record,
+) -> dict[str, Check]:
+    """Judge signs and sizes of an estimate in SI; `sd`: of its numbers, `parameters`: what the rig says."""
+    signs = _signs(plant, numbers, sd, parameters)
+    units = _lengths(plant, numbers) or _units(plant, numbers, bench)
+    return {
+        "signs": Check(passed=not signs, detail=signs or "every force pulls the way that its sensor counts"),
+        "units": Check(passed=not units, detail=units or "all sizes are typical of magnetic bearings"),
+    }
+
+
+def _signs(
+    plant: RotorModel, numbers: Mapping[str, float], sd: Mapping[str, float], parameters: Sequence[Parameter]
+) -> str:
+    """Name the axes whose force factor is negative though the rig does not say so."""
+    negative = {p.name for p in parameters if p.role != "free" and (p.value or 0.0) < 0.0}
+    wrong = [
+        axis
+        for axis in plant.axes
+        if (name := f"{axis}.k_i") not in negative and numbers[name] < -_SURE * sd.get(name, 0.0)
+    ]
+    if not wrong:
+        return ""
+    columns = "position, or voltage and current" if plant.coils else "position or current"
+    return (
+        f"k_i of {', '.join(wrong)} is negative: a column there has its sign reversed ({columns}). Give it gain = -1 "
+        "in [channels], or k_i a negative prior if it counts that way"
+    )
+
+
+def _lengths(plant: RotorModel, numbers: Mapping[str, float]) -> str:
+    planes = {p: numbers[p] for p in plant.places if p in numbers}
+    reach = float(np.ptp(list(planes.values()))) if planes else 0.0
+    if reach <= _LONGEST:
+        return ""
+    return f"the planes are {reach:.3g} m apart (usually up to {_LONGEST:g} m). Check their units in [bearings]"
+
+
+def _units(plant: RotorModel, numbers: Mapping[str, float], bench: Record) -> str:
+    """Say which size of an axis with a coil is none of a bench, and the slip of a unit that would explain it."""
+    one = model("one-axis")
+    for j in plant.coils:
+        axis = plant.axes[j]
+        roles = {role: f"{axis}_{role}" for role in (*one.inputs, *one.outputs)}
+        if any(role not in bench for role in roles.values()):
+            continue
+        u, y = (np.column_stack([bench[roles[r]].values for r in part]) for part in (one.inputs, one.outputs))
+        own = {q: numbers[f"{axis}.{q}"] for q in ("k_i", "k_x", "R", "L")}
+        signals = Signals(u=u, y=y, rate_hz=bench.rate_hz)
+        check = check_units({**own, "m": numbers["m"]}, (), signals, one)
+        if not check.passed:
+            return f"axis {axis}: {check.detail.replace('channels.', f'channels.{axis}_')}"
+    return ""

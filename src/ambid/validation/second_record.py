@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from ambid.estimation.likelihood import (
 )
 from ambid.estimation.linear import one_thread
 from ambid.estimation.predictor import PredictorProblem, noise_floor, scales_for
+from ambid.estimation.result import Reason, Result
 from ambid.physics.linear_model import model
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
@@ -212,3 +214,30 @@ def _checks(run: Replay, ratios: dict[str, float]) -> dict[str, Check]:
         "residuals_uncorrelated": uncorrelated_check(inputs),
         "innovations_consistent": consistency_check(ratios, "at identification"),
     }
+
+
+SCHEMA = "ambid.validation/1"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)
+class Validation(Result):
+    """A result judged on a further record."""
+
+    estimate: str  # names of the result and the record; empty where they have no file
+    record: str
+    model: str  # what was judged
+    samples: int  # of the record
+    fit: Mapping[str, Any]  # by output: one step, simulation and so on
+    checks: Mapping[str, Check]
+
+    @property
+    def reasons(self) -> tuple[Reason, ...]:
+        """Each check that failed; grave where an output is predicted worse than by its mean."""
+        failed = [Reason(check=k, text=c.detail) for k, c in self.checks.items() if not c.passed]
+        for output, fit in self.fit.items():
+            one = fit["one_step"]
+            size = one.get("fit") if isinstance(one, Mapping) else one
+            if size is None or not size > 0:
+                text = f"{output} is predicted worse than by its mean. Check that both are of the same bench"
+                failed.append(Reason(check="one_step", text=text, grave=True))
+        return tuple(failed)

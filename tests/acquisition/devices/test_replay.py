@@ -15,7 +15,7 @@ from ambid.errors import AmbidError, DeviceError
 from ambid.job.acquiring import opened
 from ambid.physics.presets import preset
 from ambid.rig import load_rig
-from ambid.rig.preset_rig import rig_of_preset
+from ambid.rig.draft import rig_of_preset
 
 PROTOTYPE = load_rig(Path(__file__).parents[3] / "src" / "ambid" / "data" / "prototype.toml")
 

@@ -10,7 +10,7 @@ from ambid.bearing.magnet_likelihood import criterion, search, uncertainty
 from ambid.estimation.uncertainty import WEAK
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
-from ambid.physics.power_stage import PowerStage
+from ambid.physics.nonlinear import PowerStage
 from ambid.physics.presets import preset
 from ambid.validation.nonlinear_bearing import whiteness
 from tests.bearing.magnet.bearings import Motion, as_seen, moved, problem_of, truth_of

@@ -14,8 +14,7 @@ from ambid.acquisition.settings import has_position
 from ambid.errors import DeviceError, nearest
 from ambid.physics.linear_model import model
 from ambid.physics.magnet import CoEnergy, DifferentialPair
-from ambid.physics.nonlinear import NonlinearPlant
-from ambid.physics.power_stage import IDEAL
+from ambid.physics.nonlinear import IDEAL, NonlinearPlant
 from ambid.physics.presets import Preset, preset, preset_names
 from ambid.rig.load import load_rig
 from ambid.rig.rig import Rig
