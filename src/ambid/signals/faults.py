@@ -116,7 +116,11 @@ def _stands_still(x: Array, starts: np.ndarray, lengths: np.ndarray, shortest: i
     """Runs too long for chance that are not the slow turning point of a quantised channel, nor rest without noise."""
     if starts.size == 1:
         return np.ones(1, dtype=bool)
-    if not np.any(lengths >= shortest) or _without_noise(x):
+    if not np.any(lengths >= shortest):
+        return np.zeros(starts.size, dtype=bool)
+    # a channel that moves smoothly, as only a simulated one does, has no noise: then equal samples are rest
+    fourth, moving = np.abs(np.diff(x, 4)), np.diff(x)[:-3] != 0.0
+    if moving.any() and np.median(fourth[moving]) < 1e-4 * np.std(x):
         return np.zeros(starts.size, dtype=bool)
     changes = np.abs(np.diff(x[starts]))
     jump = np.maximum(np.concatenate((changes, [0.0])), np.concatenate(([0.0], changes)))
@@ -125,13 +129,6 @@ def _stands_still(x: Array, starts: np.ndarray, lengths: np.ndarray, shortest: i
     around = np.nanmean(np.stack([padded[k : k + lengths.size] for k in (0, 1, 3, 4)]), axis=0)
     abrupt = (jump > 1.5 * level_spacing(x)) | (lengths > 10.0 * around)
     return np.asarray((lengths >= shortest) & abrupt)
-
-
-def _without_noise(x: Array) -> bool:
-    """Whether the channel moves smoothly, as only a simulated one does: then equal samples are rest."""
-    fourth = np.abs(np.diff(x, 4))
-    moving = np.diff(x)[:-3] != 0.0
-    return bool(moving.any() and np.median(fourth[moving]) < 1e-4 * np.std(x))
 
 
 def _falls_to_zero(x: Array, starts: np.ndarray) -> np.ndarray:
@@ -229,7 +226,10 @@ def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
     if spread == 0.0:
         return np.zeros(x.size)
     repeated = 1.0 - equal_runs(x)[0].size / x.size
-    common = _common_levels(x) if repeated > 0.5 else np.zeros(x.size, dtype=bool)
+    common = np.zeros(x.size, dtype=bool)
+    if repeated > 0.5:  # a held signal (steps, PRBS): a level that it visits often is no outlier
+        _, inverse, counts = np.unique(x, return_inverse=True, return_counts=True)
+        common = counts[inverse] >= max(3, 0.001 * x.size)
     clean, sizes = x, np.zeros(x.size)
     # An outlier spoils the predictor and the prediction of its neighbours: repeat with the found ones bridged.
     for _ in range(5):
@@ -244,13 +244,6 @@ def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
         good = np.flatnonzero(sizes == 0)
         clean = np.interp(np.arange(x.size), good, x[good])
     return sizes
-
-
-def _common_levels(x: Array) -> NDArray[np.bool_]:
-    """Samples of a held signal (steps, PRBS) at a level that it visits often: a level is no outlier."""
-    _, inverse, counts = np.unique(x, return_inverse=True, return_counts=True)
-    common: NDArray[np.bool_] = counts[inverse] >= max(3, 0.001 * x.size)
-    return common
 
 
 def _predictors(clean: Array) -> tuple[Array, Array]:
@@ -424,18 +417,14 @@ def _pile(x: Array, values: Array, counts: NDArray[np.int64]) -> Limit | None:
     # Rest before the first motion has no way in, and a transient that settles creeps in: neither is a limit.
     if not np.any(x[entered - 1] - x[entered] > 1e-7 * (values[-1] - values[0])):
         return None
-    if _held(x, float(np.mean(lengths))):
+    # Nor is a level of a signal that holds its inner levels about as long, as a staircase does by design.
+    levels, dwells = equal_runs(x)
+    inside = (x[levels] > np.min(x)) & (x[levels] < np.max(x))
+    if inside.any() and np.mean(dwells[inside]) > max(3.0, 0.3 * float(np.mean(lengths))):
         return None
     return Limit(
         value=float(values[0]), count=int(lengths.sum()), longest=int(lengths.max()), first_index=int(starts[0])
     )
-
-
-def _held(x: Array, dwell: float) -> bool:
-    """Whether the signal holds its inner levels about as long as its extreme, as a staircase does by design."""
-    starts, lengths = equal_runs(x)
-    inside = (x[starts] > np.min(x)) & (x[starts] < np.max(x))
-    return bool(inside.any() and np.mean(lengths[inside]) > max(3.0, 0.3 * dwell))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
