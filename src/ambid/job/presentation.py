@@ -20,7 +20,7 @@ from ambid.estimation.estimate import fields_json, json_text, plain_json
 from ambid.estimation.result import Result
 from ambid.job.files import PAGE_ENDINGS, Files
 from ambid.record import Record, read_record
-from ambid.report.document import Document, Section, page_sections, terminal
+from ambid.report.document import Document, Lines, Section, page_sections, terminal
 from ambid.report.text import SPREAD, WIDTH, WORDS, Paint, joined, plain, verdict_lines
 
 if TYPE_CHECKING:
@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from ambid.report.signals import Traces
 
 _SHOWN = 6  # numbers in a short line
+_OF_LOOPS = ("Estimate", "RotorEstimate")  # whose page shows the margins of their loop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,7 +90,7 @@ def _now() -> str:
 def _with_loop(result: Any, record: Any) -> Document:
     """Return the document of a page: of an estimate with the margins of its loop, where that is known."""
     document = document_of(result, record)
-    if not getattr(result, "sensitivity", None) or not hasattr(result, "rig"):
+    if type(result).__name__ not in _OF_LOOPS or not result.sensitivity:
         return document
     from ambid.job.loop_margins import margins_beside
 
@@ -97,7 +98,8 @@ def _with_loop(result: Any, record: Any) -> Document:
     if margins is None:
         return document
     of_loop = document_of(margins)
-    parts = [part for section in of_loop.sections for part in section.parts]
+    heads = [[Lines(lines=[s.heading])] if s.heading else [] for s in of_loop.sections]
+    parts = [part for head, s in zip(heads, of_loop.sections, strict=True) if s.page for part in (*head, *s.parts)]
     section = Section(title="Margins of the loop", parts=parts, figure=of_loop.figure)
     return replace(document, appendix=lambda: [section, *document.appendix()])
 
