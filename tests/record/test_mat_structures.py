@@ -151,12 +151,13 @@ def test_matrices_are_columns_and_labels_may_be_missing(made):
 
 ASKED = {
     "units": ({"s": series("u", U, units="V", DataInfo={"Units": "mV"})},
-              r"several units \(units says \[V\], DataInfo.Units says \[mV\]\).*--layout units=units",
+              r"several units \(units says \[V\], DataInfo.Units says \[mV\]\).*layout=\{'units': 'units'\}",
               {"units": "DataInfo.Units"}, "V"),
     "groups": ({"log": [series("a", U), series("b", U)], "u": X},
-               r"2 groups \(log/a, log/b; vectors/u\).*--layout group=",
+               r"2 groups \(log/a, log/b; vectors/u\).*layout=\{'group': 'log'\}",
                {"group": "log"}, "?"),
-    "values": ({"Signal": siemens("u", U, "mm", factor=1e-3)}, r"in \[mm\] with a unit transformation.*values=si",
+    "values": ({"Signal": siemens("u", U, "mm", factor=1e-3)},
+               r"in \[mm\] with a unit transformation.*layout=\{'values': 'si'\}",
                {"values": "si"}, "m"),
     "times": ({"log": [series("a", U), series("b", U, time=2 * TIME)]},
               r"'a' and 'b' have different times \(40 samples, 0 to 0\.039 s, 40 samples, 0 to 0\.078 s\)",

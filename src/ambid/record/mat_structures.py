@@ -141,8 +141,8 @@ def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
             raise RecordError(
                 f"record {path}: signal {signal.name!r} is in [{unit}] with a unit transformation (factor "
                 f"{signal.factor[0]:g}, offset {signal.factor[1]:g}). Say what values are in: "
-                f"{setting('layout', 'values=si')}, or"
-                f" values=label for [{unit}]"
+                f"{setting('layout', 'values=si')}, or "
+                f"{setting('layout', 'values=label')} for [{unit}]"
             )
         if layout["values"] == "si":
             unit = _si(unit)
