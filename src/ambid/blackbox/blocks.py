@@ -244,13 +244,16 @@ def electric(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
     least = 1 - _ENOUGH * float(np.linalg.norm(measured[:, 1] - clean[:, 1]) / np.linalg.norm(measured[:, 1]))
     for a, b in _starts(n, dt):
         theta = _gains(measured, clean, a, b, dt)
-        found, settled = _newton(measured, clean, theta, dt)
-        if found is None:
+        equation, settled = _newton(measured, clean, theta, dt)
+        if equation is None:
             continue
-        agree = best is not None and best[1] and settled and abs(found.fit - best[0].fit) < _AGREE
-        if best is None or (settled and found.fit > least, found.fit) > (best[1] and best[0].fit > least, best[0].fit):
-            best = (found, settled)
-        if agree and found.fit > least:
+        agree = best is not None and best[1] and settled and abs(equation.fit - best[0].fit) < _AGREE
+        if best is None or (settled and equation.fit > least, equation.fit) > (
+            best[1] and best[0].fit > least,
+            best[0].fit,
+        ):
+            best = (equation, settled)
+        if agree and equation.fit > least:
             break
     if best is None:
         raise EstimationError(
@@ -277,7 +280,7 @@ def _gains(measured: Array, clean: Array, a: float, b: float, dt: float) -> Arra
 
 
 def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equation | None, bool]:
-    found: Equation | None = None
+    last: Equation | None = None
     for _ in range(_STEPS):
         ka, a, kb, b = theta
         n = measured.shape[0]
@@ -295,16 +298,16 @@ def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equ
         try:
             change = solve(now.Z, now.Phi, now.error, who="blocks").theta
         except EstimationError:
-            return found, False
-        found = now
+            return last, False
+        last = now
         # poles move by at most half of themselves, so that both blocks stay stable
         limit = max(1.0, *(2 * abs(change[k]) / theta[k] for k in (1, 3)))
         if np.linalg.norm(now.Phi @ change) <= _SETTLED * np.linalg.norm(measured[:, 1]):
-            return found, True
+            return last, True
         theta = theta + change / limit
         if max(theta[1], theta[3]) * dt > 20:
-            return found, False
-    return found, False
+            return last, False
+    return last, False
 
 
 def mechanic(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
@@ -325,13 +328,13 @@ def mechanic(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
         Z, Phi, top = (_off(basis, m) for m in (rows[0], rows[1], target[:, None]))
         step = solve(Z, Phi, top[:, 0], who="blocks")
         fit = 1 - float(np.linalg.norm(step.residual) / np.linalg.norm(measured[:, 2]))
-        found = Equation(theta=step.theta, error=step.residual, Z=Z, Phi=Phi, basis=basis, fit=fit)
+        equation = Equation(theta=step.theta, error=step.residual, Z=Z, Phi=Phi, basis=basis, fit=fit)
         if settled:
             break
         wanted = float(np.clip(abs(step.theta[1]), slowest, 3.0 / dt))
         settled = abs(wanted - filter_pole) <= 1e-6 * filter_pole
         filter_pole = wanted
-    return found, settled
+    return equation, settled
 
 
 def _nuisance(n: int, poles: tuple[float, ...], dt: float) -> Array:

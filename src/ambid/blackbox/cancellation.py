@@ -63,19 +63,19 @@ def cancellations(fit: BlackBoxFit) -> tuple[Cancellation, ...]:
     """Find pole-zero pairs that are within the 99.9 % region of their difference, one of each complex pair."""
     if fit.covariance is None:
         return ()
-    found = list[Cancellation]()
+    pairs = list[Cancellation]()
     for where, poles, zeros in _families(fit):
-        used = set[int]()
+        paired = set[int]()
         for k, pole in enumerate(poles[0]):
             if pole.imag < 0:
                 continue
             near = [(_distance(pole, poles[1][k], z, zeros[1][j], fit.covariance), j) for j, z in enumerate(zeros[0])]
-            near = [(d, j) for d, j in near if j not in used and d < 1.0]
+            near = [(d, j) for d, j in near if j not in paired and d < 1.0]
             if near:
                 d, j = min(near)
-                used.add(j)
-                found.append(Cancellation(pole=complex(pole), zero=complex(zeros[0][j]), where=where, distance=d))
-    return tuple(found)
+                paired.add(j)
+                pairs.append(Cancellation(pole=complex(pole), zero=complex(zeros[0][j]), where=where, distance=d))
+    return tuple(pairs)
 
 
 Roots = tuple[Complex, Complex]

@@ -231,19 +231,19 @@ def single_order(who: str, orders: Orders, name: str, least: int, *, remedy: str
 
 
 def order_per_input(
-    who: str, orders: Orders, name: str, least: int, n: int, *, of: str = "input", remedy: str = "Correct it"
+    who: str, orders: Orders, name: str, least: int, n: int, *, each: str = "input", remedy: str = "Correct it"
 ) -> tuple[int, ...]:
     """Return an order for every input.
 
-    `least`: smallest allowed; `n`: number of inputs; `of`: what has an order each, if not inputs; `remedy`: what to do
+    `least`: smallest allowed; `n`: number of inputs; `each`: what has an order, if not inputs; `remedy`: what to do
     about a number that is not.
     """
     value = orders[name]
     values = tuple(value) if isinstance(value, tuple | list) else (value,) * n
     if len(values) != n:
         raise EstimationError(
-            f"{who}: order {name} has {_count(len(values), 'number')} for {_count(n, of)}. Give one number, or one for "
-            f"each {of}"
+            f"{who}: order {name} has {_count(len(values), 'number')} for {_count(n, each)}. Give one number, or one "
+            f"for each {each}"
         )
     return tuple(_whole_number(who, name, v, least, remedy) for v in values)
 
@@ -293,69 +293,71 @@ Candidate = str | tuple[str, Orders | str | None]
 """A structure to compare: ``"arx:na=2,nb=2"``, ``"n4sid"``, or its name beside its orders."""
 
 
-def orders_of(given: Mapping[str, Any] | str | None) -> Orders | None:
+def orders_of(orders: Mapping[str, Any] | str | None) -> Orders | None:
     """Return orders by name; None where all are to be chosen."""
-    if not isinstance(given, str):
-        return given and by_name(given, "orders")
-    if given.strip() == "auto":
+    if not isinstance(orders, str):
+        return orders and by_name(orders, "orders")
+    if orders.strip() == "auto":
         return None
-    where, remedy = f"{setting('orders')} {given!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
-    pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
-    found: dict[str, int | str | tuple[int, ...]] = {}
+    where, remedy = f"{setting('orders')} {orders!r}", "Write na=2,nb=2,nk=1 (nb=2/3 for two inputs), or auto"
+    pairs = _pairs(orders.split(","), where, f"{where}: {{}} is not NAME=NUMBER", remedy)
+    by_letter: dict[str, int | str | tuple[int, ...]] = {}
     for name, value in pairs.items():
         if value != "auto" and not all(n.strip().isdecimal() and len(n) < 7 for n in value.split("/")):
             raise EstimationError(f"{where}: {f'{name}={value}'!r} is not NAME=NUMBER. {remedy}")
-        found[name] = _read_first(value, int, _whole_numbers)
-    return found
+        by_letter[name] = _read_first(value, int, _whole_numbers)
+    return by_letter
 
 
-def candidates_of(given: Sequence[Candidate]) -> list[tuple[str, Orders | None]]:
+def candidates_of(candidates: Sequence[Candidate]) -> list[tuple[str, Orders | None]]:
     """Return structures with their orders."""
-    found = list[tuple[str, Orders | None]]()
-    for x in given:
+    structures = list[tuple[str, Orders | None]]()
+    for x in candidates:
         if isinstance(x, str):
             name, _, orders = x.partition(":")
-            found.append((name.strip(), orders_of(orders or "auto")))
+            structures.append((name.strip(), orders_of(orders or "auto")))
         else:
-            found.append((x[0], orders_of(x[1])))
-    return found
+            structures.append((x[0], orders_of(x[1])))
+    return structures
 
 
-def settings_of(given: Mapping[str, Any] | str | None) -> dict[str, Any]:
+def settings_of(orders: Mapping[str, Any] | str | None) -> dict[str, Any]:
     """Return the orders of a nonlinear structure by name; what is ``auto`` is left to the method."""
-    if given is None or not isinstance(given, str):
-        return dict(by_name(given, "orders"))
-    if given.strip() in ("auto", ""):
+    if orders is None or not isinstance(orders, str):
+        return dict(by_name(orders, "orders"))
+    if orders.strip() in ("auto", ""):
         return {}
-    where = f"{setting('orders')} {given!r}"
-    pairs = _pairs(given.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
+    where = f"{setting('orders')} {orders!r}"
+    pairs = _pairs(orders.split(","), where, f"{where}: {{}} is not NAME=VALUE", "Write ny=2,nu=2,degree=3")
     return {name: _read_first(x, _whole_numbers, int, float) for name, x in pairs.items() if x != "auto"}
 
 
-def fixed_of(given: Mapping[str, float] | Sequence[str] | str | None) -> dict[str, float]:
+def fixed_of(coefficients: Mapping[str, float] | Sequence[str] | str | None) -> dict[str, float]:
     """Return known coefficients by name, from ``a1=-1.5`` and so on."""
-    if isinstance(given, Mapping):
-        return dict(given)
-    said, remedy = f"{setting('fix')} {{}} is not NAME=NUMBER", f"Give {setting('fix', 'a1=-1')}, for example"
-    pairs = _pairs(given.split(",") if isinstance(given, str) else given or (), setting("fix"), said, remedy)
-    found = {name: _read_first(value, float) for name, value in pairs.items()}
-    for name, number in found.items():
+    if isinstance(coefficients, Mapping):
+        return dict(coefficients)
+    rule, remedy = f"{setting('fix')} {{}} is not NAME=NUMBER", f"Give {setting('fix', 'a1=-1')}, for example"
+    pairs = _pairs(
+        coefficients.split(",") if isinstance(coefficients, str) else coefficients or (), setting("fix"), rule, remedy
+    )
+    values = {name: _read_first(value, float) for name, value in pairs.items()}
+    for name, number in values.items():
         if isinstance(number, str):
-            raise EstimationError(f"{said.format(repr(f'{name}={number}'))}. {remedy}")
-    return found
+            raise EstimationError(f"{rule.format(repr(f'{name}={number}'))}. {remedy}")
+    return values
 
 
-def _pairs(parts: Iterable[str], where: str, said: str, remedy: str) -> dict[str, str]:
-    """Read NAME=VALUE, each name once; ``{}`` in `said` stands for a part that is not of that form."""
-    found: dict[str, str] = {}
+def _pairs(parts: Iterable[str], where: str, rule: str, remedy: str) -> dict[str, str]:
+    """Read NAME=VALUE, each name once; ``{}`` in `rule` stands for a part that is not of that form."""
+    values: dict[str, str] = {}
     for part in parts:
         name, _, value = (x.strip() for x in part.partition("="))
         if not (name and value):
-            raise EstimationError(f"{said.format(repr(part.strip()))}. {remedy}")
-        if name in found:
+            raise EstimationError(f"{rule.format(repr(part.strip()))}. {remedy}")
+        if name in values:
             raise EstimationError(f"{where}: {name} is given twice. Omit one")
-        found[name] = value
-    return found
+        values[name] = value
+    return values
 
 
 def _read_first(text: str, *kinds: Callable[[str], Any]) -> Any:

@@ -72,8 +72,10 @@ class Structure:
     @property
     def estimator(self) -> Callable[..., Any]:
         """The function that fits it."""
-        found: Callable[..., Any] = getattr(import_module(f"ambid.blackbox.{self.module}"), self.name.replace("-", "_"))
-        return found
+        function: Callable[..., Any] = getattr(
+            import_module(f"ambid.blackbox.{self.module}"), self.name.replace("-", "_")
+        )
+        return function
 
 
 def _register(kind: Kind, module: str, *rows: tuple[str, str, Feedback, str]) -> dict[str, Structure]:
@@ -181,8 +183,8 @@ def structure(name: str) -> Structure:
             f"structure {name} is fitted to a frequency response, not to inputs and outputs. Use 'ambid frf'"
         )
     if name not in STRUCTURES:
-        known = ", ".join(STRUCTURES)
-        raise EstimationError(f"structure {name!r} is unknown; known: {known}.{nearest(name, list(STRUCTURES))}")
+        names = ", ".join(STRUCTURES)
+        raise EstimationError(f"structure {name!r} is unknown; known: {names}.{nearest(name, list(STRUCTURES))}")
     return STRUCTURES[name]
 
 
@@ -268,11 +270,11 @@ def build_fit(
     """
     if not np.all(np.isfinite(model.theta)) or not np.all(np.isfinite(noise_covariance)):
         raise EstimationError(f"{name}: no finite coefficients fit this record. Lower the orders, or check the columns")
-    found = list(warnings)
+    remarks = list(warnings)
     if status != "converged":
-        found.insert(0, "the search did not converge: treat the values as a first guess")
+        remarks.insert(0, "the search did not converge: treat the values as a first guess")
     if structure(name).feedback == "biased" and data.n_inputs and not data.open_loop:
-        found.append(
+        remarks.append(
             f"{name} is biased by feedback. Use bj, armax or pbsid, or give {setting('open_loop', True)} if the "
             "record is open loop"
         )
@@ -290,7 +292,7 @@ def build_fit(
         dt=data.dt,
         record=dict(data.record),
         status=status,
-        warnings=tuple(found),
+        warnings=tuple(remarks),
         details={} if details is None else dict(details),
     )
 
@@ -342,16 +344,16 @@ def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
 def _model_json(model: BlackBoxModel, theta: Array, outputs: tuple[str, ...]) -> tuple[str, Any]:
     """Put numbers in the order of ``model.theta`` into the shape of the model's kind."""
     if isinstance(model, PolynomialModel):
-        found: list[dict[str, Any]] = [{"A": None, "B": [], "C": None, "D": None, "F": []} for _ in outputs]
+        letters: list[dict[str, Any]] = [{"A": None, "B": [], "C": None, "D": None, "F": []} for _ in outputs]
         for o, letter, i, place in model.blocks():
             p = theta[place].tolist()
             if i is None:
-                found[o][letter] = p
+                letters[o][letter] = p
             else:
-                found[o][letter].append(p)
-        for p in found if model.n_inputs == 1 else []:
+                letters[o][letter].append(p)
+        for p in letters if model.n_inputs == 1 else []:
             p["B"], p["F"] = p["B"][0], p["F"][0]
-        return "polynomials", found[0] if len(outputs) == 1 else dict(zip(outputs, found, strict=True))
+        return "polynomials", letters[0] if len(outputs) == 1 else dict(zip(outputs, letters, strict=True))
     if isinstance(model, StateSpaceModel):
         parts, first = {}, 0
         for letter in "ABCDK":
@@ -418,10 +420,10 @@ def _from_json(d: Mapping[str, Any]) -> BlackBoxFit:
 
 def _finite(value: Any, what: str) -> Array:
     """Return an array of numbers that can be computed with."""
-    found = read_as(Array, value, what)
-    if not np.all(np.abs(found) <= _LARGEST):
+    array = read_as(Array, value, what)
+    if not np.all(np.abs(array) <= _LARGEST):
         raise ValueError(f"{what} is not finite, or too large")
-    return found
+    return array
 
 
 def _rate(d: Mapping[str, Any]) -> float:
@@ -452,7 +454,7 @@ def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tup
         num, den = (tuple(tuple(_finite(x, k) for x in row) for row in tf[k]) for k in ("num", "den"))
         names = () if d["covariance"] is None else d["covariance"]["names"]
         return TransferModel(num=num, den=den, dt=dt, delay=tuple(delay), delay_estimated="delay[0]" in names)
-    found = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
+    entries = [d["polynomials"]] if len(outputs) == 1 else [d["polynomials"][o] for o in outputs]
     one = len(inputs) == 1
     sets = tuple(
         Polynomials(
@@ -462,7 +464,7 @@ def _model_from_json(d: Mapping[str, Any], inputs: tuple[str, ...], outputs: tup
             D=_finite(p["D"], "D"),
             F=tuple(_finite(x, "F") for x in ([p["F"]] if one else p["F"])),
         )
-        for p in found
+        for p in entries
     )
     if dt is None:
         raise ValueError("a polynomial model is discrete")

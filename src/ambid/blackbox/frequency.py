@@ -201,8 +201,8 @@ def search_lines(
 
     `residual`, `slope`: whitened rows and their derivative at a vector, (n_rows,) and (n_rows, n_vector).
     """
-    found = search(Rows(residual, slope), start, most=200, tolerance=1e-13, settled=1e-12)
-    return found.cost / 2, found.theta, found.converged
+    end = search(Rows(residual, slope), start, most=200, tolerance=1e-13, settled=1e-12)
+    return end.cost / 2, end.theta, end.converged
 
 
 def build_response_fit(
@@ -232,11 +232,11 @@ def build_response_fit(
             f"{name}: no finite coefficients fit these lines. Lower the orders, or check the response"
         )
     check = checked.verdict(cost, n_estimated)
-    found = [*warnings, *frf.warnings]
+    remarks = [*warnings, *frf.warnings]
     if not converged:
-        found.insert(0, "the search did not converge: treat the values as a first guess")
+        remarks.insert(0, "the search did not converge: treat the values as a first guess")
     if not check.passed:
-        found.insert(0, f"{name}: {check.detail}; standard deviations cover noise only")
+        remarks.insert(0, f"{name}: {check.detail}; standard deviations cover noise only")
     return BlackBoxFit(
         structure=name,
         orders=dict(orders),
@@ -252,7 +252,7 @@ def build_response_fit(
         record={"lines": checked.n_lines, "rate_hz": frf.rate_hz, "method": frf.method, "hold": frf.hold},
         status="converged" if converged else "stalled",
         checks={"cost": check},
-        warnings=tuple(found),
+        warnings=tuple(remarks),
         details={**dict(check.values), "p": check.p, **({} if details is None else dict(details))},
     )
 
@@ -364,7 +364,7 @@ def _form(frf: FrequencyResponse, orders: Orders, domain: Literal["s", "z"]) -> 
     who, pair = "frf-ml", "input-output pair"
     check_order_names(who, orders, ("nb", "nf"), ("nf",))
     nf = single_order(who, orders, "nf", 0)
-    nb = (max(nf, 1),) * m if left_open(orders, "nb") else order_per_input(who, orders, "nb", 1, m, of=pair)
+    nb = (max(nf, 1),) * m if left_open(orders, "nb") else order_per_input(who, orders, "nb", 1, m, each=pair)
     if max(nb) > nf + 1:
         raise EstimationError(
             f"{who}: order nb = {nb} with nf = {nf}; a numerator has at most nf + 1 coefficients. Lower nb"
@@ -409,11 +409,15 @@ def _spread_poles(
     omega: Array, n_poles: int, size: float, dt: float | None, damping: float, place: Callable[..., Array]
 ) -> Complex:
     """Lightly damped pairs over the band, and one real pole where their number is odd."""
-    used = omega[omega > 0]
-    centres = place(used[0], used[-1], n_poles // 2 + 2)[1:-1] if n_poles > 3 else [np.sqrt(used[0] * used[-1])]
+    positive = omega[omega > 0]
+    centres = (
+        place(positive[0], positive[-1], n_poles // 2 + 2)[1:-1]
+        if n_poles > 3
+        else [np.sqrt(positive[0] * positive[-1])]
+    )
     centres = np.asarray(centres)[: n_poles // 2]
     pairs = np.stack([centres * (-damping + 1j), centres * (-damping - 1j)], axis=1).ravel()
-    s = np.concatenate([pairs, [-np.sqrt(used[0] * used[-1])] * (n_poles % 2)]).astype(np.complex128)
+    s = np.concatenate([pairs, [-np.sqrt(positive[0] * positive[-1])] * (n_poles % 2)]).astype(np.complex128)
     return np.asarray(s / size if dt is None else np.exp(s * dt))
 
 
@@ -515,10 +519,10 @@ def _powers(at: _Form, vector: Array, lag: float) -> tuple[TransferModel, Array]
 
     def monic(values: Array, place: slice, own: Array) -> tuple[Array, Array]:
         """A polynomial over the denominator's leading coefficient, highest power first, and its derivative."""
-        by = np.zeros((values.size, vector.size))
-        by[:, place] = own / d[n]
-        by[:, den] -= np.outer(values / d[n] ** 2, powers[n])
-        return values[::-1] / d[n], by[::-1]
+        slope = np.zeros((values.size, vector.size))
+        slope[:, place] = own / d[n]
+        slope[:, den] -= np.outer(values / d[n] ** 2, powers[n])
+        return values[::-1] / d[n], slope[::-1]
 
     bottom, by_bottom = monic(d, den, powers)
     bottom[0], by_bottom[0] = 1.0, 0.0

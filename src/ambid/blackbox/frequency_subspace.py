@@ -64,13 +64,13 @@ def best_conditioned(omega: Array, order: int) -> float:
     grid = np.linspace(low, high, 25)
     size = [np.log(block_rows_condition(omega, order, float(np.exp(x)))) for x in grid]
     k, step = int(np.argmin(size)), grid[1] - grid[0]
-    found = minimize_scalar(
+    minimum = minimize_scalar(
         lambda x: np.log(block_rows_condition(omega, order, float(np.exp(x)))),
         bounds=(grid[k] - step, grid[k] + step),
         method="bounded",
         options={"xatol": 0.01},
     )
-    return float(np.exp(found.x if found.fun < size[k] else grid[k]))
+    return float(np.exp(minimum.x if minimum.fun < size[k] else grid[k]))
 
 
 def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[float, StateSpaceModel, bool]:
@@ -130,15 +130,17 @@ def to_continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpace
     whole = np.zeros((n + n_u, n + n_u))
     whole[:n, :n], whole[:n, n:], whole[n:, n:] = model.A, model.B, np.eye(n_u)
     log = np.real(logm(whole)) / model.dt
-    found = StateSpaceModel(A=log[:n, :n], B=log[:n, n:], C=model.C, D=model.D, K=model.K / model.dt, dt=None)
-    used, none = n * (n + n_u), np.zeros((n, 0))
-    one_each = [(x[: n * n].reshape(n, n), x[n * n :].reshape(n, n_u)) for x in np.eye(used)]
+    continuous = StateSpaceModel(A=log[:n, :n], B=log[:n, n:], C=model.C, D=model.D, K=model.K / model.dt, dt=None)
+    size, none = n * (n + n_u), np.zeros((n, 0))
+    one_each = [(x[: n * n].reshape(n, n), x[n * n :].reshape(n, n_u)) for x in np.eye(size)]
     directions = [StateSpace(A=dA, B=dB, E=none, C=model.C) for dA, dB in one_each]
-    _, slopes = discretise(StateSpace(A=found.A, B=found.B, E=none, C=model.C), model.dt, derivatives=directions)
+    _, slopes = discretise(
+        StateSpace(A=continuous.A, B=continuous.B, E=none, C=model.C), model.dt, derivatives=directions
+    )
     forward = np.stack([np.concatenate([d.A.ravel(), d.B.ravel()]) for d in slopes], axis=1)
     M = np.eye(model.theta.size)
-    M[:used, :used] = np.linalg.inv(forward)
-    return found, M @ covariance @ M.T
+    M[:size, :size] = np.linalg.inv(forward)
+    return continuous, M @ covariance @ M.T
 
 
 def _free(model: StateSpaceModel, feedthrough: bool) -> NDArray[np.bool_]:
@@ -211,13 +213,13 @@ def _of_order(frf: FrequencyResponse, n: int, asked: _Asked) -> BlackBoxFit:
     covariance, condition = information(ln, model, asked.feedthrough)
     warnings = []
     if model.dt is not None and asked.domain == "s":
-        found = to_continuous(model, covariance)
-        if found is None:
+        continuous = to_continuous(model, covariance)
+        if continuous is None:
             warnings.append(
                 "given in z: a pole on the negative real axis of z or at 0 belongs to no continuous model under a hold"
             )
         else:
-            model, covariance = found
+            model, covariance = continuous
     points = _points(ln).imag
     return build_response_fit(
         "frf-subspace",
@@ -292,18 +294,18 @@ def _best_operator(ln: Lines, n: int, rows: int, feedthrough: bool, p: float | N
     if p is not None:
         return _trial(ln, n, rows, feedthrough, p)
     omega = _points(ln).imag
-    used = omega[omega > 0]
-    grid = [best_conditioned(used, rows - 1), *np.geomspace(used[0], used[-1], _GRID + 2)[1:-1]]
-    found = []
+    positive = omega[omega > 0]
+    grid = [best_conditioned(positive, rows - 1), *np.geomspace(positive[0], positive[-1], _GRID + 2)[1:-1]]
+    trials = []
     for value in grid:
         try:
-            found.append(_trial(ln, n, rows, feedthrough, float(value)))
+            trials.append(_trial(ln, n, rows, feedthrough, float(value)))
         except np.linalg.LinAlgError:
             continue
-    found = [t for t in found if np.isfinite(t.cost)]
-    if not found:
+    trials = [t for t in trials if np.isfinite(t.cost)]
+    if not trials:
         raise EstimationError(f"no state space of order {n} fits these lines; lower the order, or check the response")
-    return min(found, key=lambda t: t.cost)
+    return min(trials, key=lambda t: t.cost)
 
 
 def _trial(ln: Lines, n: int, rows: int, feedthrough: bool, p: float) -> _Trial:

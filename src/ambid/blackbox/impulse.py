@@ -222,11 +222,11 @@ def _whiten(
     v, z = (np.asarray(lfilter(noise.D, 1.0, x, axis=0)[p:]) for x in (u, y))
     if _truncated(np.asarray(lfilter(noise.D, 1.0, left)[p:]), v, lags):
         return rough  # what is left comes from inputs older than the taps: no noise, and not to be whitened
-    found = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb)
-    constant = found.constant / float(noise.D.sum())
-    left = _left(found.mean, constant, u, y, lags, first)
-    total = float(left @ left) / max(left.size - 1 - found.freedom, 1.0)
-    return replace(found, constant=constant, noise_variance=total)
+    white = posterior(triangle([(v[:, i], k) for i, k in lags], z[:, None], first), 0, nb)
+    constant = white.constant / float(noise.D.sum())
+    left = _left(white.mean, constant, u, y, lags, first)
+    total = float(left @ left) / max(left.size - 1 - white.freedom, 1.0)
+    return replace(white, constant=constant, noise_variance=total)
 
 
 def _truncated(error: Array, v: Array, lags: Sequence[tuple[int, int]]) -> bool:

@@ -134,13 +134,13 @@ class Solution:
         Returns at most 1e12.
         """
         basis = np.linalg.qr(self.regressors)[0]
-        left, seen, right = np.linalg.svd(self.Q.T @ basis, full_matrices=False)
-        if 1.0 - seen[-1] < _INCLUDED:
+        left, correlations, right = np.linalg.svd(self.Q.T @ basis, full_matrices=False)
+        if 1.0 - correlations[-1] < _INCLUDED:
             return _EXACT
         way, direction = self.Q @ left[:, -1], basis @ right[-1]
-        noise = autoregression(direction - seen[-1] * way, _COLOUR)
+        noise = autoregression(direction - correlations[-1] * way, _COLOUR)
         variance = float(score_covariance(way[:, None], noise)[0, 0])
-        return float(min(seen[-1] ** 2 / max(variance, 1.0 / _EXACT), _EXACT))
+        return float(min(correlations[-1] ** 2 / max(variance, 1.0 / _EXACT), _EXACT))
 
 
 def solve(instruments: Array, regressors: Array, target: Array, *, who: str) -> Solution:
@@ -174,12 +174,12 @@ def weak_instruments(solutions: Sequence[Solution], outputs: Sequence[str]) -> l
 
     `solutions`: last step of each output.
     """
-    found = [(x.strength(), name) for x, name in zip(solutions, outputs, strict=True)]
+    strengths = [(x.strength(), name) for x, name in zip(solutions, outputs, strict=True)]
     return [
         f"the instruments of {name!r} are weak: the reference or input excites one combination of the terms hardly "
         f"more than noise does (first-stage F = {F:.2g}, below {_WEAK:g}). The estimate tends to least squares, "
         "and errors may be many times the standard deviations. Excite more, use a longer record, or use bj or armax"
-        for F, name in found
+        for F, name in strengths
         if F < _WEAK
     ]
 
@@ -257,11 +257,11 @@ def reference_part(who: str, data: IOData) -> tuple[Array, Array]:
         rows = np.vstack([R[:size, :size], small])
         target = np.vstack([R[:size, -n_w:], np.zeros((size, n_w))])
         theta = np.asarray(np.linalg.lstsq(rows, target, rcond=None)[0][1:], dtype=np.float64)
-        found = _impulse(theta, n_w, n_r, p, n)
-        if found is not None:
+        impulse = _impulse(theta, n_w, n_r, p, n)
+        if impulse is not None:
             from scipy.signal import oaconvolve
 
-            out = sum(oaconvolve(found[:, :, j], r[:, j : j + 1], axes=0)[:n] for j in range(n_r)) * scale[0]
+            out = sum(oaconvolve(impulse[:, :, j], r[:, j : j + 1], axes=0)[:n] for j in range(n_r)) * scale[0]
             n_y = data.n_outputs
             return out[:, n_y:], out[:, :n_y]
     raise EstimationError(
@@ -384,8 +384,8 @@ def optimal_step(
     if _cost(at_output, error.size) < _cost(noise, error.size):
         noise, C = at_output, mirrored
     solution = instrumental_step(who, data, instruments, layout, noise, C)
-    found = replace(_polynomials(layout, solution.theta), C=C, D=noise.D)
-    return ArxEstimate(layout=layout, polynomials=found, noise=noise, solution=solution)
+    polynomials = replace(_polynomials(layout, solution.theta), C=C, D=noise.D)
+    return ArxEstimate(layout=layout, polynomials=polynomials, noise=noise, solution=solution)
 
 
 def iterate_optimal(
@@ -401,12 +401,12 @@ def iterate_optimal(
     `instruments`: of an estimate; `theta`: (n_coefficients + 1,); `rounds`: at most.
     """
     for _ in range(rounds):
-        found = optimal_step(who, data, instruments(theta), layout, theta, layout.free.size + NOISE_ORDER)
-        before, theta = theta, found.solution.theta
-        moved = np.linalg.pinv(found.solution.inverse) @ (theta - before)
-        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(found.innovations):
+        estimate = optimal_step(who, data, instruments(theta), layout, theta, layout.free.size + NOISE_ORDER)
+        before, theta = theta, estimate.solution.theta
+        moved = np.linalg.pinv(estimate.solution.inverse) @ (theta - before)
+        if np.linalg.norm(moved) <= _SETTLED * np.linalg.norm(estimate.innovations):
             break
-    return found
+    return estimate
 
 
 def _polynomials(layout: Layout, theta: Array) -> Polynomials:
@@ -425,37 +425,37 @@ def _cost(noise: Autoregression, n: int) -> float:
     return float(n * np.log(noise.variance + 1e-300) + 2 * noise.order)
 
 
-def covariance(found: ArxEstimate) -> Array:
+def covariance(estimate: ArxEstimate) -> Array:
     """Return the covariance of all coefficients, leading ones and zeros included.
 
     C follows from A and has zeros. The noise of the filtered equation is modelled once more, so that a noise model of
     too low an order costs efficiency but does not make the standard deviations too small.
     """
-    rows, layout, p = found.innovations.size, found.layout, found.polynomials
-    left = autoregression(found.innovations, 10)
+    rows, layout, p = estimate.innovations.size, estimate.layout, estimate.polynomials
+    left = autoregression(estimate.innovations, 10)
     spare = rows / max(rows - layout.free.size - 1, 1)
     first = layout.places["C", None].start + p.C.size
     d = slice(first, first + p.D.size)
     out = np.zeros((d.stop + len(p.F),) * 2)
-    out[np.ix_(layout.free, layout.free)] = found.solution.covariance(left)[:-1, :-1] * spare
-    out[d, d] = noise_covariance(found.noise, rows)
+    out[np.ix_(layout.free, layout.free)] = estimate.solution.covariance(left)[:-1, :-1] * spare
+    out[d, d] = noise_covariance(estimate.noise, rows)
     return out
 
 
-def operating_point(found: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
+def operating_point(estimates: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
     """Share the constants of the equations out over input and output offsets, each moved as little as possible.
 
     A(1) y0 - B(1) u0 = constant; where A(1) is near zero (an integrating plant) the input takes it.
 
-    `found`: one for each output, for signals with the means taken off; `u_mean`, `u_sd`: (n_inputs,), SI; `y_mean`,
+    `estimates`: one for each output, for signals with the means taken off; `u_mean`, `u_sd`: (n_inputs,), SI; `y_mean`,
     `y_sd`: (n_outputs,), SI.
     """
     n_y = y_mean.size
     rows = np.zeros((n_y, n_y + u_mean.size))
-    for o, f in enumerate(found):
+    for o, f in enumerate(estimates):
         rows[o, o] = f.polynomials.A.sum() * y_sd[o]
         rows[o, n_y:] = -np.array([b.sum() for b in f.polynomials.B]) * u_sd
-    move = np.linalg.lstsq(rows, np.array([f.solution.theta[-1] for f in found]), rcond=None)[0]
+    move = np.linalg.lstsq(rows, np.array([f.solution.theta[-1] for f in estimates]), rcond=None)[0]
     return Offsets(u=u_mean + move[n_y:] * u_sd, y=y_mean + move[:n_y] * y_sd)
 
 
@@ -481,15 +481,15 @@ def estimate_output(who: str, signals: Signals, clean: Signals, layout: Layout) 
             failed.append(error)
     if not best:
         raise failed[-1]
-    found = min(best, key=lambda f: f.noise.variance)
-    if is_exact(found, signals):
-        return found
-    return iterate_optimal(who, signals, lambda _: clean, layout, found.solution.theta, _NOISE_ROUNDS)
+    rough = min(best, key=lambda f: f.noise.variance)
+    if is_exact(rough, signals):
+        return rough
+    return iterate_optimal(who, signals, lambda _: clean, layout, rough.solution.theta, _NOISE_ROUNDS)
 
 
-def is_exact(found: ArxEstimate, signals: Signals) -> bool:
+def is_exact(estimate: ArxEstimate, signals: Signals) -> bool:
     """Return whether nothing but rounding is left, of which no noise model can be made."""
-    return bool(np.linalg.norm(found.innovations) <= _ROUNDING * np.linalg.norm(signals.y))
+    return bool(np.linalg.norm(estimate.innovations) <= _ROUNDING * np.linalg.norm(signals.y))
 
 
 _ROUNDS = 10  # of instruments from the model itself, at most
@@ -502,7 +502,7 @@ def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
     `orders`: ``na``; ``nb`` and ``nk`` (default 1), one or one for each input. Past inputs are instruments. Returns a
     PolynomialModel with A, B and the noise model C/D; C is 1, or the stable counterpart of A.
     """
-    used = arx_orders("iv4", data, orders)
+    layout = arx_orders("iv4", data, orders)
     deviations, means, sds = centre(data)
     # what the inputs alone make of the outputs, by an autoregression of many lags
     u, names = deviations.u, deviations.inputs
@@ -511,24 +511,24 @@ def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
         explained: Array | None = reference_part("iv4", alone)[1]
     except EstimationError:  # none is stable
         explained = None
-    found = [
-        _one_output(Signals(y=y, u=u), used, None if explained is None else explained[:, o])
+    estimates = [
+        _one_output(Signals(y=y, u=u), layout, None if explained is None else explained[:, o])
         for o, y in enumerate(deviations.y.T)
     ]
-    return arx_fit("iv4", data, found, means, sds)
+    return arx_fit("iv4", data, estimates, means, sds)
 
 
 def arx_orders(who: str, data: IOData, orders: Orders) -> Layout:
     """Check na, nb and nk, and that the record is long enough for them."""
     check_order_names(who, orders, ("na", "nb", "nk"), ("na", "nb"))
     n_u = data.n_inputs
-    used = arx_layout(
+    layout = arx_layout(
         single_order(who, orders, "na", 0),
         order_per_input(who, orders, "nb", 1, n_u),
         order_per_input(who, {"nk": 1, **orders}, "nk", 0, n_u),
     )
-    check_length(who, data, data.n_samples - used.first_row, used.free.size + 1)
-    return used
+    check_length(who, data, data.n_samples - layout.first_row, layout.free.size + 1)
+    return layout
 
 
 def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Array]]:
@@ -545,31 +545,31 @@ def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Arra
 def arx_fit(
     who: str,
     data: IOData,
-    found: list[ArxEstimate],
+    estimates: list[ArxEstimate],
     means: tuple[Array, Array],
     sds: tuple[Array, Array],
 ) -> BlackBoxFit:
     """Put the estimates of all outputs together.
 
-    `found`: for each output, of the data with the means off.
+    `estimates`: for each output, of the data with the means off.
     """
-    layout = found[0].layout
-    rows = min(f.innovations.size for f in found)
-    e = np.stack([f.innovations[-rows:] for f in found], axis=1)
+    layout = estimates[0].layout
+    rows = min(f.innovations.size for f in estimates)
+    e = np.stack([f.innovations[-rows:] for f in estimates], axis=1)
     return build_fit(
         who,
         data,
         orders={"na": layout.na, "nb": layout.nb, "nk": layout.nk},
-        model=PolynomialModel(outputs=tuple(f.polynomials for f in found), dt=data.dt),
-        covariance=block_diag(*[covariance(f) for f in found]),
-        n_estimated=sum(layout.free.size + f.noise.order for f in found),
-        offsets=operating_point(found, *means, *sds),
+        model=PolynomialModel(outputs=tuple(f.polynomials for f in estimates), dt=data.dt),
+        covariance=block_diag(*[covariance(f) for f in estimates]),
+        n_estimated=sum(layout.free.size + f.noise.order for f in estimates),
+        offsets=operating_point(estimates, *means, *sds),
         noise_covariance=e.T @ e / max(rows - layout.free.size - 1, 1),
-        warnings=weak_instruments([f.solution for f in found], data.outputs),
+        warnings=weak_instruments([f.solution for f in estimates], data.outputs),
         details={
-            "noise_order": [f.noise.order for f in found],
-            "condition": [f.solution.condition for f in found],
-            "instrument_strength": [f.solution.strength() for f in found],
+            "noise_order": [f.noise.order for f in estimates],
+            "condition": [f.solution.condition for f in estimates],
+            "instrument_strength": [f.solution.strength() for f in estimates],
         },
     )
 
@@ -584,10 +584,10 @@ def _one_output(signals: Signals, layout: Layout, explained: Array | None) -> Ar
         return replace(signals, y=sum(lfilter(b, A, u) for b, u in zip(p.B, signals.u.T, strict=True)))
 
     clean = simulate(least_squares("iv4", signals, layout)) if explained is None else replace(signals, y=explained)
-    found = estimate_output("iv4", signals, clean, layout)
-    if is_exact(found, signals):
-        return found
-    return iterate_optimal("iv4", signals, simulate, layout, found.solution.theta, _ROUNDS)
+    estimate = estimate_output("iv4", signals, clean, layout)
+    if is_exact(estimate, signals):
+        return estimate
+    return iterate_optimal("iv4", signals, simulate, layout, estimate.solution.theta, _ROUNDS)
 
 
 def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
@@ -596,11 +596,11 @@ def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
     `data`: with a reference that the noise does not reach; `orders`: as `iv4`. Returns what `iv4` does.
     """
     require_reference("cliv", data)
-    used = arx_orders("cliv", data, orders)
+    layout = arx_orders("cliv", data, orders)
     deviations, means, sds = centre(data)
     clean_u, clean_y = reference_part("cliv", deviations)
-    found = [
-        estimate_output("cliv", Signals(y=y, u=deviations.u), Signals(y=clean, u=clean_u), used)
+    estimates = [
+        estimate_output("cliv", Signals(y=y, u=deviations.u), Signals(y=clean, u=clean_u), layout)
         for y, clean in zip(deviations.y.T, clean_y.T, strict=True)
     ]
-    return arx_fit("cliv", data, found, means, sds)
+    return arx_fit("cliv", data, estimates, means, sds)

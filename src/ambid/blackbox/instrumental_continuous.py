@@ -128,15 +128,15 @@ class Found:
 def linearise(setting: Setting, theta: Array) -> Linearised:
     """Simulate, and set up one step."""
     den, num = setting.orders.split(theta)
-    made = responses(den, num, setting.step, setting.u)
-    raw, nuisance = setting.y - made.y, _nuisance(setting, den)
+    simulated = responses(den, num, setting.step, setting.u)
+    raw, nuisance = setting.y - simulated.y, _nuisance(setting, den)
     basis = span(nuisance)
     error = raw - basis @ (basis.T @ raw)
     size = np.linalg.norm(nuisance, axis=0)
     weights = np.linalg.lstsq(nuisance / size, raw, rcond=1e-8)[0] / size
     free = nuisance[:, 1:] @ weights[1:]
-    Z = _output_columns(setting, den, made.of_output + filter_states(den, setting.step, free), made)
-    Phi = _output_columns(setting, den, filter_states(den, setting.step, made.y + free + error), made)
+    Z = _output_columns(setting, den, simulated.of_output + filter_states(den, setting.step, free), simulated)
+    Phi = _output_columns(setting, den, filter_states(den, setting.step, simulated.y + free + error), simulated)
     both = np.hstack([Z, Phi])
     both -= basis @ (basis.T @ both)
     return Linearised(error=error, Z=both[:, : theta.size], Phi=both[:, theta.size :], constant=float(weights[0]))
@@ -192,7 +192,7 @@ def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found
             "srivc: no stable continuous-time model fits this record. Check the orders and the sampling rate; for an "
             "unstable plant give the reference of its loop and use clsrivc"
         )
-    fine = [(found if found.settled else refine(found.setting, found.theta, _FINE), w0) for found, w0 in rough[:2]]
+    fine = [(end if end.settled else refine(end.setting, end.theta, _FINE), w0) for end, w0 in rough[:2]]
     return min(fine, key=lambda r: r[0].at.loss)
 
 
@@ -207,13 +207,13 @@ def _start(setting: Setting) -> Array:
     return _mirror_poles(solve(rows[:, :-1], rows[:, :-1], rows[:, -1], who="srivc").theta, setting.orders.n)
 
 
-def _output_columns(setting: Setting, den: Array, of_y: Array, made: Responses) -> Array:
+def _output_columns(setting: Setting, den: Array, of_y: Array, simulated: Responses) -> Array:
     """Derivatives of the simulated output: -p^k/F y, then p^k/F u of each input."""
     n, columns = setting.orders.n, [-of_y]
     for i, nb in enumerate(setting.orders.nb):
-        columns.append(made.of_inputs[:, i, : min(nb, n)])
+        columns.append(simulated.of_inputs[:, i, : min(nb, n)])
         if nb == n + 1:  # p^n/F u = u - sum of f_k p^k/F u
-            columns.append((setting.u[:, i] - made.of_inputs[:, i] @ den[:0:-1])[:, None])
+            columns.append((setting.u[:, i] - simulated.of_inputs[:, i] @ den[:0:-1])[:, None])
     return np.hstack(columns)
 
 
@@ -242,20 +242,20 @@ def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
     ``nk`` samples of delay, one or one for each input, ``nf`` degree of the denominator, which all inputs share.
     Without ``nk`` the delay up to 5, common to all inputs, that fits best is taken.
     """
-    used = transfer_orders("srivc", data, orders)
+    degrees = transfer_orders("srivc", data, orders)
     deviations, means, _ = centre(data)
-    settings = [used.nk] if used.nk is not None else [(k,) * data.n_inputs for k in _DELAYS]
+    settings = [degrees.nk] if degrees.nk is not None else [(k,) * data.n_inputs for k in _DELAYS]
     first = max(max(k) for k in settings)
-    check_length("srivc", data, data.n_samples - first, used.size + 1)
+    check_length("srivc", data, data.n_samples - first, degrees.size + 1)
     with one_thread():
         tried = list[tuple[float, int, list[tuple[Found, float]]]]()
         for k, nk in enumerate(settings):
             u = np.stack([deviations.u[first - d : data.n_samples - d, i] for i, d in enumerate(nk)], axis=1)
-            ends = [search(y / y.std(), u / u.std(axis=0), data.dt, used) for y in deviations.y[first:].T]
+            ends = [search(y / y.std(), u / u.std(axis=0), data.dt, degrees) for y in deviations.y[first:].T]
             tried.append((float(sum(np.log(f.at.loss / data.n_samples + 1e-300) for f, _ in ends)), k, ends))
-        _, best, found = min(tried, key=lambda t: t[:2])
+        _, best, searches = min(tried, key=lambda t: t[:2])
         nk = settings[best]
-        return _srivc_fit(data, used, nk, found, means)
+        return _srivc_fit(data, degrees, nk, searches, means)
 
 
 def transfer_orders(who: str, data: IOData, orders: Orders, more: int = 1) -> TransferOrders:
@@ -303,14 +303,14 @@ def continuous_model(outputs: Sequence[ScaledTransfer], delay: tuple[float, ...]
     """Return the continuous model of all outputs in SI, and the covariance of all its coefficients."""
     from scipy.linalg import block_diag
 
-    found = [one.in_s() for one in outputs]
+    entries = [one.in_s() for one in outputs]
     model = TransferModel(
-        num=tuple(tuple(num) for num, _, _ in found),
-        den=tuple(tuple(den) for _, den, _ in found),
+        num=tuple(tuple(num) for num, _, _ in entries),
+        den=tuple(tuple(den) for _, den, _ in entries),
         dt=None,
         delay=delay,
     )
-    slopes = zip(outputs, found, strict=True)
+    slopes = zip(outputs, entries, strict=True)
     return model, block_diag(*[slope @ one.covariance @ slope.T for one, (_, _, slope) in slopes])
 
 
@@ -318,15 +318,15 @@ def _srivc_fit(
     data: IOData,
     orders: TransferOrders,
     nk: tuple[int, ...],
-    found: list[tuple[Found, float]],
+    searches: list[tuple[Found, float]],
     means: tuple[Array, ...],
 ) -> BlackBoxFit:
-    rows = found[0][0].at.error.size
+    rows = searches[0][0].at.error.size
     y_size = data.y[-rows:].std(axis=0)
     first = data.n_samples - rows
     u_size = np.array([data.u[first - k : data.n_samples - k, i].std() for i, k in enumerate(nk)])
     scaled = []
-    for (f, w0), size in zip(found, y_size, strict=True):
+    for (f, w0), size in zip(searches, y_size, strict=True):
         error = f.at.error
         inner = f.at.solve().covariance(autoregression(error, _NOISE_ORDER))
         scaled.append(
@@ -339,7 +339,7 @@ def _srivc_fit(
             )
         )
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))
-    e = np.stack([f.at.error * s for (f, _), s in zip(found, y_size, strict=True)], axis=1)
+    e = np.stack([f.at.error * s for (f, _), s in zip(searches, y_size, strict=True)], axis=1)
     return build_fit(
         "srivc",
         data,
@@ -347,12 +347,12 @@ def _srivc_fit(
         model=model,
         covariance=covariance,
         n_estimated=data.n_outputs * orders.size,
-        offsets=Offsets(u=means[0], y=means[1] + y_size * [f.at.constant for f, _ in found]),
+        offsets=Offsets(u=means[0], y=means[1] + y_size * [f.at.constant for f, _ in searches]),
         noise_covariance=e.T @ e / max(rows - orders.size - 1, 1),
-        status="converged" if all(f.settled for f, _ in found) else "stalled",
+        status="converged" if all(f.settled for f, _ in searches) else "stalled",
         details={
-            "condition": [f.at.solve().condition for f, _ in found],
-            "steps": [f.steps for f, _ in found],
+            "condition": [f.at.solve().condition for f, _ in searches],
+            "steps": [f.steps for f, _ in searches],
         },
     )
 
@@ -380,22 +380,22 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
     """
     who = "clsrivc"
     require_reference(who, data)
-    used = transfer_orders(who, data, {"nk": 0, **orders})
-    n, nk = used.n, used.nk or ()
-    through = [b == n + 1 for b in used.nb]
+    degrees = transfer_orders(who, data, {"nk": 0, **orders})
+    n, nk = degrees.n, degrees.nk or ()
+    through = [b == n + 1 for b in degrees.nb]
     sampled = arx_layout(n, tuple(n + t for t in through), tuple(k + (not t) for k, t in zip(nk, through, strict=True)))
     check_length(who, data, data.n_samples - sampled.first_row, sampled.free.size + 1)
     deviations, means, sds = centre(data)
     with one_thread():
         clean_u, clean_y = reference_part(who, deviations)
-        found = list[ArxEstimate]()
+        estimates = list[ArxEstimate]()
         for o in range(data.n_outputs):
             own = Signals(y=deviations.y[:, o] / sds[1][o], u=deviations.u / sds[0])
             pure = Signals(y=clean_y[:, o] / sds[1][o], u=clean_u / sds[0])
-            found.append(estimate_output("cliv", own, pure, sampled))
-        w0 = [_time_scale(f.polynomials.A, data.dt) for f in found]
-        nearest = [_nearest(f, used, w * data.dt) for f, w in zip(found, w0, strict=True)]
-    return _clsrivc_fit(data, used, found, nearest, w0, means, sds)
+            estimates.append(estimate_output("cliv", own, pure, sampled))
+        w0 = [_time_scale(f.polynomials.A, data.dt) for f in estimates]
+        nearest = [_nearest(f, degrees, w * data.dt) for f, w in zip(estimates, w0, strict=True)]
+    return _clsrivc_fit(data, degrees, estimates, nearest, w0, means, sds)
 
 
 def sampled_coefficients(theta: Numbers, n: int, nb: tuple[int, ...], step: float) -> Numbers:
@@ -446,7 +446,7 @@ def _logarithms(A: Array) -> NDArray[np.complex128]:
     return np.asarray(np.log(z))
 
 
-def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Continuous:
+def _nearest(estimate: ArxEstimate, orders: TransferOrders, step: float) -> _Continuous:
     """Continuous coefficients nearest to a sampled estimate in the metric of its information."""
     from scipy.linalg import solve_triangular
     from scipy.optimize import least_squares
@@ -454,8 +454,8 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
     n, nb = orders.n, orders.nb
     # square root of the information of a_1 ..., b ..., the constant eliminated, and the estimate itself
 
-    s = found.solution
-    spread = np.linalg.cholesky(score_covariance(s.Q, autoregression(found.innovations, 10)))
+    s = estimate.solution
+    spread = np.linalg.cholesky(score_covariance(s.Q, autoregression(estimate.innovations, 10)))
     whole = solve_triangular(spread, np.linalg.inv(s.inverse), lower=True)
     R = np.asarray(np.linalg.qr(whole[:, [-1, *range(whole.shape[1] - 1)]], mode="r"))
     root, eta = R[1:, 1:], s.theta[:-1]
@@ -471,7 +471,7 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
             columns.append(sampled_coefficients(moved, n, nb, step).imag / _TINY)
         return np.asarray(root @ np.stack(columns, axis=1))
 
-    poles = _logarithms(found.polynomials.A) / step
+    poles = _logarithms(estimate.polynomials.A) / step
     f = np.asarray(np.poly(poles).real, dtype=np.float64)[:0:-1]
     start = np.concatenate([f, np.zeros(sum(nb))])
     rows = slope(start)[:, n:]  # the numerators enter linearly
@@ -489,7 +489,7 @@ def _nearest(found: ArxEstimate, orders: TransferOrders, step: float) -> _Contin
 def _clsrivc_fit(
     data: IOData,
     orders: TransferOrders,
-    found: list[ArxEstimate],
+    estimates: list[ArxEstimate],
     nearest: list[_Continuous],
     w0: list[float],
     means: tuple[Array, Array],
@@ -510,12 +510,12 @@ def _clsrivc_fit(
                 f"data (chi-square {c.misfit:.3g} with {c.freedom} degrees of freedom): check nb, nf and the delay "
                 "nk, and that the input is held over a sample"
             )
-    warnings += weak_instruments([f.solution for f in found], data.outputs)
+    warnings += weak_instruments([f.solution for f in estimates], data.outputs)
     model, covariance = continuous_model(scaled, tuple(k * data.dt for k in nk))
-    rows = min(f.innovations.size for f in found)
-    e = np.stack([f.innovations[-rows:] for f in found], axis=1) * sds[1]
-    one = np.ones(len(found))
-    shift = operating_point(found, means[0] / sds[0], 0 * one, np.ones(data.n_inputs), one)
+    rows = min(f.innovations.size for f in estimates)
+    e = np.stack([f.innovations[-rows:] for f in estimates], axis=1) * sds[1]
+    one = np.ones(len(estimates))
+    shift = operating_point(estimates, means[0] / sds[0], 0 * one, np.ones(data.n_inputs), one)
     return build_fit(
         "clsrivc",
         data,
@@ -528,9 +528,9 @@ def _clsrivc_fit(
         status="converged" if all(c.settled for c in nearest) else "stalled",
         warnings=warnings,
         details={
-            "condition": [f.solution.condition for f in found],
-            "noise_order": [f.noise.order for f in found],
-            "instrument_strength": [f.solution.strength() for f in found],
+            "condition": [f.solution.condition for f in estimates],
+            "noise_order": [f.noise.order for f in estimates],
+            "instrument_strength": [f.solution.strength() for f in estimates],
             "misfit": [c.misfit for c in nearest],
             "freedom": [c.freedom for c in nearest],
         },

@@ -428,8 +428,8 @@ def used_part(theta: Array, place: slice) -> slice:
 
     `theta`: (n_theta,); `place`: of the polynomial.
     """
-    used = np.nonzero(theta[place])[0]
-    return slice(place.start + int(used[0]) if used.size else place.stop, place.stop)
+    nonzero = np.nonzero(theta[place])[0]
+    return slice(place.start + int(nonzero[0]) if nonzero.size else place.stop, place.stop)
 
 
 def roots_at(theta: Array, *places: slice) -> tuple[Complex, Complex]:
@@ -438,14 +438,14 @@ def roots_at(theta: Array, *places: slice) -> tuple[Complex, Complex]:
     `theta`: (n_theta,); `places`: of the polynomials; leading zeros are a delay. Returns `roots`: (n_roots,), complex;
     `derivatives`: (n_roots, n_theta), complex.
     """
-    found, rows = [np.empty(0, dtype=np.complex128)], [np.zeros((0, theta.size), dtype=np.complex128)]
+    roots, rows = [np.empty(0, dtype=np.complex128)], [np.zeros((0, theta.size), dtype=np.complex128)]
     for place in places:
-        used = used_part(theta, place)
-        found.append(roots_of(theta[used]))
-        rows.append(np.zeros((found[-1].size, theta.size), dtype=np.complex128))
-        if found[-1].size:
-            rows[-1][:, used] = root_derivative(theta[used], found[-1])
-    return np.concatenate(found), np.vstack(rows)
+        part = used_part(theta, place)
+        roots.append(roots_of(theta[part]))
+        rows.append(np.zeros((roots[-1].size, theta.size), dtype=np.complex128))
+        if roots[-1].size:
+            rows[-1][:, part] = root_derivative(theta[part], roots[-1])
+    return np.concatenate(roots), np.vstack(rows)
 
 
 class RationalModel(BlackBoxModel):

@@ -166,14 +166,14 @@ def conjugate(x: Complex) -> Complex:
 
 def starting_poles(lines: Spectra, say: Callable[[float], None]) -> tuple[list[complex], list[TrialPole]]:
     """Return poles that stay as the order grows, band by band, and all that were tried."""
-    found, tried, n = list[complex](), list[TrialPole](), lines.omega.size
+    stable, tried, n = list[complex](), list[TrialPole](), lines.omega.size
     for first, last, begin, end in overlapping_bands(lines.omega, lines.step):
         low, high = lines.omega[begin], lines.omega[end - 1] + lines.step
         poles = _followed_poles(lines.part(first, last))
         tried += [p for p in poles[0] if low <= p.pole.imag < high]
-        found += [c for c in poles[1] if low <= c.imag < high]
+        stable += [c for c in poles[1] if low <= c.imag < high]
         say(last / n)
-    return found, tried
+    return stable, tried
 
 
 def overlapping_bands(
@@ -325,10 +325,10 @@ class _Window:
         root = np.linalg.inv(R) / np.swapaxes(size, 1, 2)
         y = (weight * lines.Y.T)[:, :, None]
         along = conjugate(Q) @ y
-        found = _Projected(inverse=inverse, Q=Q, root=root, c=(root @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
+        projected = _Projected(inverse=inverse, Q=Q, root=root, c=(root @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
         if without_input is None:
-            self._at = key, found
-        return found
+            self._at = key, projected
+        return projected
 
     def slopes(self, poles: Complex) -> Complex:
         """Derivatives of the residuals by the real and the imaginary part of each pole, in steps: (2n, n_outputs,
@@ -356,8 +356,8 @@ class _Window:
     def search(self, poles: Complex) -> Complex:
         """Most likely poles from these on, the noise as it is."""
         start = np.ascontiguousarray(poles / self.lines.step).view(np.float64).copy()
-        found = search(self._rows(), start, most=25, tolerance=1e-7)
-        return np.asarray(found.theta.view(np.complex128) * self.lines.step)
+        end = search(self._rows(), start, most=25, tolerance=1e-7)
+        return np.asarray(end.theta.view(np.complex128) * self.lines.step)
 
     def fit(self, poles: Complex, rounds: int = 2) -> Complex:
         """Most likely poles, the noise from what the fit leaves."""
@@ -441,8 +441,8 @@ def _window(lines: Spectra, k: int, poles: Complex) -> tuple[_Window, Complex, i
     most = max(int(part.omega.size / (2.5 * lines.U.shape[1])) - DEGREE - 1, 1)  # columns that its lines tell apart
     near = [j for j in np.argsort(distance) if distance[j] < 3 * width][:most]
     inside = [j for j in near if distance[j] < width][:5]
-    beside = [j for j in near if j not in inside]
-    return _Window(part, poles[beside]), poles[inside], inside.index(k)
+    outside = [j for j in near if j not in inside]
+    return _Window(part, poles[outside]), poles[inside], inside.index(k)
 
 
 def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
@@ -452,12 +452,12 @@ def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float],
         for k, c in enumerate(candidates):
             _fit(lines, k, poles, c, judge=turn > 0)
             say((turn + (k + 1) / len(candidates)) / _PASSES)
-        kept = _kept(candidates, lines, judged=turn > 0)
-        before, candidates = len(candidates), kept
+        modes = _kept(candidates, lines, judged=turn > 0)
+        before, candidates = len(candidates), modes
         if turn == 1:
-            poles = np.array([c.pole for c in kept])
-            candidates = [x for k, c in enumerate(kept) for x in _split(lines, k, poles, c)]
-        if not candidates or (turn > 0 and len(candidates) == before == len(kept)):
+            poles = np.array([c.pole for c in modes])
+            candidates = [x for k, c in enumerate(modes) for x in _split(lines, k, poles, c)]
+        if not candidates or (turn > 0 and len(candidates) == before == len(modes)):
             return candidates
     return candidates
 
@@ -471,18 +471,18 @@ def _split(lines: Spectra, k: int, poles: Complex, c: _Candidate) -> list[_Candi
     if n < 2 or window.lines.omega.size < 2 * (window.smooth.shape[1] + m * (inside.size + 1)):
         return [c]
     apart = 0.4j * abs(c.pole.real)
-    found = window.fit(np.r_[c.pole - apart, c.pole + apart, np.delete(inside, at)])
-    two = window.project(found)
+    pair = window.fit(np.r_[c.pole - apart, c.pole + apart, np.delete(inside, at)])
+    two = window.project(pair)
     one = window.project(window.search(inside))
     gain = 2 * (one.cost - two.cost) - (2 + 2 * n * m) * np.log(2 * two.e.size)
-    damped = np.all((found[:2].real < 0) & (-found[:2].real < MOST_DAMPED * np.abs(found[:2])))
-    near = np.all(np.abs(found[:2] - c.pole) < 2 * abs(c.pole.real))
+    damped = np.all((pair[:2].real < 0) & (-pair[:2].real < MOST_DAMPED * np.abs(pair[:2])))
+    near = np.all(np.abs(pair[:2] - c.pole) < 2 * abs(c.pole.real))
     shapes = principal(np.array([two.c[:, r * m + 1 : (r + 1) * m] for r in (0, 1)]))
     strength = np.linalg.norm(shapes, axis=1)
     alike = assurance(shapes[0].tolist(), shapes[1].tolist()) > _ALIKE or strength.min() < _WEAK * strength.max()
     if gain < 0 or alike or not (damped and near):
         return [c]
-    return [_Candidate(pole=complex(p)) for p in found[:2]]
+    return [_Candidate(pole=complex(p)) for p in pair[:2]]
 
 
 def _fit(lines: Spectra, k: int, poles: Complex, c: _Candidate, *, judge: bool) -> None:
@@ -491,23 +491,23 @@ def _fit(lines: Spectra, k: int, poles: Complex, c: _Candidate, *, judge: bool) 
     if window.lines.omega.size < 2 * window.smooth.shape[1]:
         c.pole = complex(abs(c.pole))  # at the border of the band, too few lines: dropped as undamped
         return
-    found = window.fit(inside)
-    moved = abs(found[at].imag - c.pole.imag)
-    c.pole = complex(found[at]) if moved < _half_width(c.pole, lines.step) / 2 else complex(abs(c.pole))
+    fitted = window.fit(inside)
+    moved = abs(fitted[at].imag - c.pole.imag)
+    c.pole = complex(fitted[at]) if moved < _half_width(c.pole, lines.step) / 2 else complex(abs(c.pole))
     poles[k] = c.pole
     if not judge or c.pole.real >= 0:
         return
-    own, m = window.project(found), lines.U.shape[1]
-    rest = np.delete(found, at)
+    own, m = window.project(fitted), lines.U.shape[1]
+    rest = np.delete(fitted, at)
     without = window.project(window.search(rest)) if rest.size else window.project(rest)
-    deaf = window.project(found, without_input=at)
+    deaf = window.project(fitted, without_input=at)
     numbers, n = own.e.size * 2, lines.Y.shape[1]
     price = np.log(numbers)
     c.gain = min(
         2 * (without.cost - own.cost) - (2 + 2 * n * m) * price, 2 * (deaf.cost - own.cost) - 2 * n * (m - 1) * price
     )
-    _describe(window, found, at, c, deaf)
-    likelihood, jackknife = window.covariance(found)
+    _describe(window, fitted, at, c, deaf)
+    likelihood, jackknife = window.covariance(fitted)
     own_two = slice(2 * at, 2 * at + 2)
     c.likelihood, c.jackknife = likelihood[own_two, own_two], jackknife[own_two, own_two]
 
@@ -538,14 +538,14 @@ def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Pr
 def _kept(candidates: list[_Candidate], lines: Spectra, *, judged: bool) -> list[_Candidate]:
     """Candidates that are modes: damped, in the band, not twice, and where judged worth their numbers and energy."""
     low, high = lines.omega[0], lines.omega[-1]
-    kept = list[_Candidate]()
+    modes = list[_Candidate]()
     for c in sorted(candidates, key=lambda c: -c.gain if judged else abs(c.pole.real)):
         damped = c.pole.real < 0 and c.damping <= (MOST_DAMPED if judged else 2 * MOST_DAMPED)
         wanted = _LEAST_SHARE if c.clear >= _CLEAR else _SHARE
         worth = not judged or (c.gain > 0 and c.share >= wanted)
-        if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in kept):
-            kept.append(c)
-    return sorted(kept, key=lambda c: c.pole.imag)
+        if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in modes):
+            modes.append(c)
+    return sorted(modes, key=lambda c: c.pole.imag)
 
 
 def _same(one: _Candidate, other: _Candidate, step: float) -> bool:
@@ -583,21 +583,21 @@ def find_modes(
         lines = spectra(data, band)
         starts, tried = starting_poles(lines, lambda x: say("modes: starts", x))
         unique = _kept([_Candidate(pole=p) for p in starts], lines, judged=False)
-        found = _refine(lines, unique, lambda x: say("modes: likelihood", x)) if unique else []
+        candidates = _refine(lines, unique, lambda x: say("modes: likelihood", x)) if unique else []
     if count != "auto":
-        found = sorted(sorted(found, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
+        candidates = sorted(sorted(candidates, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
     limits = float(lines.omega[0] / (2 * np.pi)), float(lines.omega[-1] / (2 * np.pi))
     modes = []
-    for c in found:  # the larger of the likelihood's interval and the jackknife's over outputs
+    for c in candidates:  # the larger of the likelihood's interval and the jackknife's over outputs
         spreads = [(c.likelihood, NORMAL_95)]
         spreads += [(c.jackknife, student(data.n_outputs - 1))] if data.n_outputs > 1 else []
         modes.append(mode_of(c.pole, spreads, data.outputs, c.shape, c.shape_variance, shown=c.misfit < _LOST))
     checks = modes_checks(tuple(modes), count, limits, f"Excite more, longer, or give {setting('band')}")
     return Modal(
-        status="converged" if found else "failed",
+        status="converged" if candidates else "failed",
         method="maximum likelihood on the record's spectrum, transients included",
         modes=tuple(modes),
-        checks={**checks, "modes_fit": _fit_check(found), **_rank_check(found, data.inputs)},
+        checks={**checks, "modes_fit": _fit_check(candidates), **_rank_check(candidates, data.inputs)},
         inputs=data.inputs,
         outputs=data.outputs,
         units={x: data.units[x] for x in (*data.inputs, *data.outputs)},
@@ -605,20 +605,20 @@ def find_modes(
         poles=tuple(tried),
         record=data.record,
         details={
-            "energy_share": [c.share for c in found],
-            "misfit": [c.misfit for c in found],
-            "residual_correlation": [c.correlation for c in found],
-            "gain": [c.gain for c in found],
+            "energy_share": [c.share for c in candidates],
+            "misfit": [c.misfit for c in candidates],
+            "residual_correlation": [c.correlation for c in candidates],
+            "gain": [c.gain for c in candidates],
         },
     )
 
 
-def _fit_check(found: list[_Candidate]) -> Check:
+def _fit_check(candidates: list[_Candidate]) -> Check:
     """Whether linear modes fit the lines about them."""
-    poor = [c for c in found if c.misfit > _LOST or (c.misfit > _MISFIT and c.correlation > _COLOURED)]
+    poor = [c for c in candidates if c.misfit > _LOST or (c.misfit > _MISFIT and c.correlation > _COLOURED)]
     names = ", ".join(f"{c.frequency_hz:.4g} Hz ({100 * c.misfit:.0f} %)" for c in poor)
     if not poor:
-        most = 100 * max((c.misfit for c in found), default=0.0)
+        most = 100 * max((c.misfit for c in candidates), default=0.0)
         return Check(passed=True, detail=f"at most {most:.2g} % of the energy at a mode is left")
     return Check(
         passed=False,
@@ -627,11 +627,11 @@ def _fit_check(found: list[_Candidate]) -> Check:
     )
 
 
-def _rank_check(found: list[_Candidate], inputs: Sequence[str]) -> dict[str, Check]:
+def _rank_check(candidates: list[_Candidate], inputs: Sequence[str]) -> dict[str, Check]:
     """Whether each mode moves in one shape whichever input excites it: two modes in one place do not."""
     if len(inputs) < 2:
         return {}
-    double = ", ".join(f"{c.frequency_hz:.4g} Hz" for c in found if c.second > _DOUBLE)
-    said = f"two modes in one place at {double}: frequency and damping are means, the shape is the stronger one's"
+    double = ", ".join(f"{c.frequency_hz:.4g} Hz" for c in candidates if c.second > _DOUBLE)
+    detail = f"two modes in one place at {double}: frequency and damping are means, the shape is the stronger one's"
     remedy = ". Excite one plane at a time"
-    return {"modes_single": Check(passed=not double, detail=said + remedy if double else "each mode has one shape")}
+    return {"modes_single": Check(passed=not double, detail=detail + remedy if double else "each mode has one shape")}

@@ -101,34 +101,34 @@ def operational_modes(
     f, _, (Y,) = lines_in_band(data, (data.y,), band, _LEAST_LINES, "operational modes")
     omega = 2 * np.pi * f
     size = np.sqrt(np.mean(np.abs(Y) ** 2, axis=0))
-    found, tried = list[_Found](), list[TrialPole]()
+    estimates, tried = list[_Found](), list[TrialPole]()
     with one_thread():
         for first, last, begin, end in overlapping_bands(
             omega, 2 * np.pi * rate / n, max(omega.size // _BANDS, 600), _SHARE
         ):
             inside = omega[begin], omega[end - 1] + 2 * np.pi * rate / n
             own, poles = _of_band(Y[first:last] / size, omega[first:last], inside)
-            found, tried = found + own, tried + poles
+            estimates, tried = estimates + own, tried + poles
             if tick is not None:
                 tick("modes: stochastic subspace", last / omega.size)
-    for x in found:
+    for x in estimates:
         x.shape, x.variance = x.shape * size, x.variance * size**2
-    found = _separate(found)
+    estimates = _separate(estimates)
     if count != "auto":
-        best = sorted(found, key=lambda x: (x.harmonic, np.trace(x.covariance) / x.pole.real**2))[:count]
-        found = sorted(best, key=lambda x: x.pole.imag)
+        best = sorted(estimates, key=lambda x: (x.harmonic, np.trace(x.covariance) / x.pole.real**2))[:count]
+        estimates = sorted(best, key=lambda x: x.pole.imag)
     limits = float(f[0]), float(f[-1])
     interval = student(_STRETCHES - 1)
     modes = tuple(
         mode_of(x.pole, [(x.covariance, interval)], data.outputs, x.shape, x.variance, shown=not x.harmonic)
-        for x in found
+        for x in estimates
     )
-    steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in found if x.harmonic)
+    steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in estimates if x.harmonic)
     remedy = f"{steady}: the envelope is steady, as a harmonic's is. Take it for no mode, or record at another speed"
     random = Check(passed=not steady, detail=remedy if steady else "no mode is a harmonic")
     checks = modes_checks(modes, count, limits, f"Record longer, or give {setting('band')}")
     return Modal(
-        status="converged" if found else "failed",
+        status="converged" if estimates else "failed",
         method="covariance-driven stochastic subspace, broadband excitation not measured",
         modes=modes,
         checks={**checks, "modes_random": random},
@@ -138,7 +138,7 @@ def operational_modes(
         band_hz=limits,
         poles=tuple(tried),
         record=data.record,
-        details={"envelope": [x.steadiness for x in found]},
+        details={"envelope": [x.steadiness for x in estimates]},
     )
 
 
@@ -203,8 +203,8 @@ def _known(
         own = np.array(trial.shape)
         largest = int(np.argmax(np.abs(own)))
         moved = []
-        for found in again:
-            p, shapes = found[trial.order]
+        for trials in again:
+            p, shapes = trials[trial.order]
             k = int(np.argmin(np.abs(p - trial.pole)))
             shape = shapes[k] / shapes[k, largest]
             moved.append(np.r_[p[k].real, p[k].imag, shape.real, shape.imag])
@@ -232,20 +232,20 @@ def _stands_out(Y: Complex, omega: Array, p: TrialPole) -> bool:
     away, width = np.abs(omega - p.pole.imag), abs(p.pole.real)
     step = omega[1] - omega[0]
     near = away <= max(width, 1.5 * step)
-    beside = (away > max(4 * width, 6 * step)) & (away < max(12 * width, 60 * step))
-    if not beside.any():
+    floor = (away > max(4 * width, 6 * step)) & (away < max(12 * width, 60 * step))
+    if not floor.any():
         return True
-    level = np.median(power[beside]) / np.log(2)
+    level = np.median(power[floor]) / np.log(2)
     return bool(np.mean(power[near]) > _PEAK * (1 + 2 / np.sqrt(np.count_nonzero(near))) * level)
 
 
-def _separate(found: list[_Found]) -> list[_Found]:
+def _separate(estimates: list[_Found]) -> list[_Found]:
     """Modes that are damped, known, and not twice, in order of frequency."""
-    kept = list[_Found]()
-    for x in sorted(found, key=lambda x: float(np.trace(x.covariance))):
+    modes = list[_Found]()
+    for x in sorted(estimates, key=lambda x: float(np.trace(x.covariance))):
         damped = 0 < -x.pole.real <= MOST_DAMPED * abs(x.pole)
-        known = x.harmonic or max(x.covariance[0, 0], x.covariance[1, 1]) < x.pole.real**2
-        near = any(abs(x.pole - y.pole) < 0.3 * (abs(x.pole.real) + abs(y.pole.real)) for y in kept)
-        if damped and known and not near:
-            kept.append(x)
-    return sorted(kept, key=lambda x: x.pole.imag)
+        certain = x.harmonic or max(x.covariance[0, 0], x.covariance[1, 1]) < x.pole.real**2
+        near = any(abs(x.pole - y.pole) < 0.3 * (abs(x.pole.real) + abs(y.pole.real)) for y in modes)
+        if damped and certain and not near:
+            modes.append(x)
+    return sorted(modes, key=lambda x: x.pole.imag)

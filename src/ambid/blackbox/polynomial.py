@@ -216,7 +216,7 @@ def cautions(model: PolynomialModel, covariance: Array, fits: Sequence[Minimum])
 
 def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
     """Return a warning where the plant looks unstable, which a predictor with F cannot be."""
-    found = []
+    warnings = []
     for o, x in enumerate(layouts):
         n = max(x.nf)
         armax = Layout(na=n, nb=x.nb, nc=n, nd=0, nf=(0,) * x.n_inputs, nk=x.nk, at_rest=x.at_rest)
@@ -229,11 +229,11 @@ def unstable_plant(layouts: Sequence[Layout], scaled: ScaledData) -> list[str]:
         covariance[np.ix_(armax.free, armax.free)] = variance * fit.directions.inverse()
         size, sd = _outermost(fit.theta, armax.places["A", None], covariance)
         if size > 1.0 + _SDS * sd:
-            found.append(
+            warnings.append(
                 f"output {o}: the plant looks unstable (armax finds a pole of magnitude {size:.4g}, sd {sd:.1g}), "
                 "and this structure would give an unstable predictor. Use armax, arx or ararmax"
             )
-    return found
+    return warnings
 
 
 def _outermost(theta: Array, place: slice, covariance: Array) -> tuple[float, float]:
@@ -255,16 +255,16 @@ def not_at_rest(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: Scal
 
     `layouts`: at rest; `fits`: one for each output.
     """
-    found = []
+    warnings = []
     for o, (layout, fit) in enumerate(zip(layouts, fits, strict=True)):
         p = rest_probability(layout, fit, scaled.y[o], scaled.u)
         if p < _LEVEL:
-            found.append(
+            warnings.append(
                 f"{f'output {o}: ' if len(fits) > 1 else ''}the record does not start at rest at zero (initial "
                 f"state and constant, estimated freely, are significant: {p_text(p)}): coefficients are biased. "
                 f"Omit {setting('at_rest')}"
             )
-    return found
+    return warnings
 
 
 def rest_probability(layout: Layout, fit: Minimum, y: Array, u: Array) -> float:
@@ -293,18 +293,18 @@ def missed_minimum(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: S
 
     `fits`: one for each output.
     """
-    found = []
+    warnings = []
     for o, (layout, fit) in enumerate(zip(layouts, fits, strict=True)):
         if any(layout.nf) or not (layout.nc or layout.nd) or (fit.converged and fit.iterations <= SMOOTH):
             continue
         p, less = _longer_model(layout, fit, scaled.y[o], scaled.u)
         if p < _LEVEL:
-            found.append(
+            warnings.append(
                 f"{f'output {o}: ' if len(fits) > 1 else ''}a longer model fits significantly better ({less:.1%} "
                 f"of the squared residual, {p_text(p)}) and the search was hard: it may have missed a better "
                 "minimum, or the orders are too low. Try pbsid or sspem, or raise the orders"
             )
-    return found
+    return warnings
 
 
 def _longer_model(layout: Layout, fit: Minimum, y: Array, u: Array) -> tuple[float, float]:
@@ -350,15 +350,15 @@ def estimate(
     `fixed`: known coefficients, by the names of `PolynomialModel.names`, in SI; `tick`: called before each look at the
     data; `at_rest`: the record begins at rest at zero.
     """
-    given, free_delay = read_orders(name, data, orders, at_rest=at_rest)
+    layout, free_delay = read_orders(name, data, orders, at_rest=at_rest)
     scaled = scale_data(name, data, at_rest=at_rest)
     with one_thread():
-        layouts = [given] * data.n_outputs
+        layouts = [layout] * data.n_outputs
         if free_delay:
-            layouts = _layouts(name, given, scaled, 0 if data.open_loop else 1, tick)
-        known = fixed_places(name, tuple(layouts), {} if fixed is None else fixed)
-        layouts = [replace(x, fixed=tuple(k)) if k else x for x, k in zip(layouts, known, strict=True)]
-        fits = [fit_output(name, x, scaled, o, known[o], tick) for o, x in enumerate(layouts)]
+            layouts = _layouts(name, layout, scaled, 0 if data.open_loop else 1, tick)
+        places = fixed_places(name, tuple(layouts), {} if fixed is None else fixed)
+        layouts = [replace(x, fixed=tuple(k)) if k else x for x, k in zip(layouts, places, strict=True)]
+        fits = [fit_output(name, x, scaled, o, places[o], tick) for o, x in enumerate(layouts)]
         return polynomial_fit(name, data, scaled, layouts, fits, estimated_delay=free_delay)
 
 
@@ -366,7 +366,9 @@ fir, arx, armax, arma = (partial(estimate, name) for name in ("fir", "arx", "arm
 ararx, ararmax, oe, bj = (partial(estimate, name) for name in ("ararx", "ararmax", "oe", "bj"))
 
 
-def _layouts(name: str, given: Layout, scaled: ScaledData, least: int, tick: Callable[[], None] | None) -> list[Layout]:
+def _layouts(
+    name: str, orders: Layout, scaled: ScaledData, least: int, tick: Callable[[], None] | None
+) -> list[Layout]:
     """Layouts of all outputs with delays estimated."""
     piece = liveliest_part(scaled.u)
     part = replace(
@@ -379,15 +381,15 @@ def _layouts(name: str, given: Layout, scaled: ScaledData, least: int, tick: Cal
     out: list[Layout] = []
     for o in range(scaled.y.shape[0]):
         nk = long_delays(name, scaled.y[o], scaled.u, least, at_rest=scaled.at_rest)
-        layout = replace(given, nk=nk, at_rest=part.at_rest)
+        layout = replace(orders, nk=nk, at_rest=part.at_rest)
         loss = _loss(fit_output(name, layout, part, o, {}, tick))
-        for i in range(given.n_inputs):  # the structure itself decides between neighbours, where they clearly differ
+        for i in range(orders.n_inputs):  # the structure itself decides between neighbours, where they clearly differ
             for k in (nk[i] - 1, nk[i] + 1):
                 near = replace(layout, nk=(*layout.nk[:i], k, *layout.nk[i + 1 :]))
                 if k >= least:
-                    found = _loss(fit_output(name, near, part, o, {}, tick))
-                    if rows * np.log(found / loss) < -np.log(rows):
-                        layout, loss = near, found
+                    near_loss = _loss(fit_output(name, near, part, o, {}, tick))
+                    if rows * np.log(near_loss / loss) < -np.log(rows):
+                        layout, loss = near, near_loss
         out.append(replace(layout, at_rest=scaled.at_rest))
     return out
 
@@ -401,12 +403,12 @@ def fit_output(
     layout: Layout,
     scaled: ScaledData,
     o: int,
-    known: Mapping[int, float],
+    fixed: Mapping[int, float],
     tick: Callable[[], None] | None,
 ) -> Minimum:
     """Fit one output from the best of its starts.
 
-    `known`: fixed coefficients by place, SI.
+    `fixed`: fixed coefficients by place, SI.
     """
     p, y = predictor(layout), scaled.y[o]
     need = layout.first_row + 2 * (p.n_nuisance + layout.free.size) + 1
@@ -416,37 +418,37 @@ def fit_output(
             "orders, or use a longer part of the record"
         )
     worth = coefficient_units(layout, scaled, o)
-    found: list[Minimum] = []
+    minima: list[Minimum] = []
     shared = bool(layout.na and layout.nd)  # A and D share roots: there always are several minima
     more = weighted_starts(layout, y, scaled.u) if any(layout.nf) else separable_starts(layout, y, scaled.u)
     for ordinary, some in ((True, starts(layout, y, scaled.u)), (False, more)):
         for start in some:
-            for place, value in known.items():
+            for place, value in fixed.items():
                 start[place] = value / worth[place]
             if not stable_predictor(layout, start):
                 continue
             end = search(p, y, scaled.u, start, most=_LONG if ordinary else _SHORT, tick=tick)
-            if not ordinary and not end.converged and found and end.cost < min(x.cost for x in found):
+            if not ordinary and not end.converged and minima and end.cost < min(x.cost for x in minima):
                 end = search(p, y, scaled.u, end.theta, tick=tick)
-            found.append(end)
-            agreed = sum(x.converged and x.cost <= _lowest(found) for x in found) > 1
-            if agreed if ordinary and shared else _smooth(found):
+            minima.append(end)
+            agreed = sum(x.converged and x.cost <= _lowest(minima) for x in minima) > 1
+            if agreed if ordinary and shared else _smooth(minima):
                 break
-        if _smooth(found) and not shared:
+        if _smooth(minima) and not shared:
             break
-    if not found:
+    if not minima:
         raise EstimationError(f"{name}: no stable predictor to start from. Change the fixed coefficients of C or F")
-    best = min(found, key=lambda x: x.cost)
+    best = min(minima, key=lambda x: x.cost)
     # one that converged, where a lower one that did not is not told from it by the data
-    near = [x for x in found if x.converged and x.cost <= best.cost * (1 + _EQUAL / best.n_rows)]
+    near = [x for x in minima if x.converged and x.cost <= best.cost * (1 + _EQUAL / best.n_rows)]
     return best if best.converged else min(near, key=lambda x: x.cost, default=best)
 
 
-def _smooth(found: list[Minimum]) -> bool:
+def _smooth(minima: list[Minimum]) -> bool:
     """Whether the last search went straight to the lowest minimum; a long way hints at a second one."""
-    last = found[-1] if found else None
-    return last is not None and last.converged and last.iterations <= SMOOTH and last.cost <= _lowest(found)
+    last = minima[-1] if minima else None
+    return last is not None and last.converged and last.iterations <= SMOOTH and last.cost <= _lowest(minima)
 
 
-def _lowest(found: list[Minimum]) -> float:
-    return min(x.cost for x in found) * (1 + 1e-6)
+def _lowest(minima: list[Minimum]) -> float:
+    return min(x.cost for x in minima) * (1 + 1e-6)

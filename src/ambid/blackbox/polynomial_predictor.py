@@ -149,7 +149,7 @@ def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = Fals
 
     `name`: structure.
     """
-    known, n_u = structure(name).orders, data.n_inputs
+    letters, n_u = structure(name).orders, data.n_inputs
     wants = structure(name).inputs
     if wants and not data.n_inputs:
         raise EstimationError(f"{name} needs an input and the data have none. Name one, or use arma")
@@ -158,14 +158,14 @@ def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = Fals
             f"{name} takes no inputs and the data have {data.n_inputs} ({', '.join(data.inputs)}). Omit them, or "
             "use armax"
         )
-    check_order_names(name, orders, known, [key for key in known if key != "nk"])
-    free_delay = "nk" in known and left_open(orders, "nk")
+    check_order_names(name, orders, letters, [key for key in letters if key != "nk"])
+    free_delay = "nk" in letters and left_open(orders, "nk")
 
     def one(key: str) -> int:
-        return single_order(name, orders, key, 0) if key in known else 0
+        return single_order(name, orders, key, 0) if key in letters else 0
 
     def each(key: str, least: int = 0) -> tuple[int, ...]:
-        return order_per_input(name, orders, key, least, n_u) if key in known else (0,) * n_u
+        return order_per_input(name, orders, key, least, n_u) if key in letters else (0,) * n_u
 
     layout = Layout(
         na=one("na"),
@@ -205,7 +205,7 @@ def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, flo
     for o, layout in enumerate(layouts):
         free.update({names[first + p]: (o, int(p)) for p in layout.free})
         first += layout.n_theta
-    found: list[dict[int, float]] = [{} for _ in layouts]
+    places: list[dict[int, float]] = [{} for _ in layouts]
     for key, value in fixed.items():
         if key not in free:
             raise EstimationError(
@@ -214,8 +214,8 @@ def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, flo
         if not np.isfinite(value):
             raise EstimationError(f"{name}: coefficient {key} is fixed at {value}; it must be a finite number")
         o, place = free[key]
-        found[o][place] = float(value)
-    return found
+        places[o][place] = float(value)
+    return places
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)

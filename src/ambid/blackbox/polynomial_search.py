@@ -101,10 +101,10 @@ def search(
         at = evaluated(start, at.nuisance + _nuisance_step(at, np.zeros(free.size)))
     damping, converged, shortened, exact, count = 0.0, False, False, False, 1
     while True:
-        seen = directions(at.R[n:-1, n:-1])
+        axes = directions(at.R[n:-1, n:-1])
         spread = max(at.rest / max(n_rows - n - free.size, 1), 1e-300)
-        left = seen.explain(at.gradient)
-        step = seen.solve(-at.gradient)
+        left = axes.explain(at.gradient)
+        step = axes.solve(-at.gradient)
         if left <= _ENOUGH * spread or at.cost <= floor or _linear(predictor):
             theta = _moved(at.theta, free, step)
             if _linear(predictor) or stable_predictor(predictor.layout, theta):
@@ -120,7 +120,7 @@ def search(
             # where rounding allows no further descent and less than a hundredth of a standard deviation is left
             converged = damping > 1e12 and left <= 1e-4 * spread
             break
-        step, cut = _kept_stable(predictor, at.theta, free, seen.solve(-at.gradient, damping))
+        step, cut = _kept_stable(predictor, at.theta, free, axes.solve(-at.gradient, damping))
         trial = evaluated(_moved(at.theta, free, step), at.nuisance + _nuisance_step(at, step))
         count += 1
         if trial.cost < at.cost:  # not where it is no number
@@ -138,7 +138,7 @@ def search(
         free=free,
         nuisance=at.nuisance,
         triangle=at.R[n:-1, n:-1],
-        directions=seen,
+        directions=axes,
         cost=at.cost,
         n_rows=n_rows,
         converged=converged,
@@ -266,9 +266,9 @@ def _pieces(n: int, history: int, most_rows: int | None) -> Iterator[slice]:
 def _least_squares(layout: Layout, y: Array, u: Array) -> Array:
     """A and B as if the noise went through 1/A; C = D = 1."""
     arx = arx_layout(max([layout.na, *layout.nf]), layout.nb, layout.nk, at_rest=layout.at_rest)
-    found = arx.polynomials(arx_coefficients(arx, y, u))
-    F = [reflect(found.A[: n + 1]) for n in layout.nf]
-    return layout.coefficients(A=found.A[: layout.na + 1], B=found.B, F=F)
+    plant = arx.polynomials(arx_coefficients(arx, y, u))
+    F = [reflect(plant.A[: n + 1]) for n in layout.nf]
+    return layout.coefficients(A=plant.A[: layout.na + 1], B=plant.B, F=F)
 
 
 def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
@@ -276,8 +276,8 @@ def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
     n = max(1, min(8 + 2 * most, y.size // (6 * (1 + layout.n_inputs))))
     arx = arx_layout(n, (n,) * layout.n_inputs, layout.nk, at_rest=layout.at_rest)
     theta, R = _regression(arx, y, u, _ROWS)
-    found = arx.polynomials(theta)
-    return LongModel(P=found.A, Q=found.B, nk=layout.nk, triangle=R)
+    polynomials = arx.polynomials(theta)
+    return LongModel(P=polynomials.A, Q=polynomials.B, nk=layout.nk, triangle=R)
 
 
 def reduce_long_model(long: LongModel, inputs: Sequence[int], nb: Sequence[int], nf: int) -> tuple[list[Array], Array]:
@@ -310,13 +310,13 @@ def reduce_long_model(long: LongModel, inputs: Sequence[int], nb: Sequence[int],
         whiten = np.asarray(np.linalg.qr(spread, mode="r")).T
         together = np.linalg.lstsq(whiten, np.column_stack([rows, right]), rcond=1e-9)[0]
         x = np.linalg.lstsq(together[:, :-1], together[:, -1], rcond=1e-12)[0]
-    found = []
+    numerators = []
     for k, i in enumerate(inputs):
         first = sum(count[:k])
         b = np.zeros(long.nk[i] + nb[k])
         b[long.nk[i] : long.nk[i] + count[k]] = x[first : first + count[k]]
-        found.append(b)
-    return found, np.concatenate([[1.0], x[sum(count) :]])
+        numerators.append(b)
+    return numerators, np.concatenate([[1.0], x[sum(count) :]])
 
 
 def _shifts(c: Array, n_columns: int, lag: int) -> Array:
@@ -335,9 +335,9 @@ def _hannan_rissanen(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
     for q, x in zip(long.Q, u, strict=True):
         e -= filter_signal(q, np.ones(1), x)
     arx = arx_layout(layout.na, (*layout.nb, layout.nc), (*layout.nk, 1), at_rest=layout.at_rest)
-    found = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
-    C = reflect(np.concatenate([[1.0], found.B[-1][1:]]))
-    yield layout.coefficients(A=found.A, B=found.B[:-1], C=C)
+    plant = arx.polynomials(arx_coefficients(arx, y, np.vstack([u, e])))
+    C = reflect(np.concatenate([[1.0], plant.B[-1][1:]]))
+    yield layout.coefficients(A=plant.A, B=plant.B[:-1], C=C)
 
 
 def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
@@ -348,8 +348,8 @@ def _noise(layout: Layout, v: Array) -> tuple[Array, Array]:
     e = filter_signal(long.polynomials(_regression(long, v, u, _ROWS)[0]).A, np.ones(1), v)
     nb = (layout.nc,) if layout.nc else ()
     arx = arx_layout(layout.nd, nb, (1,) * len(nb))
-    found = arx.polynomials(arx_coefficients(arx, v, e[None, :] if nb else u))
-    return reflect(np.concatenate([[1.0], *(b[1:] for b in found.B)])), reflect(found.A)
+    polynomials = arx.polynomials(arx_coefficients(arx, v, e[None, :] if nb else u))
+    return reflect(np.concatenate([[1.0], *(b[1:] for b in polynomials.B)])), reflect(polynomials.A)
 
 
 def _generalised(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
@@ -384,8 +384,8 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         yield theta
     if coloured:  # the plant searched for with white noise, then the noise
         white = Layout(na=0, nb=layout.nb, nc=0, nd=0, nf=layout.nf, nk=layout.nk, at_rest=layout.at_rest)
-        found = white.polynomials(search(predictor(white), y, u, ways[0](white, y, u), most=15).theta)
-        theta = layout.coefficients(B=found.B, F=found.F)
+        polynomials = white.polynomials(search(predictor(white), y, u, ways[0](white, y, u), most=15).theta)
+        theta = layout.coefficients(B=polynomials.B, F=polynomials.F)
         _set_noise(theta, layout, y, u)
         yield theta
 
@@ -412,8 +412,8 @@ def _from_data(layout: Layout, y: Array, u: Array) -> Array:
 
 def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
     long = _long_model(layout, y, u)
-    found = [reduce_long_model(long, [i], [layout.nb[i]], layout.nf[i]) for i in range(layout.n_inputs)]
-    return layout.coefficients(B=[b for (b,), _ in found], F=[reflect(f, 0.999) for _, f in found])
+    reduced = [reduce_long_model(long, [i], [layout.nb[i]], layout.nf[i]) for i in range(layout.n_inputs)]
+    return layout.coefficients(B=[b for (b,), _ in reduced], F=[reflect(f, 0.999) for _, f in reduced])
 
 
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest: bool = False) -> tuple[Array, Array]:
@@ -426,11 +426,11 @@ def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest:
     y, u = y[part], u[part]
     for _ in range(_SM_ITERATIONS if nf else 1):
         one = np.ones(1)
-        found = arx_coefficients(arx, filter_signal(one, F, y), filter_signal(one, F, u)[None, :])
-        before, F = F, reflect(found[arx.places["A", None]], 0.999)
+        theta = arx_coefficients(arx, filter_signal(one, F, y), filter_signal(one, F, u)[None, :])
+        before, F = F, reflect(theta[arx.places["A", None]], 0.999)
         if before.size == F.size and np.max(np.abs(before - F)) < 1e-3:
             break
-    return found[arx.places["B", 0]], F
+    return theta[arx.places["B", 0]], F
 
 
 SMOOTH = 12  # evaluations; a longer way hints at a second minimum
@@ -448,12 +448,12 @@ def separable_starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
         return
     part = liveliest_part(u)
     free = replace(layout, fixed=(), at_rest=layout.at_rest and not part.start)
-    found: list[tuple[float, int, Array]] = []
+    starts: list[tuple[float, int, Array]] = []
     for C in _candidates(layout.nc, _GRID, mixed=not layout.nd):
         for D in _candidates(layout.nd, _D_GRID, mixed=False):
             loss, theta = _given(free, C, D, y[part], u[:, part])
-            found.append((loss, len(found), theta))
-    yield from (theta for _, _, theta in sorted(found)[:_CANDIDATES])
+            starts.append((loss, len(starts), theta))
+    yield from (theta for _, _, theta in sorted(starts)[:_CANDIDATES])
 
 
 def _candidates(n: int, grid: Sequence[float], *, mixed: bool) -> Iterator[Array]:
@@ -475,11 +475,11 @@ def _with_roots(roots: list[float]) -> Array:
 def _given(layout: Layout, C: Array, D: Array, y: Array, u: Array) -> tuple[float, Array]:
     """Best loss for C and D, and the coefficients that have it."""
     arx = replace(layout, nc=0, nd=0)
-    p, found = predictor(arx), arx.start()
+    p, theta = predictor(arx), arx.start()
     fu = np.array([filter_signal(D, C, x) for x in u]).reshape(u.shape)
-    R = p.triangle(filter_signal(D, C, y), fu, found, np.zeros(p.n_nuisance))
-    found[arx.free] -= solve_triangle(R[:-1, :-1], R[:-1, -1])[p.n_nuisance :]
-    plant = arx.polynomials(found)
+    R = p.triangle(filter_signal(D, C, y), fu, theta, np.zeros(p.n_nuisance))
+    theta[arx.free] -= solve_triangle(R[:-1, :-1], R[:-1, -1])[p.n_nuisance :]
+    plant = arx.polynomials(theta)
     return float(R[-1, -1] ** 2), layout.coefficients(A=plant.A, B=plant.B, C=C, D=D, F=plant.F)
 
 
@@ -508,8 +508,8 @@ def long_delays(name: str, y: Array, u: Array, least: int, *, at_rest: bool = Fa
         for i, k in enumerate(delays):
             first = history + i * taps
             keep += range(first + k - least, first + taps)
-        kept: Array = np.asarray(np.linalg.qr(R[:, np.array([*keep, -1])], mode="r"))
-        cost = max(float(kept[-1, -1] ** 2), 1e-24 * n)
+        reduced: Array = np.asarray(np.linalg.qr(R[:, np.array([*keep, -1])], mode="r"))
+        cost = max(float(reduced[-1, -1] ** 2), 1e-24 * n)
         return rows * float(np.log(cost)) + len(keep) * float(np.log(rows))
 
     delays: tuple[int, ...] = (least,) * n_u

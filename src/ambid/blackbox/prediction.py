@@ -143,9 +143,9 @@ class Sensitivities:
         none = np.zeros((block, n))
         sensitivity_scan(self._F, none, none, self._state, rows, width - 1)
         self._state[:, -1] = 0.0
-        known = np.ascontiguousarray(signals[:, : self._direct.shape[1]])
+        inputs = np.ascontiguousarray(signals[:, : self._direct.shape[1]])
         out = (self._C @ rows.reshape(n, block * width)).reshape(n_y, block, width)[:, :, :-1]
-        return np.asarray(out + known @ self._direct)
+        return np.asarray(out + inputs @ self._direct)
 
 
 def companion(den: Numbers) -> Numbers:
@@ -269,15 +269,15 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
     return Errors(model=model, plant=plant, one_step=e, simulation=simulated, claims_noise=claims_noise)
 
 
-def errors_ahead(found: Errors, steps: int) -> Array:
+def errors_ahead(run: Errors, steps: int) -> Array:
     """Return y minus its prediction `steps` samples ahead, (n_samples - steps + 1, n_outputs), SI.
 
     Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
     """
-    e, power = found.one_step[steps - 1 :].copy(), found.model.K
+    e, power = run.one_step[steps - 1 :].copy(), run.model.K
     for j in range(1, steps):
-        e += found.one_step[steps - 1 - j : -j] @ (found.model.C @ power).T
-        power = found.model.A @ power
+        e += run.one_step[steps - 1 - j : -j] @ (run.model.C @ power).T
+        power = run.model.A @ power
     return np.asarray(e)
 
 
@@ -286,12 +286,12 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
 
     Returns their means are zero.
     """
-    found = errors(fit, data)
-    m = found.model
+    first = errors(fit, data)
+    m = first.model
     # a constant c in the output is (I - C (I - F)^-1 K) c in the one-step error, and c itself in the simulation
     F = m.A - m.K @ m.C
     through = np.eye(m.n_outputs) - m.C @ np.linalg.lstsq(np.eye(m.order) - F, m.K, rcond=1e-12)[0]
-    e, simulated = found.one_step, found.simulation
+    e, simulated = first.one_step, first.simulation
     late = slice(data.n_samples // 2, None)  # the initial state has taken up the constant at the start
     moved, shifted = np.zeros(m.n_outputs), np.zeros(m.n_outputs)
     for _ in range(2):
@@ -301,14 +301,14 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
         if simulated is not None:
             shifted += simulated[late].mean(axis=0)
             y = data.y - shifted
-            again = simulation(found.plant, data.u, y, fit.offsets)
+            again = simulation(first.plant, data.u, y, fit.offsets)
             simulated = None if again is None else y - again
     return Errors(
         model=m,
-        plant=found.plant,
+        plant=first.plant,
         one_step=e - e.mean(axis=0),
         simulation=None if simulated is None else simulated - simulated.mean(axis=0),
-        claims_noise=found.claims_noise,
+        claims_noise=first.claims_noise,
     )
 
 
@@ -407,10 +407,10 @@ class Gradient:
     theta: tuple[Indices, ...] | None
 
 
-def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
+def gradient(fit: BlackBoxFit, data: IOData, run: Errors) -> Gradient:
     """Differentiate the one-step predictions.
 
-    `found`: the data run through the fit. Returns started from rest: the first samples are not exact.
+    `run`: the data run through the fit. Returns started from rest: the first samples are not exact.
     """
     u, y = data.u - fit.offsets.u, data.y - fit.offsets.y
     model = fit.model
@@ -418,17 +418,17 @@ def gradient(fit: BlackBoxFit, data: IOData, found: Errors) -> Gradient:
         free = _free(fit, model)
         rows, places, first = list[Array](), list[Indices](), 0
         for o, p in enumerate(model.outputs):
-            every = polynomial_gradient(p, u, y[:, o], found.one_step[:, o])
+            every = polynomial_gradient(p, u, y[:, o], run.one_step[:, o])
             own = np.nonzero(free[first : first + every.shape[1]])[0]
             rows.append(every[:, own])
             places.append(own + first)
             first += every.shape[1]
         return Gradient(rows=tuple(rows), theta=tuple(places))
-    if isinstance(model, TransferModel) and stable(found.plant):
+    if isinstance(model, TransferModel) and stable(run.plant):
         return Gradient(
-            rows=tuple(_transfer_gradient(model, fit.dt, o, u, y, found) for o in range(model.n_outputs)), theta=None
+            rows=tuple(_transfer_gradient(model, fit.dt, o, u, y, run) for o in range(model.n_outputs)), theta=None
         )
-    return Gradient(rows=_state_space_tangent(fit, found, u, y), theta=None)
+    return Gradient(rows=_state_space_tangent(fit, run, u, y), theta=None)
 
 
 def polynomial_gradient(p: Polynomials, u: Array, y: Array, e: Array) -> Array:
@@ -474,7 +474,7 @@ def _free(fit: BlackBoxFit, model: PolynomialModel) -> NDArray[np.bool_]:
     return np.asarray(free)
 
 
-def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Array, found: Errors) -> Array:
+def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Array, run: Errors) -> Array:
     from scipy.signal import ss2tf
 
     B, F = list[Array](), list[Array]()
@@ -482,11 +482,11 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
         one = TransferModel(num=((model.num[o][i],),), den=((model.den[o][i],),), dt=model.dt, delay=(model.delay[i],))
         ss = one.state_space() if one.dt is not None else held_transfer(one, dt)
         num, den = ss2tf(ss.A, ss.B, ss.C, ss.D) if ss.order else (ss.D, np.ones(1))
-        used = int(np.nonzero(np.abs(den) > 1e-12)[0][-1]) + 1
+        size = int(np.nonzero(np.abs(den) > 1e-12)[0][-1]) + 1
         B.append(np.where(np.abs(num[0]) > 1e-12 * np.max(np.abs(num[0])), num[0], 0.0))
-        F.append(np.asarray(den[:used]))
+        F.append(np.asarray(den[:size]))
     p = Polynomials(A=np.ones(1), B=tuple(B), C=np.ones(1), D=np.ones(1), F=tuple(F))
-    every = polynomial_gradient(p, u, y[:, o], found.one_step[:, o])
+    every = polynomial_gradient(p, u, y[:, o], run.one_step[:, o])
     free, first = list[int](), 0
     for letter, _, c in p.parts():
         free += [first + k for k in range(c.size) if (k > 0 if letter == "F" else letter == "B" and c[k] != 0)]
@@ -494,19 +494,19 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
     return every[:, free]
 
 
-def _state_space_tangent(fit: BlackBoxFit, found: Errors, u: Array, y: Array) -> tuple[Array, ...]:
+def _state_space_tangent(fit: BlackBoxFit, run: Errors, u: Array, y: Array) -> tuple[Array, ...]:
     """Move along every entry of A and B, of K where there is noise, and of D where there is any.
 
     Entries that were not estimated stand still: moving them would take what they miss out of the residuals.
     """
-    m = found.model
+    m = run.model
     x = run_states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))
     moves = {"A": True, "B": True, "C": False, "D": bool(np.any(m.D)), "K": bool(np.any(m.K))}
     free = np.concatenate([np.full(getattr(m, name).size, moves[name]) for name in "ABCDK"])
     if fit.covariance is not None and fit.covariance.shape[0] == free.size:
         free &= np.diag(fit.covariance) > 0
     along = Sensitivities(m, np.eye(free.size)[:, free])
-    signals = np.hstack([x, u, found.one_step])
+    signals = np.hstack([x, u, run.one_step])
     blocks = [along.block(signals[k : k + _BLOCK]) for k in range(0, u.shape[0], _BLOCK)]
     return tuple(np.concatenate(blocks, axis=1))
 
@@ -565,8 +565,8 @@ def _entry(p: Polynomials, i: int) -> tuple[Array, Array]:
     den = np.convolve(p.A, p.F[i])
     size = max(den.size, p.B[i].size)
     num = np.pad(p.B[i], (0, size - p.B[i].size))
-    used = np.nonzero(num)[0]
-    return np.asarray(num[used[0] :] if used.size else num[-1:]), np.pad(den, (0, size - den.size))
+    nonzero = np.nonzero(num)[0]
+    return np.asarray(num[nonzero[0] :] if nonzero.size else num[-1:]), np.pad(den, (0, size - den.size))
 
 
 def _with_delay(model: TransferModel, o: int, i: int) -> tuple[Array, Array]:

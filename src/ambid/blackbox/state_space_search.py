@@ -95,9 +95,9 @@ def balance(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpace
     """
     m = model
     F, G = m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K])
-    seen = np.linalg.solve(np.linalg.cholesky(noise), m.C)
+    whitened = np.linalg.solve(np.linalg.cholesky(noise), m.C)
     try:
-        left, right = _factor(_gramian(F, G)), _factor(_gramian(F.T, seen.T))
+        left, right = _factor(_gramian(F, G)), _factor(_gramian(F.T, whitened.T))
         U, s, _ = np.linalg.svd(right.T @ left)
         s = np.sqrt(np.maximum(s, _FAINT * s[0]))
         T = (U / s).T @ right.T  # new states = T old states
@@ -258,8 +258,8 @@ def _blocks(model: StateSpaceModel, x0: Array, u: Array, y: Array) -> Iterator[t
         part = slice(first, first + _BLOCK)
         work = np.hstack([np.zeros((y[part].shape[0], n)), u[part], y[part]])
         state_scan(step, work, x)
-        known = work[:, : n + n_u]
-        yield known, y[part] - known @ out
+        regressors = work[:, : n + n_u]
+        yield regressors, y[part] - regressors @ out
 
 
 def _triangle(point: Point, ways: Array, u: Array, y: Array) -> Array:
@@ -271,8 +271,8 @@ def _triangle(point: Point, ways: Array, u: Array, y: Array) -> Array:
     along = Sensitivities(model, ways, initial=True)
     width = n + n_y + d + 1
     factor = np.zeros((width, width), order="F")
-    for known, e in _blocks(model, point.x0, u, y):
-        slopes = along.block(np.hstack([known, e]))
+    for regressors, e in _blocks(model, point.x0, u, y):
+        slopes = along.block(np.hstack([regressors, e]))
         m = e.shape[0]
         rows = np.empty((n_y, m, width))
         rows[:, :, :n] = slopes[:, :, d:]
@@ -295,8 +295,8 @@ def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
     """
     with one_thread():
         first = first_model("pbsid", data, orders, None, None, tick)
-        n, given = first.full.model.order, first.plan.channels
-        u, y = (given.u - given.mean_u) / given.scale_u, (given.y - given.mean_y) / given.scale_y
+        n, channels = first.full.model.order, first.plan.channels
+        u, y = (channels.u - channels.mean_u) / channels.scale_u, (channels.y - channels.mean_y) / channels.scale_y
         numbers = n * (u.shape[1] + 2 * y.shape[1] + 1) + y.shape[1] * (1 + first.plan.feedthrough * u.shape[1])
         if y.size < 2 * numbers:
             raise EstimationError(
@@ -338,20 +338,20 @@ def _start(data: IOData, first: FirstModel, orders: Orders, u: Array, y: Array, 
 
 
 def _result(
-    data: IOData, first: FirstModel, found: Likelihood, iterations: int, method: Method, start: Point
+    data: IOData, first: FirstModel, problem: Likelihood, iterations: int, method: Method, start: Point
 ) -> BlackBoxFit:
     """Give the numbers their units and say what has to be said of them."""
-    m, plan, given = found.point.model, first.plan, first.plan.channels
-    n_samples, n_y = given.y.shape
+    m, plan, channels = problem.point.model, first.plan, first.plan.channels
+    n_samples, n_y = channels.y.shape
     # each output has its share of the numbers
-    widened = n_samples / (n_samples - (found.factor.shape[1] - 1) / n_y)
-    noise = found.point.noise * widened
+    widened = n_samples / (n_samples - (problem.factor.shape[1] - 1) / n_y)
+    noise = problem.point.noise * widened
     scaled = Realisation(model=m, innovation=noise, Q=m.K @ noise @ m.K.T, S=m.K @ noise, R=noise)
     k = m.order + n_y
-    seen = directions(found.factor[k:-1, k:-1])  # first states and constants projected out
-    condition = min(seen.condition, 1e18)
+    axes = directions(problem.factor[k:-1, k:-1])  # first states and constants projected out
+    condition = min(axes.condition, 1e18)
     warnings = []
-    if found.point.exact:
+    if problem.point.exact:
         warnings.append(
             "the record has no noise: errors and standard deviations are rounding, and the noise model K is meaningless"
         )
@@ -365,17 +365,17 @@ def _result(
         data,
         plan,
         scaled,
-        found.ways @ seen.inverse() @ found.ways.T * widened,
+        problem.ways @ axes.inverse() @ problem.ways.T * widened,
         criterion=first.criterion,
-        n_estimated=found.ways.shape[1],
-        offsets=operating_point(scaled, given, found.point.constant),
-        status="converged" if found.promise < _ROUNDING or found.point.exact else "stalled",
+        n_estimated=problem.ways.shape[1],
+        offsets=operating_point(scaled, channels, problem.point.constant),
+        status="converged" if problem.promise < _ROUNDING or problem.point.exact else "stalled",
         warnings=warnings,
         details={
             "start": method,
             "iterations": iterations,
-            "gain_nats": 0.5 * (start.cost - found.point.cost),
-            "left_nats": 0.5 * found.promise,
+            "gain_nats": 0.5 * (start.cost - problem.point.cost),
+            "left_nats": 0.5 * problem.promise,
             "condition_number": condition,
             "covariance": {"kind": "information"},
         },

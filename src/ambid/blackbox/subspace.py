@@ -86,11 +86,11 @@ def plan_estimate(
     """
     check_order_names(method, orders, ("n",))
     n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or give 'auto'")
-    given = channels(data)
+    scaled = channels(data)
     largest = n or n_max or _AUTO_MAX
-    longest = _longest(method, data, given.n_samples, largest, horizon)
+    longest = _longest(method, data, scaled.n_samples, largest, horizon)
     length = longest + 1 if method == "pbsid" else 2 * longest
-    factors = compress(given, length, _GROUPS)
+    factors = compress(scaled, length, _GROUPS)
     if tick is not None:
         tick()
     total = merge_factors(factors.groups)
@@ -109,7 +109,7 @@ def plan_estimate(
         past=chosen,
         future=chosen,
         feedthrough=_feedthrough(data, factors, total, chosen) if feedthrough is None else feedthrough,
-        channels=given,
+        channels=scaled,
         factors=factors,
         total=total,
         autoregression=max(20, wanted_lags + wanted_lags // 2),
@@ -130,10 +130,10 @@ def _longest(method: Method, data: IOData, n_samples: int, n: int, horizon: int 
             f"of {counted(data.n_outputs, 'output')}, not {n}. Raise it, or lower n"
         )
     needed = _shortest(data, n, strict=False)
-    asked = max(horizon or 0, needed)
-    if carried < asked:
+    least = max(horizon or 0, needed)
+    if carried < least:
         raise EstimationError(
-            f"{method}: {n_samples} samples allow horizons of {max(carried, 0)}; order {n} needs {asked}. Lower "
+            f"{method}: {n_samples} samples allow horizons of {max(carried, 0)}; order {n} needs {least}. Lower "
             "the order, or use a longer record"
         )
     return horizon or min(carried, max(min(_LONGEST[method], _WIDEST[method] // n_z), needed + 5))
@@ -198,9 +198,9 @@ def build_subspace_fit(
     )
 
 
-def to_units(scaled: Realisation, given: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
+def to_units(scaled: Realisation, channels: Channels, dt: float) -> tuple[StateSpaceModel, Array]:
     """Return the model in SI, and what its coefficients were multiplied by, (n_theta,)."""
-    u, y = given.scale_u, given.scale_y
+    u, y = channels.scale_u, channels.scale_y
     n = scaled.model.order
     factors = (np.ones((n, n)), np.ones((n, 1)) / u, y[:, None] * np.ones(n), y[:, None] / u, np.ones((n, 1)) / y)
     scale = np.concatenate([f.ravel() for f in factors])
@@ -225,7 +225,7 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
     return operating_point(scaled, plan.channels, error)
 
 
-def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offsets:
+def operating_point(scaled: Realisation, channels: Channels, error: Array) -> Offsets:
     """Return the shortest shift of the channels' means that takes a mean off the innovations.
 
     `error`: (n_outputs,), mean of the innovations of the centred, scaled channels.
@@ -234,10 +234,12 @@ def operating_point(scaled: Realisation, given: Channels, error: Array) -> Offse
     n, n_u = s.A.shape[0], s.B.shape[1]
     F, G = s.A - s.K @ s.C, np.hstack([s.B - s.K @ s.D, s.K])
     at_rest = s.C @ np.linalg.solve(np.eye(n) - F, G)
-    by = np.hstack([np.eye(s.C.shape[0]) - at_rest[:, n_u:], -(s.D + at_rest[:, :n_u])])
-    shift = np.linalg.lstsq(by, -error, rcond=1e-6)[0]
+    slope = np.hstack([np.eye(s.C.shape[0]) - at_rest[:, n_u:], -(s.D + at_rest[:, :n_u])])
+    shift = np.linalg.lstsq(slope, -error, rcond=1e-6)[0]
     n_y = s.C.shape[0]
-    return Offsets(u=given.mean_u - shift[n_y:] * given.scale_u, y=given.mean_y - shift[:n_y] * given.scale_y)
+    return Offsets(
+        u=channels.mean_u - shift[n_y:] * channels.scale_u, y=channels.mean_y - shift[:n_y] * channels.scale_y
+    )
 
 
 _HORIZONS = (4, 6, 8, 11, 15, 20)  # samples of future that are tried
@@ -285,20 +287,20 @@ def first_model(
     if method != "pbsid" and horizon is None:
         plan = _choose_horizons(plan, n)
     check_inputs_differ(plan.factors, plan.total, data.inputs, n + plan.feedthrough)
-    given, found = decomposition(plan)
-    return FirstModel(plan=plan, given=given, found=found, full=model_of(plan, found, n), criterion=criterion)
+    prior, states = decomposition(plan)
+    return FirstModel(plan=plan, given=prior, found=states, full=model_of(plan, states, n), criterion=criterion)
 
 
 def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
     """Decompose what all data say.
 
-    Returns `given`: of the autoregression, where there is one; `found`: states of all orders.
+    Returns `prior`: of the autoregression, where there is one; `found`: states of all orders.
     """
     total = triangular_factor(plan.total[:, [0, *_columns(plan)]])
-    given = None  # the prior of the autoregression, from all data: it stays when groups are left out
+    prior = None  # the prior of the autoregression, from all data: it stays when groups are left out
     if plan.method == "pbsid":
-        given = fit_prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
-    return given, _decompose(plan, total, given)
+        prior = fit_prior(total, past=plan.past, feedthrough=plan.feedthrough, like=plan.factors)
+    return prior, _decompose(plan, total, prior)
 
 
 def _choose_horizons(plan: Plan, n: int) -> Plan:
@@ -313,10 +315,10 @@ def _choose_horizons(plan: Plan, n: int) -> Plan:
         if (future - 1) * n_y < n or past + future > f.length:
             continue
         tried = replace(plan, past=past, future=future)
-        found = decomposition(tried)[1]
-        if found.values.size < n:
+        states = decomposition(tried)[1]
+        if states.values.size < n:
             continue
-        model = model_of(tried, found, n)
+        model = model_of(tried, states, n)
         free = f.n_rows - past * (f.n_inputs + n_y) - future * f.n_inputs
         if not model.stable_predictor or free < 1:
             continue
@@ -333,25 +335,25 @@ def _columns(plan: Plan) -> list[int]:
     return classical_columns(plan.factors, plan.past, plan.future)
 
 
-def _decompose(plan: Plan, factor: Array, given: Prior | None) -> Projection | Prediction:
-    if given is not None:
+def _decompose(plan: Plan, factor: Array, prior: Prior | None) -> Projection | Prediction:
+    if prior is not None:
         sizes = {"past": plan.past, "future": plan.future}
-        return predict_states(factor, **sizes, feedthrough=plan.feedthrough, like=plan.factors, given=given)
+        return predict_states(factor, **sizes, feedthrough=plan.feedthrough, like=plan.factors, prior=prior)
     assert plan.method != "pbsid"
     return project(factor, plan.method, past=plan.past, future=plan.future, like=plan.factors)
 
 
-def model_of(plan: Plan, found: Projection | Prediction, n: int) -> Realisation:
+def model_of(plan: Plan, decomposed: Projection | Prediction, n: int) -> Realisation:
     """Return the model of one order."""
-    shown = found.values.size
-    if n > shown:
-        states = "1 state" if shown == 1 else f"{shown} states"
+    most = decomposed.values.size
+    if n > most:
+        states = "1 state" if most == 1 else f"{most} states"
         raise EstimationError(
             f"{plan.method}: the record identifies {states}, not {n}. Lower n, or excite the plant more"
         )
-    if isinstance(found, Prediction):
-        return regress_states(found, n, feedthrough=plan.feedthrough)
-    return realise(found, n, feedthrough=plan.feedthrough)
+    if isinstance(decomposed, Prediction):
+        return regress_states(decomposed, n, feedthrough=plan.feedthrough)
+    return realise(decomposed, n, feedthrough=plan.feedthrough)
 
 
 def order_criterion(plan: Plan) -> Array:
@@ -371,7 +373,7 @@ def order_criterion(plan: Plan) -> Array:
 
 def _result(method: Method, data: IOData, first: FirstModel, covariance: Array | None) -> BlackBoxFit:
     """Say what has to be said of the numbers."""
-    plan, given, full = first.plan, first.given, first.full
+    plan, prior, full = first.plan, first.given, first.full
     n, n_y, n_u = full.model.order, data.n_outputs, data.n_inputs
     y = plan.channels.scale_y
     warnings = []
@@ -398,7 +400,7 @@ def _result(method: Method, data: IOData, first: FirstModel, covariance: Array |
             "singular_values": first.found.values.tolist(),
             "covariance": {"kind": "jackknife", "groups": int(plan.factors.groups.shape[0])},
             "condition_number": float(sizes[0] / max(sizes[-1], 1e-18 * sizes[0])),  # at most: beyond is rounding
-            "prior": None if given is None else {"decay": given.decay, "size": given.size.tolist()},
+            "prior": None if prior is None else {"decay": prior.decay, "size": prior.size.tolist()},
             "Q": full.Q.tolist(),
             "S": (full.S * y).tolist(),
             "R": (full.R * np.outer(y, y)).tolist(),
@@ -432,11 +434,11 @@ def subspace_models(
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")
     with one_thread():
         plan = plan_estimate(method, data, {}, None, None, tick, n_max)
-        _, found = decomposition(plan)
+        _, states = decomposition(plan)
         criterion = order_criterion(plan)
         out = []
-        for n in range(1, min(plan.n_max, found.values.size, criterion.size - 1) + 1):
-            scaled = model_of(plan, found, n)
+        for n in range(1, min(plan.n_max, states.values.size, criterion.size - 1) + 1):
+            scaled = model_of(plan, states, n)
             model, _ = to_units(scaled, plan.channels, data.dt)
             scale = plan.channels.scale_y
             out.append(
@@ -445,7 +447,7 @@ def subspace_models(
                     model=model,
                     innovation=scaled.innovation * np.outer(scale, scale),
                     criterion=float(criterion[n]),
-                    singular_value=float(found.values[n - 1]),
+                    singular_value=float(states.values[n - 1]),
                 )
             )
             if tick is not None:

@@ -88,22 +88,26 @@ def channels(data: IOData) -> Channels:
     return Channels(u=u, y=y, mean_u=u.mean(0), scale_u=u.std(0), mean_y=y.mean(0), scale_y=y.std(0))
 
 
-def compress(given: Channels, length: int, n_groups: int) -> Factors:
+def compress(channels: Channels, length: int, n_groups: int) -> Factors:
     """Fold all windows of a record into triangular factors.
 
     `length`: samples in a window; `n_groups`: groups of time.
     """
-    n_rows = given.n_samples - length + 1
+    n_rows = channels.n_samples - length + 1
     edges = np.linspace(0, n_rows, n_groups + 1).astype(int)
     groups = []
     for first, last in pairwise(edges):
         part = slice(first, last + length - 1)
-        u = (given.u[part] - given.mean_u) / given.scale_u
-        z = [*u.T, *((given.y[part] - given.mean_y) / given.scale_y).T]
+        u = (channels.u[part] - channels.mean_u) / channels.scale_u
+        z = [*u.T, *((channels.y[part] - channels.mean_y) / channels.scale_y).T]
         window = [(x, lag) for lag in range(length - 1, -1, -1) for x in z]
         groups.append(lagged_triangle([(np.ones(z[0].size), 0), *window], length - 1))
     return Factors(
-        groups=np.array(groups), length=length, n_rows=n_rows, n_inputs=given.mean_u.size, n_outputs=given.mean_y.size
+        groups=np.array(groups),
+        length=length,
+        n_rows=n_rows,
+        n_inputs=channels.mean_u.size,
+        n_outputs=channels.mean_y.size,
     )
 
 
@@ -159,9 +163,9 @@ def check_inputs_differ(factors: Factors, total: Array, names: Sequence[str], wi
     numerator of the model has coefficients.
     """
     for length in sorted({1, window}):
-        found = input_relation(factors, total, names, length)
-        if found is not None:
-            raise EstimationError(f"{found}: their effects cannot be distinguished. Omit one")
+        relation = input_relation(factors, total, names, length)
+        if relation is not None:
+            raise EstimationError(f"{relation}: their effects cannot be distinguished. Omit one")
 
 
 def input_relation(factors: Factors, total: Array, names: Sequence[str], window: int) -> str | None:
@@ -177,11 +181,11 @@ def input_relation(factors: Factors, total: Array, names: Sequence[str], window:
         own = every[j::n_u]
         others = [c for i, c in enumerate(every) if i % n_u != j]
         r = triangular_factor(total[:, [0, *own[:-1], *others, own[-1]]])
-        target, known = r[1:, -1], length - 1
-        alone, left = float(np.linalg.norm(target[known:])), abs(float(target[-1]))
+        target, history = r[1:, -1], length - 1
+        alone, left = float(np.linalg.norm(target[history:])), abs(float(target[-1]))
         if alone <= _FORESEEN * np.linalg.norm(target) or left >= _TOGETHER * alone:
             continue
-        size = np.abs(np.linalg.lstsq(r[1:-1, 1:-1], target[:-1], rcond=1e-13)[0])[known:]
+        size = np.abs(np.linalg.lstsq(r[1:-1, 1:-1], target[:-1], rcond=1e-13)[0])[history:]
         weight = np.insert(size.reshape(length, n_u - 1).max(axis=0), j, np.inf)
         largest = np.max(weight[np.isfinite(weight)])
         quoted = [repr(name) for name, w in zip(names, weight, strict=True) if w > _TAKES_PART * largest]
@@ -505,33 +509,33 @@ def fit_prior(factor: Array, *, past: int, feedthrough: bool, like: Factors) -> 
         cost = np.sum(np.log(grown), axis=1)[:, None] + (1.0 / grown) @ c**2  # (sizes, outputs)
         total = float(np.sum(np.min(cost, axis=0)))
         if total < best:
-            best, found = total, (decay, _SIZES[np.argmin(cost, axis=0)])
-    return Prior(decay=found[0], size=found[1], whiten=np.asarray(whiten))
+            best, chosen = total, (decay, _SIZES[np.argmin(cost, axis=0)])
+    return Prior(decay=chosen[0], size=chosen[1], whiten=np.asarray(whiten))
 
 
 def predict_states(
-    factor: Array, *, past: int, future: int, feedthrough: bool, like: Factors, given: Prior
+    factor: Array, *, past: int, future: int, feedthrough: bool, like: Factors, prior: Prior
 ) -> Prediction:
     """Fit the autoregression and decompose what it says of the future.
 
     `factor`: (n_columns, n_columns), of the constant and `predictor_columns`; `past`, `future`: samples, future <=
-    past; `feedthrough`: whether u(t) acts on y(t); `like`: for the sizes; `given`: of the autoregression.
+    past; `feedthrough`: whether u(t) acts on y(t); `like`: for the sizes; `prior`: of the autoregression.
     """
     n_u, n_y = like.n_inputs, like.n_outputs
     n_z, width = n_u + n_y, (n_u + n_y) * past
     r = factor[1:, 1:]
     rows, y, lags = _regression(factor, past, feedthrough, like)
-    phi = _with_prior(rows, y[: rows.shape[1]] @ given.whiten, lags, given)[:width].T  # in innovations' deviations
+    phi = _with_prior(rows, y[: rows.shape[1]] @ prior.whiten, lags, prior)[:width].T  # in innovations' deviations
     blocks = np.zeros((future, n_y, width))
     for i in range(future):
         blocks[i, :, i * n_z :] = phi[:, : width - i * n_z]
-    known = blocks.reshape(future * n_y, width)
-    left, values, right = np.linalg.svd(known @ r[:width, :width].T, full_matrices=False)
+    future_taps = blocks.reshape(future * n_y, width)
+    left, values, right = np.linalg.svd(future_taps @ r[:width, :width].T, full_matrices=False)
     n_values = int(np.sum(values > 1e-13 * values[0]))
     unit = np.sqrt(like.n_rows)
     state = np.zeros((n_values, r.shape[0]))
     state[:, :width] = right[:n_values] * unit
-    to_state = (left[:, :n_values].T @ known) * (unit / values[:n_values, None])
+    to_state = (left[:, :n_values].T @ future_taps) * (unit / values[:n_values, None])
     return Prediction(
         values=values[:n_values] / unit,
         state=state,
@@ -549,11 +553,11 @@ def regress_states(prediction: Prediction, n: int, *, feedthrough: bool) -> Real
     """
     p = prediction
     x, ahead, n_u = p.state[:n], p.ahead[:n], p.u.shape[0]
-    known = np.vstack([x, p.u]) if feedthrough else x
-    CD = least_squares(known.T, p.y.T).T
+    regressors = np.vstack([x, p.u]) if feedthrough else x
+    CD = least_squares(regressors.T, p.y.T).T
     C = CD[:, :n]
     D = CD[:, n:] if feedthrough else np.zeros((p.y.shape[0], n_u))
-    e = p.y - CD @ known
+    e = p.y - CD @ regressors
     ABK = least_squares(np.vstack([x, p.u, e]).T, ahead.T).T
     A, B, K = ABK[:, :n], ABK[:, n : n + n_u], ABK[:, n + n_u :]
     w = ahead - A @ x - B @ p.u
@@ -574,12 +578,12 @@ def _regression(factor: Array, past: int, feedthrough: bool, like: Factors) -> t
     return factor[1 : 1 + k, 1 : 1 + k], factor[1:, 1 + width + n_u :], lags
 
 
-def _with_prior(rows: Array, right: Array, lags: Array, given: Prior) -> Array:
+def _with_prior(rows: Array, right: Array, lags: Array, prior: Prior) -> Array:
     """Solve for whitened coefficients, the prior as further rows: orthogonal, and once for outputs of one size."""
     out = np.empty((rows.shape[1], right.shape[1]))
-    for size in np.unique(given.size):
-        chosen = given.size == size
-        deviation = np.sqrt(size) * given.decay ** (0.5 * lags)
+    for size in np.unique(prior.size):
+        chosen = prior.size == size
+        deviation = np.sqrt(size) * prior.decay ** (0.5 * lags)
         scaled = np.vstack([rows * deviation, np.eye(lags.size)])
         target = np.vstack([right[:, chosen], np.zeros((lags.size, int(chosen.sum())))])
         both = np.asarray(np.linalg.qr(np.hstack([scaled, target]), mode="r"))

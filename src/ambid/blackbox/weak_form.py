@@ -48,22 +48,24 @@ def weakform(data: IOData, orders: Orders) -> BlackBoxFit:
     `data`: inputs held over a sample; `orders`: ``nf``, degree of the denominator, ``nb`` numerator coefficients, at
     most nf, and ``nk`` (default 0) samples of delay, one or one for each input. `details` tells the supports tried.
     """
-    used = transfer_orders("weakform", data, {"nk": 0, **orders}, more=0)
-    n, nb, nk = used.n, used.nb, used.nk or ()
+    degrees = transfer_orders("weakform", data, {"nk": 0, **orders}, more=0)
+    n, nb, nk = degrees.n, degrees.nb, degrees.nk or ()
     check_length("weakform", data, data.n_samples - max(nk) - 4 * _SHORTEST, n + sum(nb) + 1)
     halves = supports(data.n_samples - max(nk))
     u_mean, y_mean = data.u.mean(axis=0), data.y.mean(axis=0)
     u_sd, y_sd = data.u.std(axis=0), data.y.std(axis=0)
     u = (data.u - u_mean) / u_sd
     with one_thread():
-        found = [
+        searches = [
             best_support(Equation(y=y, u=u, n=n, nb=nb, nk=nk, dt=data.dt), halves)
             for y in ((data.y - y_mean) / y_sd).T
         ]
-    solutions = [f[0] for f in found]
+    solutions = [f[0] for f in searches]
     size = n + sum(nb)
     scaled = [
-        ScaledTransfer(theta=s.theta[:size], covariance=s.covariance[:size, :size], orders=used, w0=1.0, gain=sd / u_sd)
+        ScaledTransfer(
+            theta=s.theta[:size], covariance=s.covariance[:size, :size], orders=degrees, w0=1.0, gain=sd / u_sd
+        )
         for s, sd in zip(solutions, y_sd, strict=True)
     ]
     worst = max(s.contradiction for s in solutions)
@@ -83,7 +85,7 @@ def weakform(data: IOData, orders: Orders) -> BlackBoxFit:
             "half_width_s": [s.half * data.dt for s in solutions],
             "rows": [s.rows for s in solutions],
             "condition": [s.condition for s in solutions],
-            "supports": {o: tried for o, (_, tried) in zip(data.outputs, found, strict=True)},
+            "supports": {o: tried for o, (_, tried) in zip(data.outputs, searches, strict=True)},
         },
     )
 
@@ -186,9 +188,9 @@ class Rows:
             raise EstimationError(f"{self.centres.size} rows for {self.size} numbers with this support")
         self.kernels = [bump.kernel(k) for k in range(e.n + 1)]
         self.Y = self._derivatives(e.y)
-        held = [bump.held_kernel(k) for k in range(e.n)]
+        kernels_held = [bump.held_kernel(k) for k in range(e.n)]
         inputs = [
-            moments_at(e.u[:, i], held[k], bump.half, self.centres - e.nk[i])
+            moments_at(e.u[:, i], kernels_held[k], bump.half, self.centres - e.nk[i])
             for i, b in enumerate(e.nb)
             for k in range(b)
         ]
@@ -209,8 +211,8 @@ class Rows:
         """Return ordinary least squares."""
         X = np.hstack([self.Y[:, :-1], self.U])
         size = np.maximum(np.linalg.norm(X, axis=0), 1e-300)
-        found = np.linalg.lstsq(X / size, -self.Y[:, -1], rcond=None)[0]
-        return np.asarray(found / size)
+        theta = np.linalg.lstsq(X / size, -self.Y[:, -1], rcond=None)[0]
+        return np.asarray(theta / size)
 
     def at(self, theta: Array) -> State:
         """Return whitened rows and regressors, the output freed from its estimated noise."""
@@ -282,17 +284,17 @@ def solve(equation: Equation, bump: Bump, start: Array | None = None) -> Solutio
     """
     work = Rows(equation, bump)
     first = [work.ordinary(), *([] if start is None else [start])]
-    found = search(work, min(first, key=work.cost), most=_ROUNDS, tolerance=_SETTLED / work.centres.size)
-    state, theta = work.at(found.theta), found.theta
-    scale2, seen = state.cost / max(state.r.size - theta.size, 1), directions(state.Z)
+    end = search(work, min(first, key=work.cost), most=_ROUNDS, tolerance=_SETTLED / work.centres.size)
+    state, theta = work.at(end.theta), end.theta
+    scale2, axes = state.cost / max(state.r.size - theta.size, 1), directions(state.Z)
     return Solution(
         theta=theta,
-        covariance=scale2 * seen.inverse(),
+        covariance=scale2 * axes.inverse(),
         scale=float(np.sqrt(scale2)),
         half=bump.half,
         rows=state.r.size,
-        condition=seen.condition,
-        converged=found.converged,
+        condition=axes.condition,
+        converged=end.converged,
     )
 
 
@@ -309,7 +311,7 @@ def best_support(equation: Equation, halves: Sequence[int]) -> tuple[Solution, l
     So every solution is also held against the shortest support, and those that it contradicts do not count. Returns
     the best, and half support, noise, log determinant of the covariance and contradiction of each.
     """
-    found: Solution | None = None
+    solution: Solution | None = None
     results, tried, why = list[tuple[float, Solution]](), list[dict[str, float]](), "the record is too short"
 
     def bump(half: int) -> Bump:
@@ -318,19 +320,19 @@ def best_support(equation: Equation, halves: Sequence[int]) -> tuple[Solution, l
     judge = Rows(equation, bump(min([_SHORTEST, *halves])))
     for half in sorted(halves, reverse=True):
         try:
-            found = solve(equation, bump(half), None if found is None else found.theta)
-            all_band = judge.at(found.theta)
+            solution = solve(equation, bump(half), None if solution is None else solution.theta)
+            all_band = judge.at(solution.theta)
         except EstimationError as error:
             why = str(error)
             continue
-        sd = np.sqrt(np.diag(found.covariance))
-        sign, size = np.linalg.slogdet(found.covariance / np.outer(sd, sd))
+        sd = np.sqrt(np.diag(solution.covariance))
+        sign, size = np.linalg.slogdet(solution.covariance / np.outer(sd, sd))
         size = float(size + 2 * np.sum(np.log(sd))) if sign > 0 else np.inf
-        found = replace(found, contradiction=float(np.sqrt(all_band.cost / max(all_band.r.size - sd.size, 1))))
-        results.append((size, found))
+        solution = replace(solution, contradiction=float(np.sqrt(all_band.cost / max(all_band.r.size - sd.size, 1))))
+        results.append((size, solution))
         tried.append({
-            "half_width_samples": float(half), "noise_sd": found.scale, "log_det_covariance": size,
-            "noise_sd_all_band": found.contradiction,
+            "half_width_samples": float(half), "noise_sd": solution.scale, "log_det_covariance": size,
+            "noise_sd_all_band": solution.contradiction,
         })  # fmt: skip
     if not results:
         raise EstimationError(f"weak form: no support of the test functions gives a result ({why}). Record longer")
@@ -346,13 +348,13 @@ _CONTRADICTS = (
 )
 
 
-def _offsets(found: list[Solution], n: int, u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
+def _offsets(solutions: list[Solution], n: int, u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
     """Operating point: a_0 y = b_0 u + c, solved for y, or for the first input where a_0 is lost in its own spread."""
     u, y = u_mean.copy(), y_mean.copy()
-    for o, s in enumerate(found):
+    for o, s in enumerate(solutions):
         a0, b0, c = s.theta[0], s.theta[n], s.theta[-1]
         if abs(a0) > 2 * np.sqrt(s.covariance[0, 0]):
             y[o] += y_sd[o] * c / a0
-        elif len(found) == 1 and b0 != 0:
+        elif len(solutions) == 1 and b0 != 0:
             u[0] -= u_sd[0] * c / b0
     return Offsets(u=u, y=y)
