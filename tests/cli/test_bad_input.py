@@ -241,7 +241,7 @@ WORDS = {
     "folder as rig": (["identify", "record.csv", "--rig", "."], r"is a folder"),
     "from beyond the end": (["identify", "record.csv", "--from", "99"], r"99 s; the record spans 0 to 0\.15 s"),
     "from after to": (["identify", "record.csv", "--from", "0.1", "--to", "0.05"], r"from must lie before to"),
-    "from that is no number": (["identify", "record.csv", "--from", "nan"], r"nan s; the record spans"),
+    "from that is no number": (["identify", "record.csv", "--from", "nan"], r"--from is nan; it must be a number"),
     "almost nothing left": (["identify", "record.csv", "--to", "0.002"], r"samples"),
     "another rate than the time column's": (["identify", "record.csv", "--rate", "1000"], r"rate"),
     "negative rate": (["identify", "record.csv", "--rate", "-1"], r"rate"),

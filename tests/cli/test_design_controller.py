@@ -28,7 +28,7 @@ def made(tmp_path_factory):
 def designed(made):
     """The files of a design, and its result."""
     words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html",
-             "--export", made / "law.c")  # fmt: skip
+             "--law", made / "law.c")  # fmt: skip
     assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0
     return package.load(made / "d.json")
 
@@ -76,7 +76,7 @@ def test_the_loop_becomes_an_object_of_python_control(designed):
         (("--spread", "delay=x"), "--spread delay=x has no number"),
         (("--spread", "dealy=1"), "source 'dealy' of spread is unknown"),
         (("--spread", "warm_k=0.1"), "it must be two numbers"),
-        (("--method", "pod"), "method 'pod' of a design is unknown"),
+        (("--kind", "pod"), "method 'pod' of a design is unknown"),
     ],
 )
 def test_what_is_asked_for_wrongly_is_refused_on_one_line(made, ambid, words, said):

@@ -66,7 +66,7 @@ def test_several_records_to_file_figure_and_table(at, ambid) -> None:
 def test_the_former_name_of_orders_says_the_new_one(at, ambid) -> None:
     refused = ambid("fit", "r0.csv", "--structure", "narmax", *WORDS, "--settings", "ny=1")
     assert refused.code == 2
-    assert "orders now" in refused.err
+    assert "now --orders" in refused.err
 
 
 @pytest.mark.parametrize(

@@ -95,7 +95,7 @@ def test_tables_are_exported_for_other_programs(demo, ambid, monkeypatch):
     with open_ledger("export.db") as ledger:
         ledger.add([entry(k) for k in range(3)])
     for _ in range(2):  # what it wrote itself it writes again
-        assert ambid("history", "--ledger", "export.db", "--export", "tables").code == 0
+        assert ambid("history", "--ledger", "export.db", "--tables", "tables").code == 0
     values, estimates = (pandas.read_parquet(demo / "tables" / f"{n}.parquet") for n in ("value", "estimate"))
     joined = values.merge(estimates, left_on="estimate", right_on="id")
     assert joined[joined.name == "k_i"].value.tolist() == [80.0, 79.9, 79.8]
@@ -103,5 +103,5 @@ def test_tables_are_exported_for_other_programs(demo, ambid, monkeypatch):
     assert values.identifiable.dtype == bool
     (demo / "tables" / "rig.parquet").unlink()
     pandas.DataFrame({"x": [1]}).to_parquet(demo / "tables" / "rig.parquet")
-    done = ambid("history", "--ledger", "export.db", "--export", "tables")
+    done = ambid("history", "--ledger", "export.db", "--tables", "tables")
     assert (done.code, "rig.parquet exists, and is not of a ledger" in done.err) == (2, True)

@@ -113,7 +113,7 @@ REFUSED = {
     "a time outside": (("change", "--at", "9"), "from 0 to 4 s"),
     "a size of nothing": (("steady", "--size", "1"), "no size"),
     "too much": (("added-mass", "--size=-2"), "must stay positive"),
-    "no time at all": (("steady", "--duration", "0"), "at least one"),
+    "no time at all": (("steady", "--duration", "0"), "must be a positive number"),
 }
 
 

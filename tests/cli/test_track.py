@@ -78,7 +78,7 @@ def test_options_reach_the_job(bench, ambid, job):
 REFUSED = {
     "memory": (["--memory", "long"], "--memory is 'long'; it must be 'auto', 'all' or a positive number"),
     "no memory": (["--memory", "0"], "--memory is 0.0; it must be"),
-    "interval": (["--every", "0"], "--every is 0.0; it must be a positive"),
+    "interval": (["--every", "0"], "--every is 0; it must be a positive"),
     "limit": (["--limit", "nan"], "--limit is nan; it must be a positive"),
     "unknown flag": (["--flag", "3:holt"], "flag 'holt' is unknown; known: track, hold, accept, revert Did you mean"),
     "no time": (["--flag", "hold"], "--flag hold is not of the form T:FLAG"),

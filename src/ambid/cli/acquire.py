@@ -9,13 +9,12 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING
 
 import typer
 
-from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
-from ambid.cli.options import option, switch
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs, end, json_path
 from ambid.cli.terminal import say_note, watching
 from ambid.errors import AmbidError, counted
@@ -30,63 +29,8 @@ if TYPE_CHECKING:
 _ENDINGS = (".h5", ".hdf5", ".csv", ".csv.gz")
 
 
-def command(
-    port: opt.Port,
-    rig: opt.RigOfDevice,
-    record: Annotated[Path, option("--out -o FILE", "Record to write: .h5, .csv or .csv.gz.")],
-    seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 10.0,
-    excitation: Annotated[
-        str | None,
-        option(
-            "--excitation NAME",
-            "Excitation that the controller adds to its output: multisine, schroeder, prbs or steps, or a file that "
-            "'ambid design experiment --json' wrote.",
-            "none",
-        ),
-    ] = None,
-    amplitude: Annotated[
-        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, smallest first")
-    ] = None,
-    band: opt.BandHz = None,
-    mode: Annotated[
-        Literal["sample", "drive", "levitate"] | None,
-        option(
-            "--mode",
-            "sample: output off; drive: excitation without feedback; levitate: position loop on the controller.",
-            "levitate if the rig has a loop; sample for a replay",
-        ),
-    ] = None,
-    settle: Annotated[
-        float | None, option("--settle S", "Time after the start that is not recorded, in s.", "1 when levitating")
-    ] = None,
-    arm: Annotated[
-        Path | None,
-        option(
-            "--arm RIG",
-            "Rig file whose [loop] the controller tries once it levitates, and keeps: the record is made with it. It"
-            " returns to the loop before where the rotor moves more than half way to a trip.",
-        ),
-    ] = None,
-    bench: opt.BenchName = None,
-    pace: opt.Pace = "fastest",
-    seed: opt.Seed = 0,
-    track: Annotated[
-        str | None,
-        option(
-            "--track ESTIMATE.json|auto",
-            "Track the parameters during the run, starting from this estimate, or from one of the first seconds.",
-        ),
-    ] = None,
-    json: Annotated[
-        str | None,
-        option("--json FILE", "Write the result, with --track the track as lines of JSON; - for standard output."),
-    ] = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    quiet: Annotated[bool, switch("--no-live --quiet", "No live view of the track.")] = False,
-    force: opt.ForceLoop = False,
-    strict: opt.Strict = False,
-) -> None:
+@verb("acquire")
+def command(v: Values) -> None:
     """Record what a controller samples: it keeps the rotor levitated, plays the excitation and protects the bench.
 
     PORT is a serial port, 'emulated' (the firmware on an emulated controller before a simulated bench), 'simulated'
@@ -97,21 +41,18 @@ def command(
     from ambid.report.device import progress_line
     from ambid.rig import load_rig
 
-    between = opt.band_of(band)
-    replayed = Path(port.removeprefix("replay:")) if port.startswith("replay:") else None
-    start_file = None if track in (None, "auto") else Path(str(track))
-    outputs = Outputs(rig, start_file, replayed, arm, json=None if track else json, plot=plot, report=report)
-    outputs.claim(record, "out", _ENDINGS, force=force)
-    outputs.claim(json_path(json) if track else None, "json")
-    known, stop, behind = load_rig(rig), Stop(), None if bench is None else preset_of(bench) or bench
-    settings: dict[str, Any] = {
-        "seconds": seconds, "excitation": excitation, "amplitude": amplitude, "band": between, "mode": mode,
-        "settle": settle, "seed": seed, "stopped": stop.wished, "arm": None if arm is None else load_rig(arm),
-    }  # fmt: skip
-    wanted, start, before = Request(**settings), start_of_track(track), _changed(record)
-    job = Recording(wanted.measured(known), port, record, wanted.trial(port, known).settle_s, stop, force=force)
-    if (record.exists() or record.is_symlink()) and not force:
-        raise AmbidError(f"-o {record} already exists. Choose another name, or give --force")
+    replayed = Path(v.port.removeprefix("replay:")) if v.port.startswith("replay:") else None
+    start_file = None if v.track in (None, "auto") else Path(str(v.track))
+    outputs = Outputs(v.rig, start_file, replayed, v.arm, **v.outputs | ({"json": None} if v.track else {}))
+    outputs.claim(v.out, "out", _ENDINGS, force=v.force)
+    outputs.claim(json_path(v.json) if v.track else None, "json")
+    known, stop, behind = load_rig(v.rig), Stop(), None if v.bench is None else preset_of(v.bench) or v.bench
+    settings = v.only("seconds excitation amplitude band mode settle seed")
+    settings |= {"stopped": stop.wished, "arm": None if v.arm is None else load_rig(v.arm)}
+    wanted, start, before = Request(**settings), start_of_track(v.track), _changed(v.out)
+    job = Recording(wanted.measured(known), v.port, v.out, wanted.trial(v.port, known).settle_s, stop, force=v.force)
+    if (v.out.exists() or v.out.is_symlink()) and not v.force:
+        raise AmbidError(f"-o {v.out} already exists. Choose another name, or give --force")
     try:
         with watching() as watch, signals(stop.take):
 
@@ -126,22 +67,22 @@ def command(
             def show(now: Progress) -> None:
                 watch.show("record", now.samples / max(now.wanted, 1), progress_line(now.quality, now.counters))
 
-            if track is None:
+            if v.track is None:
                 done, track_end = acquire(
-                    port, known, record, **settings, bench=behind, pace=pace, force=force, on_note=note,
+                    v.port, known, v.out, **settings, bench=behind, pace=v.pace, force=v.force, on_note=note,
                     on_progress=show, on_trouble=_say_trouble, tick=stage,
                 ), None  # fmt: skip
             else:
-                opening = ready(port, known, wanted, bench=behind, pace=pace, force=force, note=note, tick=stage)
+                opening = ready(v.port, known, wanted, bench=behind, pace=v.pace, force=v.force, note=note, tick=stage)
                 with opening as (device, course):
-                    done, track_end = job.follow(device, course, start, json, quiet=quiet)
+                    done, track_end = job.follow(device, course, start, v.json, quiet=v.no_live)
     except KeyboardInterrupt:
-        typer.echo(f"ambid: interrupted{_left(record, _changed(record) != before)}", err=True)
+        typer.echo(f"ambid: interrupted{_left(v.out, _changed(v.out) != before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
-    job.tell(done, outputs, table=track is None or json != "-")
+    job.tell(done, outputs, table=v.track is None or v.json != "-")
     if track_end is not None:
         track_end()
-    job.finish(done, strict=strict)
+    job.finish(done, strict=v.strict)
 
 
 class Recording:

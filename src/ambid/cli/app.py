@@ -33,6 +33,8 @@ from ambid.cli import (
     validate,
 )
 from ambid.cli.terminal import plain_where_needed
+from ambid.errors import AmbidError
+from ambid.settings.jobs import RENAMED
 
 app = typer.Typer(
     rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
@@ -101,6 +103,7 @@ def run_verb(words: Sequence[str]) -> int:
     plain_where_needed(sys.stderr)
     compiled.announce = _say_compiling if sys.stderr.isatty() else None
     command = parser()
+    _refuse_former(words)
     if "_AMBID_COMPLETE" in os.environ:  # the shell asks what may follow
         command.main(list(words), prog_name="ambid")
     try:
@@ -109,6 +112,15 @@ def run_verb(words: Sequence[str]) -> int:
     except typer.Exit as end:
         return int(end.exit_code)
     return 0
+
+
+def _refuse_former(words: Sequence[str]) -> None:
+    """Refuse an option by its name of the release before, and say the new one."""
+    job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in RENAMED), "")
+    for word in words if job else ():
+        new = RENAMED[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
+        if new is not None:
+            raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is now --{new}. Give that")
 
 
 def refusal(error: Exception) -> str | None:

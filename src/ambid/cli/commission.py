@@ -8,15 +8,13 @@ from collections.abc import Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
-from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED, Stop, signals
-from ambid.cli.keeping import Bearing, LedgerPlace, keeping
-from ambid.cli.options import option, switch
-from ambid.cli.output import Outputs, end
+from ambid.cli.options import Values, verb
+from ambid.cli.output import Outputs, end, keeping
 from ambid.cli.terminal import painter, say_note, watching
 from ambid.errors import AmbidError
 
@@ -26,35 +24,8 @@ if TYPE_CHECKING:
     from ambid.report.commission import Step
 
 
-def command(
-    port: opt.Port,
-    rig: opt.RigOfDevice,
-    folder: Annotated[Path, option("--out -o FOLDER", "Folder for records, estimate and report.")],
-    seconds: Annotated[float, option("--seconds S", "Length of the record in s.", True)] = 20.0,
-    track_seconds: Annotated[
-        float, option("--track-seconds S", "Length of live tracking at the end, in s.", True)
-    ] = 5.0,
-    amplitude: Annotated[
-        float | None, option("--amplitude V", "Peak of the excitation in V.", "found by trials, smallest first")
-    ] = None,
-    band: opt.BandHz = None,
-    widest: Annotated[
-        float, option("--widest X", "Largest acceptable half width of a 95 % interval, relative to the value.", True)
-    ] = 0.10,
-    bench: opt.BenchName = None,
-    pace: opt.Pace = "fastest",
-    seed: opt.Seed = 0,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    ledger: LedgerPlace = None,
-    bearing: Bearing = None,
-    redesign: Annotated[
-        bool, switch("--redesign", "Design a better loop, load it on trial, and measure again.")
-    ] = False,
-    force: Annotated[bool, switch("--force", "Go on with a loop that is predicted unstable.")] = False,
-    yes: Annotated[bool, switch("--yes -y", "Do not ask before the controller switches its output on.")] = False,
-) -> None:
+@verb("commission")
+def command(v: Values) -> None:
     """Commission a bench: self-test, rest, polarity, levitate, excite, record, identify, validate, track; and report.
 
     Each step is judged before the next begins. One that is not good enough ends it with the reasons, and exit code 3;
@@ -71,35 +42,25 @@ def command(
     from ambid.report.document import sections_text
     from ambid.rig import load_rig
 
-    opt.check_positive({"seconds": seconds, "track_seconds": track_seconds, "amplitude": amplitude, "widest": widest})
-    outputs = Outputs(rig, json=json, plot=plot, report=report)
+    outputs = Outputs(v.rig, **v.outputs)
     plan = Plan(
-        record_s=seconds,
-        second_s=_second_s(seconds),
-        track_s=track_seconds,
-        amplitude_v=amplitude,
-        band_hz=opt.band_of(band),
-        widest=widest,
-        seed=seed,
-        redesign=redesign,
-    )
-    known, paint, stop = load_rig(rig), painter(), Stop()
-    _check_port(port, yes=yes)
-    _check_place(folder)
-    if folder.exists():
-        check_folder(folder)
+        record_s=v.seconds, second_s=_second_s(v.seconds), track_s=v.track_seconds, amplitude_v=v.amplitude,
+        band_hz=v.band, **v.only("widest seed redesign"),
+    )  # fmt: skip
+    known, paint, stop = load_rig(v.rig), painter(), Stop()
+    _check_port(v.port, yes=v.yes)
+    _check_place(v.out)
+    if v.out.exists():
+        check_folder(v.out)
     last: list[Step] = []
     begun: list[StepName] = []
-    behind = None if bench is None else preset_of(bench) or bench
-    opening = opened(port, known, bench=behind, pace=pace, seed=seed, closes=not force, note=say_note)
-    shelf = partial(
-        keeping, ledger, [folder / "record.h5"], rig, bearing=bearing, job="commission", taken_now=True,
-        **plain_json(plan),
-    )  # fmt: skip
+    behind = None if v.bench is None else preset_of(v.bench) or v.bench
+    opening = opened(v.port, known, bench=behind, pace=v.pace, seed=v.seed, closes=not v.force, note=say_note)
+    shelf = partial(keeping, v, "commission", [v.out / "record.h5"], taken_now=True, **plain_json(plan))
     with shelf():  # refused before the rotor moves
         pass
     with watching() as watch, signals(stop.take), opening as device:
-        new = _make(folder)
+        new = _make(v.out)
 
         def begin(name: StepName) -> None:
             begun.append(name)
@@ -112,14 +73,14 @@ def command(
             last.append(step)
             watch.clear()
             section = step_section(step, f"{len(last)}/{len(plan.steps)}")
-            typer.echo(sections_text([section], paint=paint), err=json == "-")
+            typer.echo(sections_text([section], paint=paint), err=v.json == "-")
 
         def agreed(name: StepName) -> bool:
             del name
             watch.clear()
             asked = "The controller will switch its output on and lift the rotor."
             return (
-                yes
+                v.yes
                 or device.info.kind != "serial"  # a real bench alone moves
                 or typer.confirm(f"{asked} Is the bench clear, and the emergency stop within reach?")
             )
@@ -130,22 +91,22 @@ def command(
 
         try:
             done = commission(
-                device, known, folder, plan=plan, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
-                stopped=stop.wished, tick=alive, force=force,
+                device, known, v.out, plan=plan, on_begin=begin, on_step=tell, on_progress=show, confirm=agreed,
+                stopped=stop.wished, tick=alive, force=v.force,
             )  # fmt: skip
         except AmbidError:
             with suppress(OSError):
                 if new:
-                    folder.rmdir()  # where nothing was found, nothing is left
+                    v.out.rmdir()  # where nothing was found, nothing is left
             raise
         except KeyboardInterrupt:
             stop.number = stop.number or INTERRUPTED - 128
     if stop.number is not None:
-        typer.echo(f"ambid: interrupted; the output is off, and {folder} holds what was found before", err=True)
+        typer.echo(f"ambid: interrupted; the output is off, and {v.out} holds what was found before", err=True)
         raise typer.Exit(stop.code)
     with outputs:
         outputs.give(done)
-    if json == "-":
+    if v.json == "-":
         outputs.show(done)
     if done.estimate is not None:
         with shelf() as store:
@@ -153,18 +114,22 @@ def command(
     name, command, passed = last[-1].name, "", done.passed
     if passed:
         volts = next(s.numbers["amplitude_v"] for s in last if s.name == "excite")
-        made = folder / "experiment.json"
-        flat = {"--excitation": "multisine", "--band": band, "--amplitude": f"{volts:.6g}"}
-        better = folder / "redesigned.toml"
+        made = v.out / "experiment.json"
+        flat = {
+            "--excitation": "multisine",
+            "--band": None if v.band is None else "{:g}:{:g}".format(*v.band),
+            "--amplitude": f"{volts:.6g}",
+        }
+        better = v.out / "redesigned.toml"
         given = {
-            "--port": port, "--rig": better if better.exists() else rig, "--bench": bench,
-            **({"--excitation": made} if made.exists() else flat), "--track": folder / "estimate.json",
-            "-o": folder / "next.h5",
+            "--port": v.port, "--rig": better if better.exists() else v.rig, "--bench": v.bench,
+            **({"--excitation": made} if made.exists() else flat), "--track": v.out / "estimate.json",
+            "-o": v.out / "next.h5",
         }  # fmt: skip
-        command = _line("acquire", given) + (" --force" if force else "")
+        command = _line("acquire", given) + (" --force" if v.force else "")
     elif name == "identify":
-        command = _line("identify", {"": folder / "record.h5", "--rig": rig})
-    typer.echo(next_text(passed, name, len(last), len(plan.steps), str(folder), command=command), err=json == "-")
+        command = _line("identify", {"": v.out / "record.h5", "--rig": v.rig})
+    typer.echo(next_text(passed, name, len(last), len(plan.steps), str(v.out), command=command), err=v.json == "-")
     end(failed=not passed)
 
 

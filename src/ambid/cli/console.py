@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import os
 import sys
-from pathlib import Path
-from typing import Annotated
 
-import typer
-
-from ambid.cli.options import option, switch
+from ambid.cli.options import Values, verb
 from ambid.errors import AmbidError
 
 PASSWORD = "AMBID_CONSOLE_PASSWORD"
 
 
-def command(
-    folder: Annotated[Path, typer.Argument(metavar="[FOLDER]", help="Folder whose files are shown.")] = Path("."),
-    port: Annotated[int, option("--port N", "Port of the page; 0: any that is free.", True)] = 0,
-    no_browser: Annotated[bool, switch("--no-browser", "Print the link only.")] = False,
-    read_only: Annotated[bool, switch("--read-only", "Refuse what changes something.")] = False,
-    listen: Annotated[
-        str, option("--listen ADDRESS", f"Another address; it needs TLS files, and a password in {PASSWORD}.", True)
-    ] = "127.0.0.1",
-    certificate: Annotated[Path | None, option("--certificate FILE", "TLS certificate, PEM.")] = None,
-    key: Annotated[Path | None, option("--key FILE", "TLS key, PEM.")] = None,
-) -> None:
+@verb("console")
+def command(v: Values) -> None:
     """Show the records of a folder, live signals and commissioning in the browser, until Ctrl-C.
 
     The page is served to this machine alone, and the link that is printed opens it once. What runs goes on when the
@@ -37,23 +24,21 @@ def command(
         if (missing.name or "").startswith("ambid"):
             raise
         raise AmbidError(f"the console needs {missing.name}. Install it: pip install 'ambid[console]'") from None
-    if not 0 <= port <= 65_535:
-        raise AmbidError(f"--port {port} is none; ports are 0 to 65535. Correct it")
-    if (certificate is None) != (key is None):
+    if (v.certificate is None) != (v.key is None):
         raise AmbidError("--certificate and --key belong together, and one is missing. Give both")
-    for path in (certificate, key):
+    for path in (v.certificate, v.key):
         if path is not None and not path.is_file():
             raise AmbidError(f"{path} is no file. Correct the path")
 
     def ready(link: str) -> None:
-        print(f"console of {folder}: {link}  (Ctrl-C ends it; runs go on)", flush=True)
-        if not no_browser and sys.stdout.isatty():
+        print(f"console of {v.folder}: {link}  (Ctrl-C ends it; runs go on)", flush=True)
+        if not v.no_browser and sys.stdout.isatty():
             import webbrowser
 
             webbrowser.open(link)
 
     serve(
-        folder, port=port, read_only=read_only, listen=listen,
-        tls=None if certificate is None or key is None else (certificate, key),
+        v.folder, port=v.port, read_only=v.read_only, listen=v.listen,
+        tls=None if v.certificate is None or v.key is None else (v.certificate, v.key),
         password=os.environ.get(PASSWORD) or None, on_ready=ready,
     )  # fmt: skip

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Literal
 
 import typer
 
-from ambid.cli import options as opt
-from ambid.cli.options import argument, band_of, option, switch
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
@@ -18,50 +16,8 @@ group = typer.Typer(rich_markup_mode=None, help="Design what comes next on an id
 
 
 @group.command("experiment", short_help="design the excitation that shows the parameters best within limits")
-def experiment(
-    source: Annotated[
-        str,
-        argument("RIG|PRESET|ESTIMATE", "Rig file, a bench that 'ambid models' lists, or what identify --json wrote."),
-    ],
-    record: Annotated[
-        Path | None, option("--out -o FILE", "Write one period of the excitation: .csv, .csv.gz or .h5.")
-    ] = None,
-    rig: opt.RigFile = None,
-    seconds: Annotated[float | None, option("--seconds S", "Length of the record in s.", "10")] = None,
-    period: Annotated[
-        float | None,
-        option("--period S", "Period of the excitation in s.", "a quarter of the record, or the controller's table"),
-    ] = None,
-    band: Annotated[
-        str | None, option("--band LO:HI", "Band of the excitation in Hz.", "one period to a fifth of the rate")
-    ] = None,
-    lines: Annotated[int, option("--lines N", "How many lines are excited, at most.", True, min=2)] = 100,
-    criterion: Annotated[str, option("--criterion NAME", "all, worst, or the parameter that matters.", True)] = "all",
-    target: Annotated[
-        str, option("--target SD", "Relative standard deviation whose length of record is told.", True)
-    ] = "1%",
-    use: Annotated[
-        float, option("--use SHARE", "Part of the way to the limits of position and current that may be used.", True)
-    ] = 0.3,
-    slew: Annotated[float | None, option("--slew V/S", "Largest rate of change of the voltage.", "any")] = None,
-    spread: Annotated[
-        float,
-        option(
-            "--spread SHARE", "Two relative standard deviations of a rig's free parameters, for the drawn plants.", True
-        ),
-    ] = 0.1,
-    rate: Annotated[float | None, option("--rate HZ", "Sampling rate in Hz.", "the bench's")] = None,
-    loop: Annotated[
-        Literal["open", "closed"] | None,
-        option("--loop", "With or without the controller.", "as the bench usually works"),
-    ] = None,
-    seed: opt.Seed = 0,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    strict: opt.Strict = False,
-    force: opt.Force = False,
-) -> None:
+@verb("design experiment")
+def experiment(v: Values) -> None:
     """Design the periodic excitation that shows the parameters best, within limits that it keeps by prediction.
 
     Amplitudes and phases are optimised together for the standard deviations that 'ambid identify' will report. The
@@ -72,66 +28,21 @@ def experiment(
     from ambid.physics.presets import preset_of
     from ambid.record import write_record
 
-    known = None if source.lower().endswith(".json") else preset_of(source)
-    of = None if known is not None else Path(source)
-    with Outputs(of, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
-        outputs.claim(record, "out", (".csv", ".csv.gz", ".h5", ".hdf5"), force=force)
-        found = design_experiment(
-            known or str(source), rig, seconds=seconds, period=period, band=band_of(band), lines=lines,
-            criterion=criterion, target=opt.share_of(target, "target"), use=use, slew=slew, spread=spread,
-            rate_hz=rate, closed=None if loop is None else loop == "closed", seed=seed, tick=show,
-        )  # fmt: skip
+    known = None if v.source.lower().endswith(".json") else preset_of(v.source)
+    of = None if known is not None else Path(v.source)
+    with Outputs(of, v.rig, **v.outputs) as outputs, progress("design") as show:
+        outputs.claim(v.out, "out", (".csv", ".csv.gz", ".h5", ".hdf5"), force=v.force)
+        how = v.only("seconds period band lines criterion target use slew spread rate_hz closed seed")
+        found = design_experiment(known or v.source, v.rig, **how, tick=show)
         outputs.give(found, show)
-        if record is not None:
-            outputs.stage(record, lambda path: write_record(one_period(found), path))
-    outputs.show(found, strict=strict)
+        if v.out is not None:
+            outputs.stage(v.out, lambda path: write_record(one_period(found), path))
+    outputs.show(found, strict=v.strict)
 
 
 @group.command("controller", short_help="design the controller, and verify it on plants around the estimate")
-def controller(
-    estimate: Annotated[Path, argument("ESTIMATE", "What 'ambid identify --json' wrote.")],
-    rig: opt.RigFile = None,
-    out: Annotated[Path | None, option("--out -o RIG", "Write the rig with the new [loop].")] = None,
-    method: Annotated[
-        str, option("--method NAME", "pid: the present structure, tuned; lqg or hinf: a state-space law.", True)
-    ] = "pid",
-    goal: Annotated[
-        list[str] | None,
-        option("--goal FIGURE", "To be small: peak, compliance, noise or settling; repeatable.", "peak and compliance"),
-    ] = None,
-    limit: Annotated[
-        list[str] | None,
-        option("--limit FIGURE=X", "Largest value, such as peak=9.5dB; repeatable.", "what the present loop has"),
-    ] = None,
-    spread: Annotated[
-        list[str] | None,
-        option(
-            "--spread SOURCE=X", "How far plants are drawn, such as delay=0.3; repeatable.", "see the documentation"
-        ),
-    ] = None,
-    form: Annotated[
-        str, option("--form NAME", "Gains of a rotor's PID: axes (one set), bearings, or tilt (and parallel).", True)
-    ] = "axes",
-    filters: Annotated[int, option("--filters N", "Filters around a rotor's lowest bending modes.", True, min=0)] = 0,
-    speeds: Annotated[
-        str | None, option("--speeds LO:HI", "Of a rotor in rpm.", "from rest to the speed of rig or estimate")
-    ] = None,
-    schedule: Annotated[
-        int, option("--schedule N", "Laws over a rotor's speeds, of which the nearest orders; lqg, hinf.", True, min=1)
-    ] = 1,
-    plants: Annotated[int, option("--plants N", "Plants that the design is tuned over.", True, min=1)] = 60,
-    judges: Annotated[int, option("--judges N", "Plants that judge the design.", True, min=1)] = 200,
-    seed: Annotated[int, option("--seed N", "Seed of the plants.", True, min=0)] = 0,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    export: Annotated[
-        Path | None,
-        option("--export FILE", "Write the law for other programs: .mat, .py (python-control) or .c (C source)."),
-    ] = None,
-    strict: opt.Strict = False,
-    force: Annotated[bool, switch("--force", "Overwrite an existing rig file.")] = False,
-) -> None:
+@verb("design controller")
+def controller(v: Values) -> None:
     """Design the controller of an identified bearing, and verify it on plants around the estimate.
 
     Goals are minimised on the worst of many plants; every other figure must not become worse than it is with the rig's
@@ -141,32 +52,20 @@ def controller(
     from ambid.job import design_controller
     from ambid.job.files import LAW_ENDINGS
 
-    with Outputs(estimate, rig, json=json, plot=plot, report=report) as outputs, progress("design") as show:
-        outputs.claim(out, "out", force=force)
-        outputs.claim(export, "export", LAW_ENDINGS)
-        found = design_controller(
-            estimate, rig, method=method, goals=tuple(goal) if goal else GOALS, limits=_figures(limit or ()),
-            spread=_sources(spread or ()), form=form, filters=filters,
-            speeds_rpm=None if speeds is None else _pair(speeds), schedule=schedule, plants=plants, judges=judges,
-            seed=seed, tick=show,
-        )  # fmt: skip
+    with Outputs(v.estimate, v.rig, **v.outputs) as outputs, progress("design") as show:
+        outputs.claim(v.out, "out", force=v.force)
+        outputs.claim(v.export, "export", LAW_ENDINGS)
+        how = v.only("method form filters speeds_rpm schedule plants judges seed")
+        how |= {"limits": _figures(v.limits or ()), "spread": _sources(v.spread or ())}
+        found = design_controller(v.estimate, v.rig, goals=v.goals or GOALS, **how, tick=show)
         outputs.give(found, show)
-        if out is not None:
+        if v.out is not None:
             from ambid.rig import rig_text
 
-            outputs.stage_text(out, rig_text(found.new_rig, out.parent))
-        if export is not None:
-            outputs.stage(export, found.export)
-    outputs.show(found, strict=strict)
-
-
-def _pair(text: str) -> tuple[float, float]:
-    """Read ``--speeds``."""
-    low, _, high = text.partition(":")
-    try:
-        return float(low), float(high)
-    except ValueError:
-        raise AmbidError(f"--speeds is {text!r}; give two speeds in rpm with a colon between, such as 0:6000") from None
+            outputs.stage_text(v.out, rig_text(found.new_rig, v.out.parent))
+        if v.export is not None:
+            outputs.stage(v.export, found.export)
+    outputs.show(found, strict=v.strict)
 
 
 def _figures(words: Sequence[str]) -> dict[str, float]:

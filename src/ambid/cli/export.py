@@ -3,27 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
 
 import typer
 
-from ambid.cli.options import argument, option, switch
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 
 
-def command(
-    result: Annotated[Path, argument("ESTIMATE", "What 'ambid identify --json' or 'ambid fit --json' wrote.")],
-    out: Annotated[Path, option("--out -o FILE", "File to write: .mat, .py, .c, .h or .fmu.")],
-    to: Annotated[
-        Literal["control", "ross"] | None,
-        option("--to", "Library that a script (.py) is for.", "ross for a rotor, else control"),
-    ] = None,
-    anyway: Annotated[
-        bool,
-        switch("--anyway", "Export an unusable estimate too, or one whose record does not show all; the file says so."),
-    ] = False,
-    force: Annotated[bool, switch("--force", "Overwrite a file that is no export.")] = False,
-) -> None:
+@verb("export")
+def command(v: Values) -> None:
     """Write an identified plant for other programs, by the ending of the file.
 
     .mat: matrices, continuous and sampled, parameters with covariance. .py: a script for python-control, or of a rotor
@@ -36,13 +24,15 @@ def command(
     from ambid.job.exchange import write_plant
     from ambid.job.files import EXPORT_ENDINGS
 
-    with Outputs(result) as outputs:
-        outputs.claim(out, "out", EXPORT_ENDINGS, force=force)
-        found = load(result)
+    with Outputs(v.result) as outputs:
+        outputs.claim(v.out, "out", EXPORT_ENDINGS, force=v.force)
+        found = load(v.result)
         if not isinstance(found, Linear):
-            raise EstimationError(f"{result} holds no linear plant. Give an estimate, or the fit of a linear structure")
-        outputs.stage(out, lambda beside: write_plant(found, beside, out.stem, to, anyway=anyway))
-    typer.echo(f"{out}: {_what(out)}")
+            raise EstimationError(
+                f"{v.result} holds no linear plant. Give an estimate, or the fit of a linear structure"
+            )
+        outputs.stage(v.out, lambda beside: write_plant(found, beside, v.out.stem, v.to, anyway=v.anyway))
+    typer.echo(f"{v.out}: {_what(v.out)}")
 
 
 def _what(out: Path) -> str:

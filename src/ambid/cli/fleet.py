@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import tomllib
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import typer
 
-from ambid.cli import options as opt
 from ambid.cli.interrupts import Stop, signals
-from ambid.cli.options import option
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
@@ -22,61 +21,10 @@ group = typer.Typer(
     help="Do a job on many records, or judge it on many simulated ones.",
 )
 
-JobName = Annotated[
-    str, option("--job JOB", "What is done: identify, identify_nonlinear, fit, frf, info, margins, validate.", True)
-]
-Set = Annotated[
-    list[str] | None,
-    option("--set NAME=VALUE", "Setting of the job, under its name in Python, such as from_s=0.5; repeatable."),
-]
-Workers = Annotated[int | None, option("--workers N", "Processes at work.", "one for each processor", min=1)]
-Limit = Annotated[float, option("--limit S", "Longest time for one record, in s.", True)]
-Scheduler = Annotated[
-    str | None, option("--scheduler tcp://HOST:PORT", "Dask scheduler, which somebody has started, with its workers.")
-]
-Dask = Annotated[str | None, option("--dask local:N", "Start a Dask cluster of N workers on this machine.")]
-
 
 @group.command("run", short_help="do a job on many records, each once")
-def run(
-    records: Annotated[
-        list[str],
-        opt.argument(
-            "RECORD...",
-            "Files, URLs, or patterns in quotes such as 'records/{bearing}/*.h5', where a word in braces stands for a "
-            "part of one name.",
-        ),
-    ],
-    ledger: Annotated[
-        str, option("--ledger FILE.db|URL", "Ledger that keeps the estimates: what stands there is not done again.")
-    ],
-    rig: Annotated[
-        str | None,
-        option(
-            "--rig RIG|MAP.csv",
-            "Rig file of all records; or with words of the pattern, 'rigs/{bearing}.toml'; or a table with columns "
-            "pattern, rig and perhaps bearing, taken_at.",
-        ),
-    ] = None,
-    taken_at: Annotated[
-        str | None,
-        option(
-            "--taken-at TIME|file",
-            "When those were taken that say it neither themselves nor by {taken_at} or table; file: time of the file.",
-        ),
-    ] = None,
-    job: JobName = "identify",
-    settings: Set = None,
-    again: Annotated[str | None, option("--again failed", "Do records again that failed before.")] = None,
-    workers: Workers = None,
-    limit: Limit = 600.0,
-    scheduler: Scheduler = None,
-    dask: Dask = None,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    strict: opt.Strict = False,
-) -> None:
+@verb("fleet run")
+def run(v: Values) -> None:
     """Do a job on many records, each once, in processes of their own.
 
     A record that ends its worker, or takes too long, is told as failed; all others are done. After Ctrl-C, a crash or
@@ -84,58 +32,40 @@ def run(
     """
     from ambid.fleet.run import run_fleet
 
-    if again not in (None, "failed"):
-        raise AmbidError(f"--again is {again!r}; it must be failed. Correct it")
-    files = [None if x is None or "://" in x else Path(x) for x in (*records, rig, ledger)]
+    if v.again not in (None, "failed"):
+        raise AmbidError(f"--again is {v.again!r}; it must be failed. Correct it")
+    files = [None if x is None or "://" in x else Path(x) for x in (*v.records, v.rig, v.ledger)]
     stop = Stop()
-    with Outputs(*files, json=json, plot=plot, report=report) as outputs:
+    with Outputs(*files, **v.outputs) as outputs:
         with signals(stop.take), progress("fleet") as show:
+            how = v.only("job ledger workers limit_s taken_at scheduler")
             found = run_fleet(
-                records, rig, job=job, settings=_settings(settings), ledger=ledger, workers=workers, limit_s=limit,
-                again=again is not None, taken_at=taken_at, scheduler=scheduler, dask=_local(dask),
-                stopped=stop.wished, tick=show,
+                v.records, v.rig, settings=_settings(v.set), again=v.again is not None, dask=_local(v.dask),
+                stopped=stop.wished, tick=show, **how,
             )  # fmt: skip
         outputs.give(found)
-    _show(outputs, found, stop, strict=strict)
+    _show(outputs, found, stop, strict=v.strict)
 
 
 @group.command("simulate", short_help="judge a job on many simulated records of a rig")
-def simulate(
-    rig: Annotated[
-        str, opt.argument("RIG", "Rig file, or preset by its name; each parameter has a value: that is the truth.")
-    ],
-    runs: Annotated[int, option("--runs N", "Number of records.", True, min=1)] = 100,
-    seed: Annotated[int, option("--seed N", "Seed of the first; the others follow.", True, min=0)] = 1,
-    duration: Annotated[
-        float | None, option("--duration S", "Length of each record, in s.", "as ambid simulate")
-    ] = None,
-    amplitude: Annotated[float | None, option("--amplitude V", "Peak of the excitation.", "as ambid simulate")] = None,
-    nonlinear: Annotated[bool, option("--nonlinear", "Simulate the nonlinear magnet.")] = False,
-    job: JobName = "identify",
-    settings: Set = None,
-    workers: Workers = None,
-    limit: Limit = 600.0,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    strict: opt.Strict = False,
-) -> None:
+@verb("fleet simulate")
+def simulate(v: Values) -> None:
     """Judge a job on many simulated records: bias, spread, and how often 95 % intervals hold the truth.
 
     The job gets the rig without the values of parameters that are free. Ctrl-C keeps what is done.
     """
     from ambid.fleet.trials import monte_carlo
 
-    given = {"duration": duration, "amplitude": amplitude, "nonlinear": nonlinear or None}
+    of_bench = v.only("duration amplitude") | {"nonlinear": v.nonlinear or None}
     stop = Stop()
-    with Outputs(Path(rig) if Path(rig).is_file() else None, json=json, plot=plot, report=report) as outputs:
+    with Outputs(Path(v.rig) if Path(v.rig).is_file() else None, **v.outputs) as outputs:
         with signals(stop.take), progress("fleet") as show:
             found = monte_carlo(
-                rig, runs=runs, seed=seed, job=job, simulated={n: x for n, x in given.items() if x is not None},
-                workers=workers, limit_s=limit, stopped=stop.wished, tick=show, **_settings(settings),
+                v.rig, simulated={n: x for n, x in of_bench.items() if x is not None}, stopped=stop.wished, tick=show,
+                **v.only("runs seed job workers limit_s"), **_settings(v.set),
             )  # fmt: skip
         outputs.give(found)
-    _show(outputs, found, stop, strict=strict)
+    _show(outputs, found, stop, strict=v.strict)
 
 
 def _show(outputs: Outputs, found: Result, stop: Stop, *, strict: bool) -> None:

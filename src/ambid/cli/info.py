@@ -7,32 +7,23 @@ from collections.abc import Iterable
 
 import typer
 
-from ambid.cli import options as opt
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import painter, progress
 
 
-def info(
-    record: opt.RecordFile,
-    rig: opt.RigFile = None,
-    rate: opt.Rate = None,
-    gaps: opt.Gaps = None,
-    layout: opt.Layout = None,
-    json: opt.JsonFile = None,
-    plot: opt.Plot = None,
-    report: opt.Report = None,
-    strict: opt.Strict = False,
-) -> None:
+@verb("info")
+def info(v: Values) -> None:
     """Show what a record holds: channels, rate, levels, resolution, noise, saturation, drop-outs, outliers, excitation.
 
     With --rig, channels are named by role and calibrated, and what the inputs explain does not count as noise.
     """
     from ambid.job import info
 
-    with Outputs(record, rig, json=json, plot=plot, report=report) as outputs, progress("look") as show:
-        found = info(record, rig, rate_hz=rate, gaps=gaps, layout=opt.layout_of(layout))
+    with Outputs(v.record, v.rig, **v.outputs) as outputs, progress("look") as show:
+        found = info(v.record, v.rig, **v.only("rate_hz gaps layout"))
         outputs.give(found, show)
-    outputs.show(found, strict=strict)
+    outputs.show(found, strict=v.strict)
 
 
 def models() -> None:

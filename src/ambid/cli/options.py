@@ -1,135 +1,123 @@
-"""Arguments and options that several verbs share, and how their words are read."""
+"""Options of the verbs, made from what `ambid.settings` declares, and how their words are read."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from inspect import Parameter, Signature
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import typer
 
-from ambid.cli.completion import values_of
 from ambid.errors import AmbidError
-from ambid.settings.caller import check_band, setting
-from ambid.settings.caller import check_positive as check_positive
+from ambid.settings.caller import check_band, setting, speaking
+from ambid.settings.jobs import JOBS
+from ambid.settings.schema import Setting
+
+_TYPES: Mapping[str, type] = {
+    "path": Path, "number": float, "positive": float, "from_zero": float, "share": float, "whole": int, "switch": bool,
+}  # fmt: skip
 
 
-def option(usage: str, about: str, shown: str | bool = False, **more: Any) -> Any:
-    """Declare an option: its usage, such as ``--band LO:HI``; its help; how its default reads."""
-    names = [word for word in usage.split() if word.startswith("-")]
-    metavar = usage.removeprefix(" ".join(names)).strip() or None
-    if metavar is not None:
-        more["autocompletion"] = values_of(usage)
-    return typer.Option(*names, metavar=metavar, help=about, show_default=shown, **more)
+class Values(dict[str, Any]):
+    """What a verb was given, by the names of the settings in Python; also as attributes."""
+
+    def __getattr__(self, name: str) -> Any:
+        """Return a value."""
+        return self[name]
+
+    @property
+    def outputs(self) -> dict[str, Any]:
+        """What a result is written to."""
+        return self.only("json plot report")
+
+    def only(self, names: str) -> dict[str, Any]:
+        """Return some values by name."""
+        return {name: self[name] for name in names.split()}
 
 
-def switch(names: str, about: str) -> Any:
-    """Declare an option without a value."""
-    return typer.Option(*names.split(), help=about)
+def verb(job: str) -> Callable[[Callable[[Values], None]], Callable[..., None]]:
+    """Make a verb of a function that takes the values of a job's settings: they are read and checked before."""
+    settings = JOBS[job].settings
+
+    def make(function: Callable[[Values], None]) -> Callable[..., None]:
+        def command(**words: Any) -> None:
+            with speaking("shell", {s.name: s.flag for s in settings if s.long}):
+                values = Values({s.name: _read(s, words[s.name]) for s in settings})
+                JOBS[job].check(values.items())
+                function(values)
+
+        parameters = [_parameter(s) for s in settings]
+        command.__doc__ = function.__doc__
+        command.__signature__ = Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        return command
+
+    return make
 
 
-def argument(metavar: str, about: str) -> Any:
-    """Declare an argument."""
-    return typer.Argument(metavar=metavar, help=about, show_default=False, autocompletion=values_of(metavar))
+def _parameter(s: Setting) -> Parameter:
+    """Return a setting as a parameter that Typer reads: its type, words, help and default."""
+    of: Any = Literal[s.choices] if s.choices else _TYPES.get(s.kind, str)
+    of = list[of] if s.many else of
+    default = (False if s.kind == "switch" else s.default) if not s.required else Parameter.empty
+    about: dict[str, Any] = {"help": s.about, "metavar": s.metavar or None}
+    if s.metavar:
+        about["autocompletion"] = values_of(s.metavar if s.argument else f"{s.flag} {s.metavar}")
+    if s.argument:
+        info = typer.Argument(show_default=s.default is not None, **about)
+    else:
+        long = "--out" if s.name == "out" else s.flag
+        flags = (long, f"{'-' if len(s.short) == 1 else '--'}{s.short}") if s.short else (long,)
+        info = typer.Option(*flags, show_default=s.default_words or s.kind == "switch", **about)
+    kind = of if s.required or default is not None else of | None
+    return Parameter(s.name, Parameter.KEYWORD_ONLY, default=default, annotation=Annotated[kind, info])
 
 
-RECORD = "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or .arrow"
-RecordFile = Annotated[Path, argument("RECORD", f"{RECORD}.")]
-RigFile = Annotated[Path | None, option("--rig RIG", "Rig file (TOML): what is known about the bench.")]
-From = Annotated[float | None, option("--from S", "Start time in the record, in s.")]
-To = Annotated[float | None, option("--to S", "End time in the record, in s.")]
-Rate = Annotated[float | None, option("--rate HZ", "Sampling rate in Hz, for a record without time.")]
-Gaps = Annotated[
-    Literal["error", "interpolate", "cut"] | None,
-    option(
-        "--gaps",
-        "Missing values: refuse them, interpolate, or use the longest part without any.",
-        "error, or as the rig says",
-    ),
-]
-Layout = Annotated[
-    list[str] | None,
-    option("--layout WORD=VALUE", "What the file leaves open, such as group=NAME or decimal=comma; repeatable."),
-]
-JsonFile = Annotated[str | None, option("--json FILE", "Write the result as JSON; - for standard output.")]
-TrackFile = Annotated[
-    str | None, option("--json FILE", "Write the track as lines of JSON as it is computed; - for standard output.")
-]
-Plot = Annotated[Path | None, option("--plot FILE.png", "Draw the result.")]
-Report = Annotated[
-    Path | None, option("--report FILE.html", "Write a report in one self-contained file, .html or .pdf.")
-]
-Strict = Annotated[bool, switch("--strict", "End with exit code 3 unless the verdict is usable.")]
-Inputs = Annotated[list[str] | None, option("--input COL", "Input column; repeatable.")]
-OutputColumns = Annotated[list[str] | None, option("--output COL", "Output column; repeatable.")]
-References = Annotated[
-    list[str] | None,
-    option("--reference COL", "Column of the loop's external excitation, for methods that use it; repeatable."),
-]
-OpenLoop = Annotated[bool, switch("--open-loop", "The record was taken without feedback.")]
-Force = Annotated[bool, switch("--force", "Overwrite an existing record.")]
-ForceLoop = Annotated[
-    bool, switch("--force", "Overwrite an existing record; go on with a loop that is predicted unstable.")
-]
-SecondRecord = Annotated[Path | None, option("--validate RECORD2", "Validate on this record too, on all of it.")]
+def _read(s: Setting, value: Any) -> Any:
+    """Return a value as the job takes it, from the words of a shell."""
+    if value is None or s.argument:
+        return value
+    readers: dict[str, Callable[[Any], Any]] = {
+        "band": lambda x: _band(x, s.name), "words": layout_of, "loop": lambda x: x == "closed", "percent": _share,
+    }  # fmt: skip
+    return readers.get(s.kind, lambda x: x)(value)
 
 
-Port = Annotated[str, option("--port PORT", "Serial port, or: emulated, simulated, replay:FILE.")]
-RigOfDevice = Annotated[Path, option("--rig RIG", "Rig file (TOML): calibrations, [loop], [daq].")]
-BandHz = Annotated[
-    str | None,
-    option(
-        "--band LO:HI",
-        "Band of the excitation in Hz.",
-        "that of a multisine for levitation, where the rotor moves; else what the controller can play",
-    ),
-]
-BenchName = Annotated[
-    str | None,
-    option(
-        "--bench PRESET|RIG",
-        "Plant behind an emulated or simulated controller.",
-        "daq.bench of the rig, or its own values",
-    ),
-]
-Pace = Annotated[
-    Literal["fastest", "real-time"],
-    switch("--pace", "Speed of an emulated, simulated or replayed device."),
-]
-Seed = Annotated[int, option("--seed N", "Seed of excitation and simulated noise.", True, min=0)]
-
-
-def band_of(text: str | None) -> tuple[float, float] | None:
-    """Read ``--band``: two frequencies in Hz with a colon between."""
-    if text is None:
-        return None
+def _band(text: str, name: str) -> tuple[float, float]:
+    """Read two numbers with a colon between."""
     low, _, high = text.partition(":")
     try:
-        found = (float(low), float(high))
+        band = (float(low), float(high))
     except ValueError:
-        found = (0.0, 0.0)
-    check_band(found, text)
-    return found
+        band = (0.0, 0.0)
+    check_band(band, text, name)
+    return band
 
 
-def layout_of(words: Sequence[str] | None) -> dict[str, str]:
-    """Read ``--layout``: words of a file's layout."""
-    found = dict[str, str]()
-    for text in words or ():
+def layout_of(words: Sequence[str]) -> dict[str, str]:
+    """Read words of a file's layout, each with its value."""
+    layout = dict[str, str]()
+    for text in words:
         word, sign, value = text.partition("=")
-        if not (sign and value) or word in found:
-            raise AmbidError(f"--layout {text!r}: it must be a word and its value, once. Give --layout decimal=comma")
-        found[word] = value
-    return found
+        if not (sign and value) or word in layout:
+            raise AmbidError(
+                f"{setting('layout')} {text!r}: it must be a word and its value, once. Give "
+                f"{setting('layout', 'decimal=comma')}"
+            )
+        layout[word] = value
+    return layout
 
 
-def share_of(text: str, name: str) -> float:
+def _share(text: str) -> float:
     """Read a share: a number, or one with a percent sign."""
     number, percent = text.strip().removesuffix("%"), text.strip().endswith("%")
     try:
         return float(number) / (100.0 if percent else 1.0)
     except ValueError:
-        raise AmbidError(f"{setting(name)} is {text!r}; it must be a share such as 0.01 or 1%. Correct it") from None
+        raise AmbidError(
+            f"{setting('target')} is {text!r}; it must be a share such as 0.01 or 1%. Correct it"
+        ) from None
 
 
 def refuse_twice(records: Sequence[Path]) -> None:
@@ -139,3 +127,60 @@ def refuse_twice(records: Sequence[Path]) -> None:
         if path.resolve() in seen:
             raise AmbidError(f"record {path} is given twice and would count twice. Omit one")
         seen.add(path.resolve())
+
+
+# --- what the Tab key offers: names that the program knows, or the shell's own files ---------------------------------
+
+
+def _structures() -> Iterable[str]:
+    from ambid.blackbox.fit import STRUCTURES
+    from ambid.nonlinear.fit import NONLINEAR_STRUCTURES
+
+    return (*STRUCTURES, *NONLINEAR_STRUCTURES)
+
+
+def _excitations() -> Iterable[str]:
+    from ambid.signals import AXES_EXCITATIONS, EXCITATIONS
+
+    return (*EXCITATIONS, *AXES_EXCITATIONS)
+
+
+def _presets(*, rotors: bool | None = None) -> Iterable[str]:
+    from ambid.physics.presets import preset_names
+
+    return preset_names(rotors=rotors)
+
+
+def _scenarios() -> Iterable[str]:
+    from ambid.simulation.scenarios import scenario_names
+
+    return scenario_names()
+
+
+def _methods() -> Iterable[str]:
+    from ambid.job.track_estimator import METHODS
+
+    return METHODS
+
+
+_NAMES: dict[str, Callable[[], Iterable[str]]] = {
+    "--structure NAME": _structures,
+    "STRUCTURE:ORDERS...": _structures,
+    "--excitation NAME": _excitations,
+    "--preset NAME": _presets,
+    "--bench PRESET|RIG": lambda: _presets(rotors=False),
+    "RIG|PRESET": _presets,
+    "--scenario NAME": _scenarios,
+    "--method NAME": _methods,
+    "--port PORT": lambda: ("emulated", "simulated"),
+}
+
+
+def values_of(usage: str) -> Callable[[str], list[str]]:
+    """Return what completes a value of an option or argument with this usage; nothing lets the shell offer files."""
+
+    def complete(incomplete: str) -> list[str]:
+        names = _NAMES.get(usage, tuple)()
+        return [name for name in names if name.startswith(incomplete)]
+
+    return complete

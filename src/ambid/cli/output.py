@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
 
+from ambid.cli.options import Values
 from ambid.cli.terminal import painter
 from ambid.estimation.progress import silent
 from ambid.job.files import FIGURE_ENDINGS, PAGE_ENDINGS, Files
+from ambid.settings.caller import refuse_given
 
 if TYPE_CHECKING:
     from ambid.estimation.progress import Tick
@@ -83,3 +86,43 @@ class Outputs(Files):
         else:
             typer.echo(presentation.text(result, paint=painter()))
         end(failed=strict and not result.passed)
+
+
+@contextmanager
+def keeping(
+    v: Values, job: str, records: Sequence[Path], *, taken_now: bool = False, **settings: object
+) -> Iterator[Callable[[Any], None]]:
+    """Open the ledger that is named, and give what keeps a result there; without one that does nothing.
+
+    `taken_now`: the records are yet to be taken; `settings`: as the job's function has them, a file as a path.
+    """
+    ledger, taken_at = v.ledger, v.get("taken_at")
+    if ledger is None:
+        refuse_given({"bearing": v.bearing, "taken_at": taken_at}, "{} is for --ledger. Give that too, or omit {}")
+        yield lambda _: None
+        return
+    from ambid.job.data import known_rig
+    from ambid.job.keeping import bearing_of, keep, time_of
+    from ambid.ledger import open_ledger
+    from ambid.ledger.entry import settings_text, sha_of
+
+    bench = known_rig(v.rig)
+    name = bearing_of(None if v.rig is None else bench, v.bearing)
+    at = None if taken_now else time_of(taken_at, records[0])
+    given = {key: sha_of(x) if isinstance(x, Path) else x for key, x in settings.items()}
+    new = "://" not in ledger and not Path(ledger).exists()
+    used = False
+
+    def store(result: Any) -> None:
+        nonlocal used
+        words = settings_text(job, **given)
+        said = keep(place, result, records, bench, bearing=name, taken_at=at, job=job, settings=words)
+        used = True
+        typer.echo(said, err=True)
+
+    try:
+        with open_ledger(ledger) as place:
+            yield store
+    finally:
+        if new and not used:  # a job that failed leaves no empty ledger
+            Path(ledger).unlink(missing_ok=True)

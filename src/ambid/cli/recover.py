@@ -3,53 +3,40 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import typer
 
-from ambid.cli.options import Force, JsonFile, Plot, Report, argument, option, switch
+from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs, end
 from ambid.cli.terminal import progress
 from ambid.errors import AmbidError
 
 
-def command(
-    journals: Annotated[list[Path], argument("JOURNAL", "Journal of a recording that was cut off: NAME.journal.")],
-    output: Annotated[
-        Path | None, option("--out -o FILE", "Record to write: .h5, .hdf5, .csv or .csv.gz.", "NAME")
-    ] = None,
-    delete: Annotated[
-        bool, switch("--delete", "Remove the journal once its record is written and nothing was damaged.")
-    ] = False,
-    json: JsonFile = None,
-    plot: Plot = None,
-    report: Report = None,
-    force: Force = False,
-    strict: Annotated[bool, switch("--strict", "End with exit code 3 if something was damaged or is missing.")] = False,
-) -> None:
+@verb("recover")
+def command(v: Values) -> None:
     """Recover a recording that was killed, or lost its power, from the journal that it left.
 
     Every block that the recorder had acknowledged comes back. Damaged or missing samples are counted and become empty
     rows; the other verbs treat these by --gaps. An existing record is left as it is.
     """
-    for name, one in {"-o": output, "--json": json, "--plot": plot, "--report": report}.items():
-        if one is not None and len(journals) > 1:
+    for name, one in {"-o": v.out, "--json": v.json, "--plot": v.plot, "--report": v.report}.items():
+        if one is not None and len(v.journals) > 1:
             raise AmbidError(
-                f"{name} {one} is one file for {len(journals)} journals. Recover them one by one, or without {name}"
+                f"{name} {one} is one file for {len(v.journals)} journals. Recover them one by one, or without {name}"
             )
     refused: list[AmbidError] = []
     sound = True
-    for journal in journals:
+    for journal in v.journals:
         try:
-            outputs = Outputs(journal, json=json, plot=plot, report=report)
-            sound &= _recover(journal, output, outputs, delete=delete, force=force, quiet=json == "-")
+            outputs = Outputs(journal, **v.outputs)
+            sound &= _recover(journal, v.out, outputs, delete=v.delete, force=v.force, quiet=v.json == "-")
         except AmbidError as failure:
             refused.append(failure)
     for other in refused[1:]:
         typer.echo(f"ambid: {other}", err=True)
     if refused:
         raise refused[0]
-    end(failed=strict and not sound)
+    end(failed=v.strict and not sound)
 
 
 def _recover(journal: Path, output: Path | None, outputs: Outputs, *, delete: bool, force: bool, quiet: bool) -> bool:

@@ -4,86 +4,23 @@ from __future__ import annotations
 
 import math
 import sys
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import typer
 
-from ambid.cli import options as opt
 from ambid.cli.interrupts import INTERRUPTED
-from ambid.cli.keeping import Bearing, LedgerPlace, TakenAt, keeping
-from ambid.cli.options import option, switch
-from ambid.cli.output import Outputs, json_path
+from ambid.cli.options import Values, verb
+from ambid.cli.output import Outputs, json_path, keeping
 from ambid.errors import AmbidError, nearest
+from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
     from ambid.cli.live import Flag
     from ambid.recursive.lines import TrackHeader
 
 
-def command(
-    record: opt.RecordFile,
-    rig: opt.RigFile = None,
-    method: Annotated[
-        str,
-        option(
-            "--method NAME",
-            "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from --input to --output "
-            "by rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
-            True,
-        ),
-    ] = "rpem",
-    inputs: opt.Inputs = None,
-    output: opt.OutputColumns = None,
-    orders: Annotated[str | None, option("--orders na=2,nb=2,nk=1", "Orders of the tracked coefficients.")] = None,
-    reference: opt.References = None,
-    open_loop: opt.OpenLoop = False,
-    step: Annotated[float | None, option("--step X", "Step size of lms and nlms, for signals of size one.")] = None,
-    start: Annotated[
-        Path | None,
-        option(
-            "--start ESTIMATE.json",
-            "Start from this estimate instead of one from the beginning of the record.",
-        ),
-    ] = None,
-    start_seconds: Annotated[
-        float | None, option("--start-seconds S", "Identify the start from this much of the record.")
-    ] = None,
-    every: Annotated[float, option("--every S", "Reporting interval, in s of record.", True)] = 0.01,
-    limit: Annotated[
-        float, option("--limit X", "Acceptable model error, relative to that at identification.", True)
-    ] = 1.5,
-    memory: Annotated[
-        str,
-        option(
-            "--memory auto|all|S",
-            "Memory of the estimator: found from the data, infinite, or a time constant in s.",
-            True,
-        ),
-    ] = "auto",
-    pace: Annotated[
-        Literal["fastest", "real-time"], switch("--pace", "Replay as fast as possible, or in real time.")
-    ] = "fastest",
-    flag: Annotated[
-        list[str] | None,
-        option("--flag T:hold", "Set a flag at a time of the record: track, hold, accept or revert; repeatable."),
-    ] = None,
-    from_s: opt.From = None,
-    to_s: opt.To = None,
-    rate: opt.Rate = None,
-    layout: opt.Layout = None,
-    json: opt.TrackFile = None,
-    plot: Annotated[
-        Path | None,
-        option("--plot FILE.png", "Draw the tracks, with the truth if the record has columns true_NAME."),
-    ] = None,
-    report: opt.Report = None,
-    ledger: LedgerPlace = None,
-    bearing: Bearing = None,
-    taken_at: TakenAt = None,
-    quiet: Annotated[bool, switch("--no-live --quiet", "No live view, even on a terminal.")] = False,
-    strict: opt.Strict = False,
-) -> None:
+@verb("track")
+def command(v: Values) -> None:
     """Track the physical parameters of a bench through a record, as beside a running machine.
 
     On a terminal a live view shows parameters, error, state and decisions; h, t, a and r set flags, q ends.
@@ -93,50 +30,33 @@ def command(
     from ambid.job.tracking import track
     from ambid.rig import load_rig
 
-    times = _flags(flag)
-    how: dict[str, Any] = {
-        "start": start, "start_s": start_seconds, "every_s": every, "limit": limit, "memory": _memory(memory),
-        "pace": pace, "flags": times, "rate_hz": rate,
-    }  # fmt: skip
+    times = _flags(v.flags)
+    how = v.only("start start_s every_s limit pace rate_hz") | {"memory": _memory(v.memory), "flags": times}
     check_settings(how)
-    settings: dict[str, Any] = {
-        "input": inputs, "output": output, "reference": reference, "orders": orders, "open_loop": open_loop,
-        "step": step,
-    }  # fmt: skip
-    given = {name: value for name, value in settings.items() if value}
-    if method == "rpem" and given:
-        raise AmbidError(f"{', '.join(given)}: not for the supervised tracker. Name another --method, or omit it")
-    told: dict[str, Any] = {"layout": opt.layout_of(layout)} if layout else {}
-    asked = {**how, **given, **told, "method": method, "from_s": from_s, "to_s": to_s}
-    with keeping(ledger, [record], rig, bearing=bearing, taken_at=taken_at, job="track", **asked) as store:
-        with Outputs(record, rig, start, plot=plot, report=report) as outputs:
-            outputs.claim(json_path(json), "json")
-            bench = None if rig is None else load_rig(rig)
+    own = {name: x for name, x in v.only("input output reference orders open_loop step").items() if x}
+    if v.method == "rpem" and own:
+        raise AmbidError(
+            f"{', '.join(own)}: not for the supervised tracker. Name another {setting('method')}, or omit it"
+        )
+    how |= own | ({"layout": v.layout} if v.layout else {}) | v.only("method from_s to_s")
+    with keeping(v, "track", [v.record], **how) as store:
+        with Outputs(v.record, v.rig, v.start, **v.outputs | {"json": None}) as outputs:
+            outputs.claim(json_path(v.json), "json")
+            bench = None if v.rig is None else load_rig(v.rig)
             follower = Follower(
-                json, keep=plot is not None or report is not None, quiet=quiet, real_time=pace == "real-time"
+                v.json,
+                keep=v.plot is not None or v.report is not None,
+                quiet=v.no_live,
+                real_time=v.pace == "real-time",
             )
-            follower.record, follower.rate_hz = record, rate
+            follower.record, follower.rate_hz = v.record, v.rate_hz
 
             def begin(header: TrackHeader) -> None:
-                _check_interval(every, header.rate_hz)
+                _check_interval(v.every_s, header.rate_hz)
                 follower.on_header(header)
 
-            follower.run(
-                lambda: track(
-                    record,
-                    bench,
-                    method=method,
-                    from_s=from_s,
-                    to_s=to_s,
-                    on_header=begin,
-                    on_line=follower.on_line,
-                    keep=False,
-                    tick=follower.tick,
-                    **how,
-                    **given,
-                    **told,
-                )
-            )
+            told: dict[str, Any] = {"on_header": begin, "on_line": follower.on_line, "tick": follower.tick}
+            follower.run(lambda: track(v.record, bench, keep=False, **told, **how))
             if follower.track is not None:
                 try:
                     outputs.give(follower.track)
@@ -144,7 +64,7 @@ def command(
                     kept = f"; {follower.path} holds the track" if follower.path else ""
                     print(f"ambid: interrupted while drawing{kept}", file=sys.stderr)
                     raise typer.Exit(INTERRUPTED) from None
-        follower.finish(outputs, drawn=plot, strict=strict, flags=times, store=store)
+        follower.finish(outputs, drawn=v.plot, strict=v.strict, flags=times, store=store)
 
 
 def _check_interval(every: float, rate_hz: float) -> None:

@@ -18,6 +18,7 @@ from ambid.errors import AmbidError, EstimationError
 
 Language = Literal["python", "shell", "console"]
 _language: Language = "python"
+_words: Mapping[str, str] = {}  # what the caller calls some settings, by name
 
 # Names whose flag is not made by leaving out the unit.
 _FLAGS = {
@@ -47,18 +48,20 @@ def language() -> Language:
 
 
 @contextmanager
-def speaking(caller: Language) -> Iterator[None]:
-    """Name settings as this caller does, for as long as the context lasts."""
-    global _language
-    before, _language = _language, caller
+def speaking(caller: Language, words: Mapping[str, str] | None = None) -> Iterator[None]:
+    """Name settings as this caller does, some of them by `words` of its own, for as long as the context lasts."""
+    global _language, _words
+    before, _language, _words = (_language, _words), caller, words or {}
     try:
         yield
     finally:
-        _language = before
+        _language, _words = before
 
 
 def flag(name: str) -> str:
     """Return the option of a setting in the shell."""
+    if _language == "shell" and name in _words:
+        return _words[name]
     unit = next((u for u in _UNITS if name.endswith(u)), "")
     return "-o" if name == "out" else "--" + _FLAGS.get(name, name.removesuffix(unit)).replace("_", "-")
 
@@ -75,7 +78,7 @@ def setting(name: str, value: object = None) -> str:
             value = "closed" if value else "open"
         return flag(name) if value in (None, True) else f"{flag(name)} {value}"
     if _language == "console":
-        label = name.replace("_", " ")
+        label = _words.get(name, name.replace("_", " "))
         return label if value in (None, True) else f"{label} {value}"
     name = _PYTHON.get(name, name)
     if value is None or not name.isidentifier():
@@ -146,18 +149,20 @@ def check_share(given: Mapping[str, object]) -> None:
     _check(given, Real, lambda x: 0 <= x < 1, "a number, 0 to below 1", required=True)
 
 
-def check_band(band: object, text: object = None) -> None:
-    """Refuse what is no band: two frequencies, the lower first; None was not given. `text`: how it was written."""
+def check_band(band: object, text: object = None, name: str = "band") -> None:
+    """Refuse what is no band: two numbers, the lower first; None was not given. `text`: how it was written."""
     ends = tuple(band) if isinstance(band, Iterable) else ()
     if band is not None and not (
         len(ends) == 2 and all(isinstance(x, Real) for x in ends) and 0.0 <= ends[0] < ends[1] < math.inf
     ):
         shown = f"{band if text is None else text!r:.40}"
-        rule = "two frequencies in Hz, the lower first"
-        example = setting("band", (1, 2000))
-        if _language == "shell":
-            rule, example = "two frequencies in Hz with a colon between", setting("band", "1:2000")
-        raise AmbidError(f"{setting('band')} is {shown}; it must be {rule}. Give {example}, for example")
+        of = "speeds in rpm" if name == "speeds_rpm" else "frequencies in Hz"
+        rule, example = (
+            (f"two {of} with a colon between", "1:2000")
+            if _language == "shell"
+            else (f"two {of}, the lower first", (1, 2000))
+        )
+        raise AmbidError(f"{setting(name)} is {shown}; it must be {rule}. Give {setting(name, example)}, for example")
 
 
 def check_switch(given: Mapping[str, object]) -> None:
