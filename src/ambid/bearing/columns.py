@@ -57,12 +57,12 @@ def refuse_silent(model: LinearModel, signals: Signals) -> None:
     centre = np.median(columns, axis=0)
     reach = _FAR * np.median(np.abs(columns - centre), axis=0)
     reach[reach == 0.0] = np.inf  # of a signal that mostly stands still everything counts
-    held = np.clip(columns - centre, -reach, reach)  # a glitch is no reason
-    _refuse_twins(roles, held)
+    clipped = np.clip(columns - centre, -reach, reach)  # a glitch is no reason
+    _refuse_twins(roles, clipped)
     _refuse_set_points(model, replace(signals, u=signals.u[at], y=signals.y[at]))
-    chance = _by_chance(held)
+    chance = _by_chance(clipped)
     if max(chance) > _CHANCE:
-        chance = [min(pair) for pair in zip(chance, _by_chance(np.diff(held, axis=0)), strict=True)]
+        chance = [min(pair) for pair in zip(chance, _by_chance(np.diff(clipped, axis=0)), strict=True)]
     most = int(np.argmax(chance))
     if chance[most] > _CHANCE:
         role, others = roles[most], " and ".join(r for j, r in enumerate(roles) if j != most)
@@ -156,19 +156,19 @@ def refuse_mistaken(
     if model.name == "one-axis":  # after them: two columns that are swapped look like one that lags by a lot
         _refuse_late(model, signals, parameters, delay, follow)
     for text, remedy, changed in others:
-        found = _starts(model, changed, parameters, delay)
-        per_sample = found[0].criterion / found[0].problem.n_used if found else np.inf
+        candidates = _starts(model, changed, parameters, delay)
+        per_sample = candidates[0].criterion / candidates[0].problem.n_used if candidates else np.inf
         if per_sample < below:
-            better.append((per_sample, text, remedy, found))
-    for _, text, remedy, found in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
-        _refuse_explained(text, remedy, found, follow)
+            better.append((per_sample, text, remedy, candidates))
+    for _, text, remedy, candidates in sorted(better, key=lambda b: b[0])[:_FOLLOWED]:
+        _refuse_explained(text, remedy, candidates, follow)
 
 
 def _refuse_explained(
-    text: str, remedy: str, found: Sequence[Candidate], follow: Callable[[Sequence[Candidate]], Fit]
+    text: str, remedy: str, candidates: Sequence[Candidate], follow: Callable[[Sequence[Candidate]], Fit]
 ) -> None:
     """Raise where a changed record, of which these are the start values, is explained."""
-    fit = _try(follow, found) if found else None
+    fit = _try(follow, candidates) if candidates else None
     if fit is not None and _can_be(fit):
         raise EstimationError(
             f"{text}: no bearing explains the record as it is, but one does after this change ({_numbers(fit)}). "
@@ -190,14 +190,14 @@ def _likely(model: LinearModel, changes: Iterable[Change], share: float) -> tupl
 
     `share`: of the coil as it is; what makes it less clear is left out.
     """
-    found, others = [], []
+    coils, others = [], []
     for change in changes:
         coil = _coil(model, change[2])
         if coil is not None and coil.share > _CLEAR and not coil.reversed:
-            found.append((coil.share, change))
+            coils.append((coil.share, change))
         elif coil is None or coil.share >= share:
             others.append(change)
-    return [change for _, change in sorted(found, key=lambda f: -f[0])], others
+    return [change for _, change in sorted(coils, key=lambda f: -f[0])], others
 
 
 def _refuse_late(
@@ -210,8 +210,8 @@ def _refuse_late(
     """Raise where a channel lags behind the others, and a bearing explains the record once that is taken back."""
     lag = lag_of(signals)
     if lag is not None and lag.shown and round(lag.samples):
-        found = _starts(model, without_lag(signals, lag), parameters, delay)
-        fit = _try(follow, found) if found else None
+        candidates = _starts(model, without_lag(signals, lag), parameters, delay)
+        fit = _try(follow, candidates) if candidates else None
         if fit is not None and _can_be(fit):
             raise EstimationError(
                 f"{lag.describe(signals.rate_hz)}: no bearing explains the record as it is, but one does after that "
@@ -234,10 +234,10 @@ def _refuse_units(
     if all(p.role == "free" for p in parameters if p.value):
         return
     free = [replace(p, role="free", sd=None, value=None) if p.value else p for p in parameters]
-    found = _starts(model, signals, free, delay)
-    if not found or found[0].criterion / found[0].problem.n_used > below:
+    candidates = _starts(model, signals, free, delay)
+    if not candidates or candidates[0].criterion / candidates[0].problem.n_used > below:
         return
-    fit = _try(follow, found)
+    fit = _try(follow, candidates)
     check = None if fit is None else check_units(fit.problem.parameters(fit.vector), parameters, signals, model)
     if check is not None and not check.passed:
         raise EstimationError(check.detail)
@@ -251,10 +251,10 @@ def _starts(model: LinearModel, signals: Signals, parameters: Sequence[Parameter
         return []
 
 
-def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate]) -> Fit | None:
+def _try(follow: Callable[[Sequence[Candidate]], Fit], candidates: Sequence[Candidate]) -> Fit | None:
     """Return a trial's fit where it explains the record; a trial never ends the job."""
     try:
-        fit = follow(found)
+        fit = follow(candidates)
     except (EstimationError, np.linalg.LinAlgError):
         return None
     return fit if failure(fit) == "" else None
@@ -263,8 +263,8 @@ def _try(follow: Callable[[Sequence[Candidate]], Fit], found: Sequence[Candidate
 def _can_be(fit: Fit) -> bool:
     """Whether what was found is a bearing that could be built."""
     theta, problem = fit.problem.parameters(fit.vector), fit.problem
-    seen = Signals(u=problem.u, y=problem.y, rate_hz=problem.rate_hz)
-    return possible(theta, seen, problem.model) and all(
+    signals = Signals(u=problem.u, y=problem.y, rate_hz=problem.rate_hz)
+    return possible(theta, signals, problem.model) and all(
         theta[p.name] > 0 for p in problem.model.parameters if p.positive
     )
 
@@ -373,19 +373,19 @@ def lag_of(signals: Signals) -> Lag | None:
 
 def late(model: LinearModel, signals: Signals) -> bool:
     """Whether position or current of a record lag."""
-    found = lag_of(signals) if model.name == "one-axis" else None
-    return found is not None and found.shown
+    lag = lag_of(signals) if model.name == "one-axis" else None
+    return lag is not None and lag.shown
 
 
 def check_lag(signals: Signals) -> Check:
     """Check that position and current are logged at the same instants."""
-    found = lag_of(signals)
-    if found is None or found.share <= _SHARE:
+    lag = lag_of(signals)
+    if lag is None or lag.share <= _SHARE:
         return Check(passed=True, detail="the current explains too little of the motion to tell whether a channel lags")
-    values = {"samples": found.samples, "sd": found.sd}
-    if found.shown:
-        return Check(passed=False, values=values, detail=found.describe(signals.rate_hz))
-    detail = f"position and current are logged at the same instants (lag {found.samples:.2g} ± {found.sd:.1g} samples)"
+    values = {"samples": lag.samples, "sd": lag.sd}
+    if lag.shown:
+        return Check(passed=False, values=values, detail=lag.describe(signals.rate_hz))
+    detail = f"position and current are logged at the same instants (lag {lag.samples:.2g} ± {lag.sd:.1g} samples)"
     return Check(passed=True, values=values, detail=detail)
 
 
@@ -439,9 +439,9 @@ def _sd(terms: Array, left: Array) -> float:
     """
     inverse, n = np.linalg.pinv(terms.T @ terms), left.size // 2  # real parts of the lines, then imaginary ones
     leverage = np.einsum("ij,jk,ik->i", terms, inverse, terms)
-    held = np.convolve(leverage[:n] + leverage[n:], np.ones(_JOINED), "same")
+    share = np.convolve(leverage[:n] + leverage[n:], np.ones(_JOINED), "same")
     each = terms @ inverse[2] * left
-    scores = (each[:n] + each[n:]) / (1.0 - np.minimum(held, _HELD))
+    scores = (each[:n] + each[n:]) / (1.0 - np.minimum(share, _HELD))
     sums = [(1.0 - k / _REACH) * float(scores[k:] @ scores[: n - k]) for k in range(_REACH)]
     return float(np.sqrt(2.0 * sum(sums) - sums[0]))
 

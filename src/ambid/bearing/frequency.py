@@ -56,10 +56,10 @@ def response(
     `theta`: SI; `names`: parameters to differentiate by; `delay`: in samples; `moving`: whether the derivative by it
     comes last. Returns (n_frequencies, n_outputs, n_inputs), and the same with one more axis.
     """
-    found = physical_response(
+    physical = physical_response(
         model, theta, ln.omega, dt=ln.dt if ln.held else None, delay_s=delay * ln.dt, along=names, with_delay=moving
     )
-    G, slope = (x[:, channels.outputs][:, :, channels.inputs] for x in found)
+    G, slope = (x[:, channels.outputs][:, :, channels.inputs] for x in physical)
     if moving:
         slope[..., -1] *= ln.dt
     return G, slope
@@ -231,10 +231,10 @@ def frequency_estimate(
     scale = natural_sizes(names, theta, problem.model.references(theta))
     singular_values, weakest = weakest_direction(names, covariance, scale)
     sd = np.sqrt(np.diag(covariance))
-    seen = {k: converged and bool(s < WEAK) for k, s in zip(names, sd / scale, strict=True)}
+    shows = {k: converged and bool(s < WEAK) for k, s in zip(names, sd / scale, strict=True)}
     alone = np.sqrt(np.diag(directions(data).inverse())[:n])
     spread, own = (dict(zip(names, x.tolist(), strict=True)) for x in (sd, alone))
-    unseen = [k for k in names if not seen[k]]
+    unseen = [k for k in names if not shows[k]]
     checks = {
         "cost": check,
         "response_fit": Check(
@@ -255,7 +255,7 @@ def frequency_estimate(
     return FrequencyEstimate(
         status="converged" if converged else "stalled",
         model=problem.model.name,
-        parameters=tuple(EstimatedParameter.of(p, theta, spread, seen, own) for p in parameters),
+        parameters=tuple(EstimatedParameter.of(p, theta, spread, shows, own) for p in parameters),
         covariance_names=names,
         covariance=covariance,
         covariance_method="information" if check.passed else "robust",
@@ -313,7 +313,7 @@ def greybox_frf(
 
 
 def _channels(frf: FrequencyResponse, model: LinearModel, roles: Mapping[str, str]) -> Channels:
-    found: dict[str, list[int]] = {"input": [], "output": []}
+    places: dict[str, list[int]] = {"input": [], "output": []}
     for what, names, known in (("input", frf.inputs, model.inputs), ("output", frf.outputs, model.outputs)):
         for name in names:
             role = roles.get(name, name)
@@ -322,19 +322,19 @@ def _channels(frf: FrequencyResponse, model: LinearModel, roles: Mapping[str, st
                     f"{what} {name!r} of the response is no {what} of model {model.name!r}, which has "
                     f"{', '.join(known)}.{nearest(role, list(known))} Give roles={{{name!r}: ...}}"
                 )
-            found[what].append(known.index(role))
-    return Channels(outputs=tuple(found["output"]), inputs=tuple(found["input"]))
+            places[what].append(known.index(role))
+    return Channels(outputs=tuple(places["output"]), inputs=tuple(places["input"]))
 
 
 def _order_parameters(model: LinearModel, parameters: Sequence[Parameter]) -> tuple[Parameter, ...]:
-    given = {p.name: p for p in parameters}
+    entries = {p.name: p for p in parameters}
     wanted = [p.name for p in model.parameters]
-    if sorted(given) != sorted(wanted) or len(parameters) != len(wanted):
+    if sorted(entries) != sorted(wanted) or len(parameters) != len(wanted):
         raise EstimationError(
             f"parameters {', '.join(sorted(p.name for p in parameters))} for model {model.name!r}, which has "
             f"{', '.join(wanted)}. Give each once"
         )
-    return tuple(given[k] for k in wanted)
+    return tuple(entries[k] for k in wanted)
 
 
 def _race(
@@ -411,11 +411,11 @@ def _search(problem: PhysicalProblem, v: Array, *, evaluations: int = 200) -> tu
     """Levenberg-Marquardt; cost (priors included), vector, whether it converged."""
     from scipy.optimize import least_squares
 
-    found = least_squares(
+    solution = least_squares(
         problem.residual, v, jac=problem.slope, method="lm", x_scale="jac", xtol=1e-11, ftol=1e-12, gtol=1e-11,
         max_nfev=evaluations,
     )  # fmt: skip
-    return float(found.cost), np.asarray(found.x, dtype=np.float64), bool(found.status > 0)
+    return float(solution.cost), np.asarray(solution.x, dtype=np.float64), bool(solution.status > 0)
 
 
 def _free_fraction(
@@ -429,8 +429,8 @@ def _free_fraction(
             continue
         at = replace(problem, delay=lower, fractional=True)
         begin = (1.0 if lower < problem.delay else -1.0) if problem.lines.held else 0.0
-        found = _search(at, np.append(v, begin))
-        good = at.delay_at(found[1]) >= 0 and np.isfinite(found[0])
-        if good and 2 * (best[1] - found[0]) > (_WORTH if best[0] is problem else 0.0):
-            best = (at, *found)
+        freed = _search(at, np.append(v, begin))
+        good = at.delay_at(freed[1]) >= 0 and np.isfinite(freed[0])
+        if good and 2 * (best[1] - freed[0]) > (_WORTH if best[0] is problem else 0.0):
+            best = (at, *freed)
     return best

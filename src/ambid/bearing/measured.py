@@ -80,7 +80,7 @@ class Measured(Result):
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """A response of which noise leaves few lines, and what stands against the models fitted to it."""
-        frf, found = self.response, list[Reason]()
+        frf, reasons = self.response, list[Reason]()
         with np.errstate(divide="ignore", invalid="ignore"):
             clear = np.count_nonzero(frf.sd < _CLEAR * np.abs(frf.G), axis=0)
         worst = np.unravel_index(np.argmin(clear), clear.shape)
@@ -88,18 +88,18 @@ class Measured(Result):
         if least < max(_LINES, _SHARE * lines):
             pair = f"{frf.inputs[worst[1]]} → {frf.outputs[worst[0]]}"
             text = f"{least} of {lines} lines of {pair} stand out of the noise. Excite more, longer or in another band"
-            found.append(Reason(check="noise", text=text, grave=least < _FEWEST))
+            reasons.append(Reason(check="noise", text=text, grave=least < _FEWEST))
         if not (self.references or self.open_loop):
             text = (
                 f"without a reference, feedback biases the response. Give {setting('reference')}, or "
                 f"{setting('open_loop', True)} if there is none"
             )
-            found.append(Reason(check="feedback", text=text))
+            reasons.append(Reason(check="feedback", text=text))
         if "assumed" in frf.details:
-            found.append(Reason(check="noise", text=str(frf.details["assumed"])))
+            reasons.append(Reason(check="noise", text=str(frf.details["assumed"])))
         for name, model in (("fit", self.fit), ("physical", self.estimate), ("modes", self.modal)):
-            found += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
-        return tuple(found)
+            reasons += [replace(r, check=f"{name}.{r.check}") for r in (() if model is None else model.reasons)]
+        return tuple(reasons)
 
     @property
     def modes(self) -> tuple[Mode, ...]:
@@ -138,26 +138,26 @@ def model_responses(measured: Measured, frequency_hz: Array) -> tuple[ModelRespo
     `frequency_hz`: (n_frequencies,), Hz. Returns of the black-box fit and of the physical parameters, as far as there
     are such.
     """
-    found = []
+    responses = []
     if measured.fit is not None:
-        found.append(_of_fit(measured.fit, measured.response, frequency_hz))
+        responses.append(_of_fit(measured.fit, measured.response, frequency_hz))
     if measured.estimate is not None:
-        found.append(_of_estimate(measured.estimate, measured.response, frequency_hz))
-    return tuple(found)
+        responses.append(_of_estimate(measured.estimate, measured.response, frequency_hz))
+    return tuple(responses)
 
 
 def _of_fit(fit: BlackBoxFit, frf: FrequencyResponse, frequency_hz: Array) -> ModelResponse:
-    omega, model, held = 2 * np.pi * frequency_hz, fit.model, frf.hold == "zoh"
+    omega, model, zoh = 2 * np.pi * frequency_hz, fit.model, frf.hold == "zoh"
     if isinstance(model, StateSpaceModel):
         # the method takes the known delay out of the lines beforehand
         late = np.exp(-1j * omega * float(str(fit.details.get("delay_s", 0.0))))[:, None, None]
-        if model.dt is None and held:
+        if model.dt is None and zoh:
             G = _sampled(model, omega, fit.dt) * late
             return _along(fit.structure, frequency_hz, G, _differences(model, omega, fit) * late[..., None])
         G, slope = model.frequency_response(omega) * late, model.frequency_response_derivative(omega) * late[..., None]
     else:
         G, slope = model.frequency_response(omega), model.frequency_response_derivative(omega)
-        if model.dt is None and held:  # the hold's own response, which the fit takes out
+        if model.dt is None and zoh:  # the hold's own response, which the fit takes out
             hold = (np.sinc(frequency_hz * fit.dt) * np.exp(-0.5j * omega * fit.dt))[:, None, None]
             G, slope = G * hold, slope * hold[..., None]
     return with_spread(fit.structure, frequency_hz, G, slope, fit.covariance)

@@ -56,12 +56,12 @@ class PhysicalFit(Parametric, Result):
         """A black box that cannot be this physics, and parameters that it does not show."""
         v = self.misfit.values
         gross = bool(v) and v["statistic"] >= _GROSS * v["freedom"]
-        found = [] if self.misfit.passed else [Reason(check="misfit", text=self.misfit.detail, grave=gross)]
+        reasons = [] if self.misfit.passed else [Reason(check="misfit", text=self.misfit.detail, grave=gross)]
         unseen = ", ".join(p.name for p in self.parameters if not p.identifiable)
         if unseen:
             text = f"not identifiable from the fit: {unseen}. Excite more, or give a prior"
-            found.append(Reason(check="identifiable", text=text))
-        return tuple(found)
+            reasons.append(Reason(check="identifiable", text=text))
+        return tuple(reasons)
 
 
 def physical_parameters(
@@ -122,9 +122,9 @@ def _find(
             f"the {fit.structure} model has {target.rank} independent numbers for {len(free)} free parameters. Fix "
             "parameters, raise its order, or excite more"
         )
-    found = match(target, model, parameters, delay)
+    best = match(target, model, parameters, delay)
     own = target.dt is None or target.rank <= len(free)
-    return _result(fit, model, parameters, target, found, delay_how="given" if delay != "auto" or own else "estimated")
+    return _result(fit, model, parameters, target, best, delay_how="given" if delay != "auto" or own else "estimated")
 
 
 def _result(
@@ -132,21 +132,21 @@ def _result(
     model: LinearModel,
     parameters: Sequence[Parameter],
     target: Target,
-    found: Match,
+    best: Match,
     *,
     delay_how: Literal["estimated", "given"],
 ) -> PhysicalFit:
     """Covariance, goodness of fit and identifiability of a finished match."""
-    names, theta, n = found.names, found.theta, len(found.names)
-    own = spread(target, found)
-    check, factor = _misfit(fit, model, target, found, own)
+    names, theta, n = best.names, best.theta, len(best.names)
+    own = spread(target, best)
+    check, factor = _misfit(fit, model, target, best, own)
     whole = own.covariance * factor**2 * _roughness(target)
     scale = natural_sizes(names, theta, model.references(theta))
     singular_values, weakest = weakest_direction(names, whole[:n, :n], scale)
     relative = np.diag(whole)[:n] / scale**2
     sd = dict(zip(names, np.sqrt(np.diag(whole)).tolist(), strict=False))
     near = factor**2 < _GROSS
-    seen = {k: near and bool(r < WEAK**2) for k, r in zip(names, relative, strict=True)}
+    shows = {k: near and bool(r < WEAK**2) for k, r in zip(names, relative, strict=True)}
     warnings = [] if check.passed else [check.detail]
     warnings += [
         f"a check of the {fit.structure} model failed: {c.detail}" for c in fit.checks.values() if not c.passed
@@ -157,11 +157,11 @@ def _result(
     return PhysicalFit(
         model=model.name,
         structure=fit.structure,
-        parameters=tuple(EstimatedParameter.of(p, theta, sd, seen) for p in _ordered(model, parameters)),
+        parameters=tuple(EstimatedParameter.of(p, theta, sd, shows) for p in _ordered(model, parameters)),
         covariance_names=names,
         covariance=whole[:n, :n],
         delay=Delay.of(
-            found.delay / fit.dt, float(np.sqrt(whole[-1, -1])) / fit.dt if found.delay_free else None, delay_how
+            best.delay / fit.dt, float(np.sqrt(whole[-1, -1])) / fit.dt if best.delay_free else None, delay_how
         ),
         misfit=check,
         band_hz=target.band_hz,
@@ -177,7 +177,7 @@ def _roughness(target: Target) -> float:
     return 1.0 if np.isinf(freedom) else freedom / (freedom - 2.0)
 
 
-def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match, own: Spread) -> tuple[Check, float]:
+def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, best: Match, own: Spread) -> tuple[Check, float]:
     """Test of what the match leaves over, and by how much standard deviations widen.
 
     A sum of chi-squares of several sizes is one chi-square by its mean and variance (Satterthwaite 1946); where the
@@ -185,11 +185,11 @@ def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, found: Match, 
     """
     from scipy.stats import chi2, f
 
-    if target.rank - len(found.names) - found.delay_free + found.n_priors <= 0:
+    if target.rank - len(best.names) - best.delay_free + best.n_priors <= 0:
         return Check(passed=True, detail="no degrees of freedom are left to test the physical model", p=None), 1.0
     mean = float(np.sum(own.left))
     freedom = mean**2 / float(np.sum(own.left**2))
-    left = found.criterion / mean * freedom
+    left = best.criterion / mean * freedom
     if target.groups is None:
         p = float(chi2.sf(left, freedom))
     else:
@@ -259,24 +259,24 @@ class Spread:
     left: Array
 
 
-def spread(target: Target, found: Match) -> Spread:
+def spread(target: Target, best: Match) -> Spread:
     """Propagate the black box's covariance S through a weighted match: (J'WJ)^-1 J'W S W J (J'WJ)^-1.
 
     What the black box's covariance does not reach at all gets the weight's own noise, so that a direction without
     information is not taken for one without error.
     """
-    norm = np.maximum(np.linalg.norm(found.J, axis=0), 1e-100)
-    U, s, Vt = np.linalg.svd(found.J / norm, full_matrices=False)
+    norm = np.maximum(np.linalg.norm(best.J, axis=0), 1e-100)
+    U, s, Vt = np.linalg.svd(best.J / norm, full_matrices=False)
     back = (Vt.T / np.maximum(s, 1e-15 * s[0])) / norm[:, None]  # J^+ = back U'
-    points, priors = target.noise.shape[0], found.J.shape[0] - target.noise.shape[0]
-    noise = np.zeros((found.J.shape[0], target.rank + priors))
+    points, priors = target.noise.shape[0], best.J.shape[0] - target.noise.shape[0]
+    noise = np.zeros((best.J.shape[0], target.rank + priors))
     noise[:points, : target.rank] = target.noise
     noise[points:, target.rank :] = np.eye(priors)
     reached = np.linalg.qr(noise)[0]
-    seen, blind = U.T @ noise, U.T - (U.T @ reached) @ reached.T
-    inner = seen @ seen.T + blind @ blind.T
-    over = noise - U @ seen
-    size = found.size
+    visible, blind = U.T @ noise, U.T - (U.T @ reached) @ reached.T
+    inner = visible @ visible.T + blind @ blind.T
+    over = noise - U @ visible
+    size = best.size
     covariance = back @ inner @ back.T * np.outer(size, size)
     return Spread(
         covariance=0.5 * (covariance + covariance.T), left=np.asarray(np.linalg.svd(over, compute_uv=False) ** 2)
@@ -308,7 +308,7 @@ def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], d
             f"resembles this black-box model. Check channels and signs, or give start values"
         )
     scored.sort(key=lambda s: s[0])
-    found: list[Match] = []
+    matches: list[Match] = []
     for samples, values in _different(scored, [p.name for p in free]):
         reference = model.references(values)
         size = [max(abs(values[p.name]), 1e-3 * reference.get(p.name, 0.0)) or 1.0 for p in free]
@@ -327,9 +327,9 @@ def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], d
         )
         if free_delay:
             at = round(samples) * target.period_s
-            found.append(search(target, replace(blank, delay=at, delay_free=False)))
-        found.append(search(target, blank))
-    physical = [m for m in found if all(m.theta[p.name] > 0 for p in model.parameters if p.positive)]
+            matches.append(search(target, replace(blank, delay=at, delay_free=False)))
+        matches.append(search(target, blank))
+    physical = [m for m in matches if all(m.theta[p.name] > 0 for p in model.parameters if p.positive)]
     if not physical or not np.isfinite(min(m.criterion for m in physical)):
         raise EstimationError(
             f"the match to {model.name!r} gives a negative "
@@ -400,14 +400,14 @@ def _different(
     scored: list[tuple[float, float, dict[str, float]]], names: list[str]
 ) -> list[tuple[float, dict[str, float]]]:
     """The best starts that are not alike."""
-    kept: list[tuple[float, dict[str, float]]] = []
+    distinct: list[tuple[float, dict[str, float]]] = []
     for _, delay, values in scored:
         alike = any(
             d == delay and all(abs(v[k] - values[k]) <= 0.1 * max(abs(v[k]), abs(values[k])) for k in names)
-            for d, v in kept
+            for d, v in distinct
         )
         if not alike:
-            kept.append((delay, values))
-        if len(kept) == _TRIED:
+            distinct.append((delay, values))
+        if len(distinct) == _TRIED:
             break
-    return kept
+    return distinct

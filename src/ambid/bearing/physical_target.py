@@ -196,8 +196,8 @@ def _weight(
 
 def _groups(fit: BlackBoxFit) -> int | None:
     """Number of groups of a jackknife, None for a covariance of another kind."""
-    said = fit.details.get("covariance")
-    groups = said.get("groups") if isinstance(said, Mapping) else None
+    method = fit.details.get("covariance")
+    groups = method.get("groups") if isinstance(method, Mapping) else None
     return groups if isinstance(groups, int) else None
 
 
@@ -238,11 +238,11 @@ def physical_response(
     if dt is None:
         lag = np.exp(-1j * omega * delay_s)[:, None, None]
         inner = _Resolvent(space.A, space.C, np.asarray(1j * omega, dtype=np.complex128))
-        found = inner.response(np.broadcast_to(space.B, (omega.size, *space.B.shape))) * lag
+        response = inner.response(np.broadcast_to(space.B, (omega.size, *space.B.shape))) * lag
         rows = [inner.slope(space.B, d.A, np.broadcast_to(d.B, (omega.size, *d.B.shape)), d.C) * lag for d in slopes]
         if with_delay:
-            rows.append(-1j * omega[:, None, None] * found)
-        return found, _stacked(rows, found)
+            rows.append(-1j * omega[:, None, None] * response)
+        return response, _stacked(rows, response)
     whole = int(np.floor(delay_s / dt + 1e-9))
     fraction = max(0.0, delay_s / dt - whole)
     discrete, directions = discretise(space, dt, fraction=fraction, derivatives=slopes)
@@ -257,8 +257,8 @@ def physical_response(
     wanted = rows if with_delay else rows[: len(slopes)]
     if with_delay:
         wanted[-1] = wanted[-1] / dt
-    found = inner.response(b) * lag
-    return found, _stacked(wanted, found)
+    response = inner.response(b) * lag
+    return response, _stacked(wanted, response)
 
 
 class _Resolvent:

@@ -157,8 +157,8 @@ def check_units(
 
 def possible(values: Mapping[str, float], signals: Signals, plant: LinearModel) -> bool:
     """Return whether a bench of these sizes can exist; arguments as of `check_units`."""
-    known = {**values, **_seen(signals, plant)}
-    return _inside(SIZES, [_log(size, known) for size in SIZES])
+    numbers = {**values, **_seen(signals, plant)}
+    return _inside(SIZES, [_log(size, numbers) for size in SIZES])
 
 
 def _inside(sizes: Sequence[Size], logs: Sequence[float] | Array) -> bool:
@@ -169,27 +169,27 @@ def _inside(sizes: Sequence[Size], logs: Sequence[float] | Array) -> bool:
 def _seen(signals: Signals, plant: LinearModel) -> dict[str, float]:
     """Largest voltage and current, travel, and rate, as far as the model has them."""
     columns = dict(zip((*plant.inputs, *plant.outputs), np.column_stack([signals.u, signals.y]).T, strict=True))
-    found = {role: _largest(x) for role, x in columns.items()} | {"rate": signals.rate_hz}
+    sizes = {role: _largest(x) for role, x in columns.items()} | {"rate": signals.rate_hz}
     if "position" in columns:
-        found["position"] = 2.0 * _largest(columns["position"] - np.median(columns["position"]))
-    return found
+        sizes["position"] = 2.0 * _largest(columns["position"] - np.median(columns["position"]))
+    return sizes
 
 
-def _mistaken_values(known: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:
+def _mistaken_values(parameters: Sequence[Parameter], values: Mapping[str, float]) -> list[str]:
     """Say which of a rig's values are a power of thousand off what the record alone gives, `values` in SI."""
-    found = []
-    for p in known:
+    lines = []
+    for p in parameters:
         alone = values.get(p.name, 0.0)
         if p.role == "free" or not p.value or not alone:
             continue
         decades = float(np.log10(abs(p.value / alone)))
         thousands = round(decades / 3.0)
         if thousands and abs(decades - 3.0 * thousands) < _EXACT:
-            found.append(
+            lines.append(
                 f"{p.name} = {p.value:.4g} {p.unit} in the rig is about 10^{3 * thousands} times the value from the "
                 f"data ({alone:.4g} {p.unit}). Correct its unit in the rig"
             )
-    return found
+    return lines
 
 
 def _largest(signal: Array) -> float:
@@ -210,15 +210,15 @@ def _log(size: Size, values: Mapping[str, float]) -> float:
 
 def _said(parameters: Sequence[Parameter]) -> list[Size]:
     """What a rig says of parameters, as sizes of a narrow range."""
-    found = []
+    sizes = []
     for p in parameters:
         if p.role != "free" and p.value and p.name != "c":
             wide = 10 ** max(_NAMED, 3.0 * np.log10(1.0 + (p.sd or 0.0) / abs(p.value)))
             usual = (abs(p.value) / wide, abs(p.value) * wide)
-            found.append(
+            sizes.append(
                 Size(name=p.name, of={p.name: 1}, unit=p.unit, usual=usual, possible=(0.0, np.inf), source="rig")
             )
-    return found
+    return sizes
 
 
 def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
@@ -227,7 +227,7 @@ def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
     `far`: (n,), distances from the middles of the ranges in half widths; `moves`: (n, 4), what a power of ten moves;
     `channels`: those of the model, and time.
     """
-    applies, found = np.isfinite(far), []
+    applies, slips = np.isfinite(far), []
     most = float(np.sum(far[applies] ** 2)) - _GAIN
     for j, (channel, unit) in enumerate(_UNITS.items()):
         if channel not in channels:
@@ -238,6 +238,6 @@ def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
             if np.all(np.abs(after) <= 1.0):
                 rare = 0.0 if factor in (1e3, 1e-3) and channel != "time" else _RARE
                 words = text.format(unit=unit)
-                found.append((float(np.sum(after**2)) + rare, UnitSlip(channel=channel, factor=factor, text=words)))
-    found = sorted((f for f in found if f[0] < most), key=lambda f: f[0])
-    return [slip for score, slip in found if score < found[0][0] + _ALIKE]
+                slips.append((float(np.sum(after**2)) + rare, UnitSlip(channel=channel, factor=factor, text=words)))
+    slips = sorted((f for f in slips if f[0] < most), key=lambda f: f[0])
+    return [slip for score, slip in slips if score < slips[0][0] + _ALIKE]

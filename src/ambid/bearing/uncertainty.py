@@ -209,10 +209,10 @@ def _gram(a: Array) -> Array:
 def _scores(fit: Fit) -> Array:
     """Scores of the stretches of the record, (n_stretches, size)."""
     work = workspace_near(fit, fit.problem)
-    found = products(fit.problem, fit.vector, weight_of(fit.covariance), work, stretches=STRETCHES)
-    if found is None:
+    sums = products(fit.problem, fit.vector, weight_of(fit.covariance), work, stretches=STRETCHES)
+    if sums is None:
         raise ValueError("the fit has no predictor; it has failed")
-    return found.scores
+    return sums.scores
 
 
 def _scatter(scores: Array) -> Array:
@@ -260,8 +260,8 @@ def _frequencies(values: Mapping[str, float], band_hz: tuple[float, float, float
     stiff = np.sqrt(v["k_x"] / v["m"]) / (2 * np.pi) if {"k_x", "m"} <= v.keys() else lowest
     coupled = np.sqrt(v["k_i"] ** 2 / (v["m"] * v["L"])) / (2 * np.pi) if {"k_i", "m", "L"} <= v.keys() else stiff
     corner = v["R"] / v["L"] / (2 * np.pi) if {"R", "L"} <= v.keys() else stiff
-    held = {"low": min(stiff, lowest) / 3, "mid": max(coupled, stiff), "corner": corner}
-    within = {name: float(np.clip(f, first, last)) for name, f in held.items()}
+    corners = {"low": min(stiff, lowest) / 3, "mid": max(coupled, stiff), "corner": corner}
+    within = {name: float(np.clip(f, first, last)) for name, f in corners.items()}
     return {**within, "settle": 5 / (2 * np.pi * within["corner"])}
 
 
@@ -291,14 +291,14 @@ def estimate_of(
     theta = problem.parameters(fit.vector)
     sd = dict(zip(known.names, known.standard_deviations(robust=robust).tolist(), strict=True))
     settled = fit.status == "converged"  # of a search that has not ended nothing is certain
-    seen = {k: settled and ok for k, ok in zip(known.names, known.identifiable_at(robust=robust), strict=True)}
+    shows = {k: settled and ok for k, ok in zip(known.names, known.identifiable_at(robust=robust), strict=True)}
     alone = dict(zip(known.names, known.data_only_sd.tolist(), strict=True))
     delay = Delay.of(problem.delay_samples(fit.vector), known.delay_sd, delay_how)
     return Estimate(
         status=fit.status,
         model=problem.model.name,
         record=record,
-        parameters=tuple(EstimatedParameter.of(p, theta, sd, seen, alone) for p in parameters),
+        parameters=tuple(EstimatedParameter.of(p, theta, sd, shows, alone) for p in parameters),
         covariance_names=known.names,
         covariance=known.covariance(robust=robust),
         covariance_method="robust" if robust else "information",

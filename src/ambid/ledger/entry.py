@@ -165,12 +165,12 @@ def _time_of(about: Mapping[str, object]) -> float:
 
 def _parameters(result: Any) -> tuple[EstimatedParameter, ...]:
     """Return the numbers of a result: its parameters, bending modes, and the peak of the sensitivity by axis."""
-    found = [*getattr(result, "parameters", ()), *getattr(result, "mode_parameters", ())]
+    numbers = [*getattr(result, "parameters", ()), *getattr(result, "mode_parameters", ())]
     for axis, s in (getattr(result, "sensitivity", None) or {}).items():
         peak = plain_json(s)["peak_db"]
         ends = dict(peak, ci95=tuple(peak["ci95"]))
-        found.append(EstimatedParameter(name=f"{axis}.sensitivity", unit="dB", role="free", **ends))
-    return tuple(found)
+        numbers.append(EstimatedParameter(name=f"{axis}.sensitivity", unit="dB", role="free", **ends))
+    return tuple(numbers)
 
 
 def _tracked(track: Track) -> tuple[EstimatedParameter, ...]:
@@ -193,14 +193,14 @@ def key_of(sha: str, rig_sha: str, settings: str, version: str | None = None) ->
 
 def sha_of(*records: Path) -> str:
     """Return the SHA-256 of a record's file as it lies there; of several that of theirs, in their order."""
-    found = list[str]()
+    digests = list[str]()
     for path in records:
         try:
             with path.open("rb") as file:
-                found.append(hashlib.file_digest(file, "sha256").hexdigest())
+                digests.append(hashlib.file_digest(file, "sha256").hexdigest())
         except OSError as failure:
             raise AmbidError(f"record {path} cannot be read: {failure.strerror or failure}. Check the path") from None
-    return found[0] if len(found) == 1 else hashlib.sha256(" ".join(found).encode()).hexdigest()
+    return digests[0] if len(digests) == 1 else hashlib.sha256(" ".join(digests).encode()).hexdigest()
 
 
 def rig_sha_of(rig: Rig) -> str:
@@ -218,18 +218,18 @@ def settings_text(job: str, **settings: object) -> str:
 
     A file among them stands there as its `sha_of`.
     """
-    given = {name: x for name, x in settings.items() if x is not None and x is not False and x not in ((), [], {})}
-    return json.dumps({"job": job, **given}, sort_keys=True, default=str, separators=(",", ":"))
+    options = {name: x for name, x in settings.items() if x is not None and x is not False and x not in ((), [], {})}
+    return json.dumps({"job": job, **options}, sort_keys=True, default=str, separators=(",", ":"))
 
 
 def moment(text: str, name: str = "taken_at") -> float:
     """Read a date, or a date and time, as ISO 8601 has it; without an offset it is UTC. Returns s since 1970, UTC."""
     try:
-        found = datetime.fromisoformat(text)
+        time = datetime.fromisoformat(text)
     except ValueError:
         raise AmbidError(
             f"{setting(name)} is {text!r:.40}; it must be a date and time such as 2026-03-01T14:30 (UTC, or with an "
             "offset). "
             "Correct it"
         ) from None
-    return (found if found.tzinfo is not None else found.replace(tzinfo=UTC)).timestamp()
+    return (time if time.tzinfo is not None else time.replace(tzinfo=UTC)).timestamp()

@@ -134,34 +134,34 @@ class History(Result):
 
     def __getitem__(self, name: str) -> Series:
         if name not in self.series:
-            known = list(self.series)
+            names = list(self.series)
             raise EstimationError(
-                f"the history has no parameter {name!r}; it has {', '.join(known)}.{nearest(name, known)} "
+                f"the history has no parameter {name!r}; it has {', '.join(names)}.{nearest(name, names)} "
                 "Check the name"
             )
         return self.series[name]
 
 
-def history_of(c: Connection, bearing: str, shown: str) -> History:
-    """Read the history of a bearing; `shown`: name of the ledger."""
+def history_of(c: Connection, bearing: str, ledger: str) -> History:
+    """Read the history of a bearing; `ledger`: name of the ledger."""
     (known,) = _rows(c, ("SELECT id, name, plant FROM bearing WHERE name = ?", bearing))
     if not known:
-        listing = command("history", ledger=shown)
+        listing = command("history", ledger=ledger)
         names = [name for rows in _rows(c, ("SELECT name FROM bearing ORDER BY name",)) for (name,) in rows]
-        raise AmbidError(f"ledger {shown} has no bearing {bearing!r}.{nearest(bearing, names)} '{listing}' lists them")
+        raise AmbidError(f"ledger {ledger} has no bearing {bearing!r}.{nearest(bearing, names)} '{listing}' lists them")
     ((of, name, plant),) = known
-    asked = ", ".join(KnownEstimate.__slots__)
+    columns = ", ".join(KnownEstimate.__slots__)
     heads, events, rows = _rows(
         c,
         (_HEADS, of),
         ("SELECT at, kind, text, parameter FROM event WHERE bearing = ? ORDER BY at", of),
-        (f"SELECT {asked}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of),
+        (f"SELECT {columns}, id FROM estimate WHERE bearing = ? ORDER BY taken_at, id", of),
     )
     estimates = tuple(starmap(KnownEstimate, (row[:-1] for row in rows)))
     notes = [Note(at=at, kind=kind, text=text, parameter=parameter) for at, kind, text, parameter in events]
     notes += _rig_changes(c, estimates)
     return History(
-        bearing=name, plant=plant, ledger=shown, estimates=estimates,
+        bearing=name, plant=plant, ledger=ledger, estimates=estimates,
         series=_series(c, of, heads, [row[-1] for row in rows], estimates),
         events=tuple(sorted(notes, key=lambda x: x.at)),
     )  # fmt: skip
@@ -173,11 +173,11 @@ def _rows(c: Connection, *questions: tuple[Any, ...]) -> Iterator[list[tuple[Any
     A server hears all questions at once: it answers the next while the rows of one are made into objects.
     """
     if c.dialect.name == "sqlite":
-        yield from (list(c.exec_driver_sql(asked, tuple(of)).cursor.fetchall()) for asked, *of in questions)
+        yield from (list(c.exec_driver_sql(query, tuple(values)).cursor.fetchall()) for query, *values in questions)
         return
     driver: Any = c.connection.driver_connection
     with driver.pipeline() if len(questions) > 1 else nullcontext():
-        cursors = [driver.cursor(binary=True).execute(asked.replace("?", "%s"), of) for asked, *of in questions]
+        cursors = [driver.cursor(binary=True).execute(query.replace("?", "%s"), values) for query, *values in questions]
         yield from (cursor.fetchall() for cursor in cursors)
 
 
@@ -187,8 +187,8 @@ def _series(
     """Read the series of a bearing; `heads`: name, unit and role of each."""
     usable = np.array([x.verdict != "unusable" for x in estimates], dtype=bool)
     times, all_of_them = np.array([x.taken_at for x in estimates]), np.arange(len(ids))
-    named, found = "FROM value WHERE bearing = ? AND name = ?", {}
-    numbers = f"SELECT coalesce(CASE WHEN identifiable THEN value END, ?), coalesce(sd, ?) {named}"
+    rest, series = "FROM value WHERE bearing = ? AND name = ?", {}
+    numbers = f"SELECT coalesce(CASE WHEN identifiable THEN value END, ?), coalesce(sd, ?) {rest}"
     ordered = f"{numbers} ORDER BY taken_at, estimate"
     for (name, unit, role), rows in zip(
         heads, _rows(c, *((ordered, _NONE, _NONE, of, name) for name, *_ in heads)), strict=True
@@ -196,15 +196,15 @@ def _series(
         table = np.fromiter(chain.from_iterable(rows), float, 2 * len(rows)).reshape(-1, 2)
         place = all_of_them
         if len(rows) < len(ids):
-            there = {x for rows in _rows(c, (f"SELECT estimate {named}", of, name)) for (x,) in rows}
+            there = {x for rows in _rows(c, (f"SELECT estimate {rest}", of, name)) for (x,) in rows}
             place = np.array([k for k, x in enumerate(ids) if x in there])
         seen = (table != _NONE).all(axis=1)
         table[~(seen & usable[place])] = np.nan
-        found[name] = Series(
+        series[name] = Series(
             name=name, unit=unit, role=role or "fixed", taken_at=times[place], value=table[:, 0],
             sd=table[:, 1], identifiable=seen, estimate=place,
         )  # fmt: skip
-    return dict(sorted(found.items(), key=_place))
+    return dict(sorted(series.items(), key=_place))
 
 
 def _place(item: tuple[str, Series]) -> tuple[str, int, str]:
@@ -221,10 +221,10 @@ def _rig_changes(c: Connection, estimates: tuple[KnownEstimate, ...]) -> list[No
     if not at:
         return []
     t = schema.tables().tables["rig"].c
-    used = {estimates[k - j].rig_sha for k in at for j in (0, 1)}
+    digests = {estimates[k - j].rig_sha for k in at for j in (0, 1)}
     lines = {
         row.sha: zlib.decompress(row.text).decode().splitlines()
-        for row in c.execute(select(t.sha, t.text).where(t.sha.in_(used)))
+        for row in c.execute(select(t.sha, t.text).where(t.sha.in_(digests)))
     }
     return [
         Note(
@@ -241,9 +241,9 @@ def _difference(old: list[str], new: list[str]) -> str:
     come = [x for x in new if x and x not in old]
     if not gone and not come:
         return "a calibration table changed"
-    shown = "; ".join(
+    changes = "; ".join(
         f"{' '.join(a.split()) or 'nothing'} became {' '.join(b.split()) or 'nothing'}"
         for a, b in islice(zip_longest(gone, come, fillvalue=""), _SHOWN)
     )
     rest = max(len(gone), len(come)) - _SHOWN
-    return shown + (f"; and {counted(rest, 'more line')}" if rest > 0 else "")
+    return changes + (f"; and {counted(rest, 'more line')}" if rest > 0 else "")

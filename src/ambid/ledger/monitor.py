@@ -240,20 +240,20 @@ def read_rules(path: str | Path) -> tuple[Rule, ...]:
     rules = content.get("alarm")
     other = [key for key in content if key != "alarm"]
     if other or not isinstance(rules, list) or not rules or not all(isinstance(r, dict) for r in rules):
-        said = f"{other[0]!r} is unknown.{nearest(other[0], ['alarm'])} " if other else ""
-        raise AmbidError(f"alarm rules {path}: {said}It must hold tables [[alarm]] and nothing else. Correct it")
+        why = f"{other[0]!r} is unknown.{nearest(other[0], ['alarm'])} " if other else ""
+        raise AmbidError(f"alarm rules {path}: {why}It must hold tables [[alarm]] and nothing else. Correct it")
     found = tuple(_rule(r, f"alarm rules {path}, rule {k}") for k, r in enumerate(rules, 1))
     if len(set(found)) < len(found):
         raise AmbidError(f"alarm rules {path} say the same thing twice. Remove one of the two")
     return found
 
 
-def _rule(given: Mapping[str, Any], where: str) -> Rule:
-    known = ("parameter", "change", "confidence", "since")
-    for key in given:
-        if key not in known:
-            raise AmbidError(f"{where}: {key!r} is unknown; known: {', '.join(known)}.{nearest(key, known)} Correct it")
-    name, change = given.get("parameter"), given.get("change")
+def _rule(entry: Mapping[str, Any], where: str) -> Rule:
+    keys = ("parameter", "change", "confidence", "since")
+    for key in entry:
+        if key not in keys:
+            raise AmbidError(f"{where}: {key!r} is unknown; known: {', '.join(keys)}.{nearest(key, keys)} Correct it")
+    name, change = entry.get("parameter"), entry.get("change")
     if not isinstance(name, str) or not name:
         raise AmbidError(f'{where}: parameter must be a name such as "k_i". Give it')
     text = change.replace(" ", "").removesuffix("%") if isinstance(change, str) and "%" in change else ""
@@ -263,12 +263,12 @@ def _rule(given: Mapping[str, Any], where: str) -> Rule:
         share = math.nan
     if not -1.0 < share < 100.0 or share == 0.0:
         raise AmbidError(f'{where}: change is {change!r}; it must be signed and in percent, such as "-5 %". Correct it')
-    confidence = given.get("confidence", 0.99)
+    confidence = entry.get("confidence", 0.99)
     if isinstance(confidence, bool) or not isinstance(confidence, (int, float)) or not 0.5 < confidence < 1.0:
         raise AmbidError(
             f"{where}: confidence is {confidence!r}; it must be between 0.5 and 1, such as 0.99. Correct it"
         )
-    since: Any = given.get("since", "start")
+    since: Any = entry.get("since", "start")
     if since not in ("start", "rig"):
         try:
             since = moment(since if isinstance(since, str) else since.isoformat())
@@ -300,24 +300,25 @@ def watch(histories: Iterable[History], rules: Sequence[Rule] = BUILT_IN) -> Wat
     >>> with open_ledger("works.db", write=False) as ledger:  # doctest: +SKIP
     ...     watched = watch(ledger.history(b.name) for b in ledger.bearings())
     """
-    found, names = list[History](), set[str]()
+    bearings, names = list[History](), set[str]()
     alarms, trends = list[Alarm](), list[Trend]()
     for h in histories:
-        found.append(h)
+        bearings.append(h)
         names |= set(h.measured)
         for s in h.measured.values():
             own = [rule for rule in rules if rule.of(s.name)]
             raised = [a for rule in own for a in _alarms(h, s, rule)]
             alarms += raised
             trends += _trend(h, s, own)
-    for rule in rules if rules is not BUILT_IN and found else ():
+    for rule in rules if rules is not BUILT_IN and bearings else ():
         if not any(rule.of(name) for name in names):
-            known = sorted(names | {name.rpartition(".")[2] for name in names})
-            near = nearest(rule.parameter, known)
+            parameters = sorted(names | {name.rpartition(".")[2] for name in names})
+            near = nearest(rule.parameter, parameters)
             raise AmbidError(f"alarm {rule}: no bearing has a parameter {rule.parameter!r}.{near} Correct it")
     ordered = sorted(alarms, key=lambda a: (a.cleared is not None, a.raised, a.bearing))
     return Watched(
-        used=tuple(found), ledger=found[0].ledger if found else "", bearings=tuple(h.bearing for h in found),
+        used=tuple(bearings), ledger=bearings[0].ledger if bearings else "",
+        bearings=tuple(h.bearing for h in bearings),
         rules=tuple(rules), alarms=tuple(ordered), trends=tuple(trends),
     )  # fmt: skip
 
@@ -331,8 +332,8 @@ class _Values:
     sd: Array
     scatter: float = 1.0
 
-    def __getitem__(self, of: slice) -> _Values:
-        return _Values(self.t[of], self.y[of], self.sd[of], self.scatter)
+    def __getitem__(self, part: slice) -> _Values:
+        return _Values(self.t[part], self.y[part], self.sd[part], self.scatter)
 
     @property
     def first(self) -> int:
@@ -343,8 +344,8 @@ class _Values:
         """Return what the scatter was at each value, from those before it: as it was known when that came."""
         jumps = np.abs(np.diff(self.y)) / np.hypot(self.sd[1:], self.sd[:-1]) * self.scatter
         ends = [n for n in 2 ** np.arange(2, 40) if n < self.t.size]  # anew whenever the history has doubled
-        known = [1.0, *(_enlarged(jumps[: n - 1]) for n in ends)]
-        return np.asarray(np.repeat(known, np.diff([0, *ends, self.t.size])), dtype=float)
+        scatters = [1.0, *(_enlarged(jumps[: n - 1]) for n in ends)]
+        return np.asarray(np.repeat(scatters, np.diff([0, *ends, self.t.size])), dtype=float)
 
 
 def _values(h: History, s: Series, since: str | float = "start") -> _Values:
@@ -431,8 +432,8 @@ def _alarms(h: History, s: Series, rule: Rule) -> Iterable[Alarm]:
 
 def _twice(which: Any, begin: int) -> int | None:
     """Return from `begin` the first index that holds and whose predecessor holds."""
-    found = np.flatnonzero(which[begin + 1 :] & which[begin:-1])
-    return None if not found.size else begin + 1 + int(found[0])
+    places = np.flatnonzero(which[begin + 1 :] & which[begin:-1])
+    return None if not places.size else begin + 1 + int(places[0])
 
 
 # --- what happened, and when ------------------------------------------------------------------------------------------
@@ -550,18 +551,18 @@ def _trend(h: History, s: Series, rules: Sequence[Rule]) -> Iterable[Trend]:
     kind = f.best("level", "line", "bend", "step")
     if f.chi["level"] - f.chi[kind] < _PLAIN * f.scale:
         kind = "level"
-    of: dict[str, Any] = {"bearing": h.bearing, "parameter": s.name, "unit": s.unit, "values": int(v.t.size)}
+    about: dict[str, Any] = {"bearing": h.bearing, "parameter": s.name, "unit": s.unit, "values": int(v.t.size)}
     if kind == "step":
         size, sd, at, begin, to = _step(v, f)
-        yield Trend(**of, kind="step", step=size, step_sd=sd, at=at, at_from=begin, at_to=to, limits={})
+        yield Trend(**about, kind="step", step=size, step_sd=sd, at=at, at_from=begin, at_to=to, limits={})
     elif kind == "level":
-        yield Trend(**of, kind="none", limits={})
+        yield Trend(**about, kind="none", limits={})
     else:
         moving = f.x >= f.bend if kind == "bend" else f.x >= 0
         (a, b), cov, _ = _line(f.x[moving], f.y[moving], f.w[moving])
         cov = cov * f.scale
         yield Trend(
-            **of, kind="drift", per_month=float(b), per_month_sd=math.sqrt(cov[1, 1]),
+            **about, kind="drift", per_month=float(b), per_month_sd=math.sqrt(cov[1, 1]),
             limits={str(r): when for r in rules if (when := _ahead(v, f, a, b, cov, r))},
         )  # fmt: skip
 
@@ -587,7 +588,7 @@ def _ahead(v: _Values, f: _Fits, a: float, b: float, cov: Array, rule: Rule) -> 
 def _cause(h: History, name: str, rule: Rule, kind: str, at: float, end: float) -> str:
     """Say what the changes of an axis' parameters together speak for."""
     axis = name.rpartition(".")[0]
-    seen, change, spread = [], [], []
+    places, change, spread = [], [], []
     for j, own in enumerate(_NAMES):
         s = h.measured.get(f"{axis}.{own}" if axis else own) or (h.measured.get(own) if own == "m" else None)
         v = None if s is None else _values(h, s, rule.since)
@@ -602,11 +603,11 @@ def _cause(h: History, name: str, rule: Rule, kind: str, at: float, end: float) 
         (a, a_sd), (b, b_sd) = _level(before), _level(after)
         if a * b <= 0:
             return "the cause is not clear: a parameter changed its sign"
-        seen.append(j)
+        places.append(j)
         change.append(math.log(b / a))
         spread.append(math.hypot(a_sd / a, b_sd / b))
     coil = f"{axis}.L" in h.series if axis else "L" in h.series
-    return _likeliest(np.array(seen, dtype=int), np.array(change), np.array(spread), kind, coil)
+    return _likeliest(np.array(places, dtype=int), np.array(change), np.array(spread), kind, coil)
 
 
 def _patterns(*, mass: bool, coil: bool) -> Iterator[tuple[str, Array]]:

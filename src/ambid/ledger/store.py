@@ -187,14 +187,14 @@ class Ledger:
 
         t = schema.tables().tables
         e, d = t["estimate"].c, t["document"].c
-        asked = select(e.key, e.status, e.verdict, e.failed, d.json).join_from(
+        query = select(e.key, e.status, e.verdict, e.failed, d.json).join_from(
             t["estimate"], t["document"], isouter=True
         )
         with self._reading() as c:
             return {
                 row.key: (row.status, row.verdict, row.failed, zlib.decompress(row.json).decode() if row.json else "")
                 for some in _chunks(list(keys))
-                for row in c.execute(asked.where(e.key.in_(some)))
+                for row in c.execute(query.where(e.key.in_(some)))
             }
 
     def failures(self) -> Mapping[str, Failure]:
@@ -221,7 +221,7 @@ class Ledger:
 
         t = schema.tables().tables
         b, e = t["bearing"].c, t["estimate"].c
-        asked = (
+        query = (
             select(
                 b.name, b.plant, func.count(e.id).label("estimates"), func.min(e.taken_at).label("first"),
                 func.max(e.taken_at).label("last"),
@@ -229,7 +229,7 @@ class Ledger:
             .join_from(t["bearing"], t["estimate"]).group_by(b.id, b.name, b.plant).order_by(b.name)
         )  # fmt: skip
         with self._reading() as c:
-            return tuple(KnownBearing(**row) for row in _mappings(c, asked))
+            return tuple(KnownBearing(**row) for row in _mappings(c, query))
 
     def history(self, bearing: str) -> History:
         """Return what is known of one bearing over time.
@@ -322,8 +322,8 @@ class Ledger:
     def _numbers(self, c: Connection, n: int) -> Sequence[int]:
         """Return numbers for n new estimates, which no other writer gets."""
         if self._postgres:
-            asked = "SELECT nextval('estimate_id') FROM generate_series(1, %s)"
-            return [row[0] for row in c.exec_driver_sql(asked, (n,))]
+            query = "SELECT nextval('estimate_id') FROM generate_series(1, %s)"
+            return [row[0] for row in c.exec_driver_sql(query, (n,))]
         last = c.exec_driver_sql("SELECT coalesce(max(id), 0) FROM estimate").scalar_one()
         return range(last + 1, last + 1 + n)
 
@@ -378,8 +378,8 @@ def _chunks(items: Sequence[str]) -> Iterator[Sequence[str]]:
     return (items[k : k + _MANY] for k in range(0, len(items), _MANY))
 
 
-def _mappings(c: Connection, asked: Any) -> Sequence[Any]:
-    return c.execute(asked).mappings().all()
+def _mappings(c: Connection, query: Any) -> Sequence[Any]:
+    return c.execute(query).mappings().all()
 
 
 # --- opening --------------------------------------------------------------------------------------------------------
@@ -409,11 +409,11 @@ def open_ledger(where: str | Path, *, write: bool = True) -> Ledger:
     except ImportError:
         raise AmbidError("SQLAlchemy is not installed, and a ledger needs it. Install ambid[fleet]") from None
     text = str(where)
-    engine, shown = _server(text) if "://" in text else _file(Path(text), write=write)
-    ledger = Ledger(engine, shown)
+    engine, name = _server(text) if "://" in text else _file(Path(text), write=write)
+    ledger = Ledger(engine, name)
     try:
-        with _told(shown):
-            _make_ready(engine, shown, write=write)
+        with _told(name):
+            _make_ready(engine, name, write=write)
     except BaseException:
         ledger.close()
         raise
@@ -427,19 +427,19 @@ def _server(url: str) -> tuple[Engine, str]:
     from sqlalchemy.exc import ArgumentError
 
     try:
-        found = make_url(url)
+        address = make_url(url)
     except (ArgumentError, ValueError):
         raise AmbidError("the URL of the ledger cannot be read. Write postgresql://user@host/name") from None
-    if found.get_backend_name() != "postgresql":
+    if address.get_backend_name() != "postgresql":
         raise AmbidError(
-            f"ledger {found.render_as_string()} is of {found.get_backend_name()!r}; it must be a file of SQLite or a "
-            "URL postgresql://user@host/name. Correct it"
+            f"ledger {address.render_as_string()} is of {address.get_backend_name()!r}; it must be a file of SQLite or "
+            "a URL postgresql://user@host/name. Correct it"
         )
     try:
         import psycopg  # noqa: F401
     except ImportError:
         raise AmbidError("psycopg is not installed, and PostgreSQL needs it. Install ambid[postgres]") from None
-    return create_engine(found.set(drivername="postgresql+psycopg")), found.render_as_string()
+    return create_engine(address.set(drivername="postgresql+psycopg")), address.render_as_string()
 
 
 def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
@@ -447,7 +447,7 @@ def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
     from sqlalchemy import create_engine, event
     from sqlalchemy.pool import StaticPool
 
-    shown = str(path)
+    name = str(path)
     new = not path.exists() or path.stat().st_size == 0
     if path.is_dir() or (path.exists() and not path.is_file()):
         raise AmbidError(f"ledger {path} is no file. Name one, such as fleet.db")
@@ -459,12 +459,12 @@ def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
         _check_file(path)
 
     def connect() -> Any:
-        found = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S, "rw")  # leaves no log
-        found.execute("PRAGMA foreign_keys = ON")
-        found.execute(f"PRAGMA mmap_size = {_MAPPED}")  # estimates of one bearing lie on as many pages
+        connection = _connected(path, "rwc", _TRY_S) if write else _read_only(path, _TRY_S, "rw")  # leaves no log
+        connection.execute("PRAGMA foreign_keys = ON")
+        connection.execute(f"PRAGMA mmap_size = {_MAPPED}")  # estimates of one bearing lie on as many pages
         if write:
-            found.execute("PRAGMA journal_mode = WAL")
-        return found
+            connection.execute("PRAGMA journal_mode = WAL")
+        return connection
 
     engine = create_engine("sqlite://", creator=connect, poolclass=StaticPool)
 
@@ -472,7 +472,7 @@ def _file(path: Path, *, write: bool) -> tuple[Engine, str]:
     def begin(c: Connection) -> None:
         _patiently(lambda: c.exec_driver_sql("BEGIN" if c.get_execution_options().get("reads") else "BEGIN IMMEDIATE"))
 
-    return engine, shown
+    return engine, name
 
 
 def _patiently(do: Callable[[], object]) -> None:
@@ -498,13 +498,13 @@ def _check_file(path: Path) -> None:
         if file.read(16) != b"SQLite format 3\0":
             raise AmbidError(refusal)
     try:
-        found = _read_only(path, PATIENCE_S)
+        connection = _read_only(path, PATIENCE_S)
         try:
-            if found.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
+            if connection.execute("SELECT count(*) FROM sqlite_master").fetchone() == (0,):
                 return  # another writer is about to make the tables
-            row = found.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
+            row = connection.execute("SELECT value FROM meta WHERE name = 'schema'").fetchone()
         finally:
-            found.close()
+            connection.close()
     except sqlite3.DatabaseError:
         row = None
     if row != (schema.SCHEMA,):
@@ -515,12 +515,12 @@ def _read_only(path: Path, patience_s: float, mode: str = "ro") -> Any:
     """Open a file for reading, also in a folder that may not be written to, where SQLite cannot index its log."""
     import sqlite3
 
-    found = _connected(path, mode, patience_s)
-    found.execute("PRAGMA query_only = ON")
+    connection = _connected(path, mode, patience_s)
+    connection.execute("PRAGMA query_only = ON")
     try:
-        found.execute("SELECT count(*) FROM sqlite_master").fetchone()
+        connection.execute("SELECT count(*) FROM sqlite_master").fetchone()
     except sqlite3.OperationalError:
-        found.close()
+        connection.close()
         log = path.with_name(f"{path.name}-wal")
         if log.exists() and log.stat().st_size:
             raise AmbidError(
@@ -528,7 +528,7 @@ def _read_only(path: Path, patience_s: float, mode: str = "ro") -> Any:
                 "from an account that may"
             ) from None
         return _connected(path, "ro&immutable=1", patience_s)
-    return found
+    return connection
 
 
 def _connected(path: Path, mode: str, patience_s: float) -> Any:
@@ -540,7 +540,7 @@ def _connected(path: Path, mode: str, patience_s: float) -> Any:
     )  # fmt: skip
 
 
-def _make_ready(engine: Engine, shown: str, *, write: bool) -> None:
+def _make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
     """Make the tables where there are none; bring them to this version; refuse what is of another kind or newer."""
     from sqlalchemy import insert, inspect, select, update
 
@@ -552,23 +552,23 @@ def _make_ready(engine: Engine, shown: str, *, write: bool) -> None:
             c.exec_driver_sql("SELECT pg_advisory_xact_lock(7281001)")  # one writer at a time makes tables
         there = set(inspect(c).get_table_names()) & set(whole.tables)
         if not there and not write:
-            raise AmbidError(f"ledger {shown} holds no ledger yet. Check the URL")
+            raise AmbidError(f"ledger {ledger} holds no ledger yet. Check the URL")
         if not there:
             whole.create_all(c)
             c.execute(insert(meta), [{"name": n, "value": v} for n, v in (("schema", schema.SCHEMA), ("version", "1"))])
             c.execute(update(meta).where(meta.c.name == "version").values(value=str(schema.VERSION)))
             return
         if "meta" not in there:
-            raise AmbidError(f"{shown} is not a ledger of ambid: it has other tables of the same names. Give another")
-        found = {row.name: row.value for row in c.execute(select(meta.c.name, meta.c.value))}
-        version = int(found.get("version", "0"))
+            raise AmbidError(f"{ledger} is not a ledger of ambid: it has other tables of the same names. Give another")
+        facts = {row.name: row.value for row in c.execute(select(meta.c.name, meta.c.value))}
+        version = int(facts.get("version", "0"))
         if version > schema.VERSION:
             raise AmbidError(
-                f"ledger {shown} is of version {version}; this ambid reads {schema.VERSION}. Install a newer one"
+                f"ledger {ledger} is of version {version}; this ambid reads {schema.VERSION}. Install a newer one"
             )
         if version < schema.VERSION and not write:
             raise AmbidError(
-                f"ledger {shown} is of version {version}, and is read as {schema.VERSION}. Write to it once, which "
+                f"ledger {ledger} is of version {version}, and is read as {schema.VERSION}. Write to it once, which "
                 "brings it to that version"
             )
         for step in range(version, schema.VERSION):
@@ -579,7 +579,7 @@ def _make_ready(engine: Engine, shown: str, *, write: bool) -> None:
 
 
 @contextmanager
-def _told(shown: str) -> Iterator[None]:
+def _told(ledger: str) -> Iterator[None]:
     """Put what the database says into one line."""
     import sqlite3
 
@@ -589,10 +589,12 @@ def _told(shown: str) -> Iterator[None]:
     try:
         yield
     except tuple(drivers) as failure:
-        said = str(getattr(failure, "orig", None) or failure).strip().splitlines()[0]
-        if "locked" in said:
-            said = f"another program has been writing to it for {PATIENCE_S:.0f} s"
-        raise AmbidError(f"ledger {shown}: {said}. Nothing of this was stored; check disk, rights and server") from None
+        reason = str(getattr(failure, "orig", None) or failure).strip().splitlines()[0]
+        if "locked" in reason:
+            reason = f"another program has been writing to it for {PATIENCE_S:.0f} s"
+        raise AmbidError(
+            f"ledger {ledger}: {reason}. Nothing of this was stored; check disk, rights and server"
+        ) from None
 
 
 _TABLES = ("bearing", "rig", "estimate", "value", "event", "failure")
@@ -630,15 +632,15 @@ def _write(c: Connection, name: str, path: Path) -> None:
     table = schema.tables().tables[name]
     kinds = [pa.field(x.name, _kind(pa, name, x)) for x in table.columns]
     whole = pa.schema(kinds, metadata={_MADE: schema.SCHEMA.encode()})
-    beside = path.with_name(f".{path.name}")
+    partial = path.with_name(f".{path.name}")
     try:
-        with parquet.ParquetWriter(beside, whole) as writer:
-            found = c.execute(select(table)).mappings()
-            for rows in found.partitions(_ROWS):
+        with parquet.ParquetWriter(partial, whole) as writer:
+            records = c.execute(select(table)).mappings()
+            for rows in records.partitions(_ROWS):
                 writer.write_table(pa.Table.from_pylist([_row(row) for row in rows], schema=whole))
-        beside.replace(path)
+        partial.replace(path)
     finally:
-        beside.unlink(missing_ok=True)
+        partial.unlink(missing_ok=True)
 
 
 def _kind(pa: Any, table: str, column: Any) -> Any:
@@ -652,13 +654,13 @@ def _kind(pa: Any, table: str, column: Any) -> Any:
 
 
 def _row(row: Any) -> dict[str, Any]:
-    found = dict(row)
+    values = dict(row)
     for name in _TIMES:
-        if name in found:
-            found[name] = round(1e6 * found[name])
-    if isinstance(found.get("text"), bytes):
-        found["text"] = zlib.decompress(found["text"]).decode()
-    return found
+        if name in values:
+            values[name] = round(1e6 * values[name])
+    if isinstance(values.get("text"), bytes):
+        values["text"] = zlib.decompress(values["text"]).decode()
+    return values
 
 
 SCHEMA = "ambid.fleet/1"
@@ -718,36 +720,36 @@ class FleetRun(Result):
     @property
     def counts(self) -> Mapping[str, int]:
         """Number of records by state: done, failed, known, left."""
-        of = Counter(row.state for row in self.rows)
-        return {s: of[s] for s in ("done", "failed", "known")} | {"left": self.records - len(self.rows)}
+        states = Counter(row.state for row in self.rows)
+        return {s: states[s] for s in ("done", "failed", "known")} | {"left": self.records - len(self.rows)}
 
     @property
     def failures(self) -> Mapping[str, tuple[str, ...]]:
         """Records by the reason why there is no result of them, the commonest first."""
-        found: dict[str, list[str]] = {}
+        failures: dict[str, list[str]] = {}
         for row in self.rows:
             if row.state == "failed":
                 name = row.record.rpartition("/")[2]
                 reason = row.reason.replace(row.record, "…").replace(name, "…")
-                found.setdefault(reason, []).append(row.record)
-        return {reason: tuple(r) for reason, r in sorted(found.items(), key=lambda x: -len(x[1]))}
+                failures.setdefault(reason, []).append(row.record)
+        return {reason: tuple(r) for reason, r in sorted(failures.items(), key=lambda x: -len(x[1]))}
 
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """What stands against the run as a whole: failures, results in doubt, records that it did not come to."""
-        found, n = [], self.counts
+        reasons, n = [], self.counts
         if n["failed"]:
             text = f"{n['failed']} of {counted(self.records, 'record')} failed"
-            found.append(
+            reasons.append(
                 Reason(check="failures", text=f"{text}; the reasons are below", grave=not n["done"] + n["known"])
             )
         doubtful = {word: sum(r.verdict == word for r in self.rows) for word in ("unusable", "caution")}
         for word, m in doubtful.items():
             if m:
-                found.append(
+                reasons.append(
                     Reason(check="verdicts", text=f"{counted(m, 'result')} {'is' if m == 1 else 'are'} {word}")
                 )
         if n["left"]:
             text = f"{counted(n['left'], 'record')} left: run again to go on"
-            found.append(Reason(check="interrupted", text=text))
-        return tuple(found)
+            reasons.append(Reason(check="interrupted", text=text))
+        return tuple(reasons)

@@ -19,7 +19,7 @@ from ambid.settings.caller import setting
 PATIENCE_S = 10.0  # for which a broker may stay silent
 
 
-def write_metrics(found: Watched, path: str | Path) -> None:
+def write_metrics(watched: Watched, path: str | Path) -> None:
     """Write gauges as a text file that Prometheus' node exporter collects; needs the extra ``ambid[metrics]``.
 
     Parameters
@@ -40,29 +40,29 @@ def write_metrics(found: Watched, path: str | Path) -> None:
         raise AmbidError(
             f"prometheus-client is not installed, and {setting('metrics')} needs it. Install ambid[metrics]"
         ) from None
-    kept = CollectorRegistry()
+    registry = CollectorRegistry()
 
     def gauge(name: str, says: str, *labels: str) -> Any:
-        return Gauge(f"ambid_{name}", says, ("bearing", *labels), registry=kept)
+        return Gauge(f"ambid_{name}", says, ("bearing", *labels), registry=registry)
 
     value = gauge("parameter", "Latest usable value, SI", "parameter", "unit")
     sd = gauge("parameter_sd", "Its standard deviation, SI", "parameter", "unit")
     taken = gauge("record_timestamp_seconds", "When the latest record was taken")
     alarm = gauge("alarm", "1 where the alarm stands", "parameter", "rule")
-    for h in found.used or ():
+    for h in watched.used or ():
         taken.labels(h.bearing).set(h.estimates[-1].taken_at)
         for name, x in _latest(h).items():
             value.labels(h.bearing, name, x["unit"]).set(x["value"])
             sd.labels(h.bearing, name, x["unit"]).set(x["sd"])
-            for rule in found.rules:
+            for rule in watched.rules:
                 if rule.of(name):
                     alarm.labels(h.bearing, name, str(rule)).set(0)
-    for a in found.standing:
+    for a in watched.standing:
         alarm.labels(a.bearing, a.parameter, a.rule).set(1)
-    Path(path).write_bytes(generate_latest(kept))
+    Path(path).write_bytes(generate_latest(registry))
 
 
-def publish(found: Watched, where: str) -> int:
+def publish(watched: Watched, where: str) -> int:
     """Send a retained message for each bearing to a broker of MQTT; needs the extra ``ambid[mqtt]``.
 
     User and password are taken from ``AMBID_MQTT_USER`` and ``AMBID_MQTT_PASSWORD``: no list of processes shows them.
@@ -101,9 +101,9 @@ def publish(found: Watched, where: str) -> int:
         raise AmbidError(
             f"{setting('mqtt')} is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it"
         )
-    said = Queue[str]()
+    replies = Queue[str]()
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
-    client.on_connect = lambda *given: said.put("" if not given[3].is_failure else str(given[3]))
+    client.on_connect = lambda *given: replies.put("" if not given[3].is_failure else str(given[3]))
     if secure:
         client.tls_set()
     if "AMBID_MQTT_USER" in os.environ:
@@ -111,12 +111,12 @@ def publish(found: Watched, where: str) -> int:
     try:
         client.connect(host, int(port) if port else 8883 if secure else 1883)
         client.loop_start()
-        refused = said.get(timeout=PATIENCE_S)
+        refused = replies.get(timeout=PATIENCE_S)
         if refused:
             raise AmbidError(f"{setting('mqtt', where)}: {refused}. Check user and password")
         sent = [
-            client.publish(f"{topic.strip('/')}/{_plain(h.bearing)}", _message(found, h), qos=1, retain=True)
-            for h in found.used or ()
+            client.publish(f"{topic.strip('/')}/{_plain(h.bearing)}", _message(watched, h), qos=1, retain=True)
+            for h in watched.used or ()
         ]
         for message in sent:
             message.wait_for_publish(PATIENCE_S)
@@ -142,22 +142,22 @@ def _plain(name: str) -> str:
 
 def _latest(h: History) -> dict[str, dict[str, Any]]:
     """Return the latest known number of each parameter."""
-    found = {}
+    latest = {}
     for s in h.measured.values():
         known = np.flatnonzero(np.isfinite(s.value))
         if known.size:
             k = known[-1]
-            found[s.name] = {
+            latest[s.name] = {
                 "value": float(s.value[k]), "sd": float(s.sd[k]), "unit": s.unit, "taken_at": float(s.taken_at[k]),
             }  # fmt: skip
-    return found
+    return latest
 
 
-def _message(found: Watched, h: History) -> str:
+def _message(watched: Watched, h: History) -> str:
     return json.dumps(
         {
             "schema": "ambid.message/1", "bearing": h.bearing, "taken_at": h.estimates[-1].taken_at,
             "verdict": h.estimates[-1].verdict, "values": _latest(h),
-            "alarms": [asdict(a) for a in found.standing if a.bearing == h.bearing],
+            "alarms": [asdict(a) for a in watched.standing if a.bearing == h.bearing],
         }
     )  # fmt: skip

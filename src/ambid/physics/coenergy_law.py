@@ -172,8 +172,8 @@ class MagnetLaw:
             g = strength * np.exp(-d / s) if self.gap == "exponential" else strength / (s + d)
             total = total + g * j**2 / (1.0 + np.sqrt(1.0 + sigma * j**2))
         core = knee * (i * np.arctan(i / knee) - 0.5 * knee * np.log(1.0 + (i / knee) ** 2))
-        found: Number = total + 0.5 * (leak + rise) * i**2 - rise * core
-        return found
+        energy: Number = total + 0.5 * (leak + rise) * i**2 - rise * core
+        return energy
 
     def force(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
         """Return the force dW'/dx at many points, by a complex step.
@@ -190,8 +190,8 @@ class MagnetLaw:
         `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns `values`: (n_points, 4), in N, N/m (k_x =
         -df/dx), N/A and H; `slopes`: (n_points, 4, 9).
         """
-        found, slopes = self._derivatives(x, i, values)
-        return found[:, :4] * _SIGN, slopes[:, :4] * _SIGN[:, None]
+        table, slopes = self._derivatives(x, i, values)
+        return table[:, :4] * _SIGN, slopes[:, :4] * _SIGN[:, None]
 
     def gradients(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
         """Return the derivatives of force, k_x, k_i, L by position and current.
@@ -204,11 +204,11 @@ class MagnetLaw:
 
     def _derivatives(self, x: Array, i: Array, values: Mapping[str, float]) -> tuple[Array, Array]:
         q, w, dw = self.vector(values), np.zeros(len(ORDERS)), np.zeros((len(SLOPED), len(MAGNET_NUMBERS)))
-        found, slopes = np.zeros((x.size, len(ORDERS))), np.zeros((x.size, *dw.shape))
+        table, slopes = np.zeros((x.size, len(ORDERS))), np.zeros((x.size, *dw.shape))
         for n, (at, current) in enumerate(zip(x.tolist(), i.tolist(), strict=True)):
             coenergy_derivatives(at, current, q, self.gap == "exponential", self.pair, w, dw)
-            found[n], slopes[n] = w, dw
-        return found, slopes
+            table[n], slopes[n] = w, dw
+        return table, slopes
 
 
 def law_numbers(coenergy: CoEnergy) -> dict[str, float]:

@@ -41,8 +41,8 @@ class StateLaw:
             raise ModelError("loop.D is empty; it has a row for each command, a column for each signal. Give them")
         shapes = {"A": (n, n), "B": (n, n_y), "C": (n_u, n), "D": (n_u, n_y), "G": (n, n_u)}
         for name, shape in shapes.items():
-            given = getattr(self, name)
-            x = np.zeros(shape) if given is None else _matrix(name, given)
+            matrix = getattr(self, name)
+            x = np.zeros(shape) if matrix is None else _matrix(name, matrix)
             if x.size == 0 and 0 in shape:
                 x = x.reshape(shape)
             if x.shape != shape:
@@ -78,8 +78,8 @@ class StateLaw:
 
     def in_units(self, inputs: Sequence[float], output: float) -> StateLaw:
         """Return the law whose signals are first multiplied by `inputs`, (n_y,), and its commands last by `output`."""
-        seen = self.scaled(inputs)
-        return replace(seen, C=self.C * output, D=seen.D * output, G=self.windup / output)
+        scaled = self.scaled(inputs)
+        return replace(scaled, C=self.C * output, D=scaled.D * output, G=self.windup / output)
 
     def through(self, rows: Array, columns: Array) -> StateLaw:
         """Return the law that sees `rows` y, (n_seen, n_y), and commands `columns` w, (n_u, n_given)."""
@@ -128,9 +128,9 @@ def l1_norms(A: Array, B: Array, C: Array | None = None) -> Array:
     return np.asarray(total + tail)
 
 
-def _matrix(name: str, given: object) -> Array:
+def _matrix(name: str, entries: object) -> Array:
     try:
-        x = np.array(given, dtype=np.float64)
+        x = np.array(entries, dtype=np.float64)
     except (TypeError, ValueError):
         raise ModelError(f"loop.{name} is no matrix of numbers; give its rows, all of one length") from None
     if x.ndim != 2 and x.size:

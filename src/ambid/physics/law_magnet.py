@@ -73,9 +73,9 @@ class LawMagnet:
         missing = [name for name in needed if name not in self.values]
         if missing:
             raise ModelError(f"{law}: there is no value for {', '.join(missing)}. Give it")
-        of = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
-        of |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
-        kept = {n: float(self.values[n]) for n in law.names if n in self.values and of.get(n, True)}
+        switches = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
+        switches |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
+        kept = {n: float(self.values[n]) for n in law.names if n in self.values and switches.get(n, True)}
         positive = {law.names[0], "i0", "i_knee"} | ({law.names[1]} if law.pair or law.gap == "exponential" else set())
         for name, value in kept.items():
             least = 0.0 if name in positive or name in ("sigma", "L_leak", "L_rise") else -math.inf
@@ -112,34 +112,34 @@ class LawMagnet:
 
     def value(self, x: Number, i: Number) -> Number:
         """Return W' in J at position `x` in m and axis current `i` in A."""
-        found: Number = self.law.value(x - self.x_offset, i, self.values)
-        return found
+        energy: Number = self.law.value(x - self.x_offset, i, self.values)
+        return energy
 
     def force(self, x: Number, i: Number) -> Number:
         """Return the force dW'/dx in N along +x at `x` in m and `i` in A."""
-        found: Number = self._at(x, i)[0]
-        return found
+        force: Number = self._at(x, i)[0]
+        return force
 
     def flux_linkage(self, x: Number, i: Number) -> Number:
         """Return the flux linkage dW'/di in V s at `x` in m and `i` in A, by the complex step."""
         step = 1e-30
-        found: Any = complex(self.law.value(x - self.x_offset, complex(i, step), self.values)).imag / step
-        return found  # type: ignore[no-any-return]
+        flux: Any = complex(self.law.value(x - self.x_offset, complex(i, step), self.values)).imag / step
+        return flux  # type: ignore[no-any-return]
 
     def inductance(self, x: Number, i: Number | float = 0.0) -> Number:
         """Return L = dlambda/di in H at `x` in m and `i` in A."""
-        found: Number = self._at(x, i)[3]
-        return found
+        inductance: Number = self._at(x, i)[3]
+        return inductance
 
     def force_per_current(self, x: Number, i: Number) -> Number:
         """Return k_i = df/di = dlambda/dx in N/A at `x` in m and `i` in A."""
-        found: Number = self._at(x, i)[2]
-        return found
+        factor: Number = self._at(x, i)[2]
+        return factor
 
     def displacement_coefficient(self, x: Number, i: Number) -> Number:
         """Return k_x = -df/dx in N/m at `x` in m and `i` in A."""
-        found: Number = -self._at(x, i)[1]
-        return found
+        coefficient: Number = -self._at(x, i)[1]
+        return coefficient
 
     def holding_current(self, x: float, load: float) -> float:
         """Return the axis current that holds a load at rest, of a pair with both magnets conducting.

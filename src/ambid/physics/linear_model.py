@@ -138,14 +138,14 @@ class LinearModel(Protocol):
         ...
 
 
-def unknown_parameter(of: LinearModel, parameter: str) -> ModelError:
+def unknown_parameter(plant: LinearModel, parameter: str) -> ModelError:
     """Return the error for a parameter that a model does not have.
 
     `parameter`: what was asked for. Returns names the nearest known parameter.
     """
-    names = [p.name for p in of.parameters]
+    names = [p.name for p in plant.parameters]
     return ModelError(
-        f"model {of.name!r} has no parameter {parameter!r}; it has {', '.join(names)}.{nearest(parameter, names)}"
+        f"model {plant.name!r} has no parameter {parameter!r}; it has {', '.join(names)}.{nearest(parameter, names)}"
     )
 
 

@@ -458,9 +458,9 @@ def preset(name: str) -> Preset:
         If there is none of that name; the message names the nearest.
     """
     if name not in _MAKERS:
-        known = list(_MAKERS)
+        names = list(_MAKERS)
         raise ModelError(
-            f"preset {name!r} is unknown; known: {', '.join(known)}.{nearest(name, known)} Give one of them"
+            f"preset {name!r} is unknown; known: {', '.join(names)}.{nearest(name, names)} Give one of them"
         )
     return _MAKERS[name]()
 

@@ -142,11 +142,11 @@ class RotorModel:
     def coordinates(self) -> tuple[str, ...]:
         """Generalised coordinates: per plane translation, slope, modes; the axial translation."""
         modes = tuple(f"mode{r}" for r in range(1, self.n_modes + 1))
-        found: list[str] = []
+        names: list[str] = []
         for plane, letter in ((0, "x"), (1, "y")):
             if plane in self.planes:
-                found += [letter, f"slope_{letter}", *(f"{mode}_{letter}" for mode in modes)]
-        return (*found, *(("z",) if 2 in self.planes else ()))
+                names += [letter, f"slope_{letter}", *(f"{mode}_{letter}" for mode in modes)]
+        return (*names, *(("z",) if 2 in self.planes else ()))
 
     @cached_property
     def states(self) -> tuple[str, ...]:
@@ -180,17 +180,17 @@ class RotorModel:
     def parameters(self) -> tuple[ParameterSpec, ...]:
         """All numbers of the model."""
         radial = any(not b.axial for b in self.bearings)
-        found = [M, *((ID,) if radial else ()), *((IP,) if self.polar else ()), *((Z_CG,) if radial else ())]
-        found += [EDDY] if "a" in self.extras else []
+        specs = [M, *((ID,) if radial else ()), *((IP,) if self.polar else ()), *((Z_CG,) if radial else ())]
+        specs += [EDDY] if "a" in self.extras else []
         for j, axis in enumerate(self.axes):
-            found += [
+            specs += [
                 ParameterSpec(name=f"{axis}.k_i", unit="N/A", meaning=f"force–current factor of axis {axis}"),
                 ParameterSpec(
                     name=f"{axis}.k_x", unit="N/m", meaning=f"position stiffness of axis {axis} (negative for a magnet)"
                 ),
             ]
             if j in self.coils:
-                found += [
+                specs += [
                     ParameterSpec(
                         name=f"{axis}.R", unit="ohm", meaning=f"coil resistance of axis {axis}", positive=True
                     ),
@@ -198,20 +198,20 @@ class RotorModel:
                 ]
             if j in self.amplified:
                 gain, pole = f"{axis}.amplifier_gain", f"{axis}.amplifier_pole"
-                found += [
+                specs += [
                     ParameterSpec(name=gain, unit="A/V", meaning=f"static gain of the amplifier of axis {axis}"),
                     ParameterSpec(
                         name=pole, unit="rad/s", meaning=f"pole of the amplifier of axis {axis}", positive=True
                     ),
                 ]
             if f"{axis}.gain" in self.extras:
-                found.append(
+                specs.append(
                     ParameterSpec(
                         name=f"{axis}.gain", unit="1", meaning=f"gain error of the position sensor of axis {axis}"
                     )
                 )
             if self._pole(j):
-                found.append(
+                specs.append(
                     ParameterSpec(
                         name=f"{axis}.sensor_pole",
                         unit="rad/s",
@@ -222,19 +222,19 @@ class RotorModel:
         for b in self.bearings:
             if b.axial:
                 continue
-            found.append(ParameterSpec(name=f"{b.name}.z", unit="m", meaning=f"plane of bearing {b.name}", default=b.z))
-            found += [
+            specs.append(ParameterSpec(name=f"{b.name}.z", unit="m", meaning=f"plane of bearing {b.name}", default=b.z))
+            specs += [
                 ParameterSpec(name=b.sensor_parameter(k), unit="m", meaning=f"sensor plane of {b.name}", default=z)
                 for k, z in enumerate(b.z_sensors)
             ]  # fmt: skip
-        return (*found, *self.mode_parameters)
+        return (*specs, *self.mode_parameters)
 
     @cached_property
     def mode_parameters(self) -> tuple[ParameterSpec, ...]:
         """Numbers of the bending modes: pole, shape at bearings and sensors, gyroscopic terms."""
-        found: list[ParameterSpec] = []
+        specs: list[ParameterSpec] = []
         for r in range(1, self.n_modes + 1):
-            found += [
+            specs += [
                 ParameterSpec(
                     name=f"mode{r}.omega",
                     unit="rad/s",
@@ -243,16 +243,16 @@ class RotorModel:
                 ),
                 ParameterSpec(name=f"mode{r}.zeta", unit="1", meaning=f"damping ratio of bending mode {r}"),
             ]
-            found += [
+            specs += [
                 ParameterSpec(name=f"mode{r}.{place}", unit="1", meaning=f"shape of bending mode {r} at {place}")
                 for place in self.places
             ]
         if self.turning:
             for s in range(1, self.n_modes + 1):
                 for r in range(s + 1):
-                    of = f"gyroscopic term of mode {s} and " + (f"mode {r}" if r else "the rigid slope")
-                    found.append(ParameterSpec(name=f"gyro.{r}{s}", unit="kg" if r else "kg m", meaning=of))
-        return tuple(found)
+                    meaning = f"gyroscopic term of mode {s} and " + (f"mode {r}" if r else "the rigid slope")
+                    specs.append(ParameterSpec(name=f"gyro.{r}{s}", unit="kg" if r else "kg m", meaning=meaning))
+        return tuple(specs)
 
     @cached_property
     def places(self) -> tuple[str, ...]:
@@ -303,16 +303,16 @@ class RotorModel:
         index, n = {q: k for k, q in enumerate(self.coordinates)}, len(self.coordinates)
 
         def row(plane: int, place: str) -> Array:
-            found: Array = np.zeros(n, dtype=kind)
+            entries: Array = np.zeros(n, dtype=kind)
             if plane == 2:
-                found[index["z"]] = 1.0
-                return found
+                entries[index["z"]] = 1.0
+                return entries
             letter = "xy"[plane]
-            found[index[letter]] = 1.0
-            found[index[f"slope_{letter}"]] = theta[place] - theta["z_cg"]
+            entries[index[letter]] = 1.0
+            entries[index[f"slope_{letter}"]] = theta[place] - theta["z_cg"]
             for r in range(1, self.n_modes + 1):
-                found[index[f"mode{r}_{letter}"]] = theta[f"mode{r}.{place}"]
-            return found
+                entries[index[f"mode{r}_{letter}"]] = theta[f"mode{r}.{place}"]
+            return entries
 
         magnets = np.array([row(plane, f"{b.name}.z") for b, plane in self.placed])
         read = [row(self.placed[j][1], self.placed[j][0].sensor_parameter(k)) for j, k in self.sensors]

@@ -62,8 +62,8 @@ def other_plane(model: RotorModel, k: int) -> int | None:
     """Return the sensor of the other plane beside sensor `k` of a rotor: the one it may have a cross-talk of."""
     j, number = model.sensors[k]
     bearing = model.placed[j][0]
-    beside = (i for i, (axis, n) in enumerate(model.sensors) if n == number and model.placed[axis][0] is bearing)
-    return next((i for i in beside if i != k), None)
+    sensors = (i for i, (axis, n) in enumerate(model.sensors) if n == number and model.placed[axis][0] is bearing)
+    return next((i for i in sensors if i != k), None)
 
 
 def position_errors(model: RotorModel) -> tuple[SensorError, ...]:

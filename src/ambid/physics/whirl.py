@@ -89,7 +89,7 @@ class Campbell:
         """
         from scipy.interpolate import CubicSpline
 
-        found: list[CriticalSpeed] = []
+        speeds: list[CriticalSpeed] = []
         for line in range(self.poles.shape[1]):
             f, damping, direction = (x[:, line] for x in (self.frequency, self.damping, self.direction))
             known = np.isfinite(f) & (self.speed > 0)
@@ -97,11 +97,11 @@ class Campbell:
                 w = self.speed[known]
                 roots = CubicSpline(w, f[known] - w).roots(extrapolate=False)
                 at = (np.interp(roots, w, x[known]) for x in (direction, damping))
-                found += [
+                speeds += [
                     CriticalSpeed(speed=float(x), line=line, direction=float(d), damping=float(z))
                     for x, d, z in zip(roots, *at, strict=True)
                 ]
-        return tuple(sorted(found, key=lambda c: c.speed))
+        return tuple(sorted(speeds, key=lambda c: c.speed))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -287,14 +287,14 @@ def _circular(poles: Complex, shapes: Complex) -> Complex:
     """Return the shapes of equal poles, which may be any mixture, as forward and backward whirl."""
     n = shapes.shape[0] // 2
     turn = np.kron(np.array([[0.0, 1j], [-1j, 0.0]]), np.eye(n))  # v^H turn v is the direction of v
-    found = shapes.copy()
+    turned = shapes.copy()
     for k, pole in enumerate(poles):
         alike = np.abs(poles - pole) < _EQUAL * np.abs(pole)
         if alike.sum() > 1 and not alike[:k].any():
             basis, spread, _ = np.linalg.svd(shapes[:, alike], full_matrices=False)
             if spread[-1] > _EQUAL:  # else they are one shape
-                found[:, alike] = basis @ np.linalg.eigh(basis.conj().T @ turn @ basis)[1]
-    return found
+                turned[:, alike] = basis @ np.linalg.eigh(basis.conj().T @ turn @ basis)[1]
+    return turned
 
 
 def _followed(whirl: _Whirl, before: _At, speed: float, top: float) -> _At:
@@ -334,13 +334,13 @@ def drawn_numbers(model: RotorModel, shaft: Shaft, planes: Mapping[str, float]) 
     at = [planes[place] for place in model.places]
     rotor = shaft.free_rotor(model.n_modes, planes=at)
     rows = rotor.deflection(at)
-    found = {"m": rotor.mass[0], "Id": rotor.mass[1], "Ip": rotor.gyro[1, 1], "z_cg": rotor.z_cg}
+    numbers = {"m": rotor.mass[0], "Id": rotor.mass[1], "Ip": rotor.gyro[1, 1], "z_cg": rotor.z_cg}
     for r in range(1, model.n_modes + 1):
-        found |= {f"mode{r}.omega": rotor.omega[r + 1], f"mode{r}.zeta": rotor.zeta[r + 1]}
-        found |= {f"mode{r}.{place}": row[r + 1] for place, row in zip(model.places, rows, strict=True)}
-        found |= {f"gyro.{s}{r}": rotor.gyro[s + 1, r + 1] for s in range(r + 1)}
+        numbers |= {f"mode{r}.omega": rotor.omega[r + 1], f"mode{r}.zeta": rotor.zeta[r + 1]}
+        numbers |= {f"mode{r}.{place}": row[r + 1] for place, row in zip(model.places, rows, strict=True)}
+        numbers |= {f"gyro.{s}{r}": rotor.gyro[s + 1, r + 1] for s in range(r + 1)}
     names = {p.name for p in model.parameters}
-    return {name: float(value) for name, value in found.items() if name in names}
+    return {name: float(value) for name, value in numbers.items() if name in names}
 
 
 def free_rotor_of(model: RotorModel, theta: Mapping[str, float]) -> FreeRotor:

@@ -51,8 +51,8 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
     if len(axes) > 1:
         return _draft_rotor(record, axes)
     ranked = rank_roles(record) if ranked is None else ranked
-    coil, held = bool(ranked["voltage"] and ranked["current"]), at_rest(ranked)
-    plant = model("coil" if coil and (held or not ranked["position"]) else "one-axis")
+    coil, resting = bool(ranked["voltage"] and ranked["current"]), at_rest(ranked)
+    plant = model("coil" if coil and (resting or not ranked["position"]) else "one-axis")
     name = record.provenance.get("file", "a record")
     lines = [
         f"# Guessed from {name}: check every line marked CHECK, then run: "
@@ -60,7 +60,7 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         'schema = "ambid.rig/1"',
         f"name   = {toml_text(f'bench of {name}')}",
         f'model  = "{plant.name}"'
-        + ("   # CHECK: the position does not move with voltage and current" if held else ""),
+        + ("   # CHECK: the position does not move with voltage and current" if resting else ""),
         "",
     ]
     units = role_units(plant)
@@ -95,8 +95,8 @@ def _record_lines(record: Record) -> list[str]:
 def axes_of(record: Record) -> list[str]:
     """Return the axes of a record whose columns are named ``<axis>_position`` with ``<axis>_voltage`` or a current."""
     names = set(record.names)
-    found = [name.removesuffix("_position") for name in record.names if name.endswith("_position")]
-    return [axis for axis in found if axis and names & {f"{axis}_voltage", f"{axis}_current"}]
+    axes = [name.removesuffix("_position") for name in record.names if name.endswith("_position")]
+    return [axis for axis in axes if axis and names & {f"{axis}_voltage", f"{axis}_current"}]
 
 
 def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
@@ -130,7 +130,7 @@ def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
 
 def _turning(record: Record) -> dict[str, Channel]:
     """Return speed and angle of the rotor where a column has both the name and the unit: nothing needs them."""
-    found: dict[str, Channel] = {}
+    channels: dict[str, Channel] = {}
     for role in ("speed", "angle"):
         fits = [
             c
@@ -139,8 +139,8 @@ def _turning(record: Record) -> dict[str, Channel]:
             and re.search(NAMES[role], c.name.lower())
             and not re.search(SET_POINT, c.name.lower())
         ]
-        found |= {role: fits[0]} if fits else {}
-    return found
+        channels |= {role: fits[0]} if fits else {}
+    return channels
 
 
 def _channel_lines(role: str, ranked: Sequence[Candidate], unit: str, record: Record, *, is_input: bool) -> list[str]:
@@ -213,17 +213,17 @@ def rig_of_preset(bench: Preset) -> Rig:
     """
     if bench.rotor is not None:
         return _rig_of_rotor(bench, bench.rotor)
-    of = model(bench.model)
+    plant = model(bench.model)
     point = {"position": bench.operating_point.position, "current": bench.operating_point.current,
              "voltage": bench.operating_point.voltage}  # fmt: skip
     return Rig(
         name=bench.summary,
         model=bench.model,
         channels=tuple(
-            RigChannel(role=role, column=role, delay="auto" if role in of.inputs else 0)
-            for role in (*of.inputs, *of.outputs)
+            RigChannel(role=role, column=role, delay="auto" if role in plant.inputs else 0)
+            for role in (*plant.inputs, *plant.outputs)
         ),
-        parameters=tuple(_parameter(s.name, s.unit, bench.parameters[s.name]) for s in of.parameters),
+        parameters=tuple(_parameter(s.name, s.unit, bench.parameters[s.name]) for s in plant.parameters),
         magnet=None if bench.plant is None else _magnet(bench.plant),
         operating_point=point if any(point.values()) else {},
         loop=bench.loop,
@@ -235,21 +235,21 @@ def rig_of_preset(bench: Preset) -> Rig:
 
 
 def _rig_of_rotor(bench: Preset, body: RotorBody) -> Rig:
-    of = body.model.with_modes(0)
-    values = {**{p.name: p.default for p in of.parameters}, **bench.parameters}
-    known = {*of.places, *(p.name for p in of.parameters if p.name.endswith(".sensor_pole"))}
-    turning = ("angle",) if of.speed else ()
-    roles = (*of.inputs, *of.outputs, *turning, *(f"{axis}_reference" for axis in of.axes))
+    plant = body.model.with_modes(0)
+    values = {**{p.name: p.default for p in plant.parameters}, **bench.parameters}
+    known = {*plant.places, *(p.name for p in plant.parameters if p.name.endswith(".sensor_pole"))}
+    turning = ("angle",) if plant.speed else ()
+    roles = (*plant.inputs, *plant.outputs, *turning, *(f"{axis}_reference" for axis in plant.axes))
     numbers = {"s": body.gap, **({"sigma": body.sigma} if body.sigma else {})}
     specs = {spec.name: spec for spec in BEARING_NUMBERS}
     return Rig(
         name=bench.summary,
         model=bench.model,
-        channels=tuple(RigChannel(role=r, column=r, delay="auto" if r in of.inputs else 0) for r in roles),
-        rotor=of,
+        channels=tuple(RigChannel(role=r, column=r, delay="auto" if r in plant.inputs else 0) for r in roles),
+        rotor=plant,
         parameters=tuple(
             Parameter(name=p.name, unit=p.unit, value=values[p.name], role="fixed" if p.name in known else "free")
-            for p in of.parameters
+            for p in plant.parameters
         ),
         modes=RigModes(count=body.model.n_modes or None) if body.shaft else RigModes(),
         shaft=body.shaft,

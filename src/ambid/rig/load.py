@@ -192,14 +192,14 @@ def _channels(entries: Mapping[str, ChannelEntry], plant: LinearModel, path: Pat
             raise RigError(
                 f"{where}: [channels.{role}] is missing; model {plant.name!r} needs it. Add it with its column"
             )
-    taken: dict[str, str] = {}
+    owners: dict[str, str] = {}
     for c in (x for channel in channels for x in (channel, *channel.sensors)):
-        if c.column in taken:
+        if c.column in owners:
             raise RigError(
-                f"{where}: column {c.column!r} is both channels.{taken[c.column]} and channels.{c.role};"
+                f"{where}: column {c.column!r} is both channels.{owners[c.column]} and channels.{c.role};"
                 " a column has one role. Correct one"
             )
-        taken[c.column] = c.role
+        owners[c.column] = c.role
     return tuple(channels)
 
 
@@ -286,9 +286,9 @@ def _operating_point(entry: object, plant: LinearModel, where: str) -> Mapping[s
     values: dict[str, float] = {}
     for role, quantity in entry.items():
         if role not in units:
-            known = ", ".join(units)
+            roles = ", ".join(units)
             raise RigError(
-                f"{where}: unknown key {role!r} in [operating_point]; known: {known}.{nearest(role, list(units))}"
+                f"{where}: unknown key {role!r} in [operating_point]; known: {roles}.{nearest(role, list(units))}"
             )
         if quantity == "auto":
             continue
@@ -301,10 +301,10 @@ def _loop(entry: LoopEntry, where: str) -> Loop:
     gains = {name: getattr(entry, name) for name in ("kp", "ki", "kd", "kc", "derivative_cutoff_hz")}
     matrices = {name: getattr(entry, name) for name in (*"ABCD", "rate_hz")}
     if entry.kind == "pid":
-        given = [name for name, x in {**matrices, "G": entry.G, "laws": entry.laws or None}.items() if x is not None]
-        if given:
+        keys = [name for name, x in {**matrices, "G": entry.G, "laws": entry.laws or None}.items() if x is not None]
+        if keys:
             raise RigError(
-                f'{where}: loop.{given[0]} is of a state-space law, and loop.kind is "pid". Omit it, or give kind = '
+                f'{where}: loop.{keys[0]} is of a state-space law, and loop.kind is "pid". Omit it, or give kind = '
                 '"state-space"'
             )
         cutoff = math.inf if entry.derivative_cutoff_hz is None else entry.derivative_cutoff_hz
@@ -329,10 +329,10 @@ def _law(entry: LoopEntry | LawEntry, rate_hz: float) -> StateLaw:
 def _limits(entry: LimitsEntry, where: str) -> Limits:
     intervals: dict[str, tuple[float, float]] = {}
     for role in ("voltage", "current", "position"):
-        given = getattr(entry, role)
-        if given is None:
+        limits = getattr(entry, role)
+        if limits is None:
             continue
-        low, high = given if isinstance(given, tuple) else (-given, given)
+        low, high = limits if isinstance(limits, tuple) else (-limits, limits)
         if not low < high:
             raise RigError(
                 f"{where}: loop.limits.{role} is [{low}, {high}]; the lower comes first. Swap or correct them"
@@ -401,17 +401,17 @@ def _check_third(third: str | None, channels: Sequence[RigChannel], plant: Linea
 
 def _trip(
     role: Literal["position", "current"],
-    given: float | Interval | None,
+    value: float | Interval | None,
     limits: Limits | None,
     plant: LinearModel,
     place: str,
 ) -> Interval | None:
     """Return the interval of a trip, which has to lie inside the limits of the bench."""
-    if given is None:
+    if value is None:
         return None
     if role not in plant.outputs and role not in plant.inputs:
         raise RigError(f"{place}.trip.{role} is given; model {plant.name!r} has no {role}. Remove it")
-    low, high = given if isinstance(given, tuple) else (-given, given)
+    low, high = value if isinstance(value, tuple) else (-value, value)
     if not low < high:
         raise RigError(f"{place}.trip.{role} is [{low}, {high}]; the lower comes first. Swap or correct them")
     least, most = UNLIMITED if limits is None else getattr(limits, role)
@@ -705,15 +705,18 @@ def _in_declared_unit(channel: Channel, c: RigChannel) -> Channel:
     return channel
 
 
-def _refuse_swapped(found: dict[str, Channel], wanted: dict[str, str], rig: Rig) -> None:
+def _refuse_swapped(channels: dict[str, Channel], wanted: dict[str, str], rig: Rig) -> None:
     """Refuse two columns each of which has exactly the unit of the other's role."""
-    plain = [c.role for c in rig.channels if c.calibration is None and found[c.role].unit != wanted[c.role] != UNKNOWN]
+    plain = [
+        c.role for c in rig.channels if c.calibration is None and channels[c.role].unit != wanted[c.role] != UNKNOWN
+    ]
     for a in plain:
         for b in plain:
-            if a != b and found[a].unit == wanted[b] and found[b].unit == wanted[a]:
+            if a != b and channels[a].unit == wanted[b] and channels[b].unit == wanted[a]:
                 raise UnitError(
-                    f"swapped columns? channels.{a} is column {found[a].name!r} in [{found[a].unit}] and channels.{b}"
-                    f" is column {found[b].name!r} in [{found[b].unit}]. Swap the two, or fix the header"
+                    f"swapped columns? channels.{a} is column {channels[a].name!r} in [{channels[a].unit}] "
+                    f"and channels.{b} is column {channels[b].name!r} in [{channels[b].unit}]. Swap the two, or fix the "
+                    "header"
                 )
 
 

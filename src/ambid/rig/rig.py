@@ -347,9 +347,9 @@ class Rig:
             In m or A: as ``[daq.trip]`` gives it, else the middle 90 % of ``loop.limits.position`` or all of
             ``loop.limits.current``; infinite where the rig says nothing.
         """
-        given = (self.daq.position_trip if role == "position" else self.daq.current_trip) if self.daq else None
-        if given is not None:
-            return given
+        trip = (self.daq.position_trip if role == "position" else self.daq.current_trip) if self.daq else None
+        if trip is not None:
+            return trip
         low, high = UNLIMITED if self.limits is None else getattr(self.limits, role)
         if role == "current" or (low, high) == UNLIMITED:
             return low, high
@@ -533,8 +533,8 @@ def _rotor_lines(rig: Rig) -> list[str]:
     return lines + (["", *shaft_lines(rig.shaft)] if rig.shaft else [])
 
 
-def _turning(found: Turning, unit: str) -> str:
-    return f'{{ value = {found.value!r}, unit = "{unit}", phase = {found.phase!r} }}'
+def _turning(turning: Turning, unit: str) -> str:
+    return f'{{ value = {turning.value!r}, unit = "{unit}", phase = {turning.phase!r} }}'
 
 
 def _mode_lines(numbers: Mapping[str, float], n: int) -> list[str]:

@@ -74,14 +74,14 @@ def rank_roles(record: Record) -> Mapping[str, Sequence[Candidate]]:
     `record`: as read from its file, columns under their own names. Returns voltage, current and position; empty where
     no column looks like one.
     """
-    found = {
+    ranked = {
         role: sorted((_named(c, role, record) for c in record.channels if _name(c, role)), key=lambda c: -c.score)
         for role in ROLES
     }
-    shown = {role: [c for c in cs if c.signal > 0][:_CANDIDATES] for role, cs in found.items()}
-    coils = _coils(record, shown)
-    coherent = _coherences(record, {c.channel.name for cs in shown.values() for c in cs})
-    judged = {role: [_judged(c, coils, coherent, shown, record) for c in cs] for role, cs in found.items()}
+    likely = {role: [c for c in cs if c.signal > 0][:_CANDIDATES] for role, cs in ranked.items()}
+    coils = _coils(record, likely)
+    coherent = _coherences(record, {c.channel.name for cs in likely.values() for c in cs})
+    judged = {role: [_judged(c, coils, coherent, likely, record) for c in cs] for role, cs in ranked.items()}
     return _distinct({
         role: sorted((c for c in cs if c.named > _UNNAMED or c.fits >= _LIKE), key=lambda c: -c.score)
         for role, cs in judged.items()
@@ -123,14 +123,14 @@ def _named(c: Channel, role: str, record: Record) -> Candidate:
     return Candidate(role=role, channel=c, named=_name(c, role), signal=part, fits=0.0, why="")
 
 
-def _coils(record: Record, shown: Mapping[str, Sequence[Candidate]]) -> dict[tuple[str, str], Coil]:
+def _coils(record: Record, candidates: Mapping[str, Sequence[Candidate]]) -> dict[tuple[str, str], Coil]:
     """Coils between candidates for voltage and current, with the motion that suits them best."""
     if record.n_samples < _LEAST:
         return {}
-    columns = {c.channel.name: c.channel.values[:_LOOKED] for cs in shown.values() for c in cs}
-    motions: list[str | None] = [c.channel.name for c in shown["position"]]
-    found: dict[tuple[str, str], Coil] = {}
-    for v, i in itertools.product(shown["voltage"], shown["current"]):
+    columns = {c.channel.name: c.channel.values[:_LOOKED] for cs in candidates.values() for c in cs}
+    motions: list[str | None] = [c.channel.name for c in candidates["position"]]
+    coils: dict[tuple[str, str], Coil] = {}
+    for v, i in itertools.product(candidates["voltage"], candidates["current"]):
         pair = v.channel.name, i.channel.name
         if pair[0] != pair[1]:
             fits = [
@@ -138,8 +138,8 @@ def _coils(record: Record, shown: Mapping[str, Sequence[Candidate]]) -> dict[tup
                 for x in (motions or [None])
                 if x not in pair
             ]
-            found |= {pair: max(fits, key=lambda c: c.share)} if fits else {}
-    return found
+            coils |= {pair: max(fits, key=lambda c: c.share)} if fits else {}
+    return coils
 
 
 def coil_of(v: Array, i: Array, x: Array | None, rate_hz: float) -> Coil:
@@ -185,11 +185,11 @@ def _coherences(record: Record, names: set[str]) -> dict[tuple[str, str], float]
     own = sorted(names)
     if record.n_samples < _LEAST or len(own) < 2:
         return {}
-    found = cross_spectra(np.column_stack([record[name][:_LOOKED] for name in own]), record.rate_hz)
-    power = np.einsum("fii->fi", found.density).real
+    spectra = cross_spectra(np.column_stack([record[name][:_LOOKED] for name in own]), record.rate_hz)
+    power = np.einsum("fii->fi", spectra.density).real
     with np.errstate(divide="ignore", invalid="ignore"):
-        share = np.abs(found.density) ** 2 / (power[:, :, None] * power[:, None, :])
-    chance = 1.0 / max(found.n_effective, 1.0 + 1e-9)  # of two signals that have nothing to do with each other
+        share = np.abs(spectra.density) ** 2 / (power[:, :, None] * power[:, None, :])
+    chance = 1.0 / max(spectra.n_effective, 1.0 + 1e-9)  # of two signals that have nothing to do with each other
     share = np.clip((np.nan_to_num(share) - chance) / (1.0 - chance), 0.0, 1.0)
     part = np.einsum("fij,fi->ij", share[1:], power[1:]) / np.maximum(power[1:].sum(axis=0), 1e-300)[:, None]
     return {(a, b): float(part[j, k]) for j, a in enumerate(own) for k, b in enumerate(own) if j != k}
@@ -199,7 +199,7 @@ def _judged(
     c: Candidate,
     coils: Mapping[tuple[str, str], Coil],
     coherent: Mapping[tuple[str, str], float],
-    shown: Mapping[str, Sequence[Candidate]],
+    candidates: Mapping[str, Sequence[Candidate]],
     record: Record,
 ) -> Candidate:
     """A candidate with what it does in a bearing."""
@@ -209,7 +209,9 @@ def _judged(
         return replace(c, why=f"{_unit_words(c)}; {what}")
     words, fits = [_unit_words(c)], 0.0
     if c.role == "position":
-        sources = [x.channel.name for role in ("current", "voltage") for x in shown[role] if x.channel.name != name]
+        sources = [
+            x.channel.name for role in ("current", "voltage") for x in candidates[role] if x.channel.name != name
+        ]
         pairs = [(coherent[name, s], s) for s in sources if (name, s) in coherent]
         if pairs:
             fits, source = max(pairs)
@@ -258,9 +260,9 @@ def _distinct(ranked: Mapping[str, Sequence[Candidate]]) -> Mapping[str, Sequenc
         ),
         key=lambda choice: sum(c.score for c in choice if c),
     )
-    found = {}
+    roles = {}
     for (role, cs), top in zip(ranked.items(), best, strict=True):
         taken = {c.channel.name for c in best if c and c is not top}
         rest = [c for c in cs if c is not top and c.channel.name not in taken]
-        found[role] = (top, *rest) if top else ()
-    return found
+        roles[role] = (top, *rest) if top else ()
+    return roles

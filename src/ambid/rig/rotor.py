@@ -60,7 +60,7 @@ def planes_of(file: RigFile) -> Mapping[str, ParameterEntry]:
         role = plane.role or ("free" if plane.value is None else "fixed")
         return ParameterEntry(value=plane.value, unit=plane.unit, role=role, sd=plane.sd)
 
-    found: dict[str, ParameterEntry] = {}
+    entries: dict[str, ParameterEntry] = {}
     for name, given in file.bearings.items():
         if not given.axial:
             bearing = Bearing(name=name, axes=tuple(given.axes))
@@ -68,52 +68,52 @@ def planes_of(file: RigFile) -> Mapping[str, ParameterEntry]:
                 (f"{name}.z", given.z),
                 *((bearing.sensor_parameter(k), z) for k, z in enumerate(_read_at(given))),
             ]
-            found |= {place: entry(plane) for place, plane in planes if plane is not None}
-    return found
+            entries |= {place: entry(plane) for place, plane in planes if plane is not None}
+    return entries
 
 
 def modes_of(file: RigFile, plant: LinearModel, where: str) -> RigModes:
     """Return what a rig file says of bending modes; with shapes, all numbers that a simulation needs."""
-    given = file.modes
-    if given is None or not isinstance(plant, RotorModel):
+    entry = file.modes
+    if entry is None or not isinstance(plant, RotorModel):
         return RigModes()
-    count = None if given.count == "auto" else int(given.count)
-    n, numbers = len(given.frequency_hz), dict[str, float]()
-    lone = "gyroscopic" if given.gyroscopic else "damping" if given.damping is not None else None
-    if lone and not given.shapes:
+    count = None if entry.count == "auto" else int(entry.count)
+    n, numbers = len(entry.frequency_hz), dict[str, float]()
+    lone = "gyroscopic" if entry.gyroscopic else "damping" if entry.damping is not None else None
+    if lone and not entry.shapes:
         raise RigError(
             f"{where}: modes.{lone} is given without modes.shapes; a simulation takes all of a mode from here, or from "
             "[shaft]. Give the shapes, or remove it"
         )
-    if given.shapes and given.damping is None:
+    if entry.shapes and entry.damping is None:
         raise RigError(f"{where}: modes.shapes are given without modes.damping. Give the ratio of each mode, or one")
-    damping = given.damping if isinstance(given.damping, list) else [given.damping or 0.0] * n
-    if given.shapes:
+    damping = entry.damping if isinstance(entry.damping, list) else [entry.damping or 0.0] * n
+    if entry.shapes:
         places = {*plant.places, *(f"unbalance.{name}" for name in file.unbalance)}
-        wrong = next((p for p in [*given.shapes, *places] if (p in places) != (p in given.shapes)), None)
+        wrong = next((p for p in [*entry.shapes, *places] if (p in places) != (p in entry.shapes)), None)
         if wrong is not None:
             what = "is missing" if wrong in places else "is no plane of this rotor"
             raise RigError(
                 f"{where}: modes.shapes.{wrong!r} {what}; shapes are given at {', '.join(sorted(places))}."
                 f"{nearest(wrong, sorted(places - {wrong}))} Correct it"
             )
-        for key, values in {"damping": damping, **{f"shapes.{p!r}": v for p, v in given.shapes.items()}}.items():
+        for key, values in {"damping": damping, **{f"shapes.{p!r}": v for p, v in entry.shapes.items()}}.items():
             if len(values) != n:
                 raise RigError(
                     f"{where}: modes.{key} has {len(values)} numbers, modes.frequency_hz {n}; give one for each mode"
                 )
         for r in range(n):
-            numbers |= {f"mode{r + 1}.omega": TURN * given.frequency_hz[r], f"mode{r + 1}.zeta": damping[r]}
-            numbers |= {f"mode{r + 1}.{place}": shape[r] for place, shape in given.shapes.items()}
+            numbers |= {f"mode{r + 1}.omega": TURN * entry.frequency_hz[r], f"mode{r + 1}.zeta": damping[r]}
+            numbers |= {f"mode{r + 1}.{place}": shape[r] for place, shape in entry.shapes.items()}
     terms = [p.name.removeprefix("gyro.") for p in plant.at_speed(1.0).with_modes(n).parameters if "gyro." in p.name]
-    for term, value in given.gyroscopic.items():
+    for term, value in entry.gyroscopic.items():
         if term not in terms:
             raise RigError(
                 f"{where}: modes.gyroscopic.{term!r} is no pair of modes; they are {', '.join(terms)}, 0 the rigid "
                 "slope. Correct it"
             )
         numbers[f"gyro.{term}"] = value
-    return RigModes(count=count, frequency_hz=tuple(given.frequency_hz), numbers=MappingProxyType(numbers))
+    return RigModes(count=count, frequency_hz=tuple(entry.frequency_hz), numbers=MappingProxyType(numbers))
 
 
 def turning_of(file: RigFile, where: str) -> tuple[tuple[Turning, ...], tuple[Turning, ...]]:
@@ -133,18 +133,18 @@ def turning_of(file: RigFile, where: str) -> tuple[tuple[Turning, ...], tuple[Tu
     return unbalance, runout
 
 
-def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
-    if given.axial:
-        if len(given.axes) != 1:
-            raise RigError(f"{place} is axial with {len(given.axes)} axes; it has one. Name one, or remove axial")
-        return Bearing(name=name, axes=tuple(given.axes), axial=True)
-    if given.z is None:
+def _bearing(name: str, entry: BearingEntry, place: str) -> Bearing:
+    if entry.axial:
+        if len(entry.axes) != 1:
+            raise RigError(f"{place} is axial with {len(entry.axes)} axes; it has one. Name one, or remove axial")
+        return Bearing(name=name, axes=tuple(entry.axes), axial=True)
+    if entry.z is None:
         raise RigError(
             f'{place}.z is missing; the magnet stands there along the shaft. Give z = {{ value = …, unit = "mm" }}'
         )
-    if given.z_sensor is not None and given.z_sensors is not None:
+    if entry.z_sensor is not None and entry.z_sensors is not None:
         raise RigError(f"{place} has both z_sensor and z_sensors; it has one of them. Remove one")
-    sensors = _read_at(given)
+    sensors = _read_at(entry)
     if not sensors:
         raise RigError(
             f"{place}.z_sensor is missing; it is the plane of the sensor. Give it, equal to z if they are one"
@@ -152,8 +152,8 @@ def _bearing(name: str, given: BearingEntry, place: str) -> Bearing:
     values = [None if plane.value is None else si_of(plane, "m", place) for plane in sensors]
     return Bearing(
         name=name,
-        axes=tuple(given.axes),
-        z=None if given.z.value is None else si_of(given.z, "m", place),
+        axes=tuple(entry.axes),
+        z=None if entry.z.value is None else si_of(entry.z, "m", place),
         z_sensors=tuple(values),
     )
 
@@ -172,9 +172,9 @@ def _apart(bearings: tuple[Bearing, ...], where: str) -> None:
             )
 
 
-def _read_at(given: BearingEntry) -> list[PlaneEntry]:
+def _read_at(entry: BearingEntry) -> list[PlaneEntry]:
     """Return the planes of the sensors of a bearing."""
-    return given.z_sensors or ([] if given.z_sensor is None else [given.z_sensor])
+    return entry.z_sensors or ([] if entry.z_sensor is None else [entry.z_sensor])
 
 
 def speed_of(entry: QuantityEntry | None, where: str) -> float:

@@ -322,9 +322,9 @@ def checked(content: dict[str, Any], where: str) -> RigFile:
 
     `content`: what the TOML file holds; `where`: the file, for messages. Returns the same, typed.
     """
-    given = content.get("schema")
-    if given != SCHEMA:
-        got = "has no schema" if given is None else f"has schema {given!r}"
+    schema = content.get("schema")
+    if schema != SCHEMA:
+        got = "has no schema" if schema is None else f"has schema {schema!r}"
         raise RigError(f'rig {where} {got}; this program reads {SCHEMA!r}. Write schema = "{SCHEMA}" on top')
     try:
         return RigFile.model_validate(content)
@@ -345,7 +345,7 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
     if kind == "missing" and keys[-1] != "duty" and "limits" not in keys[:-1] and "trip" not in keys[:-1]:
         return f"{place} is missing. Add it"
     got = error["input"]
-    shown = "a table" if isinstance(got, dict) else f"{got!r}"
+    value = "a table" if isinstance(got, dict) else f"{got!r}"
     if keys[:2] in (["loop", "limits"], ["daq", "trip"]):
         rule = "it must be a positive number, or [low, high]"
     elif keys[:2] == ["daq", "duty"]:
@@ -377,7 +377,7 @@ def _in_words(error: Any, content: dict[str, Any]) -> str:
         rule = "it must be a matrix of numbers, a list of rows such as [[1.0, 2.0], [3.0, 4.0]]"
     else:
         rule = "it must be a number, without quotes"
-    return f"{place} is {shown}; {rule}{'' if rule.endswith('?') else '.'} Correct it"
+    return f"{place} is {value}; {rule}{'' if rule.endswith('?') else '.'} Correct it"
 
 
 def _place(loc: tuple[int | str, ...], content: Any) -> list[str]:
@@ -425,5 +425,5 @@ def _entry_in(annotation: Any) -> tuple[type[_Entry], bool] | None:
     """Return the entry that a type holds, and whether it holds several."""
     if isinstance(annotation, type) and issubclass(annotation, _Entry):
         return annotation, False
-    held = next((x for x in map(_entry_in, get_args(annotation)) if x is not None), None)
-    return held and (held[0], held[1] or get_origin(annotation) in (dict, list, tuple))
+    inner = next((x for x in map(_entry_in, get_args(annotation)) if x is not None), None)
+    return inner and (inner[0], inner[1] or get_origin(annotation) in (dict, list, tuple))

@@ -78,8 +78,8 @@ def _step(entry: StepEntry, place: str) -> Step:
 
 def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
     z = si_of(entry.z, "m", f"{place}.z")
-    given = {name: getattr(entry, name) for name in _DISC if getattr(entry, name) is not None}
-    sizes = {name: si_of(x, _DISC[name], f"{place}.{name}") for name, x in given.items()}
+    values = {name: getattr(entry, name) for name in _DISC if getattr(entry, name) is not None}
+    sizes = {name: si_of(x, _DISC[name], f"{place}.{name}") for name, x in values.items()}
     try:
         if set(sizes) in ({"m"}, {"m", "Id", "Ip"}):
             return Disc(z=z, **sizes)
@@ -110,11 +110,11 @@ def unit_of(text: str, place: str) -> Unit:
         raise RigError(f"{place}.unit: {error}") from None
 
 
-def si_of(given: QuantityEntry | PlaneEntry | TurningEntry | None, si: str, place: str) -> float:
+def si_of(entry: QuantityEntry | PlaneEntry | TurningEntry | None, si: str, place: str) -> float:
     """Return a quantity in its SI unit, 0 where none is given."""
-    if given is None or given.value is None:
+    if entry is None or entry.value is None:
         return 0.0
-    unit = unit_of(given.unit, place)
+    unit = unit_of(entry.unit, place)
     if unit.si != parse_unit(si).si:
-        raise RigError(f"{place} is in [{given.unit}]; it is measured in [{si}]. Correct unit")
-    return unit.to_si(given.value)
+        raise RigError(f"{place} is in [{entry.unit}]; it is measured in [{si}]. Correct unit")
+    return unit.to_si(entry.value)
