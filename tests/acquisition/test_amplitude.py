@@ -121,12 +121,12 @@ def test_a_voltage_at_its_end_is_too_much():
 
 def test_a_given_size_is_only_tried():
     look, sizes = linear(1e-4)
-    assert found(look, given=2.0).amplitude_v == 2.0
+    assert found(look, amplitude_v=2.0).amplitude_v == 2.0
     assert sizes == [2.0]
-    assert found(look, given=7.0).reasons == ()  # more than its part: whoever gives a size has decided that
+    assert found(look, amplitude_v=7.0).reasons == ()  # more than its part: whoever gives a size has decided that
     assert (
         "moves position through 95 % of its available range; 85 % are allowed: give a smaller one"
-        in found(look, given=9.5).reasons[0]
+        in found(look, amplitude_v=9.5).reasons[0]
     )
 
 
@@ -146,7 +146,7 @@ def test_without_limits_of_the_voltage_a_size_has_to_be_given():
     size = find_amplitude(look, room, TRIAL, REST, rate_hz=2000.0, use=0.3)
     assert "no loop.limits.voltage" in size.reasons[0]
     assert sizes == []
-    assert find_amplitude(look, room, TRIAL, REST, rate_hz=2000.0, use=0.3, given=1.0).reasons == ()
+    assert find_amplitude(look, room, TRIAL, REST, rate_hz=2000.0, use=0.3, amplitude_v=1.0).reasons == ()
 
 
 def test_on_the_prototype_a_third_of_the_room_is_used():

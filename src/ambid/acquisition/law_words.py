@@ -208,8 +208,14 @@ def _with_room(law: StateLaw) -> StateLaw:
     return _scaled(law, LARGEST_STATE / peaks)
 
 
-def _scaled(law: StateLaw, by: Array) -> StateLaw:
-    return replace(law, A=by[:, None] * law.A / by, B=by[:, None] * law.B, C=law.C / by, G=by[:, None] * law.windup)
+def _scaled(law: StateLaw, factors: Array) -> StateLaw:
+    return replace(
+        law,
+        A=factors[:, None] * law.A / factors,
+        B=factors[:, None] * law.B,
+        C=law.C / factors,
+        G=factors[:, None] * law.windup,
+    )
 
 
 def _peaks(law: StateLaw) -> Array:
@@ -221,7 +227,7 @@ def _peaks(law: StateLaw) -> Array:
     peaks = l1_norms(law.A - G @ law.C, np.hstack([law.B - G @ law.D, G])) @ [_INPUT, _INPUT, PWM_TOP]
     if not np.all(np.isfinite(peaks)):
         integrates = (np.eye(law.order) == law.A).all(axis=1)
-        kept = np.flatnonzero(~integrates)
+        others = np.flatnonzero(~integrates)
         peaks = _CARRIED / np.maximum(np.abs(law.C[0]), 1e-300)
-        peaks[kept] = _INPUT * l1_norms(law.A[np.ix_(kept, kept)], law.B[kept]).sum(axis=1)
+        peaks[others] = _INPUT * l1_norms(law.A[np.ix_(others, others)], law.B[others]).sum(axis=1)
     return np.where((peaks > 0.0) & np.isfinite(peaks), peaks, 1.0)

@@ -135,8 +135,8 @@ class Periods:
 
     def variances(self) -> tuple[Array, Array]:
         """Return those of signal and noise, each shape (n_columns,); `freedom` has to be positive."""
-        seen = self._visits > 0
-        visits, sums = self._visits[seen, None], self._sum[seen]
+        visited = self._visits > 0
+        visits, sums = self._visits[visited, None], self._sum[visited]
         total = int(visits.sum())
         between = (sums**2 / visits).sum(axis=0)
         noise = np.maximum(self._squares - between, 0.0) / self.freedom
@@ -283,7 +283,7 @@ class Quality:
         """Return how good the stream is so far, with what is not good enough in words."""
         self._judge()
         measured, sd = self._rate.slope()
-        made = QualityReport(
+        report = QualityReport(
             samples=self._moments.count,
             lost=self._lost,
             gaps=self._gaps,
@@ -296,7 +296,7 @@ class Quality:
             excited=self._excited,
             columns=self._columns(),
         )
-        return replace(made, faults=faults(made, self._info))
+        return replace(report, faults=faults(report, self._info))
 
     def _take(self, first: int, x: Array) -> None:
         """Take sound consecutive samples."""
@@ -315,12 +315,12 @@ class Quality:
         m = self._moments
         if m.count == 0:
             return tuple(ColumnQuality(name=c.name, role=c.role, unit=c.unit) for c in self._info.columns)
-        by: Literal["periods", "differences"] = "differences"
+        method: Literal["periods", "differences"] = "differences"
         noise = np.minimum(self._differences.variance, m.variance)
         signal = m.variance - noise
         periods = self._periods
         if periods is not None and periods.freedom >= max(_FREEDOM, _FREE_SHARE * periods.period):
-            by = "periods"
+            method = "periods"
             signal, noise = periods.variances()
         return tuple(
             ColumnQuality(
@@ -337,7 +337,7 @@ class Quality:
                 signal_sd=math.sqrt(signal[k]),
                 noise_sd=math.sqrt(noise[k]),
                 snr_db=_decibels(float(signal[k]), float(noise[k])),
-                noise_by=by,
+                noise_by=method,
                 still_s=float(m.longest[k] / self._info.rate_hz),
             )
             for k, c in enumerate(self._info.columns)
@@ -362,7 +362,7 @@ def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
     `report`: all but its verdict; `info`: of the device. Returns empty where all is well, or where there are too few
     samples to tell.
     """
-    found = list(_stream(report, info))
+    reasons = list(_stream(report, info))
     if report.samples >= _FEWEST:
         for column in report.columns:
             if not math.isfinite(column.rms):
@@ -370,11 +370,11 @@ def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
                     f"{column.name} ranges from {column.least:.4g} to {column.most:.4g}, which is too large for a mean "
                     "and standard deviation. Check its source"
                 )
-                found.append(Reason(check="size", text=text, grave=True))
+                reasons.append(Reason(check="size", text=text, grave=True))
                 continue
             sensed = column.role in MEASURED
-            found += [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
-    return tuple(found)
+            reasons += [*_range(column), *_content(column, report)] if sensed else _ordered(column, report.excited)
+    return tuple(reasons)
 
 
 def _stream(report: QualityReport, info: DeviceInfo) -> Iterator[Reason]:
@@ -464,8 +464,8 @@ def _content(column: ColumnQuality, report: QualityReport) -> Iterator[Reason]:
             text=f"{column.name} was constant for {column.still_s:.2g} s during an excitation: the rotor rests on a "
             "stop, or a cable is loose. Check both",
         )
-    told = report.excited and column.noise_by == "periods" and column.role != "extra"
-    if told and column.snr_db is not None and column.snr_db < _SNR_DB:
+    periodic = report.excited and column.noise_by == "periods" and column.role != "extra"
+    if periodic and column.snr_db is not None and column.snr_db < _SNR_DB:
         rest = 1.0 / (1.0 + 10.0 ** (column.snr_db / 10.0))
         yield Reason(
             check="snr",

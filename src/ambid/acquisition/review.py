@@ -67,11 +67,11 @@ def _voltage(rig: Rig, settings: ControllerSettings) -> list[str]:
 
 def _trips(rig: Rig, settings: ControllerSettings) -> list[str]:
     """Say where noise could trip at rest, and where the converter hardly sees the range it is to protect."""
-    found = [("current", settings.current_low, settings.current_rest, settings.current_high)]
+    trips = [("current", settings.current_low, settings.current_rest, settings.current_high)]
     if has_position(rig):
-        found.append(("position", settings.position_low, settings.setpoint, settings.position_high))
+        trips.append(("position", settings.position_low, settings.setpoint, settings.position_high))
     lines = []
-    for role, low, rest, high in found:
+    for role, low, rest, high in trips:
         near = min(rest - low, high - rest)
         # an end at the converter's own end cannot trip: nothing to be near to
         if near < _NEAR_TRIP and not (low == 0 and rest - low == near):
@@ -130,19 +130,19 @@ def _slopes(rig: Rig, settings: ControllerSettings) -> list[str]:
 
 def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float]) -> list[str]:
     """Say where the loop as the controller closes it does not hold the plant that the rig knows."""
-    found, whose = predicted(rig, settings, parameters)
-    if found is None:
+    margins, whose = predicted(rig, settings, parameters)
+    if margins is None:
         return [whose]
-    if not found.stable:
+    if not margins.stable:
         try:
-            _refuse(found, whose, settings.rate_hz)
+            _refuse(margins, whose, settings.rate_hz)
         except ModelError as failure:
             return [str(failure)]
-    if found.largest_pole > 1.0 - 1.0 / _SLOW_PERIODS:
-        seconds = math.inf if found.largest_pole >= 1.0 else -1.0 / math.log(found.largest_pole) / settings.rate_hz
+    if margins.largest_pole > 1.0 - 1.0 / _SLOW_PERIODS:
+        seconds = math.inf if margins.largest_pole >= 1.0 else -1.0 / math.log(margins.largest_pole) / settings.rate_hz
         return [
             f"the loop hardly damps {whose}: a mode takes {seconds:.2g} s to fall to a third (largest pole"
-            f" {found.largest_pole:.5f}). Raise loop.kd or loop.ki"
+            f" {margins.largest_pole:.5f}). Raise loop.kd or loop.ki"
         ]
     return []
 
@@ -155,9 +155,9 @@ def predicted(
     `rig`: with a loop; `settings`: made from it; `parameters`: of the bench, SI, where the rig has no value of its own.
     Returns the margins and whose plant it is; None and why where a value is missing.
     """
-    known = {p.name: p.value for p in rig.parameters if p.value is not None}
-    lent = [p.name for p in rig.parameters if p.name not in known and p.name in parameters]
-    missing = [p.name for p in rig.parameters if p.name not in known and p.name not in parameters]
+    values = {p.name: p.value for p in rig.parameters if p.value is not None}
+    lent = [p.name for p in rig.parameters if p.name not in values and p.name in parameters]
+    missing = [p.name for p in rig.parameters if p.name not in values and p.name not in parameters]
     if missing:
         return None, (
             "the stability of the loop could not be checked, because the rig has no value for "
@@ -165,8 +165,8 @@ def predicted(
         )
     whose = "the rig's own plant" + (f" with {', '.join(lent)} of the bench" if lent else "")
     try:
-        of, loop = {**known, **{name: parameters[name] for name in lent}}, realised(settings, rig)
-        return loop_margins(of, loop, settings.rate_hz, of=rig.model), whose
+        numbers, loop = {**values, **{name: parameters[name] for name in lent}}, realised(settings, rig)
+        return loop_margins(numbers, loop, settings.rate_hz, of=rig.model), whose
     except ModelError as failure:
         raise RigError(f"{who(rig)}: on {whose} {failure}") from None
 
@@ -188,11 +188,11 @@ def refuse_unstable(rig: Rig, info: DeviceInfo) -> None:
 
     `rig`: with a loop; `info`: of the device.
     """
-    found, whose = loop_on(rig, info)
-    if found is not None:
-        _refuse(found, whose, info.rate_hz)
+    margins, whose = loop_on(rig, info)
+    if margins is not None:
+        _refuse(margins, whose, info.rate_hz)
 
 
-def _refuse(found: LoopMargins, whose: str, rate_hz: float) -> None:
+def _refuse(margins: LoopMargins, whose: str, rate_hz: float) -> None:
     where = f"{whose} at {rate_hz:g} Hz with the controller's delay of {LAG_S * rate_hz:.2g} samples"
-    found.refuse(where, remedy="Design [loop] for that rate and delay")
+    margins.refuse(where, remedy="Design [loop] for that rate and delay")

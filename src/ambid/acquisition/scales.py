@@ -105,27 +105,27 @@ def scale_of(rig: Rig, role: str) -> Scale:
     """
     c = rig.channel(role)
     top = PWM_TOP if role == "voltage" else ADC_TOP
-    of = c.calibration
-    if of is None:
+    calibration = c.calibration
+    if calibration is None:
         raise RigError(
             f"{who(rig)}: channels.{role} has no calibration; the controller gives counts (0 to {top})."
             f" Give channels.{role}.gain and offset, or a table, from counts"
         )
     _check_counts(rig, c)
-    if of.raw is None or of.out is None:
+    if calibration.raw is None or calibration.out is None:
         raw = np.array([0.0, float(top)])
-        si = of.gain * raw + of.offset
+        si = calibration.gain * raw + calibration.offset
         _check_slopes(rig, role, raw, si)
         return Scale(role=role, column=c.column, top=top, raw=raw, si=si)
-    steps = np.diff(of.out)
+    steps = np.diff(calibration.out)
     if not (np.all(steps > 0.0) or np.all(steps < 0.0)):
         raise RigError(
             f"{who(rig)}: channels.{role}.table is not monotonic; the controller needs one value for each count "
             "and back. Cut the table to a part that only rises or only falls"
         )
-    _check_slopes(rig, role, of.raw, of.out)
-    ends = None if of.extrapolate else (float(of.raw[0]), float(of.raw[-1]))
-    return Scale(role=role, column=c.column, top=top, raw=of.raw, si=of.out, ends=ends)
+    _check_slopes(rig, role, calibration.raw, calibration.out)
+    ends = None if calibration.extrapolate else (float(calibration.raw[0]), float(calibration.raw[-1]))
+    return Scale(role=role, column=c.column, top=top, raw=calibration.raw, si=calibration.out, ends=ends)
 
 
 def who(rig: Rig) -> str:
@@ -205,9 +205,9 @@ def duty_off(rig: Rig, daq: Daq, voltage: Scale) -> int:
     # A single transistor that is never on is without voltage, whatever the line through its pulses says there.
     never_on = daq.duty_off == 0 and abs(volts[0]) <= _NO_PULSE * most and volts[0] * volts[-1] <= 0.0
     if abs(volts[off]) > _OFF_SHARE * most and not never_on:
-        asked = "daq.duty_off is" if daq.duty_off is not None else "the pulse width nearest to 0 V is"
+        which = "daq.duty_off is" if daq.duty_off is not None else "the pulse width nearest to 0 V is"
         raise RigError(
-            f"{who(rig)}: {asked} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state must be 0 V "
+            f"{who(rig)}: {which} {off} counts, {volts[off]:.4g} V by channels.voltage; the safe state must be 0 V "
             f"within {_OFF_SHARE:.0%} of {most:.4g} V. Correct daq.duty_off or that calibration"
         )
     return off
@@ -244,18 +244,18 @@ def _one_sided(scale: Scale, wanted: Interval, low: int, high: int) -> tuple[int
     for side, count in ((0, low), (1, high)):
         if 1 <= count <= ADC_TOP - 1:
             continue
-        seen = wanted[side] if scale.si[-1] > scale.si[0] else wanted[1 - side]
-        if abs(seen) >= _ONE_SIDED * needed:
+        end = wanted[side] if scale.si[-1] > scale.si[0] else wanted[1 - side]
+        if abs(end) >= _ONE_SIDED * needed:
             return 1, 0
         low, high = (max(low, 0), high) if side == 0 else (low, min(high, ADC_TOP))
     return low, high
 
 
 def _beyond(rig: Rig, scale: Scale, wanted: Interval) -> RigError:
-    shown = np.sort(scale.to_si([0.0, float(ADC_TOP)]))
+    ends = np.sort(scale.to_si([0.0, float(ADC_TOP)]))
     return RigError(
         f"{who(rig)}: the trip of {scale.role}, {wanted[0]:.4g} to {wanted[1]:.4g}, is not inside the range of the "
-        f"converter, {shown[0]:.4g} to {shown[1]:.4g} (0 to {ADC_TOP} counts by channels.{scale.role}): it would "
+        f"converter, {ends[0]:.4g} to {ends[1]:.4g} (0 to {ADC_TOP} counts by channels.{scale.role}): it would "
         f"never trip. Narrow daq.trip.{scale.role}, or correct the calibration"
     )
 

@@ -91,27 +91,27 @@ def run(
     `device`: opened, idle; `taps`: each is given every block, cut to the wanted part; `on_event`: told of each event of
     the device as it comes; `stopped`: asked between blocks; True ends the run in an orderly way.
     """
-    made = _Run(device, course, taps, on_event)
+    state = _Run(device, course, taps, on_event)
     try:
-        made.forget()
+        state.forget()
         if course.transient and course.program is not None:
             device.load(course.program)
         device.start(course.mode)
-        made.settle(stopped, told=course.transient)
-        if made.going and course.trial is not None:
-            made.arm(course.trial, stopped)
-        if made.going and course.program is not None:
+        state.settle(stopped, passed_on=course.transient)
+        if state.going and course.trial is not None:
+            state.arm(course.trial, stopped)
+        if state.going and course.program is not None:
             device.excite(course.program)
-            made.lead_in(course.program, told=course.transient)
-        made.listen(stopped)
+            state.lead_in(course.program, passed_on=course.transient)
+        state.listen(stopped)
     except BaseException:
         with suppress(DeviceError):  # a line that is lost cannot be told to stop; what went wrong first is raised
             device.stop()
-        made.hear()
+        state.hear()
         raise
     device.stop()
-    made.hear()
-    return made.report
+    state.hear()
+    return state.report
 
 
 class _Run:
@@ -141,13 +141,13 @@ class _Run:
         while self._device.read(0.0) is not None:
             pass
 
-    def settle(self, stopped: Callable[[], bool], *, told: bool) -> None:
-        """Let the first samples pass, unseen unless `told`."""
+    def settle(self, stopped: Callable[[], bool], *, passed_on: bool) -> None:
+        """Let the first samples pass, unseen unless `passed_on`."""
         settled = None
         for frame in self._frames(stopped) if self._settling else ():
             block = frame.block
             settled = block.first + self._settling if settled is None else settled
-            if told:
+            if passed_on:
                 self._extend(block, None)
                 self._pass_on(frame, block)
             if block.first + len(block.values) >= settled:
@@ -181,25 +181,25 @@ class _Run:
 
     def _pass_on(self, frame: Frame, block: Block) -> bool:
         """Give the taps what of a block is wanted; whether that was the last."""
-        made = self.report
-        if not made.samples:
-            made.first = made.after = block.first
-        end = made.first + made.wanted
+        report = self.report
+        if not report.samples:
+            report.first = report.after = block.first
+        end = report.first + report.wanted
         if block.first >= end:
             return True
-        kept = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
-        passed = frame if kept is frame.block else replace(frame, block=kept)
+        part = block if block.first + len(block.values) <= end else _cut(block, end - block.first)
+        passed = frame if part is frame.block else replace(frame, block=part)
         for tap in self._taps:
             tap.take(passed)
-        made.samples += len(kept.values)
-        made.lost += max(0, kept.first - made.after)
-        made.after = max(made.after, kept.first + len(kept.values))
-        return made.after >= end
+        report.samples += len(part.values)
+        report.lost += max(0, part.first - report.after)
+        report.after = max(report.after, part.first + len(part.values))
+        return report.after >= end
 
-    def lead_in(self, program: Program, *, told: bool) -> None:
-        """Let the excitation settle before samples are passed on; `told`: it is waited for, but all is passed on."""
-        self._awaited = told and self._excited is not None
-        if self._excited is not None and not told:
+    def lead_in(self, program: Program, *, passed_on: bool) -> None:
+        """Let the excitation settle before samples are passed on; `passed_on`: wait for it, but pass all on."""
+        self._awaited = passed_on and self._excited is not None
+        if self._excited is not None and not passed_on:
             self._lead = min(period_ticks(program), round(_LONGEST_LEAD_S * self._rate_hz))
 
     def _after_lead(self, block: Block) -> Block | None:
@@ -330,20 +330,20 @@ class Acquired(Result):
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """A run that ended early, samples that are not in the record, and what is not good enough of the others."""
-        found, run = list[Reason](), self.run
+        reasons, run = list[Reason](), self.run
         if self.recorded is None:
             text = "nothing was recorded. Look at cable and supply, and record again"
-            found.append(Reason(check="samples", text=text, grave=True))
+            reasons.append(Reason(check="samples", text=text, grave=True))
         if run.fault is not None:
             text = f"the controller went to its safe state: {run.fault.what}. Remove the cause, and record again"
-            found.append(Reason(check="fault", text=text))
+            reasons.append(Reason(check="fault", text=text))
         elif not run.complete and not run.lost:
             text = f"{run.samples} of {run.wanted} samples came before the end. Record again if they are too few"
-            found.append(Reason(check="complete", text=text))
+            reasons.append(Reason(check="complete", text=text))
         if self.not_stored:
             text = f"{self.not_stored} samples are not in the record: the disk was too slow or failed. Make room"
-            found.append(Reason(check="stored", text=text))
-        return (*found, *self.quality.faults)
+            reasons.append(Reason(check="stored", text=text))
+        return (*reasons, *self.quality.faults)
 
 
 class Listeners(TypedDict, total=False):

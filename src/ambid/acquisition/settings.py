@@ -207,13 +207,13 @@ def rest_of(rig: Rig) -> dict[str, float]:
 
     Returns ``position`` (m), ``current`` (A), ``voltage`` (V).
     """
-    given = rig.operating_point
-    current = given.get("current", 0.0)
+    point = rig.operating_point
+    current = point.get("current", 0.0)
     resistance = next((p.value for p in rig.parameters if p.name == "R"), None) or 0.0
     return {
-        "position": given.get("position", 0.0),
+        "position": point.get("position", 0.0),
         "current": current,
-        "voltage": given.get("voltage", resistance * current),
+        "voltage": point.get("voltage", resistance * current),
     }
 
 
@@ -334,19 +334,19 @@ def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tupl
     the order of the stream mask; spans are what the converter can give, for the voltage what the controller orders at
     most.
     """
-    taken = {c.column for c in rig.channels}
-    found = []
+    names = {c.column for c in rig.channels}
+    result = []
     for role in carried(settings):
-        name, kept, span = _column(rig, settings, role)
-        if role == "excitation" and name in taken:
+        name, column_role, span = _column(rig, settings, role)
+        if role == "excitation" and name in names:
             name = "excitation_counts"
         scale = _si_scale(rig, settings, role) if si else None
         unit = "1"
         if scale is not None:
             low, high = sorted(scale.to_si(span).tolist())
-            span, unit = (low, high), "V" if role == "excitation" else _unit(rig, kept)
-        found.append(Column(name=name, role=kept, unit=unit, span=span))
-    return tuple(found)
+            span, unit = (low, high), "V" if role == "excitation" else _unit(rig, column_role)
+        result.append(Column(name=name, role=column_role, unit=unit, span=span))
+    return tuple(result)
 
 
 def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
@@ -411,8 +411,8 @@ def _column(rig: Rig, settings: ControllerSettings, role: str) -> tuple[str, str
 def _si_scale(rig: Rig, settings: ControllerSettings, role: str) -> Scale | None:
     """Return the scale of a column, None where its counts have no meaning in SI."""
     if role == "third":
-        of = _third_role(rig)
-        return scale_of(rig, of) if of is not None and rig.channel(of).calibration is not None else None
+        third = _third_role(rig)
+        return scale_of(rig, third) if third is not None and rig.channel(third).calibration is not None else None
     if role == "excitation":
         slope = scale_of(rig, "voltage").slope(settings.duty_bias)
         ends = np.array([0.0, float(PWM_TOP)])
@@ -480,9 +480,9 @@ def _calibrated(rig: Rig, c: RigChannel, notes: list[str]) -> RigChannel:
     """Give a channel a straight line from counts; its column is then in counts, whatever unit it was read in."""
     low, high = _full_scale(rig, c.role)
     top = PWM_TOP if c.role == "voltage" else ADC_TOP
-    of = Calibration(unit_in="1", unit_out=_UNITS[c.role], gain=(high - low) / top, offset=low)
+    calibration = Calibration(unit_in="1", unit_out=_UNITS[c.role], gain=(high - low) / top, offset=low)
     notes.append(f"{c.role}: 0 to {top} counts assumed to be {low:.4g} to {high:.4g} {_UNITS[c.role]}")
-    return replace(c, calibration=of, unit=None)
+    return replace(c, calibration=calibration, unit=None)
 
 
 def _full_scale(rig: Rig, role: str) -> Interval:
@@ -559,8 +559,8 @@ class BenchView:
                 "Remove it for live work"
             )
         spare = [0.0 if c.span is None else (c.span[0] + c.span[1]) / 2.0 for c in info.columns]
-        seen = self.record(np.array([spare]))  # so that what does not fit is told at once
-        self.units = {role: seen.channel(role).unit for role in roles}
+        record = self.record(np.array([spare]))  # so that what does not fit is told at once
+        self.units = {role: record.channel(role).unit for role in roles}
         self._lines = self._linear()
 
     def block(self, raw: Block) -> Block:
@@ -569,8 +569,8 @@ class BenchView:
         `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
         """
         if self._lines is None:
-            seen = self.record(raw.values)
-            values = np.column_stack([seen[role].values for role in self.units])
+            record = self.record(raw.values)
+            values = np.column_stack([record[role].values for role in self.units])
         else:
             columns, gain, offset = self._lines
             values = np.ascontiguousarray(gain * raw.values[:, columns] + offset)
@@ -583,13 +583,13 @@ class BenchView:
         """
         columns = {c.name: k for k, c in enumerate(self._columns)}
         channels = {c.role: c for c in self._rig.channels}
-        found = []
+        lines = []
         for c in (channels[role] for role in self.units):
-            k, of = columns[c.column], c.calibration
-            if c.unit not in (None, self._columns[k].unit) or (of is not None and of.raw is not None):
+            k, calibration = columns[c.column], c.calibration
+            if c.unit not in (None, self._columns[k].unit) or (calibration is not None and calibration.raw is not None):
                 return None
-            found.append((k, 1.0, 0.0) if of is None else (k, of.gain, of.offset))
-        k, gain, offset = np.array(found).T
+            lines.append((k, 1.0, 0.0) if calibration is None else (k, calibration.gain, calibration.offset))
+        k, gain, offset = np.array(lines).T
         return k.astype(int), gain, offset
 
     def record(self, values: Array, *, start_s: float = 0.0) -> Record:

@@ -94,9 +94,9 @@ def make_look(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
 
     def look(course: Course) -> tuple[RunReport, dict[str, Array]]:
-        kept = Kept(view)
-        report = run(device, course, taps=[kept], stopped=stopped)
-        return report, kept.roles()
+        tap = Kept(view)
+        report = run(device, course, taps=[tap], stopped=stopped)
+        return report, tap.roles()
 
     return look
 
@@ -191,7 +191,7 @@ def find_amplitude(
     *,
     rate_hz: float,
     use: float,
-    given: float | None = None,
+    amplitude_v: float | None = None,
 ) -> Size:
     """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
 
@@ -200,30 +200,30 @@ def find_amplitude(
     reasons where it tripped, or used too much. It may use less than its part where trials have run out.
     """
     low, high = room.voltage
-    if given is None and not math.isfinite(high - low):
+    if amplitude_v is None and not math.isfinite(high - low):
         why = "the rig has no loop.limits.voltage to derive an amplitude from: give one"
         return Size(amplitude_v=math.nan, used=math.nan, findings=(), reasons=(why,))
-    size = _FIRST * (high - low) / 2.0 if given is None else given
+    size = _FIRST * (high - low) / 2.0 if amplitude_v is None else amplitude_v
     tried: list[tuple[float, float]] = []  # size, and what it used
     findings: list[str] = []
     while True:
-        report, seen = look(trial.course(size, rate_hz))
+        report, signals = look(trial.course(size, rate_hz))
         reasons = why_incomplete(report, f"excitation of {size:.3g} V")
         if reasons:
             return Size(
                 amplitude_v=size, used=math.nan, findings=tuple(findings), reasons=reasons, trials=tuple(tried),
-                last=seen,
+                last=signals,
             )  # fmt: skip
-        worst, used = room_used(seen, room, resting, use)
-        tried.append((size, used))
-        findings.append(f"{size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range")
-        larger_or_smaller = _next_size(tried, use) if given is None else None
+        worst, share = room_used(signals, room, resting, use)
+        tried.append((size, share))
+        findings.append(f"{size:.3g} V moves {worst} through {100.0 * share:.0f} % of its available range")
+        larger_or_smaller = _next_size(tried, use) if amplitude_v is None else None
         if larger_or_smaller is None:
             break
         size = larger_or_smaller
     return Size(
-        amplitude_v=size, used=used, findings=tuple(findings), trials=tuple(tried), last=seen,
-        reasons=_too_much(tried, worst, TOO_MUCH * use if given is None else _NEAR),
+        amplitude_v=size, used=share, findings=tuple(findings), trials=tuple(tried), last=signals,
+        reasons=_too_much(tried, worst, TOO_MUCH * use if amplitude_v is None else _NEAR),
     )  # fmt: skip
 
 
@@ -234,14 +234,14 @@ def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callab
     `session.run`. Returns peak in V.
     """
     look, room = make_look(device, rig, stopped), Room.of(rig)
-    report, seen = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
+    report, signals = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
     reasons = why_incomplete(report, "the look before the excitation")
     if not reasons:
-        resting = {role: float(seen[role].mean()) for role in room.trips}
-        found = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=USE)
-        if not found.reasons:
-            return found.amplitude_v
-        reasons = found.reasons
+        resting = {role: float(signals[role].mean()) for role in room.trips}
+        size = find_amplitude(look, room, trial, resting, rate_hz=device.info.rate_hz, use=USE)
+        if not size.reasons:
+            return size.amplitude_v
+        reasons = size.reasons
     raise DeviceError(
         f"{device.info.port}: no suitable amplitude was found: {'; '.join(reasons)}. Give {setting('amplitude')}"
     )
@@ -249,11 +249,11 @@ def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callab
 
 def _next_size(tried: list[tuple[float, float]], use: float) -> float | None:
     """Return the size to try next; None where the last one is good, or another would not be better."""
-    size, used = tried[-1]
-    good = _ENOUGH * use <= used <= TOO_MUCH * use
-    if good or len(tried) == _TRIALS or (used > use and _at_the_floor(tried)):
+    size, share = tried[-1]
+    good = _ENOUGH * use <= share <= TOO_MUCH * use
+    if good or len(tried) == _TRIALS or (share > use and _at_the_floor(tried)):
         return None
-    wanted = size * (_GROWTH if used <= 0.0 else min(max(AIM * use / used, 1.0 / _GROWTH), _GROWTH))
+    wanted = size * (_GROWTH if share <= 0.0 else min(max(AIM * use / share, 1.0 / _GROWTH), _GROWTH))
     # Where more is used than in proportion, the good size lies between two that were tried.
     below = max((s for s, part in tried if part <= use), default=0.0)
     above = min((s for s, part in tried if part > use), default=math.inf)
@@ -270,27 +270,27 @@ def _at_the_floor(tried: list[tuple[float, float]]) -> bool:
 
 def _too_much(tried: list[tuple[float, float]], worst: str, most: float) -> tuple[str, ...]:
     """Say that the last trial used more of the room than `most`; nothing where it did not."""
-    size, used = tried[-1]
-    if used <= most:
+    size, share = tried[-1]
+    if share <= most:
         return ()
-    said = (
-        f"an excitation of {size:.3g} V moves {worst} through {100.0 * used:.0f} % of its available range; "
+    text = (
+        f"an excitation of {size:.3g} V moves {worst} through {100.0 * share:.0f} % of its available range; "
         f"{100.0 * most:.0f} % are"
     )
     if _at_the_floor(tried):
         return (
-            f"{said} allowed, and a larger amplitude hardly moved it more: the bench moves by itself; check noise "
+            f"{text} allowed, and a larger amplitude hardly moved it more: the bench moves by itself; check noise "
             "and gains",
         )
-    return (f"{said} allowed: give a smaller one",)
+    return (f"{text} allowed: give a smaller one",)
 
 
-def room_used(seen: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
+def room_used(signals: Mapping[str, Array], room: Room, resting: Mapping[str, float], use: float) -> tuple[str, float]:
     """Return which quantity uses most of its room, and how much of it."""
-    shares = {role: room.used(role, seen[role], resting[role]) for role in room.trips}
+    shares = {role: room.used(role, signals[role], resting[role]) for role in room.trips}
     low, high = room.voltage
     if math.isfinite(high - low):
-        volts = seen["voltage"]
+        volts = signals["voltage"]
         rest = min(max(float(volts.mean()), low), high)  # an excitation has no mean; what holds the rotor may have one
         up, down = float(volts.max()) - rest, rest - float(volts.min())
         reach = max(up / (high - rest) if high > rest else 1.0, down / (rest - low) if rest > low else 1.0)
@@ -425,12 +425,12 @@ class _Pulses:
         for share in _STEPS:
             for side in (1.0, -1.0):
                 volts, hold_s = self._size_for(share, side)
-                seen = self._play(volts, hold_s)
-                if not seen.motion:
+                pulse = self._play(volts, hold_s)
+                if not pulse.motion:
                     continue
-                if self._play(volts, hold_s).motion * seen.motion < 0.0:
+                if self._play(volts, hold_s).motion * pulse.motion < 0.0:
                     raise _End("equal pulses moved the rotor once up and once down: something else moves it. Hold it")
-                return _sign(seen.motion * volts * self._per_volt)
+                return _sign(pulse.motion * volts * self._per_volt)
         return 0
 
     def _size_for(self, share: float, side: float) -> tuple[float, float]:
@@ -463,8 +463,8 @@ class _Pulses:
             transient=True,
         )
         for _ in range(_TRIES):
-            report, seen = self._look(course)
-            pulse = self._seen(volts, ticks, seen)
+            report, signals = self._look(course)
+            pulse = self._seen(volts, ticks, signals)
             if report.fault is None or report.fault.what != "out_of_gap":
                 break
             self._clear()  # the time to lift was over before the pulse was: it shows motion, or comes again
@@ -476,8 +476,8 @@ class _Pulses:
             raise _End(reasons[0])
         return pulse
 
-    def _seen(self, volts: float, ticks: int, seen: dict[str, Array]) -> Pulse:
-        voltage = seen["voltage"]
+    def _seen(self, volts: float, ticks: int, signals: dict[str, Array]) -> Pulse:
+        voltage = signals["voltage"]
         rest = voltage[-1] if voltage.size else 0.0
         ordered = np.flatnonzero((voltage - rest) * math.copysign(1.0, volts) > abs(volts) / 2.0)
         first = int(ordered[0]) if ordered.size else max(0, voltage.size - 1)
@@ -485,12 +485,12 @@ class _Pulses:
         change, noise, motion = 0.0, math.inf, 0.0
         if ordered.size > ticks // 2:
             end = slice(first + 1 + 3 * ticks // 4, first + 1 + ticks)
-            change, noise = _change(seen["current"], before, end)
-            motion = self._moved(seen["position"], before, first)
+            change, noise = _change(signals["current"], before, end)
+            motion = self._moved(signals["position"], before, first)
         time_s = (np.arange(voltage.size) - first) / self._rate_hz
         return Pulse(
-            volts=volts, hold_s=ticks / self._rate_hz, time_s=time_s, voltage=voltage, current=seen["current"],
-            position=seen["position"], current_change=change, current_noise=noise, motion=motion,
+            volts=volts, hold_s=ticks / self._rate_hz, time_s=time_s, voltage=voltage, current=signals["current"],
+            position=signals["position"], current_change=change, current_noise=noise, motion=motion,
         )  # fmt: skip
 
     def _moved(self, position: Array, before: slice, first: int) -> float:
@@ -501,10 +501,10 @@ class _Pulses:
         swing = float(np.ptp(position[: first + 1]))  # what it does without the pulse
         bound = max(_SIGMAS * float(position[before].std()), swing, _COUNTS * self._counts["position"], _MOTION * width)
         beyond = np.abs(away) > bound
-        held = np.convolve(beyond, np.ones(_TOGETHER), "valid") >= _TOGETHER
-        if not held.any():
+        lasting = np.convolve(beyond, np.ones(_TOGETHER), "valid") >= _TOGETHER
+        if not lasting.any():
             return 0.0
-        begun = int(np.argmax(held))
+        begun = int(np.argmax(lasting))
         same = away * away[begun] > 0.0  # a rotor that comes back and swings through is not looked at further
         stop = begun + int(np.argmin(same[begun:])) if not same[begun:].all() else away.size
         return float(away[begun:stop][np.argmax(np.abs(away[begun:stop]))])

@@ -70,8 +70,8 @@ class Workbench:
 
         Without limits it is five times the weight.
         """
-        of = self.plant
-        prefixes = [f"{axis}." for axis in of.axes] if isinstance(of.model, RotorModel) else [""]
+        plant = self.plant
+        prefixes = [f"{axis}." for axis in plant.axes] if isinstance(plant.model, RotorModel) else [""]
         return np.array([self._holds(prefix) for prefix in prefixes])
 
     def _holds(self, prefix: str) -> float:
@@ -109,19 +109,23 @@ def workbench(plant: Plant, rig: Rig, loop: Loop, *, nonlinear: bool = True) -> 
 
 def _without_fast_eddies(plant: Plant) -> Plant:
     """Return the plant with a delay in place of eddy currents that are gone within half a sample."""
-    pole, of = plant.theta.get("a", 0.0), plant.model
+    pole, plant_model = plant.theta.get("a", 0.0), plant.model
     if pole < _FAST * plant.rate_hz:
         return plant
-    slow = replace(of, extras=tuple(x for x in of.extras if x != "a")) if isinstance(of, RotorModel) else OneAxis()
+    slow = (
+        replace(plant_model, extras=tuple(x for x in plant_model.extras if x != "a"))
+        if isinstance(plant_model, RotorModel)
+        else OneAxis()
+    )
     theta = {name: x for name, x in plant.theta.items() if name != "a"}
     return replace(plant, model=slow, theta=theta, delays=plant.delays + plant.rate_hz / pole)
 
 
 def _gap(rig: Rig, farthest: float) -> tuple[float, str]:
     """Return the air gap at rest, and how it is known; infinite where nothing tells it."""
-    known = None if rig.magnet is None else rig.magnet.known("s")
-    if known is not None and known.value and known.value > 0.0:
-        return known.value, f"the rig's gap of {1e6 * known.value:.4g} µm"
+    known_gap = None if rig.magnet is None else rig.magnet.known("s")
+    if known_gap is not None and known_gap.value and known_gap.value > 0.0:
+        return known_gap.value, f"the rig's gap of {1e6 * known_gap.value:.4g} µm"
     gap = GAP_OF_TRAVEL * farthest
     return gap, f"a gap of {GAP_OF_TRAVEL:g} times the travel inside limits.position, {1e6 * gap:.4g} µm"
 
@@ -169,12 +173,12 @@ class _OneAxis(Workbench):
         rest.setdefault("voltage", theta.get("R", 0.0) * rest.get("current", 0.0))
         point = OperatingPoint(**{name: rest.get(name, 0.0) for name in OperatingPoint._fields})
         linear = LinearPlant(model=plant.model, parameters=theta)
-        body, rests, said = (
+        body, rests, note = (
             _around_rest(linear, rig, point, limits) if nonlinear
             else (linear, point, "the magnet is linear, as asked for")
         )  # fmt: skip
         return cls(
-            plant=plant, loop=loop, limits=limits, noise=rig.noise or Noise(), body=body, point=rests, assumed=(said,)
+            plant=plant, loop=loop, limits=limits, noise=rig.noise or Noise(), body=body, point=rests, assumed=(note,)
         )  # fmt: skip
 
     @property
@@ -187,13 +191,17 @@ class _OneAxis(Workbench):
         seed: int | None = None, linear: bool = False,  # noqa: ARG002
     ) -> Answer:  # fmt: skip
         """Simulate; an axis knows no speed, and `linear` is what it is."""
-        of, first, steps = self.plant.model, None, 1
+        plant_model, first, steps = self.plant.model, None, 1
         if start is not None:
             x = self.point.position + float(start[0])
-            first = [x, 0.0, 0.0][: len(of.states)]
+            first = [x, 0.0, 0.0][: len(plant_model.states)]
             if isinstance(self.body, LinearPlant):
                 still = self.plant.theta
-                force = -still["k_i"] * self.point.current - still["k_x"] * float(start[0]) if len(of.states) > 3 else 0
+                force = (
+                    -still["k_i"] * self.point.current - still["k_x"] * float(start[0])
+                    if len(plant_model.states) > 3
+                    else 0
+                )
             else:
                 force = self.body.magnet.coenergy.force(x, 0.0)
             if "a" in self.plant.theta:
@@ -206,7 +214,7 @@ class _OneAxis(Workbench):
             substeps=steps,
         )  # fmt: skip
         done = run.advance(np.zeros(n), load=None if load is None else load[:, 0])
-        names = of.states
+        names = plant_model.states
         currents = done.states[:, [names.index("current")]] if "current" in names else done.command[:, None]
         position = done.states[:, [names.index("position")]] - self.point.position
         return Answer(position, currents, done.command[:, None], int(run.counts[3]), run.n_over_current)
@@ -245,22 +253,22 @@ def _around_rest(
     return body, rest, f"the law of the magnets is that of two opposed ones with {how}{_BEYOND}"
 
 
-def _scaled(theta: Mapping[str, float], known: NonlinearPlant, rig: Rig) -> tuple[NonlinearPlant, OperatingPoint]:
+def _scaled(theta: Mapping[str, float], nominal: NonlinearPlant, rig: Rig) -> tuple[NonlinearPlant, OperatingPoint]:
     """Return the rig's plant with its co-energy scaled to numbers at rest, and the load with it."""
-    own, rest, magnet = known.linearise(rest_of_rig(rig, known).position), rest_of_rig(rig, known), known.magnet
+    own, rest, magnet = nominal.linearise(rest_of_rig(rig, nominal).position), rest_of_rig(rig, nominal), nominal.magnet
     assert isinstance(magnet, LawMagnet)
     a = theta["k_x"] / own["k_x"]
     b = theta["k_i"] / (a * own["k_i"])
     if not (a > 0.0 and b > 0.0):
         raise ModelError("the rig's [magnet] pulls the other way than the plant's. Correct one of them")
     square = a * b**2
-    by = {magnet.law.names[0]: square, "L_rise": square, "L_leak": square, "sigma": b**2}
-    by |= dict.fromkeys(("i0", "i0_asym", "i_knee"), 1.0 / b)
-    values = {name: value * by.get(name, 1.0) for name, value in {"L_leak": 0.0, **magnet.values}.items()}
+    factors = {magnet.law.names[0]: square, "L_rise": square, "L_leak": square, "sigma": b**2}
+    factors |= dict.fromkeys(("i0", "i0_asym", "i_knee"), 1.0 / b)
+    values = {name: value * factors.get(name, 1.0) for name, value in {"L_leak": 0.0, **magnet.values}.items()}
     values["L_leak"] += theta["L"] - square * own["L"]
     body = replace(
-        known, magnet=replace(magnet, values=values), m=theta["m"], c=theta.get("c", 0.0),
-        R=theta["R"] - known.stage.slope(rest.current / b), gravity=a * known.m * known.gravity / theta["m"],
+        nominal, magnet=replace(magnet, values=values), m=theta["m"], c=theta.get("c", 0.0),
+        R=theta["R"] - nominal.stage.slope(rest.current / b), gravity=a * nominal.m * nominal.gravity / theta["m"],
         eddy_pole=theta.get("a", math.inf),
     )  # fmt: skip
     return body, body.equilibrium(rest.position)
@@ -281,10 +289,10 @@ class _Rotor(Workbench):
         """Return the bench, and what is assumed of its magnets."""
         model, limits = plant.model, rig.limits or Limits()
         assert isinstance(model, RotorModel)
-        poles, said = None, "the magnets are linear, as asked for"
+        poles, note = None, "the magnets are linear, as asked for"
         if nonlinear:
             gap, how = _gap(rig, max(map(abs, limits.position)))
-            known = replace(
+            nominal = replace(
                 rig.magnet or RigMagnet(kind="pair"),
                 parameters=(Parameter(name="s", unit="m", role="fixed", value=gap),
                             *(p for p in (rig.magnet.parameters if rig.magnet else ()) if p.name != "s")),
@@ -292,13 +300,13 @@ class _Rotor(Workbench):
             try:
                 if not math.isfinite(gap):
                     raise RigError("neither a gap nor limits.position is given")
-                poles = poles_of(replace(rig, magnet=known), model, plant.theta)
-                said = f"the law of the magnets is that of opposed pole pairs with {how}{_BEYOND}"
+                poles = poles_of(replace(rig, magnet=nominal), model, plant.theta)
+                note = f"the law of the magnets is that of opposed pole pairs with {how}{_BEYOND}"
             except RigError as problem:
-                said = f"{_LINEAR}{problem}"
+                note = f"{_LINEAR}{problem}"
         bare = replace(rig, unbalance=(), runout=(), limits=limits)
         return cls(
-            plant=plant, loop=loop, limits=limits, noise=rig.noise or Noise(), rig=bare, poles=poles, assumed=(said,),
+            plant=plant, loop=loop, limits=limits, noise=rig.noise or Noise(), rig=bare, poles=poles, assumed=(note,),
             top_speed=model.speed, moment=sum(abs(u.value) for u in rig.unbalance),
         )  # fmt: skip
 
@@ -311,46 +319,46 @@ class _Rotor(Workbench):
     def at_speed(self, speed: float | None) -> RotorModel:
         """Return the model at another speed, as far as its numbers are known; without Ip it is that at rest."""
         turned = self.model if speed is None else self.model.at_speed(speed)
-        known = set(self.plant.theta)
-        return turned if all(p.name in known or p.default is not None for p in turned.parameters) else self.model
+        names = set(self.plant.theta)
+        return turned if all(p.name in names or p.default is not None for p in turned.parameters) else self.model
 
     def respond(
         self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | Array | None = None,
         seed: int | None = None, linear: bool = False,
     ) -> Answer:  # fmt: skip
         """Simulate, with magnets that are linear where `linear`; a speed that changes does so in small steps."""
-        of, noise = self.model, _quiet(self.noise) if seed is None else self.noise
-        n_axes, size = len(of.axes), _EVEN if isinstance(speed, np.ndarray) else n
+        rotor, noise = self.model, _quiet(self.noise) if seed is None else self.noise
+        n_axes, size = len(rotor.axes), _EVEN if isinstance(speed, np.ndarray) else n
         running, parts, limited, over = None, [], 0, 0
         for k in range(0, n, size):
-            of = self.at_speed(float(speed[k : k + size].mean()) if isinstance(speed, np.ndarray) else speed)
+            rotor = self.at_speed(float(speed[k : k + size].mean()) if isinstance(speed, np.ndarray) else speed)
             bench = RotorBench(
-                rig=replace(self.rig, noise=noise), plant=LinearPlant(model=of, parameters=self.plant.theta),
+                rig=replace(self.rig, noise=noise), plant=LinearPlant(model=rotor, parameters=self.plant.theta),
                 loop=self.loop, rate_hz=self.plant.rate_hz, shapes={}, poles=None if linear else self.poles,
             )  # fmt: skip
-            running = running or bench.begun(None if start is None else _placed(of, self.plant.theta, start))
+            running = running or bench.begun(None if start is None else _placed(rotor, self.plant.theta, start))
             done = bench.simulate(
-                np.zeros((min(size, n - k), len(of.inputs))), seed=(seed or 0) + k, columns=False, start=running,
+                np.zeros((min(size, n - k), len(rotor.inputs))), seed=(seed or 0) + k, columns=False, start=running,
                 load=None if load is None else load[k : k + size],
             )  # fmt: skip
-            commands = np.column_stack([done.record[name].values for name in of.inputs])
+            commands = np.column_stack([done.record[name].values for name in rotor.inputs])
             parts.append((done.states[:, :n_axes], done.states[:, n_axes:], commands))
             limited, over = limited + done.n_saturated, over + done.n_over_current
         position, current, command = (np.concatenate(x) for x in zip(*parts, strict=True))
         return Answer(position, current, command, limited, over)
 
 
-def _placed(of: RotorModel, theta: Mapping[str, float], positions: Array) -> Array:
+def _placed(rotor: RotorModel, theta: Mapping[str, float], positions: Array) -> Array:
     """Return the states of a rigid rotor that lies still with these positions of its axes."""
-    magnets, sensors = of.rows(theta)
-    rigid = np.array([not q.startswith("mode") for q in of.coordinates])
-    q = np.zeros(len(of.coordinates))
+    magnets, sensors = rotor.rows(theta)
+    rigid = np.array([not q.startswith("mode") for q in rotor.coordinates])
+    q = np.zeros(len(rotor.coordinates))
     q[rigid] = np.linalg.lstsq(magnets[:, rigid], positions, rcond=None)[0]
-    x = np.zeros(len(of.states))
+    x = np.zeros(len(rotor.states))
     x[: q.size] = q
-    for name, seen in zip(of.outputs, sensors @ q, strict=False):  # positions come first
-        if name in of.states:
-            x[of.states.index(name)] = seen
+    for name, value in zip(rotor.outputs, sensors @ q, strict=False):  # positions come first
+        if name in rotor.states:
+            x[rotor.states.index(name)] = value
     return x
 
 
@@ -363,8 +371,8 @@ def integrates(loop: Loop) -> bool:
 
 def slowest_pole(bench: Workbench) -> float:
     """Return the time constant of the loop's slowest pole in s; infinite of an unstable one."""
-    of: LinearModel = bench.plant.model
-    poles = np.abs(closed_loop_poles(bench.plant.theta, bench.loop, bench.plant.rate_hz, of=of))
+    plant_model: LinearModel = bench.plant.model
+    poles = np.abs(closed_loop_poles(bench.plant.theta, bench.loop, bench.plant.rate_hz, of=plant_model))
     poles = poles[poles > 0.0]
     largest = float(poles.max(initial=0.0))
     return -1.0 / (bench.plant.rate_hz * math.log(largest)) if 0.0 < largest < 1.0 else math.inf

@@ -73,10 +73,10 @@ class Plant:
         outputs = self.model.outputs
         if not isinstance(self.model, RotorModel):
             return ((outputs.index("position"),),) if "position" in outputs else ()
-        of = self.model
+        rotor = self.model
         return tuple(
-            tuple(outputs.index(position_role(axis, k)) for i, k in of.sensors if i == j)
-            for j, axis in enumerate(of.axes)
+            tuple(outputs.index(position_role(axis, k)) for i, k in rotor.sensors if i == j)
+            for j, axis in enumerate(rotor.axes)
         )
 
     @cached_property
@@ -86,19 +86,19 @@ class Plant:
 
     def sampled(self, frequency_hz: Array) -> Sampled:
         """Return the sampled response at some frequencies."""
-        of = self.model
-        held = of.held if isinstance(of, RotorModel) else (True,) * len(of.inputs)
+        plant_model = self.model
+        holds = plant_model.held if isinstance(plant_model, RotorModel) else (True,) * len(plant_model.inputs)
         return Sampled(
-            space=self.space, omega=2.0 * np.pi * frequency_hz, rate_hz=self.rate_hz, delays=self.delays, held=held
+            space=self.space, omega=2.0 * np.pi * frequency_hz, rate_hz=self.rate_hz, delays=self.delays, held=holds
         )
 
     def slopes(self, at: Sampled, driven: Complex) -> Complex:
         """Return the derivatives of H by `names` at spectra of the inputs `driven` (n, n_u): (n, n_y, n_names)."""
         roles = [f"{role}.delay" for role in self.model.inputs]
-        known = [n for n in self.names if n not in roles]
-        found = at.slopes(driven, [self.model.derivative(self.theta, n) for n in known], len(roles))
-        order = [len(known) + roles.index(n) if n in roles else known.index(n) for n in self.names]
-        return np.asarray(found[:, :, order])
+        numbers = [n for n in self.names if n not in roles]
+        slopes = at.slopes(driven, [self.model.derivative(self.theta, n) for n in numbers], len(roles))
+        order = [len(numbers) + roles.index(n) if n in roles else numbers.index(n) for n in self.names]
+        return np.asarray(slopes[:, :, order])
 
     def grid(self, n: int = _FREQUENCIES) -> Array:
         """Return `n` frequencies up to half the rate, and more around the plant's resonances."""
@@ -203,13 +203,13 @@ class ClosedLoop:
     def weights(self) -> Complex:
         """How the controller of each axis weighs its sensors, (n, n_axes, n_p): 1 for a single one."""
         p = self._parts[0]
-        found = np.zeros((self.frequency_hz.size, len(self.plant.sensors), len(p)), dtype=complex)
+        weights = np.zeros((self.frequency_hz.size, len(self.plant.sensors), len(p)), dtype=complex)
         for j, group in enumerate(self.plant.sensors):
             at = [p.index(k) for k in group]
             own = self.K[:, j, list(group)]
             total = own.sum(axis=1, keepdims=True)
-            found[:, j, at] = np.where(total == 0.0, 1.0 / len(group), own / np.where(total == 0.0, 1.0, total))
-        return found
+            weights[:, j, at] = np.where(total == 0.0, 1.0 / len(group), own / np.where(total == 0.0, 1.0, total))
+        return weights
 
     @cached_property
     def together(self) -> Array:
@@ -225,8 +225,8 @@ class ClosedLoop:
     @cached_property
     def at_commands(self) -> Complex:
         """The sensitivity at the inputs, diagonal of (I + K H)⁻¹, (n, n_u)."""
-        found = np.linalg.inv(np.eye(self.H.shape[2]) + self.K @ self.H)
-        return np.asarray(np.diagonal(found, axis1=1, axis2=2))
+        S = np.linalg.inv(np.eye(self.H.shape[2]) + self.K @ self.H)
+        return np.asarray(np.diagonal(S, axis1=1, axis2=2))
 
     @property
     def of_axes(self) -> Complex:
@@ -256,12 +256,12 @@ class ClosedLoop:
 
         Disturbances: those of the model, held over a sample; then a harmonic force at each magnet, (j omega - A)⁻¹.
         """
-        of, space, n = self.plant.model, self.plant.space, len(self.plant.axes)
-        if isinstance(of, RotorModel):
-            magnets = of.rows(self.plant.theta)[0]
+        plant_model, space, n = self.plant.model, self.plant.space, len(self.plant.axes)
+        if isinstance(plant_model, RotorModel):
+            magnets = plant_model.rows(self.plant.theta)[0]
             rows = np.hstack([magnets, np.zeros((n, space.A.shape[0] - magnets.shape[1]))])
         else:
-            rows = space.C[[of.outputs.index("position")]]
+            rows = space.C[[plant_model.outputs.index("position")]]
         wide = replace(self.sampled, space=replace(space, C=np.vstack([space.C, rows])))
         values, V, inverse = wide.eigen
         h = 1.0 / (1j * wide.omega[:, None] - values)
@@ -273,16 +273,16 @@ class ClosedLoop:
         """What the inputs do, (n, n_u, ...), by the disturbances of `pushed`, then by the noise of each output."""
         n_y = self.H.shape[1]
         noise = np.broadcast_to(np.eye(n_y), (self.H.shape[0], n_y, n_y))
-        seen = np.concatenate([self.pushed[0][:, :n_y], noise], axis=2)
-        return np.asarray(-np.linalg.solve(np.eye(self.H.shape[2]) + self.K @ self.H, self.K @ seen))
+        causes = np.concatenate([self.pushed[0][:, :n_y], noise], axis=2)
+        return np.asarray(-np.linalg.solve(np.eye(self.H.shape[2]) + self.K @ self.H, self.K @ causes))
 
     @cached_property
     def motions(self) -> Complex:
         """What plant outputs and magnets do by the causes of `answers`; noise of the sensors is not added to them."""
         by_forces, by_inputs = self.pushed
-        found = by_inputs @ self.answers
-        found[:, :, : by_forces.shape[2]] += by_forces
-        return np.asarray(found)
+        motions = by_inputs @ self.answers
+        motions[:, :, : by_forces.shape[2]] += by_forces
+        return np.asarray(motions)
 
     @cached_property
     def compliance(self) -> Complex:
@@ -308,23 +308,23 @@ class ClosedLoop:
         if covariance is not None and self.plant.names:
             g = np.real(scale * (row @ self.plant.slopes(self.sampled, driven[None, :])[0]))
             variance += float(g @ covariance @ g)
-        seen = np.zeros(H.shape[0], dtype=complex)
-        seen[p], seen[q] = right, -H[q] @ driven
+        outputs = np.zeros(H.shape[0], dtype=complex)
+        outputs[p], outputs[q] = right, -H[q] @ driven
         weights = scale * (left @ H[p] @ inner)
-        variance += self.controller.variance(self.frequency_hz, seen, weights)
+        variance += self.controller.variance(self.frequency_hz, outputs, weights)
         return float(np.sqrt(max(variance, 0.0)))
 
 
 def _too_far(watched: Complex, n: int) -> NDArray[np.bool_]:
     """Return between which frequencies and the next a loop changes too much, (n_frequencies - 1,)."""
     det, S = watched[:, 0], watched[:, 1 : 1 + n]
-    found: NDArray[np.bool_] = np.abs(np.log(det[1:] / det[:-1])) > _TURN
+    far: NDArray[np.bool_] = np.abs(np.log(det[1:] / det[:-1])) > _TURN
     L = 1.0 / S - 1.0
-    for of in (np.abs(L) > 1.0, L.imag > 0.0):
-        found |= np.any(of[1:] != of[:-1], axis=1)
+    for side in (np.abs(L) > 1.0, L.imag > 0.0):
+        far |= np.any(side[1:] != side[:-1], axis=1)
     peaks = np.argmax(watched[:, 1 + n :].real, axis=0)
-    found[np.clip(np.concatenate([peaks - 1, peaks]), 0, found.size - 1)] = True
-    return found
+    far[np.clip(np.concatenate([peaks - 1, peaks]), 0, far.size - 1)] = True
+    return far
 
 
 # The sensitivity as a record itself shows it: from the responses to the references, without a model of the plant.
@@ -360,17 +360,17 @@ class MeasuredSensitivity:
 
         It is hidden too where lines that are too noisy to show a peak stand higher, taken together, than the one found.
         """
-        known = self.ratio > 0.0
-        relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=known)
+        measured = self.ratio > 0.0
+        relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=measured)
         noise = np.sqrt(smoothed(relative[:, None] ** 2)[:, 0])
-        top = self._found(known, noise)
+        top = self._found(measured, noise)
         if top is None:
             return None
         power = smoothed((self.ratio**2 - 2.0 * self.sd**2)[:, None], _TOGETHER)[:, 0]
         surely = power * (1.0 - 4.0 * noise / np.sqrt(2.0 * _TOGETHER + 1.0))  # by two standard deviations
         return None if np.any(surely[noise > _SEEN] > top[0] ** 2) else top
 
-    def _found(self, known: NDArray[np.bool_], noise: Array) -> tuple[float, float, float] | None:
+    def _found(self, measured: NDArray[np.bool_], noise: Array) -> tuple[float, float, float] | None:
         """Return the peak by the relative noise of the lines.
 
         It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
@@ -383,7 +383,7 @@ class MeasuredSensitivity:
             return None
         wide = int(np.max(np.abs(np.flatnonzero(np.abs(np.log(f / f[k])) < np.log(_NEAR)) - k), initial=0))
         for half in (max(wide, _HALVES[0]), *_HALVES[1:]):
-            near = np.flatnonzero(known[max(k - half, 0) : k + half + 1]) + max(k - half, 0)
+            near = np.flatnonzero(measured[max(k - half, 0) : k + half + 1]) + max(k - half, 0)
             if noise[k] == 0.0 or not self.phase.size or near.size < 2 * _ORDERS[0]:
                 break
             S = self.ratio[near] * np.exp(1j * self.phase[near])
@@ -409,10 +409,10 @@ def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | Non
             best = (score, order, np.linalg.solve(R, projected), R, left / (2.0 * (x.size - order - 1)))
     if best is None or best[4] > _MISFIT:
         return None
-    _, order, found, R, misfit = best
+    _, order, coefficients, R, misfit = best
     at = np.linspace(max(float(x[0]) / reach, -_INNER), min(float(x[-1]) / reach, _INNER), 1001)
     rows = np.polynomial.chebyshev.chebvander(at, order)
-    size = np.abs(rows @ found)
+    size = np.abs(rows @ coefficients)
     k = int(np.argmin(size))
     sd = np.linalg.norm(np.linalg.solve(R.T, rows[k])) * np.sqrt(max(misfit, 1.0))
     return float(1.0 / size[k]), float(at[k] * reach), float(sd / size[k] ** 2)
@@ -453,15 +453,15 @@ def _of_axis(
     for other, column in columns.items():
         if other == j or np.all(np.abs(through[:, other]) <= _COUPLED * np.abs(through[:, j])):
             continue
-        known = f[np.flatnonzero(on[:, other])]
-        place = np.interp(f[at], known, np.arange(known.size))
-        below = np.clip(place.astype(int), 0, max(known.size - 2, 0))
+        lines = f[np.flatnonzero(on[:, other])]
+        place = np.interp(f[at], lines, np.arange(lines.size))
+        below = np.clip(place.astype(int), 0, max(lines.size - 2, 0))
         t = (place - below)[:, None]
-        found = (1.0 - t) * column[:, below] + t * column[:, np.minimum(below + 1, known.size - 1)]
-        if known.size > 2:
+        interpolated = (1.0 - t) * column[:, below] + t * column[:, np.minimum(below + 1, lines.size - 1)]
+        if lines.size > 2:
             bend = np.pad(np.diff(column, 2, axis=1), ((0, 0), (1, 0), (0, 0)), mode="edge")
-            found = found - 0.5 * t * (1.0 - t) * bend[:, below]
-        S = S - np.sum(weights * found, axis=2) * through[:, other]
+            interpolated = interpolated - 0.5 * t * (1.0 - t) * bend[:, below]
+        S = S - np.sum(weights * interpolated, axis=2) * through[:, other]
     mean = S.mean(axis=0)
     scatter = np.var(S, axis=0, ddof=1) / S.shape[0] if S.shape[0] > 1 else np.zeros(at.size)
     return MeasuredSensitivity(
@@ -479,15 +479,15 @@ def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Compl
         return alone
     others = np.flatnonzero(np.any(on[at], axis=0))
     window = min(2 * _LINES_PER_UNKNOWN * others.size, R.shape[0])
-    found = alone
+    column = alone
     for m, k in zip(shared, at[shared], strict=True):
         first = int(np.clip(k - window // 2, 0, R.shape[0] - window))
         near = slice(first, first + window)
         run = (spectra.frequency_hz[near] - spectra.frequency_hz[k])[:, None] / np.ptp(spectra.frequency_hz[near])
         rows = np.hstack([R[near][:, others], run * R[near][:, others]])
         answers = np.linalg.lstsq(rows, spectra.Y[:, near][:, :, p].transpose(1, 0, 2).reshape(window, -1), rcond=None)
-        found[:, m] = answers[0][int(np.flatnonzero(others == mine)[0])].reshape(spectra.n_periods, len(p))
-    return found
+        column[:, m] = answers[0][int(np.flatnonzero(others == mine)[0])].reshape(spectra.n_periods, len(p))
+    return column
 
 
 def measured_locally(response: FrequencyResponse, loop: ClosedLoop) -> tuple[MeasuredSensitivity | None, ...]:
@@ -498,11 +498,13 @@ def measured_locally(response: FrequencyResponse, loop: ClosedLoop) -> tuple[Mea
     p = [k for group in loop.plant.sensors for k in group]
     K, F = loop.controller.response(response.frequency_hz)
     C = np.linalg.pinv(F) @ K[:, :, p]
-    found = []
+    results = []
     for j in range(len(loop.plant.sensors)):
         through, weights = C @ loop.together[:, j], loop.weights[:, j]
         S = 1.0 - np.einsum("kp,kpr,kr->k", weights, response.G, through)
         size = np.abs(weights)[:, :, None] * response.sd * np.abs(through)[:, None, :]
         sd = np.sqrt(np.sum(size**2, axis=(1, 2)) / 2.0)
-        found.append(MeasuredSensitivity(frequency_hz=response.frequency_hz, ratio=np.abs(S), sd=sd, phase=np.angle(S)))
-    return tuple(found)
+        results.append(
+            MeasuredSensitivity(frequency_hz=response.frequency_hz, ratio=np.abs(S), sd=sd, phase=np.angle(S))
+        )
+    return tuple(results)

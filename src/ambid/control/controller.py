@@ -106,30 +106,30 @@ class Controller:
             K[:, :, list(self.fed_back)] = -self.state.response(frequency_hz)
             F[:] = np.eye(self.n_inputs)
         for j, law in enumerate(self.laws):
-            found = law.ratios(d)
-            K[:, j, list(law.outputs)] = found[:, : len(law.outputs)]
-            F[:, j, list(law.references)] = found[:, len(law.outputs) :]
+            ratios = law.ratios(d)
+            K[:, j, list(law.outputs)] = ratios[:, : len(law.outputs)]
+            F[:, j, list(law.references)] = ratios[:, len(law.outputs) :]
         return K, F
 
-    def variance(self, frequency_hz: Array, seen: Complex, weights: Complex) -> float:
+    def variance(self, frequency_hz: Array, outputs: Complex, weights: Complex) -> float:
         """Return the variance of Re(weights K seen) at one frequency."""
         d = complex(self.backward(frequency_hz)[0])
         return sum(
-            law.variance(d, seen[list(law.outputs)], complex(w)) for law, w in zip(self.laws, weights, strict=False)
+            law.variance(d, outputs[list(law.outputs)], complex(w)) for law, w in zip(self.laws, weights, strict=False)
         )
 
 
-def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controller:
+def controller_of_loop(loop: Loop, plant_model: LinearModel, rate_hz: float) -> Controller:
     """Return the controller of a rig's [loop], of which a PID is the same on every axis; see `ambid.physics.loop.Loop`.
 
     The reference of an axis is what is added to the controller's output.
     """
-    n_u, n_y = len(of.inputs), len(of.outputs)
-    law = law_on(loop, of, rate_hz)
+    n_u, n_y = len(plant_model.inputs), len(plant_model.outputs)
+    law = law_on(loop, plant_model, rate_hz)
     if law is not None:
-        seen = tuple(int(k) for k in signals_fed_back(of))
+        signals = tuple(int(k) for k in signals_fed_back(plant_model))
         return Controller(
-            laws=(), rate_hz=rate_hz, n_outputs=n_y, n_references=n_u, source="rig", state=law, fed_back=seen
+            laws=(), rate_hz=rate_hz, n_outputs=n_y, n_references=n_u, source="rig", state=law, fed_back=signals
         )  # fmt: skip
     T, tau = 1.0 / rate_hz, loop.filter_s
     lag = np.polynomial.Polynomial([T, tau])  # of the derivative, over which d stands
@@ -138,7 +138,7 @@ def controller_of_loop(loop: Loop, of: LinearModel, rate_hz: float) -> Controlle
     B = loop.kp * A + loop.kd * one * (one if integrates else 1.0)
     B = B + loop.ki * T * (1.0 - one) * lag if integrates else B
     laws = []
-    for j, (position, current) in enumerate(fed_back(of)):
+    for j, (position, current) in enumerate(fed_back(plant_model)):
         own = [k for k in (position, current) if k >= 0]
         rows = [A, *([B] if position >= 0 else []), *([loop.kc * A] if current >= 0 else []), A]
         table = np.zeros((len(rows), 2 + integrates))
@@ -162,16 +162,16 @@ def identify_controller(
     laws = []
     for j in range(n_u):
         mine = (j,) if n_r == n_u else tuple(range(n_r))
-        found = _law(d, u[:, j], y, r, tuple(own[j]), mine)
-        if found is None or found[0].misfit > _COUPLED:
+        law = _law(d, u[:, j], y, r, tuple(own[j]), mine)
+        if law is None or law[0].misfit > _COUPLED:
             every = _law(d, u[:, j], y, r, tuple(range(n_y)), tuple(range(n_r)))
-            found = every if found is None or (every is not None and every[1] < found[1]) else found
-        if found is None:
+            law = every if law is None or (every is not None and every[1] < law[1]) else law
+        if law is None:
             raise EstimationError(
                 f"the record excites {d.size} lines; they are too few to identify the controller. Excite more lines, "
                 "or give [loop] in the rig"
             )
-        laws.append(found[0])
+        laws.append(law[0])
     return Controller(laws=tuple(laws), rate_hz=rate_hz, n_outputs=n_y, n_references=n_r, source="record")
 
 
@@ -229,10 +229,10 @@ def _fit(d: Complex, signals: Complex, n: int) -> tuple[float, Array, Array, Arr
         size = np.sqrt(smoothed(left[:, None] ** 2)[:, 0] + (_ROUNDING * level) ** 2)
     half = Vt[:-1] / s[:-1, None] / norm / gauge
     variance = s[-1] ** 2 / max(rows.shape[0] - c.size, 1)
-    kept = signals.shape[1] * (n + 1)
+    n_laws = signals.shape[1] * (n + 1)
     power = (size / level) ** 2
     misfit = float(np.sqrt(np.mean((left / level) ** 2)))
     return (
-        scale, c[:kept].reshape(-1, n + 1), variance * (half.T @ half)[:kept, :kept], np.maximum(power, _EXACT**2),
-        misfit,
+        scale, c[:n_laws].reshape(-1, n + 1), variance * (half.T @ half)[:n_laws, :n_laws],
+        np.maximum(power, _EXACT**2), misfit,
     )  # fmt: skip

@@ -45,24 +45,24 @@ def beyond_tangent(law: Law, moved: Array, rate_hz: float) -> Array:
     return np.column_stack([0.5 * (force[1:] + force[:-1]), -np.diff(flux) * rate_hz])
 
 
-def expected_shift(task: Task, lines: Lines, c: Complex, known: Information, law: Law) -> Array:
+def expected_shift(task: Task, lines: Lines, c: Complex, information: Information, law: Law) -> Array:
     """Return the shift of what is estimated from a record of an excitation, in standard deviations, (n,).
 
-    `known`: information of the lines.
+    `information`: information of the lines.
     """
-    of = task.loops[0].plant
+    plant = task.loops[0].plant
     waves = task.limited(lines, [0]).waves(c)[:, :2]
     w = beyond_tangent(law, np.vstack([waves, waves[:1]]), task.rate_hz)
     spectrum = np.fft.rfft(w, axis=0)[lines] / (0.5 * task.period)
     omega = 2.0 * np.pi * task.frequency_hz(lines)
-    d, _ = discretise(of.space, 1.0 / task.rate_hz)
+    d, _ = discretise(plant.space, 1.0 / task.rate_hz)
     z = np.exp(1j * omega / task.rate_hz)[:, None, None]
     y = d.C @ np.linalg.solve(z * np.eye(d.A.shape[0]) - d.A, d.E @ spectrum[:, :, None])
-    sampled, driven = of.sampled(task.frequency_hz(lines)), task.driven(lines, 0) * c[:, None]
-    whiten = task.noise(of).whiten(of, omega)
-    rows = whiten @ of.slopes(sampled, driven) * known.sizes
+    sampled, driven = plant.sampled(task.frequency_hz(lines)), task.driven(lines, 0) * c[:, None]
+    whiten = task.noise(plant).whiten(plant, omega)
+    rows = whiten @ plant.slopes(sampled, driven) * information.sizes
     pull = 0.5 * task.samples * np.real(np.sum(rows.conj() * (whiten @ y), axis=(0, 1)))
-    covariance = np.linalg.inv(known.total(np.abs(c) ** 2, task.samples)[0])
+    covariance = np.linalg.inv(information.total(np.abs(c) ** 2, task.samples)[0])
     return np.asarray(covariance @ pull / np.sqrt(np.diag(covariance)))
 
 
@@ -78,16 +78,16 @@ def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
     sc = problem.scales
     w = beyond_tangent(law, problem.y[problem.skip :] - e * sc.output, problem.rate_hz)
     v = run(np.hstack([at.A - at.gain @ at.C, at.E]), w / sc.disturbance, np.zeros(at.A.shape[0])) @ at.C.T @ weight.T
-    found = products(problem, fit.vector, weight, workspace_near(fit, problem), [(v, (0,))])
-    assert found is not None
+    pulls = products(problem, fit.vector, weight, workspace_near(fit, problem), [(v, (0,))])
+    assert pulls is not None
     own, p = range(v.shape[1]), problem.size
-    prior = fit.J_prior @ found.turn
-    along = np.sum([found.cross[o, :, o] for o in own], axis=0)
-    inverse = np.linalg.pinv(found.rows[:p, :p] + prior.T @ prior, rcond=1e-13, hermitian=True)
+    prior = fit.J_prior @ pulls.turn
+    along = np.sum([pulls.cross[o, :, o] for o in own], axis=0)
+    inverse = np.linalg.pinv(pulls.rows[:p, :p] + prior.T @ prior, rcond=1e-13, hermitian=True)
     step = inverse @ along[:p]
-    left = float(np.trace(found.inner)) - along[:p] @ step
-    pull = along[p] - step @ (found.rows[:p, p] + prior.T @ fit.r_prior)
-    shift = -(found.turn @ step)[: problem.n_physical] * problem.magnitude
+    left = float(np.trace(pulls.inner)) - along[:p] @ step
+    pull = along[p] - step @ (pulls.rows[:p, p] + prior.T @ fit.r_prior)
+    shift = -(pulls.turn @ step)[: problem.n_physical] * problem.magnitude
     return shift, float(pull / left), float(left**-0.5)
 
 
@@ -111,14 +111,14 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
         counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
     names = fit.problem.estimated
     values = dict(zip(names, (counted * shift / sd).tolist(), strict=True))
-    passed, said = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta)
+    passed, text = judge_shift(values, dict(zip(names, (counted * shift).tolist(), strict=True)), theta)
     if not passed:
-        said += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
-        said += (
+        text += f" ({assumed[0]}; the record shows {part:.2g} ± {part_sd:.2g} of it)"
+        text += (
             f". Record with {advised(values):.2g} of the excitation or less, or identify with "
             f"{setting('identify_nonlinear')}"
         )
-    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=said)
+    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=text)
 
 
 def advised(shift: Mapping[str, float]) -> float:
@@ -133,5 +133,5 @@ def judge_shift(shift: Mapping[str, float], size: Mapping[str, float], theta: Ma
     if not far:
         most = f"{worst[0]} by {shift[worst[0]]:+.2f} sd"
         return True, f"over this motion the magnet's curvature moves no number far ({most} at most)"
-    told = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
-    return False, f"over this motion the magnet's curvature moves {told} from the value at the operating point"
+    listed = ", ".join(f"{n} by {shift[n]:+.1f} sd ({100.0 * size[n] / abs(theta[n]):+.2g} %)" for n in far)
+    return False, f"over this motion the magnet's curvature moves {listed} from the value at the operating point"

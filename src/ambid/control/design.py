@@ -107,8 +107,8 @@ class Goals:
             raise ModelError(f"goals are {minimise!r}; give them as a list, such as ('peak', 'noise')")
         for name in (*minimise, *limits):
             if name not in FIGURES:
-                known = f"{', '.join(FIGURES)}.{nearest(name, list(FIGURES))}"
-                raise ModelError(f"figure {name!r} of a design is unknown; known: {known} Give one of them")
+                names = f"{', '.join(FIGURES)}.{nearest(name, list(FIGURES))}"
+                raise ModelError(f"figure {name!r} of a design is unknown; known: {names} Give one of them")
         if not minimise:
             raise ModelError("a design needs a goal. Give at least one of " + ", ".join(FIGURES))
         for name, x in limits.items():
@@ -126,13 +126,13 @@ class Goals:
         """Return the limits that figures pass."""
         return tuple(name for name, x in self.limits.items() if getattr(worst, name) > SAME * x)
 
-    def closer(self, asked: Goals, worst: Figures) -> Goals | None:
-        """Return what to ask for, where `asked` led to figures that pass these limits; None where they do not."""
+    def closer(self, goals: Goals, worst: Figures) -> Goals | None:
+        """Return what to ask for, where `goals` led to figures that pass these limits; None where they do not."""
         beyond = {name: getattr(worst, name) / self.limits[name] for name in self.missed(worst)}
         if not beyond or not all(map(math.isfinite, beyond.values())):
             return None
         return replace(
-            asked, limits={n: x / (beyond[n] * SAME if n in beyond else 1.0) for n, x in asked.limits.items()}
+            goals, limits={n: x / (beyond[n] * SAME if n in beyond else 1.0) for n, x in goals.limits.items()}
         )
 
 
@@ -162,16 +162,19 @@ def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float
 
     `noise`: the rig's; `sensor_sd`: as estimated, where the rig says nothing.
     """
-    given = noise or Noise()
-    found = [
+    noise_given = noise or Noise()
+    values = [
         math.hypot(white, step / math.sqrt(12.0))
-        for white, step in ((given.position, given.position_resolution), (given.current, given.current_resolution))
+        for white, step in (
+            (noise_given.position, noise_given.position_resolution),
+            (noise_given.current, noise_given.current_resolution),
+        )
     ]
-    if any(found):
-        return found[0], found[1], "the noise of the sensors is the rig's [noise]"
-    known = [[x for name, x in sensor_sd.items() if name.endswith(kind)] for kind in ("position", "current")]
-    if any(map(any, known)):
-        return max(known[0], default=0.0), max(known[1], default=0.0), "the noise of the sensors is as estimated"
+    if any(values):
+        return values[0], values[1], "the noise of the sensors is the rig's [noise]"
+    sds = [[x for name, x in sensor_sd.items() if name.endswith(kind)] for kind in ("position", "current")]
+    if any(map(any, sds)):
+        return max(sds[0], default=0.0), max(sds[1], default=0.0), "the noise of the sensors is as estimated"
     return 1e-6, 0.0, "nothing says how noisy the sensors are: 1 µm rms is taken"
 
 
@@ -199,21 +202,21 @@ def examine(plant: Plant, loop: Loop, noise: tuple[float, float]) -> Examined:
     if largest > 1.0 - CIRCLE:
         return Examined(figures=UNSTABLE)
     f, own = plant.grid(FREQUENCIES), np.abs(np.angle(poles)) * plant.rate_hz / (2.0 * np.pi)
-    of = closed_loop_of(plant, loop, np.union1d(f, own[(own > f[0]) & (own < f[-1])]))
+    loop_at = closed_loop_of(plant, loop, np.union1d(f, own[(own > f[0]) & (own < f[-1])]))
     pole = -math.log(max(largest, 1e-300)) * plant.rate_hz
-    S, G = np.abs(of.of_axes), np.abs(of.compliance)
+    S, G = np.abs(loop_at.of_axes), np.abs(loop_at.compliance)
     figures = Figures(
-        peak=float(np.max(S)), compliance=float(np.max(G)), noise=float(np.max(noise_in_command(of, noise))),
+        peak=float(np.max(S)), compliance=float(np.max(G)), noise=float(np.max(noise_in_command(loop_at, noise))),
         settling=settling_of(plant, z, pole)[0], pole=pole,
     )  # fmt: skip
-    return Examined(figures=figures, frequency_hz=of.frequency_hz, sensitivity=S, compliance=G)
+    return Examined(figures=figures, frequency_hz=loop_at.frequency_hz, sensitivity=S, compliance=G)
 
 
 def mean_over(frequency_hz: Array, power: Array) -> Array:
     """Return the mean of a power over all frequencies up to half the rate, along the first axis (trapezoidal rule)."""
     f = np.concatenate([[0.0], frequency_hz])
-    of = np.concatenate([power[:1], power])
-    return np.asarray(np.trapezoid(of, f, axis=0) / f[-1])
+    padded = np.concatenate([power[:1], power])
+    return np.asarray(np.trapezoid(padded, f, axis=0) / f[-1])
 
 
 def noise_in_command(loop: ClosedLoop, noise: tuple[float, float]) -> Array:
@@ -257,22 +260,22 @@ def settling_of(plant: Plant, z: Array, pole: float) -> tuple[float, Array, Arra
 
 def worst_of(figures: Sequence[Figures]) -> Figures:
     """Return the worst of each figure over the plants that are held; `UNSTABLE` where none is."""
-    held = [f for f in figures if f.stable]
-    if not held:
+    stable = [f for f in figures if f.stable]
+    if not stable:
         return UNSTABLE
-    worst = {name: max(getattr(f, name) for f in held) for name in FIGURES}
-    return Figures(**worst, pole=min(f.pole for f in held))
+    worst = {name: max(getattr(f, name) for f in stable) for name in FIGURES}
+    return Figures(**worst, pole=min(f.pole for f in stable))
 
 
 def verify(
     plants: Sequence[Drawn], loop: Loop, noise: tuple[float, float], tick: Tick = silent
 ) -> tuple[Examined, ...]:
     """Examine a loop on each plant, in their order."""
-    found = []
+    examined = []
     for k, drawn in enumerate(plants):
         tick("verify", k / len(plants))
-        found.append(examine(drawn.plant, loop, noise))
-    return tuple(found)
+        examined.append(examine(drawn.plant, loop, noise))
+    return tuple(examined)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -395,9 +398,9 @@ class Design(Judged):
     @property
     def loop(self) -> Loop:
         """The new loop."""
-        found = self.new_rig.loop
-        assert found is not None
-        return found
+        loop = self.new_rig.loop
+        assert loop is not None
+        return loop
 
     def to_control(self) -> Any:
         """Return the new controller for python-control; needs the extra ``ambid[control]``.
@@ -414,8 +417,8 @@ class Design(Judged):
     @property
     def law(self) -> StateLaw:
         """The new loop as a law of all axes."""
-        of = self._model
-        axes, pairs = len(of.inputs), fed_back(of)
+        plant_model = self._model
+        axes, pairs = len(plant_model.inputs), fed_back(plant_model)
         if self.loop.law is not None:
             return self.loop.law
         return beside([self.loop.as_law(self.rate_hz, current=bool(pairs[j, 1] >= 0)) for j in range(axes)])
@@ -437,44 +440,44 @@ class Design(Judged):
         """
         from ambid.control.law_files import write_law
 
-        of = self._model
-        signals = [of.outputs[k] for k in signals_fed_back(of)]
-        write_law(self.law, path, self.new_rig.name, signals, of.inputs)
+        plant_model = self._model
+        signals = [plant_model.outputs[k] for k in signals_fed_back(plant_model)]
+        write_law(self.law, path, self.new_rig.name, signals, plant_model.inputs)
 
 
-def _turning(of: LinearModel, speed: float) -> LinearModel:
-    assert isinstance(of, RotorModel)
-    return of.at_speed(speed)
+def _turning(plant_model: LinearModel, speed: float) -> LinearModel:
+    assert isinstance(plant_model, RotorModel)
+    return plant_model.at_speed(speed)
 
 
-def situation_of(seen: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:
+def situation_of(examined: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:
     """Return what there is to say of a loop; `estimate`: with its covariance."""
-    of = closed_loop_of(estimate, loop)
+    closed = closed_loop_of(estimate, loop)
     return Situation(
-        loop=loop_entry(loop), figures=seen[0].figures, worst=worst_of([x.figures for x in seen]),
-        unstable=sum(not x.figures.stable for x in seen), sensitivity=sensitivity_by_axis(of),
-        singular=float(np.max(of.singular)),
-        margins=margins_by_axis(of), compliance=compliance_by_axis(of),
+        loop=loop_entry(loop), figures=examined[0].figures, worst=worst_of([x.figures for x in examined]),
+        unstable=sum(not x.figures.stable for x in examined), sensitivity=sensitivity_by_axis(closed),
+        singular=float(np.max(closed.singular)),
+        margins=margins_by_axis(closed), compliance=compliance_by_axis(closed),
     )  # fmt: skip
 
 
-def curves_of(seen: Sequence[Examined], estimate: Plant, loop: Loop, until_s: float) -> LoopCurves:
+def curves_of(examined: Sequence[Examined], estimate: Plant, loop: Loop, until_s: float) -> LoopCurves:
     """Return the curves of a loop on the plants, and its force step up to a time."""
     f, axes = np.geomspace(_SPAN * estimate.rate_hz, 0.499 * estimate.rate_hz, FREQUENCIES), estimate.axes
 
     def over(curve: str, plants: Sequence[Examined]) -> Mapping[str, Array]:
-        held = [x for x in plants if x.figures.stable]
-        found = [[np.interp(f, x.frequency_hz, y) for y in getattr(x, curve).T] for x in held]
-        return dict(zip(axes, np.max(found, axis=0), strict=True)) if held else {}
+        stable = [x for x in plants if x.figures.stable]
+        curves = [[np.interp(f, x.frequency_hz, y) for y in getattr(x, curve).T] for x in stable]
+        return dict(zip(axes, np.max(curves, axis=0), strict=True)) if stable else {}
 
     z = closed_loop_matrix(estimate.theta, on(loop, estimate), estimate.rate_hz, of=estimate.model)
     n = min(max(int(until_s * estimate.rate_hz), 16), _MOST)
     x = force_step(estimate, z, n)
-    kept = np.unique(np.geomspace(1, n, _SHOWN).round().astype(int)) - 1
+    places = np.unique(np.geomspace(1, n, _SHOWN).round().astype(int)) - 1
     return LoopCurves(
-        frequency_hz=f, sensitivity=over("sensitivity", seen[:1]), highest=over("sensitivity", seen),
-        compliance=over("compliance", seen[:1]), softest=over("compliance", seen),
-        time_s=(kept + 1) / estimate.rate_hz, step=dict(zip(axes, x[kept].T, strict=True)),
+        frequency_hz=f, sensitivity=over("sensitivity", examined[:1]), highest=over("sensitivity", examined),
+        compliance=over("compliance", examined[:1]), softest=over("compliance", examined),
+        time_s=(places + 1) / estimate.rate_hz, step=dict(zip(axes, x[places].T, strict=True)),
     )  # fmt: skip
 
 
@@ -492,11 +495,12 @@ def loop_entry(loop: Loop) -> dict[str, object]:
     return {"kind": "pid", **gains, "derivative_cutoff_hz": cutoff, "delay": loop.delay}
 
 
-def hardest(plants: Sequence[Drawn], seen: Sequence[Examined]) -> dict[str, Plant]:
+def hardest(plants: Sequence[Drawn], examined: Sequence[Examined]) -> dict[str, Plant]:
     """Return the estimate, and the plant with the highest peak; of one axis also the softest and the slowest one."""
-    figures, of = [x.figures for x in seen], ("peak", "compliance", "settling")
+    figures, names = [x.figures for x in examined], ("peak", "compliance", "settling")
     worst = {
-        int(np.argmax([getattr(f, name) for f in figures])) for name in of[: 1 if len(plants[0].plant.axes) > 1 else 3]
+        int(np.argmax([getattr(f, name) for f in figures]))
+        for name in names[: 1 if len(plants[0].plant.axes) > 1 else 3]
     }
     return {
         "the estimate": plants[0].plant,
@@ -504,10 +508,10 @@ def hardest(plants: Sequence[Drawn], seen: Sequence[Examined]) -> dict[str, Plan
     }
 
 
-def worst_plant(plants: Sequence[Drawn], seen: Sequence[Examined]) -> WorstPlant:
+def worst_plant(plants: Sequence[Drawn], examined: Sequence[Examined]) -> WorstPlant:
     """Return the plant with the highest peak, or the first that is not held."""
-    k = int(np.argmax([x.figures.peak for x in seen]))
-    drawn, peak = plants[k], seen[k].figures.peak
+    k = int(np.argmax([x.figures.peak for x in examined]))
+    drawn, peak = plants[k], examined[k].figures.peak
     return WorstPlant(
         number=drawn.number, words=drawn.words(), changed=drawn.changed, zone=zone_of(peak),
         peak_db=float(20.0 * np.log10(peak)),
@@ -517,12 +521,12 @@ def worst_plant(plants: Sequence[Drawn], seen: Sequence[Examined]) -> WorstPlant
 def checks_of(goals: Goals, before: Situation, after: Situation, worst: WorstPlant, n: int) -> dict[str, Check]:
     """Judge stability, limits and zone of the new loop over the plants, and whether it is better at all."""
     missed = goals.missed(after.worst)
-    held = f"{n - after.unstable} of {n} plants drawn around the estimate are held"
+    text = f"{n - after.unstable} of {n} plants drawn around the estimate are held"
     gains = [getattr(after.worst, g) < getattr(before.worst, g) for g in goals.minimise] or [True]
     return {
         "stability": Check(
             passed=after.unstable == 0, values={"unstable": after.unstable, "plants": n},
-            detail=held if not after.unstable else f"only {held}; the worst: {worst.words}. Lower the spread, or "
+            detail=text if not after.unstable else f"only {text}; the worst: {worst.words}. Lower the spread, or "
             "give up some goals",
         ),
         "limits": Check(

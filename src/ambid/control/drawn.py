@@ -86,17 +86,17 @@ class Drawn:
 
     def words(self) -> str:
         """Say what was changed, on one line."""
-        said, by_axis = [], sorted(self.changed.items(), key=lambda item: -abs(item[1]))
+        texts, by_axis = [], sorted(self.changed.items(), key=lambda item: -abs(item[1]))
         for kind, words in _WORDS.items():
-            found = [(name, x) for name, x in by_axis if name.rsplit(".", 1)[-1] == kind]
-            for name, x in found[:1]:  # of a rotor the axis that is changed most
+            axes = [(name, x) for name, x in by_axis if name.rsplit(".", 1)[-1] == kind]
+            for name, x in axes[:1]:  # of a rotor the axis that is changed most
                 axis = f"axis {name.partition('.')[0]}: " if "." in name else ""
-                said.append(axis + words.format(x * _SHOWN.get(kind, 1.0)))
+                texts.append(axis + words.format(x * _SHOWN.get(kind, 1.0)))
         sizes = sorted(
             ((n, x) for n, x in self.changed.items() if n.rsplit(".", 1)[-1] not in _WORDS), key=lambda x: -abs(x[1])
         )
-        said += [f"{n} {100.0 * x:+.2g} %" for n, x in sizes[:_TOLD] if abs(x) >= 0.005]
-        return ", ".join(said) or "the estimate itself"
+        texts += [f"{n} {100.0 * x:+.2g} %" for n, x in sizes[:_TOLD] if abs(x) >= 0.005]
+        return ", ".join(texts) or "the estimate itself"
 
 
 _WORDS = {
@@ -127,7 +127,7 @@ def draw_plants(
     spread = spread or Spread()
     at = rig.operating_point if point is None else point
     laws, assumed = laws_of(plant, rig, at)
-    found, rejected = [Drawn(plant=replace(plant, names=(), covariance=None), number=0, changed=_NONE)], 0
+    plants_drawn, rejected = [Drawn(plant=replace(plant, names=(), covariance=None), number=0, changed=_NONE)], 0
     for number in range(1, n):
         rng = np.random.default_rng([seed, number])
         for _ in range(_TRIES):
@@ -140,8 +140,8 @@ def draw_plants(
                 f"none of {_TRIES} plants drawn by the estimate's covariance is physical: the record does not show the "
                 "numbers. Identify them from a longer or stronger record, or lower the spread of the covariance"
             )
-        found.append(replace(drawn, number=number))
-    return Draws(plants=tuple(found), rejected=rejected, assumed=assumed)
+        plants_drawn.append(replace(drawn, number=number))
+    return Draws(plants=tuple(plants_drawn), rejected=rejected, assumed=assumed)
 
 
 _NONE: Mapping[str, float] = MappingProxyType({})
@@ -152,22 +152,22 @@ def over_speeds(draws: Draws, speeds: Interval) -> Draws:
 
     EstimationError where the estimate does not know what a turning rotor does.
     """
-    found = list(draws.plants[:1])
+    plants = list(draws.plants[:1])
     for k, drawn in enumerate(draws.plants[1:]):
         share = k if k < 2 else (k * _GOLDEN) % 1.0
-        speed, of = speeds[1] - share * (speeds[1] - speeds[0]), drawn.plant.model
-        assert isinstance(of, RotorModel)
-        turned = of.at_speed(speed)
+        speed, plant_model = speeds[1] - share * (speeds[1] - speeds[0]), drawn.plant.model
+        assert isinstance(plant_model, RotorModel)
+        turned = plant_model.at_speed(speed)
         missing = [p.name for p in turned.parameters if p.name not in drawn.plant.theta]
         if missing:
             raise EstimationError(
                 f"the estimate does not know {', '.join(missing)}, which a turning rotor has. Identify it with a "
                 "record at speed too, or give speeds 0:0"
             )
-        found.append(replace(
+        plants.append(replace(
             drawn, plant=replace(drawn.plant, model=turned), changed={"speed": speed, **drawn.changed}
         ))  # fmt: skip
-    return replace(draws, plants=tuple(found))
+    return replace(draws, plants=tuple(plants))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -220,14 +220,16 @@ def _drawn(plant: Plant, rig: Rig, laws: Mapping[str, Law], spread: Spread, rng:
             theta[name] *= 1.0 + spread.frequency * u if name.endswith("omega") else 1.0 - spread.damping * (1 - u) / 2
     shift = float(rng.uniform(max(-spread.delay, -float(delays.min())), spread.delay))
     changed |= {"delay": shift} if shift else {}
-    of, eddy_s = _lagged(plant, rig, theta, spread, rng)
+    drawn_model, eddy_s = _lagged(plant, rig, theta, spread, rng)
     changed |= {"eddy_s": eddy_s} if eddy_s else {}
-    if not all(math.isfinite(theta[s.name]) and (theta[s.name] > 0.0 or not s.positive) for s in of.parameters):
+    if not all(
+        math.isfinite(theta[s.name]) and (theta[s.name] > 0.0 or not s.positive) for s in drawn_model.parameters
+    ):
         return None
     rates = {n: x / plant.theta[n] - 1.0 for n, x in theta.items() if n in plant.theta and plant.theta[n] != 0.0}
     if any(rates.get(n, 0.0) <= -1.0 for n in theta if n.rsplit(".", 1)[-1] in ("k_i", "k_x")):
         return None  # a sign turned round is not scatter but another plant
-    drawn = replace(plant, model=of, theta=theta, delays=delays + shift, names=(), covariance=None)
+    drawn = replace(plant, model=drawn_model, theta=theta, delays=delays + shift, names=(), covariance=None)
     return Drawn(plant=drawn, number=-1, changed=changed | {n: x for n, x in rates.items() if x})
 
 
@@ -284,34 +286,40 @@ def _lagged(
 
     A model of an estimate that has their pole keeps it: the covariance says how it scatters.
     """
-    known = None if rig.magnet is None or not rig.magnet.eddy else rig.magnet.known("a")
-    own = 1.0 / plant.rate_hz if known is None or not known.value else 1.0 / known.value
+    pole = None if rig.magnet is None or not rig.magnet.eddy else rig.magnet.known("a")
+    own = 1.0 / plant.rate_hz if pole is None or not pole.value else 1.0 / pole.value
     lag = float(rng.uniform(0.0, 1.0)) * spread.eddy * own
-    of = plant.model
-    if lag == 0.0 or not isinstance(of, OneAxis | RotorModel):
-        return of, 0.0
+    plant_model = plant.model
+    if lag == 0.0 or not isinstance(plant_model, OneAxis | RotorModel):
+        return plant_model, 0.0
     if "a" in theta:
         theta["a"] = 1.0 / (1.0 / theta["a"] + lag)
-        return of, lag
+        return plant_model, lag
     theta["a"] = 1.0 / lag
-    return (replace(of, extras=(*of.extras, "a")) if isinstance(of, RotorModel) else _EddyAxis()), lag
+    return (
+        replace(plant_model, extras=(*plant_model.extras, "a")) if isinstance(plant_model, RotorModel) else _EddyAxis()
+    ), lag
 
 
 def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, Law], tuple[str, ...]]:
     """Return the law of each axis by the prefix of its numbers, and what is assumed of it."""
-    of, theta = plant.model, plant.theta
-    prefixes = [f"{axis}." for axis in of.axes] if isinstance(of, RotorModel) else [""]
+    plant_model, theta = plant.model, plant.theta
+    prefixes = [f"{axis}." for axis in plant_model.axes] if isinstance(plant_model, RotorModel) else [""]
     prefixes = [p for p in prefixes if f"{p}k_x" in theta and f"{p}k_i" in theta]
     travel, most = (UNLIMITED, UNLIMITED) if rig.limits is None else (rig.limits.position, rig.limits.current)
-    if not isinstance(of, RotorModel) and rig.magnet is not None:
+    if not isinstance(plant_model, RotorModel) and rig.magnet is not None:
         try:
-            known = plant_of_rig(rig)
-            rest = rest_of_rig(rig, known)
+            nominal = plant_of_rig(rig)
+            rest = rest_of_rig(rig, nominal)
             x, i = at.get("position", rest.position), at.get("current", rest.current)
             if not (travel[0] < x < travel[1] and most[0] < i < most[1]):  # a record of deviations from rest
                 x, i = rest.position, rest.current
             law = Law(
-                energy=known.magnet.coenergy, rest=(x, i), position=_ways(x, travel), current=_ways(i, most), known=True
+                energy=nominal.magnet.coenergy,
+                rest=(x, i),
+                position=_ways(x, travel),
+                current=_ways(i, most),
+                known=True,
             )
             return {"": law}, ("the law of the magnet is the rig's [magnet]",)
         except (RigError, ModelError):  # some numbers are to be found by an identification
@@ -321,21 +329,25 @@ def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, 
     pulled = [p for p in prefixes if theta[f"{p}k_x"] < 0.0 and theta[f"{p}k_i"] != 0.0]
     if not pulled:
         return {}, ("k_x is not negative, which no magnet's law explains: the plants are those of the rotor at rest",)
-    given = None if rig.magnet is None else rig.magnet.known("s")
+    known_gap = None if rig.magnet is None else rig.magnet.known("s")
     half = (travel[1] - travel[0]) / 2.0
-    gap = given.value if given is not None and given.value else GAP_OF_TRAVEL * half
+    gap = known_gap.value if known_gap is not None and known_gap.value else GAP_OF_TRAVEL * half
     laws = {}
     for p in pulled:
         k_x, k_i, L = theta[f"{p}k_x"], abs(theta[f"{p}k_i"]), theta.get(f"{p}L", 0.0)
         energy = CoEnergy.opposed(k_i=k_i, k_x=k_x, L=max(L, -(k_i**2) / k_x), gap=gap)
-        middle = at.get("position", 0.0) if not isinstance(of, RotorModel) else 0.0
+        middle = at.get("position", 0.0) if not isinstance(plant_model, RotorModel) else 0.0
         inside = middle if travel[0] < middle < travel[1] else (travel[0] + travel[1]) / 2.0
         laws[p] = Law(
             energy=energy, rest=(0.0, 0.0), position=_ways(inside, travel),
             current=_ways(0.0, most) if all(map(math.isfinite, most)) else (-energy.i0, energy.i0),
-            known=given is not None and bool(given.value),
+            known=known_gap is not None and bool(known_gap.value),
         )  # fmt: skip
-    whose = "the rig's gap" if given is not None and given.value else "a gap of twice the travel inside limits.position"
+    whose = (
+        "the rig's gap"
+        if known_gap is not None and known_gap.value
+        else "a gap of twice the travel inside limits.position"
+    )
     return laws, (f"the law of the magnets is that of two opposed ones with {whose}, {1e6 * gap:.4g} µm",)
 
 

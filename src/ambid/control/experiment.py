@@ -134,11 +134,11 @@ def _search(
         by_share = 2.0 * (1.0 - BROADBAND) * q * (by_power - q @ by_power)
         return float(np.log(judged)), np.concatenate([by_share, -by_size * np.imag(turned)])
 
-    found = minimize(
+    answer = minimize(
         value, np.concatenate([0.5 * np.log(own), np.angle(start)]), jac=True, method="L-BFGS-B",
         options={"maxiter": steps, "maxcor": 20},
     )  # fmt: skip
-    return unpack(found.x)[2]
+    return unpack(answer.x)[2]
 
 
 # A plant in its loop with an excitation added to the commands: what moves, in steady state and from rest.
@@ -178,8 +178,8 @@ class ExcitedLoop:
     @property
     def signals(self) -> tuple[str, ...]:
         """Names of the signals."""
-        of = self.plant.model
-        return (*of.outputs, *of.inputs, *(f"{name}{SLEW}" for name in of.inputs))
+        plant_model = self.plant.model
+        return (*plant_model.outputs, *plant_model.inputs, *(f"{name}{SLEW}" for name in plant_model.inputs))
 
     @property
     def pole(self) -> float:
@@ -202,21 +202,21 @@ class ExcitedLoop:
 
     def decay(self, samples: int) -> Array:
         """Return what is left of a state, (samples, n_signals, n), by doubling."""
-        found, power = self.rows[None], self.Z
-        while found.shape[0] < samples:
-            found = np.concatenate([found, found @ power])
+        rows, power = self.rows[None], self.Z
+        while rows.shape[0] < samples:
+            rows = np.concatenate([rows, rows @ power])
             power = power @ power
-        found, n_u = found[:samples], self.e.shape[1]
-        inputs = found[:, -n_u:]
+        rows, n_u = rows[:samples], self.e.shape[1]
+        inputs = rows[:, -n_u:]
         slew = np.diff(inputs, axis=0, prepend=np.zeros((1, *inputs.shape[1:]))) * self.plant.rate_hz
         slew[0] = 0.0
-        return np.concatenate([found, slew], axis=1)
+        return np.concatenate([rows, slew], axis=1)
 
     def noise_sd(self, noise: Innovation) -> Array:
         """Return the standard deviation that noise gives the signals as they are logged, (n_signals,)."""
-        of, rate = self.plant.model, self.plant.rate_hz
+        plant_model, rate = self.plant.model, self.plant.rate_hz
         f = np.asarray((np.arange(_NOISE_LINES) + 0.5) * (0.5 * rate / _NOISE_LINES), dtype=np.float64)
-        H, K = self.plant.sampled(f).transfer(), controller_of_loop(self.loop, of, rate).response(f)[0]
+        H, K = self.plant.sampled(f).transfer(), controller_of_loop(self.loop, plant_model, rate).response(f)[0]
         V = np.asarray(np.linalg.inv(np.asarray(noise.whiten(self.plant, 2.0 * np.pi * f))))
         answer = -np.linalg.solve(np.eye(H.shape[2]) + K @ H, K @ V)
         slew = answer * (rate * np.abs(1.0 - np.exp(-2j * np.pi * f / rate)))[:, None, None]
@@ -227,20 +227,20 @@ class ExcitedLoop:
 def begin_at(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> tuple[int, Array]:
     """Return the sample at which the period best begins from rest, and the largest part of each signal from there."""
     starts = _candidates(excited, limited, c, inputs)
-    found = from_rest(excited, limited, c, inputs, starts)
-    best = int(np.argmin(found.max(axis=1)))
-    return int(starts[best]), found[best]
+    parts = from_rest(excited, limited, c, inputs, starts)
+    best = int(np.argmin(parts.max(axis=1)))
+    return int(starts[best]), parts[best]
 
 
 def from_rest(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines, starts: Lines) -> Array:
     """Return the largest part of each signal from rest, the period begun at some samples, (n_starts, n_signals)."""
     waves, n, n_u = limited.waves(c), limited.period, excited.e.shape[1]
-    z, decay, found = _steady(excited, limited, c, inputs), excited.decay(_PERIODS * n), []
+    z, decay, parts = _steady(excited, limited, c, inputs), excited.decay(_PERIODS * n), []
     for start in starts:
         moved = np.tile(np.roll(waves, -start, axis=0), (_PERIODS, 1)) - decay @ z[start]
         moved[0, -n_u:] = moved[0, -2 * n_u : -n_u] * excited.plant.rate_hz  # from 0
-        found.append(limited.part(moved).max(axis=0))
-    return np.array(found)
+        parts.append(limited.part(moved).max(axis=0))
+    return np.array(parts)
 
 
 def _steady(excited: ExcitedLoop, limited: Limited, c: Complex, inputs: Lines) -> Array:
@@ -425,10 +425,10 @@ class Experiment(Judged):
                 f"with {setting('rate_hz')}, or correct the rate"
             )
         if closed not in (None, self.closed):
-            of, now = ("closed", "open") if self.closed else ("open", "closed")
+            designed, now = ("closed", "open") if self.closed else ("open", "closed")
             raise EstimationError(
-                f"the experiment is designed for the {of} loop, here the loop is {now}: it may pass limits. Design it "
-                f"with {setting('closed')} {now}, or play it with the {of} loop"
+                f"the experiment is designed for the {designed} loop, here the loop is {now}: it may pass limits. "
+                f"Design it with {setting('closed')} {now}, or play it with the {designed} loop"
             )
         waves = np.column_stack(list(self.excitation.values()))
         return np.asarray(np.resize(waves, (samples, waves.shape[1])))
@@ -453,27 +453,27 @@ def reached(experiment: Experiment, estimate: Estimate | RotorEstimate) -> Check
     """Compare the standard deviations of an estimate with what the experiment promised for records of that length."""
     records = estimate.records if isinstance(estimate, RotorEstimate) else (estimate.record,)
     seconds = sum(float(str(r["samples"])) / float(str(r["rate_hz"])) for r in records)
-    found, ratio = {p.name: p.sd for p in estimate.parameters if p.sd > 0.0}, dict[str, float]()
+    sds, ratio = {p.name: p.sd for p in estimate.parameters if p.sd > 0.0}, dict[str, float]()
     if isinstance(estimate, RotorEstimate):  # frequencies and dampings of its modes too
-        found = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
+        sds = dict(zip(estimate.covariance_names, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))
     lengths = experiment.shown.seconds
     nearest = np.clip(seconds, lengths[0], lengths[-1])
     for name, x in experiment.expected.items():
-        if name in found:
+        if name in sds:
             curve = np.log(experiment.shown.by_length[name])
             there = np.exp(np.interp(np.log(nearest), np.log(lengths), curve)) * np.sqrt(nearest / seconds)
-            ratio[name] = float(found[name] / (x.sd / x.relative_sd * there))
+            ratio[name] = float(sds[name] / (x.sd / x.relative_sd * there))
     if not ratio:
         raise EstimationError(
             f"the experiment was designed for {', '.join(experiment.expected)}, none of which was estimated. Give the "
             "experiment of this record"
         )
-    said = ", ".join(f"{name} {x:.2f}" for name, x in ratio.items())
+    text = ", ".join(f"{name} {x:.2f}" for name, x in ratio.items())
     good = max(ratio.values()) < _WORSE
     return Check(
         passed=good, values=ratio,
-        detail=f"standard deviations over those that the experiment promised: {said}" if good else
-        f"standard deviations are larger than the experiment promised ({said} times): there is more noise than it was "
+        detail=f"standard deviations over those that the experiment promised: {text}" if good else
+        f"standard deviations are larger than the experiment promised ({text} times): there is more noise than it was "
         "designed for, or it was not played. Design the next one from this estimate",
     )  # fmt: skip
 
@@ -554,9 +554,9 @@ class Task:
 
     def driven(self, lines: Lines, plant: int) -> Complex:
         """Return the inputs of a plant by unit excitation of each line's input, (n_lines, n_inputs)."""
-        on, of = self.inputs(lines), self.loops[plant]
-        rows = of.rows[len(of.plant.model.outputs) :]
-        return np.asarray(of.states(lines, self.period, on) @ rows.T + np.eye(of.e.shape[1])[on])
+        on, excited = self.inputs(lines), self.loops[plant]
+        rows = excited.rows[len(excited.plant.model.outputs) :]
+        return np.asarray(excited.states(lines, self.period, on) @ rows.T + np.eye(excited.e.shape[1])[on])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -609,12 +609,12 @@ def uses(task: Task, lines: Lines, c: Complex) -> Array:
     From rest are the plant itself and those drawn ones that use most in steady state.
     """
     steady = np.array([task.limited(lines, [k]).use(c) for k in range(len(task.loops))])
-    found = np.repeat(steady[:, None], 2, axis=1)
+    parts = np.repeat(steady[:, None], 2, axis=1)
     for k in {0, *np.argsort(-steady.max(axis=1))[:_FROM_REST].tolist()}:
-        found[k, 1] = from_rest(task.loops[k], task.limited(lines, [k]), c, task.inputs(lines), np.zeros(1, dtype=int))[
+        parts[k, 1] = from_rest(task.loops[k], task.limited(lines, [k]), c, task.inputs(lines), np.zeros(1, dtype=int))[
             0
         ]
-    return found
+    return parts
 
 
 def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Table | None]:

@@ -94,22 +94,26 @@ class Form:
         return np.asarray(T.T @ T)
 
 
-def form_of(of: LinearModel, theta: Mapping[str, float], name: str) -> Form:
+def form_of(plant_model: LinearModel, theta: Mapping[str, float], name: str) -> Form:
     """Return a form of `FORMS` for a model."""
-    if not isinstance(of, RotorModel) or name == "axes":
-        n = len(of.inputs)
+    if not isinstance(plant_model, RotorModel) or name == "axes":
+        n = len(plant_model.inputs)
         return Form(transform=np.eye(n), sets=(0,) * n, names=("all axes",))
     if name == "bearings":
-        names = tuple(b.name for b in of.bearings)
-        return Form(transform=np.eye(len(of.axes)), sets=tuple(names.index(b.name) for b, _ in of.placed), names=names)
-    T, sets = np.eye(len(of.axes)), [2] * len(of.axes)
+        names = tuple(b.name for b in plant_model.bearings)
+        return Form(
+            transform=np.eye(len(plant_model.axes)),
+            sets=tuple(names.index(b.name) for b, _ in plant_model.placed),
+            names=names,
+        )
+    T, sets = np.eye(len(plant_model.axes)), [2] * len(plant_model.axes)
     for plane in (0, 1):
-        own = [j for j, (_, p) in enumerate(of.placed) if p == plane]
+        own = [j for j, (_, p) in enumerate(plant_model.placed) if p == plane]
         if len(own) < 2:
             raise EstimationError(
                 f"{len(own)} axes hold plane {'xy'[plane]}; tilting takes two bearings. Give another form of gains"
             )
-        levers = np.array([theta[f"{of.placed[j][0].name}.z"] - theta["z_cg"] for j in own])
+        levers = np.array([theta[f"{plant_model.placed[j][0].name}.z"] - theta["z_cg"] for j in own])
         p = np.linalg.pinv(np.vstack([np.ones(len(own)), levers]))[:, 0]
         turn = np.linalg.svd(p[None])[2]
         T[np.ix_(own, own)] = turn * np.where(turn @ np.ones(len(own)) < 0.0, -1.0, 1.0)[:, None]
@@ -131,8 +135,8 @@ class GainSets:
     @classmethod
     def of(cls, loop: Loop, model: LinearModel, rate_hz: float, form: Form, filters: int = 0) -> GainSets:
         """Return the structure that holds the gains of a loop in a form."""
-        seen = tuple(bool(k >= 0) for k in fed_back(model)[:, 1])
-        return cls(form=form, pid=Pid.of(loop, rate_hz), current=seen, filters=filters)
+        current = tuple(bool(k >= 0) for k in fed_back(model)[:, 1])
+        return cls(form=form, pid=Pid.of(loop, rate_hz), current=current, filters=filters)
 
     @property
     def signs(self) -> Array:
@@ -172,16 +176,16 @@ class GainSets:
         position, current = ends[:-1], ends[:-1] + 1
         laws, rows = [], []
         for c, k in enumerate(self.form.sets):
-            of = np.flatnonzero(T[c])
-            with_current = all(self.current[j] for j in of)
+            axes = np.flatnonzero(T[c])
+            with_current = all(self.current[j] for j in axes)
             loop = self.pid.loop(gains[k], Loop())
             law = replace(loop, kc=0.0).as_law(rate, current=False)
             for one in filters:
                 law = _filtered(law, one)
             row = np.zeros((1 + with_current, ends[-1]))
-            row[0, position[of]] = T[c, of]
+            row[0, position[axes]] = T[c, axes]
             if with_current:
-                row[1, current[of]] = T[c, of]
+                row[1, current[axes]] = T[c, axes]
                 law = replace(law, B=np.pad(law.B, ((0, 0), (0, 1))), D=np.append(law.D, [[-loop.kc]], axis=1))
             laws.append(law)
             rows.append(row)
@@ -273,15 +277,15 @@ class RotorLoops:
     @cached_property
     def frequency_hz(self) -> Array:
         """Frequencies of each plant, (n_plants, n), the last one repeated where there are fewer."""
-        law, found = self.sets.law(self.around), []
-        for plant, of in zip(self.plants, self.sampled, strict=True):
+        law, grids = self.sets.law(self.around), []
+        for plant, sampled in zip(self.plants, self.sampled, strict=True):
             f = plant.grid(FREQUENCIES)
-            own = np.abs(np.angle(np.linalg.eigvals(of.closed(law)))) * self.rate_hz / (2.0 * np.pi)
+            own = np.abs(np.angle(np.linalg.eigvals(sampled.closed(law)))) * self.rate_hz / (2.0 * np.pi)
             own = np.concatenate([own * (1.0 + w) for w in (-0.01, -0.003, 0.0, 0.003, 0.01)])
             f = np.union1d(f, own[(own > f[0]) & (own < f[-1])])
-            found.append(f[np.append(True, np.diff(f) > _SAME * f[1:])])
-        size = max(f.size for f in found)
-        return np.array([np.pad(f, (0, size - f.size), mode="edge") for f in found])
+            grids.append(f[np.append(True, np.diff(f) > _SAME * f[1:])])
+        size = max(f.size for f in grids)
+        return np.array([np.pad(f, (0, size - f.size), mode="edge") for f in grids])
 
     @cached_property
     def responses(self) -> tuple[Complex, Complex]:
@@ -299,8 +303,8 @@ class RotorLoops:
     @cached_property
     def shares(self) -> tuple[tuple[Array, Array], ...]:
         """Of each set where it acts by positions, and by the currents that are measured, (n, n) and (n, n_i)."""
-        seen = np.array(self.sets.current)
-        return tuple((M, M[:, seen]) for M in map(self.sets.form.share, range(len(self.sets.form.names))))
+        current = np.array(self.sets.current)
+        return tuple((M, M[:, current]) for M in map(self.sets.form.share, range(len(self.sets.form.names))))
 
     def figures(self, at: Array) -> tuple[Array, Array]:
         """Return the logarithms of peak, compliance and noise, (n_plants, 3), and their slopes, (n_plants, 3, n)."""
@@ -324,17 +328,17 @@ class RotorLoops:
         worst = np.argmax(mean, axis=1)
         many = np.arange(worst.size)
         tops = [_smooth_maximum(np.log(np.abs(x))) for x in (S, soft)]
-        found = np.stack([tops[0][0], tops[1][0], 0.5 * np.log(mean[many, worst])], axis=1)
-        slopes = np.zeros((*found.shape, at.size))
+        figures = np.stack([tops[0][0], tops[1][0], 0.5 * np.log(mean[many, worst])], axis=1)
+        slopes = np.zeros((*figures.shape, at.size))
         back = sd * np.conj(N[many, :, worst])
-        seen = (
+        parts = (
             (moved[:, :, :n], Z[..., :n], tops[0][1] / S), (moved[:, :, n_y:], pushed, tops[1][1] / soft),
         )  # fmt: skip
         for k, ((_, rates), (M, by_current)) in enumerate(zip(gains, self.shares, strict=True)):
             for part, M_k in ((slice(0, n), M), (slice(n, n_y), by_current)):
                 weights = [
                     -np.sum(w * np.sum((left @ M_k) * np.swapaxes(right[:, :, part], 2, 3), axis=3), axis=2)
-                    for left, right, w in seen
+                    for left, right, w in parts
                 ]
                 row = inner[many, :, worst] @ M_k  # (n_plants, n_f, n)
                 noisy = np.einsum("pfv,pfvy,pfy->pf", row, Z[:, :, part], back)
@@ -344,7 +348,7 @@ class RotorLoops:
                         slopes[:, j] += np.real(np.einsum("pf,pfm->pm", weight, rates))
                     else:
                         slopes[:, j, 5 * k + 3] += kc[k] * np.real(np.sum(weight, axis=1))
-        return found, slopes
+        return figures, slopes
 
     def decays(self, at: Array, *, integrates: bool) -> tuple[Array, Array]:
         """Return how fast force steps settle on each plant, 1/s, and its slopes, (n_plants, n).
@@ -353,30 +357,30 @@ class RotorLoops:
         so (a smooth minimum: axes have almost the same poles), in decays of one with the whole step. c falls with the
         square of the frequency, as inertia does: a bending mode that hardly takes part may decay slowly.
         """
-        laws, found, slopes = self._laws(at), [], []
-        for of in self.sampled:
-            n, (decay, values, left, right, scale) = of.A.shape[0], self._slow(of, laws[0], integrates)
+        laws, decays, slopes = self._laws(at), [], []
+        for sampled in self.sampled:
+            n, (decay, values, left, right, scale) = sampled.A.shape[0], self._slow(sampled, laws[0], integrates)
             near = np.flatnonzero(decay < decay.min() + 10.0 * self._pace / _EVEN)
             share = np.exp(-_EVEN * (decay[near] - decay.min()) / self._pace)
             rates = []
             for k in near:
                 w, x = left[:, k], right[:, k]
-                (a, c), (b, d) = (w[:n] @ of.B, w[n:]), (of.C @ x[:n], x[n:])
+                (a, c), (b, d) = (w[:n] @ sampled.B, w[n:]), (sampled.C @ x[:n], x[n:])
                 rates.append([
                     a @ ((p.D - m.D) @ b + (p.C - m.C) @ d) + c @ ((p.B - m.B) @ b + (p.A - m.A) @ d)
                     for p, m in zip(laws[1::2], laws[2::2], strict=True)
                 ])  # fmt: skip
-            by = -np.real(np.array(rates) / (2.0 * _STEP * values[near, None])) * scale[near, None]
-            found.append(decay.min() - math.log(share.sum()) * self._pace / _EVEN)
-            slopes.append(share @ by / share.sum())
-        return np.array(found), np.array(slopes)
+            rises = -np.real(np.array(rates) / (2.0 * _STEP * values[near, None])) * scale[near, None]
+            decays.append(decay.min() - math.log(share.sum()) * self._pace / _EVEN)
+            slopes.append(share @ rises / share.sum())
+        return np.array(decays), np.array(slopes)
 
     @cached_property
     def _pace(self) -> float:
         """What decays are large or small against, 1/s: the slowest of the loop that is looked around."""
         law = self.sets.law(self.around)
         integrates = bool(self.sets.signs[1])
-        return max(min(float(self._slow(of, law, integrates)[0].min()) for of in self.sampled), 1e-3)
+        return max(min(float(self._slow(sampled, law, integrates)[0].min()) for sampled in self.sampled), 1e-3)
 
     @cached_property
     def _stiff(self) -> float:
@@ -384,10 +388,10 @@ class RotorLoops:
         return 2.0 / (self.plants[0].theta["m"] * float(np.exp(self.figures(self.around)[0][0, 1])))
 
     def _slow(
-        self, of: SampledPlant, law: StateLaw, integrates: bool
+        self, sampled: SampledPlant, law: StateLaw, integrates: bool
     ) -> tuple[Array, Complex, Complex, Complex, Array]:
         """Return decays as `decays` counts them, poles, left and right vectors, and decay over -ln|pole|."""
-        values, right = np.linalg.eig(of.closed(law))
+        values, right = np.linalg.eig(sampled.closed(law))
         left = np.linalg.inv(right).T  # axes that are alike have the same poles: vectors one by one would not fit
         part = 1.0 / (1.0 + (np.angle(values) * self.rate_hz) ** 2 / self._stiff)
         weight = np.maximum(np.log(part / SETTLED), _SILENT)
@@ -418,11 +422,11 @@ def _smooth_maximum(ln: Array) -> tuple[Array, Array]:
 def _widths(frequency_hz: Array) -> Array:
     """Return the weights of a mean over the frequencies, (n_plants, n), by the trapezoidal rule from rest on."""
     gaps = np.diff(frequency_hz, axis=1) / 2.0
-    found = np.zeros(frequency_hz.shape)
-    found[:, :-1] += gaps
-    found[:, 1:] += gaps
-    found[:, 0] += frequency_hz[:, 0]
-    return found / frequency_hz[:, -1:]
+    widths = np.zeros(frequency_hz.shape)
+    widths[:, :-1] += gaps
+    widths[:, 1:] += gaps
+    widths[:, 0] += frequency_hz[:, 0]
+    return widths / frequency_hz[:, -1:]
 
 
 def _mean(frequency_hz: Array, power: Array) -> Array:

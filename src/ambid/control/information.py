@@ -46,15 +46,15 @@ class Innovation:
     @classmethod
     def of(cls, plant: Plant, noise: Noise) -> Innovation:
         """Return that of a bench's noise; EstimationError where an output has none, and could be known exactly."""
-        of, force, voltage = plant.model, *noise.held_rms(plant.rate_hz)
-        sensors = np.array([_sensor_sd(noise, role) for role in of.outputs])
+        plant_model, force, voltage = plant.model, *noise.held_rms(plant.rate_hz)
+        sensors = np.array([_sensor_sd(noise, role) for role in plant_model.outputs])
         if not np.all(sensors > 0.0):
-            silent = of.outputs[int(np.argmin(sensors))]
+            silent = plant_model.outputs[int(np.argmin(sensors))]
             raise EstimationError(
                 f"nothing is known of the noise of {silent!r}, and without noise any excitation would do. Give [noise] "
                 "in the rig, or an estimate"
             )
-        pushed = np.array([force if "force" in name else voltage for name in of.disturbances])
+        pushed = np.array([force if "force" in name else voltage for name in plant_model.disturbances])
         return cls.of_sources(plant, sensors, pushed)
 
     @classmethod
@@ -106,21 +106,21 @@ class Information:
         """Return the information of `names` of the plants; `driven` (n_lines, n_inputs): T of each line's input."""
         first = plants[0]
         roles, names = {f"{role}.delay" for role in first.model.inputs}, first.names
-        known = [n for n in names if n not in roles]
+        numbers = [n for n in names if n not in roles]
         sizes = np.ones(len(names))
-        sizes[[names.index(n) for n in known]] = natural_sizes(
-            known, dict(first.theta), first.model.references(first.theta)
+        sizes[[names.index(n) for n in numbers]] = natural_sizes(
+            numbers, dict(first.theta), first.model.references(first.theta)
         )
         prior = np.array([sizes[k] / prior_sd[n] if n in prior_sd else 0.0 for k, n in enumerate(names)])
-        chosen = [n for n in known if reported(n)] if criterion in ("all", "worst") else [criterion]
+        chosen = [n for n in numbers if reported(n)] if criterion in ("all", "worst") else [criterion]
         shapes = split_rows(first.model, first.theta, names) * sizes if isinstance(first.model, RotorModel) else None
-        found = []
+        lines_of_plants = []
         for plant, noise, T in zip(plants, noises, driven, strict=True):
             rows = noise.whiten(plant, 2.0 * np.pi * frequency_hz) @ plant.slopes(plant.sampled(frequency_hz), T)
             rows = rows * sizes
-            found.append(0.5 * np.real(np.swapaxes(rows.conj(), 1, 2) @ rows))
+            lines_of_plants.append(0.5 * np.real(np.swapaxes(rows.conj(), 1, 2) @ rows))
         return cls(
-            names=names, sizes=sizes, lines=np.array(found),
+            names=names, sizes=sizes, lines=np.array(lines_of_plants),
             prior=np.diag(prior**2) + (0.0 if shapes is None else shapes.T @ shapes),
             weights=np.array([(n in chosen) / len(chosen) for n in names]), worst=criterion == "worst",
         )  # fmt: skip
@@ -182,5 +182,5 @@ def informed_lines(power: Array, cost: Array, count: int) -> NDArray[np.int64]:
     best = np.argsort(-power * cost)[: count // 2]
     rest = np.setdiff1d(np.arange(cost.size), best)
     spread = rest[np.unique(np.geomspace(1, rest.size, 20 * count).round().astype(int)) - 1]
-    taken = np.linspace(0, spread.size - 1, min(count - best.size, spread.size)).round().astype(int)
-    return np.union1d(best, spread[taken])
+    places = np.linspace(0, spread.size - 1, min(count - best.size, spread.size)).round().astype(int)
+    return np.union1d(best, spread[places])

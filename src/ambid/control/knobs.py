@@ -78,7 +78,7 @@ class Family:
 
     def poles(self, law: StateLaw) -> Array:
         """Return the largest modulus of the poles on each plant."""
-        return np.array([of.largest_pole(law) for of in self.sampled])
+        return np.array([sampled.largest_pole(law) for sampled in self.sampled])
 
     def peaks(self, law: StateLaw) -> tuple[Array, Array]:
         """Return the peak of the sensitivity on each plant, of any axis: at its position signal, at its command."""
@@ -148,20 +148,20 @@ class Score:
     @classmethod
     def of(cls, goals: Goals) -> Score:
         """Return the score of a design's goals; the peak at the commands stays in zone A."""
-        kept = {n: x * math.exp(-_SLACK) for n, x in goals.limits.items()}
-        return cls(goals=goals, minimise=goals.minimise, limits={**kept, "command": ZONES[0][0]})
+        limits = {n: x * math.exp(-_SLACK) for n, x in goals.limits.items()}
+        return cls(goals=goals, minimise=goals.minimise, limits={**limits, "command": ZONES[0][0]})
 
-    def __call__(self, found: Mapping[str, float]) -> float:
+    def __call__(self, figures: Mapping[str, float]) -> float:
         """Return the score."""
-        if found["pole"] >= 1.0:
-            return _LOST + found["pole"]
-        excess = max((math.log(found[n] / x) for n, x in self.limits.items()), default=-math.inf)
-        goal = max(math.log(found[n] / self.goals.reference[n]) for n in self.minimise)
+        if figures["pole"] >= 1.0:
+            return _LOST + figures["pole"]
+        excess = max((math.log(figures[n] / x) for n, x in self.limits.items()), default=-math.inf)
+        goal = max(math.log(figures[n] / self.goals.reference[n]) for n in self.minimise)
         return _BEYOND + excess if excess > 0.0 else goal
 
-    def met(self, found: Mapping[str, float]) -> bool:
+    def met(self, figures: Mapping[str, float]) -> bool:
         """Whether no limit is passed."""
-        return self(found) < _BEYOND
+        return self(figures) < _BEYOND
 
 
 def _search(tries: _Tries, score: Score, grid: Sequence[Knobs]) -> Knobs:
@@ -205,8 +205,8 @@ def design_by_knobs(
     tries = _Tries(make=make, family=Family(plants=tuple(plants), noise=noise), tick=advance)
     for _ in range(_ROUNDS):
         best = _search(tries, score, grid)
-        law, found = tries.at(best)
-        if law is None or not score.met(found):
+        law, figures = tries.at(best)
+        if law is None or not score.met(figures):
             break
         loop = Loop(law=law, delay=0.0 if rig.loop is None else rig.loop.delay)
         over = worst_of([examine(p, loop, noise).figures for p in plants]).settling / goals.limits.get(
@@ -214,7 +214,7 @@ def design_by_knobs(
         )
         if over <= 1.0:
             return loop
-        score.limits["settling"] = found["settling"] * math.exp(-_SLACK) / over
+        score.limits["settling"] = figures["settling"] * math.exp(-_SLACK) / over
         grid = [*grid, best]
     raise EstimationError(_refusal(tries, score, grid, name))
 
@@ -224,16 +224,18 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> s
     ways, goals = [], score.goals
     for limit in goals.limits:
         alone = replace(score, minimise=(limit,), limits={n: x for n, x in score.limits.items() if n != limit})
-        found = tries.at(_search(tries, alone, grid))[1]
-        if alone.met(found) and found[limit] > score.limits[limit]:
-            ways.append((found[limit] / score.limits[limit], limit))
-    asked = ", ".join(said(n, x) for n, x in goals.limits.items())
+        figures = tries.at(_search(tries, alone, grid))[1]
+        if alone.met(figures) and figures[limit] > score.limits[limit]:
+            ways.append((figures[limit] / score.limits[limit], limit))
+    limits = ", ".join(said(n, x) for n, x in goals.limits.items())
     if not ways:
-        return f"no {name} law meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
+        return (
+            f"no {name} law meets the limits ({limits}), nor where any one of them is left out. Raise several of them"
+        )
     ratio, limit = min(ways)
     least = ratio * goals.limits[limit]
     return (
-        f"no {name} law meets the limits ({asked}) on all plants; with the others kept, {said(limit, least)} is the "
+        f"no {name} law meets the limits ({limits}) on all plants; with the others kept, {said(limit, least)} is the "
         f"least. Give {raised(limit, least)}, or raise another"
     )
 
@@ -347,7 +349,7 @@ def fixed_point(law: StateLaw, plant: Plant, counts: Counts, words: LawWords | N
     )  # fmt: skip
 
 
-def _rounding(of: SampledPlant, law: StateLaw, counts: Counts) -> tuple[float, float, float]:
+def _rounding(sampled: SampledPlant, law: StateLaw, counts: Counts) -> tuple[float, float, float]:
     """Return V rms in the command by rounding of states, m of a limit cycle by that, and by all that rounds.
 
     (A - 1) and C see the difference of a state from its upper part; then there is the last bit of the state itself. The
@@ -355,16 +357,16 @@ def _rounding(of: SampledPlant, law: StateLaw, counts: Counts) -> tuple[float, f
     """
     from scipy.linalg import solve_discrete_lyapunov
 
-    z, n = of.closed(law), law.order
+    z, n = sampled.closed(law), law.order
     if np.max(np.abs(np.linalg.eigvals(z))) >= 1.0:
         return math.inf, math.inf, math.inf
-    last = np.vstack([np.zeros((of.A.shape[0], n)), 2.0**-_BELOW * np.eye(n)])
-    states = np.hstack([np.vstack([of.B @ law.C, law.A - np.eye(n)]), last])
-    seen = np.vstack([of.B @ law.D, law.B]) * np.array([counts.position, counts.current])
-    ordered = np.vstack([of.B * counts.command, np.zeros((n, 1))])
-    command = np.hstack([law.D @ of.C, law.C])
+    last = np.vstack([np.zeros((sampled.A.shape[0], n)), 2.0**-_BELOW * np.eye(n)])
+    states = np.hstack([np.vstack([sampled.B @ law.C, law.A - np.eye(n)]), last])
+    inputs = np.vstack([sampled.B @ law.D, law.B]) * np.array([counts.position, counts.current])
+    ordered = np.vstack([sampled.B * counts.command, np.zeros((n, 1))])
+    command = np.hstack([law.D @ sampled.C, law.C])
     P = solve_discrete_lyapunov(z, states @ states.T / 12.0, method="bilinear")
     noise = float(np.sqrt((command @ P @ command.T)[0, 0] + np.sum(law.C**2) / 12.0))
-    position: Array = np.concatenate([of.C[of.kinds[0]], np.zeros((1, n))], axis=1)
-    sums = l1_norms(z, np.hstack([states, seen, ordered]), position)[0] / 2.0
+    position: Array = np.concatenate([sampled.C[sampled.kinds[0]], np.zeros((1, n))], axis=1)
+    sums = l1_norms(z, np.hstack([states, inputs, ordered]), position)[0] / 2.0
     return noise, float(np.sum(np.abs(sums[: 2 * n]))), float(np.sum(np.abs(sums)))

@@ -28,7 +28,7 @@ def write_law(law: StateLaw, path: str | Path, name: str, signals: Sequence[str]
     path = Path(path)
     if path.suffix == ".mat":
         names = {"signals": signals, "commands": commands}
-        cells = {key: np.array(list(of), dtype=object) for key, of in names.items()}
+        cells = {key: np.array(list(texts), dtype=object) for key, texts in names.items()}
         write_mat(path, {**_matrices(law), "rate_hz": law.rate_hz, **cells})
     elif path.suffix == ".py":
         path.write_text(python_of(law, name, signals, commands), encoding="utf-8")
@@ -140,5 +140,5 @@ def _table(name: str, matrix: Array) -> str:
 
 def comment_text(name: str) -> str:
     """Return a text, such as a name that somebody gave, that begins and ends no comment and no string."""
-    kept = "".join(c if c.isprintable() and c not in '"\\' else " " for c in name)
-    return kept.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").strip() or "a rig"
+    text = "".join(c if c.isprintable() and c not in '"\\' else " " for c in name)
+    return text.replace("*/", "* /").replace("/*", "/ *").replace("??", "? ?").strip() or "a rig"

@@ -84,13 +84,13 @@ class SampledPlant:
 
     def sensors(self, noise: Noise) -> Array:
         """Return the standard deviations of the outputs, with those of rounding."""
-        found = np.zeros(self.C.shape[0])
+        sd = np.zeros(self.C.shape[0])
         for rows, white, step in zip(
             self.kinds, (noise.position, noise.current), (noise.position_resolution, noise.current_resolution),
             strict=True,
         ):  # fmt: skip
-            found[rows] = math.hypot(white, step / math.sqrt(12.0))
-        return found
+            sd[rows] = math.hypot(white, step / math.sqrt(12.0))
+        return sd
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -112,10 +112,10 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     `effort`: factor on the price of the command: small is fast; `disturbance`: factor on the process noise: large
     trusts the sensors, small the model. EstimationError where the equations have no good solution.
     """
-    of = SampledPlant.of(plant)
-    scale = scales_of(of, weights)
-    A, B, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.C * scale
-    n, (position, current) = A.shape[0], of.kinds
+    sampled = SampledPlant.of(plant)
+    scale = scales_of(sampled, weights)
+    A, B, C = sampled.A * scale / scale[:, None], sampled.B / scale[:, None], sampled.C * scale
+    n, (position, current) = A.shape[0], sampled.kinds
     if position.size == 0:
         raise EstimationError(f"model {plant.model.name!r} has no position to hold. Give one with a position")
     T, axes, p = 1.0 / plant.rate_hz, position.size, C[position] / weights.position
@@ -125,22 +125,22 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     wide_B, R = np.vstack([B, np.zeros((axes, B.shape[1]))]) * weights.command, effort**2 * np.eye(B.shape[1])
     P, first = _riccati(wide, wide_B, Q, R)
     K = weights.command * np.linalg.solve(R + wide_B.T @ P @ wide_B, wide_B.T @ P @ wide)
-    M, second = _filter(of, A, C, scale, weights, noise, disturbance)
-    kept = np.eye(n) - M @ C
+    M, second = _filter(sampled, A, C, scale, weights, noise, disturbance)
+    remainder = np.eye(n) - M @ C
     moved, direct = A - B @ K[:, :n], -K[:, :n] @ M
     total = K[:, n:]
     back = min(T / weights.integral_s, 1.0)
     integrates = np.zeros((axes, C.shape[0]))
     integrates[np.arange(axes), position] = T / (weights.integral_s * weights.position)
     law = StateLaw(
-        A=np.block([[moved @ kept, -B @ total], [np.zeros((axes, n)), np.eye(axes)]]),
+        A=np.block([[moved @ remainder, -B @ total], [np.zeros((axes, n)), np.eye(axes)]]),
         B=np.vstack([moved @ M, integrates]),
-        C=np.hstack([-K[:, :n] @ kept, -total]),
+        C=np.hstack([-K[:, :n] @ remainder, -total]),
         D=direct,
         G=np.vstack([B, -back * np.linalg.pinv(total)]),
         rate_hz=plant.rate_hz,
     )
-    size, residual = of.largest_pole(law), max(first, second)
+    size, residual = sampled.largest_pole(law), max(first, second)
     if not (residual <= RESIDUAL and size < 1.0):
         raise EstimationError(
             f"the Riccati equations of LQG are solved to {residual:.1e} of their terms only and the largest pole is "
@@ -153,15 +153,15 @@ def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, di
     )  # fmt: skip
 
 
-def scales_of(of: SampledPlant, weights: Weights) -> Array:
+def scales_of(sampled: SampledPlant, weights: Weights) -> Array:
     """Return sizes of the states, powers of two, that make the rows of plant, inputs and outputs alike (Osborne)."""
     from scipy.linalg import matrix_balance
 
-    n, n_u, (position, current) = of.A.shape[0], of.B.shape[1], of.kinds
-    rows = [of.C[position] / weights.position, *([of.C[current] / weights.current] if current.size else [])]
+    n, n_u, (position, current) = sampled.A.shape[0], sampled.B.shape[1], sampled.kinds
+    rows = [sampled.C[position] / weights.position, *([sampled.C[current] / weights.current] if current.size else [])]
     outputs = np.vstack(rows)
     whole = np.zeros((n + max(n_u, outputs.shape[0]),) * 2)
-    whole[:n, :n], whole[:n, n : n + n_u] = of.A, of.B * weights.command
+    whole[:n, :n], whole[:n, n : n + n_u] = sampled.A, sampled.B * weights.command
     whole[n : n + outputs.shape[0], :n] = outputs
     return np.asarray(matrix_balance(whole, permute=False, separate=True)[1][0][:n])
 
@@ -183,13 +183,13 @@ def _riccati(A: Array, B: Array, Q: Array, R: Array) -> tuple[Array, float]:
     return P, float(np.max(np.abs(left)) / max(float(np.max(np.abs(t))) for t in terms))
 
 
-def filter_noise(of: SampledPlant, weights: Weights, noise: Noise, disturbance: float) -> tuple[Array, Array]:
+def filter_noise(sampled: SampledPlant, weights: Weights, noise: Noise, disturbance: float) -> tuple[Array, Array]:
     """Return what disturbances of unit size do to the states in a sample, and the sizes of the sensors' noise."""
-    force, voltage = noise.held_rms(of.plant.rate_hz)
-    size = [force if name.rsplit("_", 1)[-1] == "force" else voltage for name in of.plant.model.disturbances]
-    driven = np.hstack([of.E * np.array(size), of.B * (_ROUNDED * weights.command)]) * disturbance
-    sd = of.sensors(noise)
-    for rows, largest in zip(of.kinds, (weights.position, weights.current), strict=True):
+    force, voltage = noise.held_rms(sampled.plant.rate_hz)
+    size = [force if name.rsplit("_", 1)[-1] == "force" else voltage for name in sampled.plant.model.disturbances]
+    driven = np.hstack([sampled.E * np.array(size), sampled.B * (_ROUNDED * weights.command)]) * disturbance
+    sd = sampled.sensors(noise)
+    for rows, largest in zip(sampled.kinds, (weights.position, weights.current), strict=True):
         sd[rows] = np.maximum(sd[rows], _HIDDEN * (largest if math.isfinite(largest) else 0.0))
     if not np.all(sd > 0.0):
         raise ModelError("noise.current is not given; the filter of LQG weighs by it. Give noise.current")
@@ -197,15 +197,15 @@ def filter_noise(of: SampledPlant, weights: Weights, noise: Noise, disturbance: 
 
 
 def _filter(
-    of: SampledPlant, A: Array, C: Array, scale: Array, weights: Weights, noise: Noise, disturbance: float
+    sampled: SampledPlant, A: Array, C: Array, scale: Array, weights: Weights, noise: Noise, disturbance: float
 ) -> tuple[Array, float]:
     """Return the gain M of the stationary filter, and the residual of its equation, outputs counted in their noise."""
-    driven, sd = filter_noise(of, weights, noise, disturbance)
+    driven, sd = filter_noise(sampled, weights, noise, disturbance)
     driven = driven / scale[:, None]
     level = float(np.max(np.abs(driven)))
-    seen, driven = C / sd[:, None] * level, driven / level
-    P, residual = _riccati(A.T, seen.T, driven @ driven.T, np.eye(sd.size))
-    M = np.linalg.solve(seen @ P @ seen.T + np.eye(sd.size), seen @ P).T
+    outputs, driven = C / sd[:, None] * level, driven / level
+    P, residual = _riccati(A.T, outputs.T, driven @ driven.T, np.eye(sd.size))
+    M = np.linalg.solve(outputs @ P @ outputs.T + np.eye(sd.size), outputs @ P).T
     return M * (level / sd), residual
 
 
@@ -245,26 +245,26 @@ class Generalised:
         return B[:, :m], B[:, m:], C[:p], C[p:], D[:p, :m], D[:p, m:], D[p:, :m], D[p:, m:]
 
 
-def to_continuous(of: System) -> System:
+def to_continuous(system: System) -> System:
     """Return a discrete system through z = (1 + s)/(1 - s)."""
-    A, B, C, D = of
+    A, B, C, D = system
     inverse = np.linalg.inv(np.eye(A.shape[0]) + A)
     root = np.sqrt(2.0)
     return inverse @ (A - np.eye(A.shape[0])), root * inverse @ B, root * C @ inverse, D - C @ inverse @ B
 
 
-def to_discrete(of: System) -> System:
+def to_discrete(system: System) -> System:
     """Return a system through s = (z - 1)/(z + 1)."""
-    A, B, C, D = of
+    A, B, C, D = system
     inverse = np.linalg.inv(np.eye(A.shape[0]) - A)
     root = np.sqrt(2.0)
     return inverse @ (A + np.eye(A.shape[0])), root * inverse @ B, root * C @ inverse, D + C @ inverse @ B
 
 
-def central(of: Generalised, gamma: float) -> System | None:
+def central(weighted: Generalised, gamma: float) -> System | None:
     """Return the central controller for a bound on a continuous plant, u = K y; None where there is none."""
-    A = of.matrices[0]
-    B1, B2, C1, C2, D11, D12, D21, D22 = of.parts()
+    A = weighted.matrices[0]
+    B1, B2, C1, C2, D11, D12, D21, D22 = weighted.parts()
     # D12 -> [0; 1] and D21 -> [0 1] by rotations of z and w and units of u and y
     U, s, V = np.linalg.svd(D12)
     m2, p2 = D12.shape[1], D21.shape[0]
@@ -293,9 +293,9 @@ def central(of: Generalised, gamma: float) -> System | None:
     except np.linalg.LinAlgError:  # the direct path alone is beyond the bound
         return None
     Z = np.linalg.inv(np.eye(A.shape[0]) - Y @ X / g)
-    out, seen = (B2 + L[:, p:p1]) @ first, -second @ (C2 + F[m:m1]) @ Z
+    out, entry = (B2 + L[:, p:p1]) @ first, -second @ (C2 + F[m:m1]) @ Z
     entered = -L[:, p1:] + out @ np.linalg.solve(first, direct)
-    ordered = F[m1:] @ Z + direct @ np.linalg.solve(second, seen)
+    ordered = F[m1:] @ Z + direct @ np.linalg.solve(second, entry)
     K = A + L @ C + out @ np.linalg.solve(first, ordered), entered @ scale, units @ ordered, units @ direct @ scale
     return _without(K, D22)
 
@@ -320,10 +320,10 @@ def _without(K: System, D22: Array) -> System:
     return A - B @ D22 @ loop @ C, B @ through, loop @ C, loop @ D
 
 
-def least_bound(of: Generalised) -> tuple[float, System]:
+def least_bound(weighted: Generalised) -> tuple[float, System]:
     """Return the least bound of a continuous plant, and the central controller for one a little larger."""
     low, high = 0.0, _FIRST
-    while central(of, high) is None:
+    while central(weighted, high) is None:
         low, high = high, 2.0 * high
         if high > _MOST:
             raise EstimationError("no H-infinity law holds the estimated plant. Check its numbers and noise")
@@ -331,22 +331,24 @@ def least_bound(of: Generalised) -> tuple[float, System]:
         low = high / 1024.0
     while high / low > _CLOSE:
         middle = float(np.sqrt(low * high))
-        low, high = (low, middle) if central(of, middle) is not None else (middle, high)
+        low, high = (low, middle) if central(weighted, middle) is not None else (middle, high)
     for gamma in (_OVER * high, _OVER**2 * high, high):
-        found = central(of, gamma)
-        if found is not None:
-            return gamma, found
+        controller = central(weighted, gamma)
+        if controller is not None:
+            return gamma, controller
     raise EstimationError("the Riccati equations of the H-infinity law have no sound solution. Change the weights")
 
 
-def generalised(of: SampledPlant, weights: Weights, noise: Noise, effort: float, disturbance: float) -> Generalised:
+def generalised(
+    sampled: SampledPlant, weights: Weights, noise: Noise, effort: float, disturbance: float
+) -> Generalised:
     """Return the weighted discrete plant; the controller sees its outputs and the integral of the positions."""
-    scale = scales_of(of, weights)
-    A, B, C = of.A * scale / scale[:, None], of.B / scale[:, None], of.C * scale
-    driven, sd = filter_noise(of, weights, noise, disturbance)
+    scale = scales_of(sampled, weights)
+    A, B, C = sampled.A * scale / scale[:, None], sampled.B / scale[:, None], sampled.C * scale
+    driven, sd = filter_noise(sampled, weights, noise, disturbance)
     driven = driven / scale[:, None]
-    (position, current), n, n_y, n_u = of.kinds, A.shape[0], C.shape[0], B.shape[1]
-    axes, step = position.size, 1.0 / (of.plant.rate_hz * weights.integral_s * weights.position)
+    (position, current), n, n_y, n_u = sampled.kinds, A.shape[0], C.shape[0], B.shape[1]
+    axes, step = position.size, 1.0 / (sampled.plant.rate_hz * weights.integral_s * weights.position)
     n_w = driven.shape[1]
     picked = np.zeros((axes, n_y))
     picked[np.arange(axes), position] = 1.0
@@ -370,26 +372,26 @@ def hinf(
     plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, disturbance: float = 1.0
 ) -> tuple[StateLaw, float]:
     """Return the law for a plant, and the bound on the weighted gain that it keeps; arguments as of `lqg`."""
-    of = SampledPlant.of(plant)
-    P = generalised(of, weights, noise, effort, disturbance)
-    gamma, found = least_bound(replace(P, matrices=to_continuous(P.matrices)))
-    A, B, C, D = to_discrete(found)
-    sd = filter_noise(of, weights, noise, disturbance)[1]
-    n, axes, n_y = A.shape[0], of.kinds[0].size, of.C.shape[0]
+    sampled = SampledPlant.of(plant)
+    P = generalised(sampled, weights, noise, effort, disturbance)
+    gamma, controller = least_bound(replace(P, matrices=to_continuous(P.matrices)))
+    A, B, C, D = to_discrete(controller)
+    sd = filter_noise(sampled, weights, noise, disturbance)[1]
+    n, axes, n_y = A.shape[0], sampled.kinds[0].size, sampled.C.shape[0]
     step = 1.0 / (plant.rate_hz * weights.integral_s * weights.position)
     picked = np.zeros((axes, n_y))
-    picked[np.arange(axes), of.kinds[0]] = step
-    seen, summed = B[:, :n_y] / sd, B[:, n_y:] / _FEW
+    picked[np.arange(axes), sampled.kinds[0]] = step
+    measured, summed = B[:, :n_y] / sd, B[:, n_y:] / _FEW
     direct, through = weights.command * D[:, :n_y] / sd, weights.command * D[:, n_y:] / _FEW
     law = StateLaw(
-        A=np.block([[A, summed], [np.zeros((axes, n)), np.eye(axes)]]), B=np.vstack([seen, picked]),
+        A=np.block([[A, summed], [np.zeros((axes, n)), np.eye(axes)]]), B=np.vstack([measured, picked]),
         C=np.hstack([weights.command * C, through]), D=direct, rate_hz=plant.rate_hz,
     )  # fmt: skip
     largest = np.zeros(n_y)
-    for rows, x in zip(of.kinds, (weights.position, weights.current), strict=True):
+    for rows, x in zip(sampled.kinds, (weights.position, weights.current), strict=True):
         largest[rows] = x if np.isfinite(x) else sd[rows]
     law = _quicker(tracked(law, law.B * largest, weights.command), axes)
-    if of.largest_pole(law) >= 1.0:
+    if sampled.largest_pole(law) >= 1.0:
         raise EstimationError("the H-infinity law does not hold its own plant: the equations are too ill-conditioned")
     return law, gamma
 
@@ -412,12 +414,12 @@ def tracked(law: StateLaw, driven: Array, command: float) -> StateLaw:
 
 def _quicker(law: StateLaw, axes: int) -> StateLaw:
     """Return a law whose integrals, its last states, are tracked back so fast that the slowest pole is fastest."""
-    found = []
+    candidates = []
     for factor in np.geomspace(1.0, _FASTER, 25):
         G = law.windup.copy()
         G[-axes:] *= factor
-        found.append((float(np.max(np.abs(np.linalg.eigvals(law.A - G @ law.C)))), G))
-    return replace(law, G=min(found, key=lambda x: x[0])[1])
+        candidates.append((float(np.max(np.abs(np.linalg.eigvals(law.A - G @ law.C)))), G))
+    return replace(law, G=min(candidates, key=lambda x: x[0])[1])
 
 
 # Order reduction of a law: balanced truncation of its stable part; integrals and growing modes are kept apart.
@@ -437,12 +439,13 @@ def reduced(law: StateLaw, order: int, largest: Array, command: float = 1.0) -> 
 
     inside = 1.0 - _STABLE
     T, Z, n = schur(law.A, sort=lambda re, im: np.hypot(re, im) < inside)
-    kept = law.order - n
+    apart = law.order - n
     if order >= law.order:
         return law, 0.0
-    if order < kept:
+    if order < apart:
         raise ModelError(
-            f"the law has {kept} integrals and growing modes, which cannot be left out; its order cannot become {order}"
+            f"the law has {apart} integrals and growing modes, which cannot be left out; its order cannot become"
+            f" {order}"
         )
     S = np.eye(law.order)
     S[:n, n:] = solve_sylvester(T[:n, :n], -T[n:, n:], -T[:n, n:])  # T S = S diag: no coupling of the two parts
@@ -454,12 +457,12 @@ def reduced(law: StateLaw, order: int, largest: Array, command: float = 1.0) -> 
     Q = solve_discrete_lyapunov(A[:n, :n].T, C[:, :n].T @ C[:, :n] / command**2)
     left, right = _root(P), _root(Q)
     U, sigma, V = svd(right.T @ left)
-    r = order - kept
+    r = order - apart
     size = np.sqrt(np.maximum(sigma[:r], 1e-300))
     down, up = (U[:, :r] / size).T @ right.T, left @ V[:r].T / size
     rows, columns = np.zeros((order, law.order)), np.zeros((law.order, order))
     rows[:r, :n], columns[:n, :r] = down, up
-    rows[r:, n:] = columns[n:, r:] = np.eye(kept)
+    rows[r:, n:] = columns[n:, r:] = np.eye(apart)
     small = replace(law, A=rows @ A @ columns, B=rows @ B, C=C @ columns, G=rows @ G)
     return small, 2.0 * float(np.sum(sigma[r:]))
 

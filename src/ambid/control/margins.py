@@ -76,7 +76,7 @@ def room_by_axis(
     `noise`: standard deviation of the model's disturbances, held over a sample, and of its outputs' noise, by name;
     `room`: by role; `machine`: the rotor, where unbalance can be said of it.
     """
-    found = {}
+    rooms = {}
     answers, peaks = _answers(loop), _step_peaks(loop)
     for axis in loop.plant.axes:
         rows = quantity_rows(loop, axis)
@@ -92,24 +92,24 @@ def room_by_axis(
         steps = {q: x / demands[q].step for q, x in free.items()}
         force = min(steps, key=lambda q: steps[q]) if steps else None
         unbalance = _unbalance(loop, axis, free, machine) if free else _MISSING
-        found[axis] = Room(
+        rooms[axis] = Room(
             quantities=demands, force_step=None if force is None else steps[force], force_limit=force,
             unbalance=unbalance[0], unbalance_limit=unbalance[1], unbalance_hz=unbalance[2],
         )  # fmt: skip
-    return found
+    return rooms
 
 
 def quantity_rows(loop: ClosedLoop, axis: str) -> dict[str, int]:
     """Return where an axis' input, current and position at the magnet stand: inputs, then `ClosedLoop.motions`."""
-    of, n_u = loop.plant.model, len(loop.plant.model.inputs)
-    before = f"{axis}_" if isinstance(of, RotorModel) else ""
+    plant_model, n_u = loop.plant.model, len(loop.plant.model.inputs)
+    before = f"{axis}_" if isinstance(plant_model, RotorModel) else ""
     rows = {}
     for kind in ("voltage", "current"):
-        if f"{before}{kind}" in of.inputs:
-            rows[kind] = of.inputs.index(f"{before}{kind}")
-        elif f"{before}{kind}" in of.outputs:
-            rows[kind] = n_u + of.outputs.index(f"{before}{kind}")
-    return {**rows, "position": n_u + len(of.outputs) + loop.plant.axes.index(axis)}
+        if f"{before}{kind}" in plant_model.inputs:
+            rows[kind] = plant_model.inputs.index(f"{before}{kind}")
+        elif f"{before}{kind}" in plant_model.outputs:
+            rows[kind] = n_u + plant_model.outputs.index(f"{before}{kind}")
+    return {**rows, "position": n_u + len(plant_model.outputs) + loop.plant.axes.index(axis)}
 
 
 def role_of(loop: ClosedLoop, axis: str, quantity: str) -> str:
@@ -128,9 +128,12 @@ def _noise(
     """Return the rms of a quantity by all noise, by that of the sensors, and by that of the process."""
     if noise is None:
         return _MISSING
-    of, f = loop.plant.model, loop.frequency_hz
-    n_d, n_y = len(of.disturbances), len(of.outputs)
-    names = {**dict(enumerate(of.disturbances)), **dict(enumerate(of.outputs, through.shape[1] - n_y))}
+    plant_model, f = loop.plant.model, loop.frequency_hz
+    n_d, n_y = len(plant_model.disturbances), len(plant_model.outputs)
+    names = {
+        **dict(enumerate(plant_model.disturbances)),
+        **dict(enumerate(plant_model.outputs, through.shape[1] - n_y)),
+    }
     power = {}
     for k, name in names.items():
         size = np.abs(through[:, k]) ** 2 * 2.0 * noise.get(name, 0.0) ** 2 / loop.plant.rate_hz
@@ -150,29 +153,29 @@ def _step_peaks(loop: ClosedLoop) -> dict[str, dict[str, float]]:
         f = np.linspace(0.0, 0.5, _LINES * 2**k + 1) * loop.plant.rate_hz
         f[0] = 1e-3 * f[1]  # at rest an integrator of the controller is infinite
         impulse = np.fft.irfft(_answers(loop.at(f))[:, rows, causes], axis=0)
-        found = np.max(np.abs(np.cumsum(impulse, axis=0)), axis=0)
-        if np.all(np.abs(found - before) <= _SETTLED * found):
+        peaks = np.max(np.abs(np.cumsum(impulse, axis=0)), axis=0)
+        if np.all(np.abs(peaks - before) <= _SETTLED * peaks):
             break
-        before = found
-    return {axis: {q: float(found[m]) for m, (a, q, *_) in enumerate(at) if a == axis} for axis in axes}
+        before = peaks
+    return {axis: {q: float(peaks[m]) for m, (a, q, *_) in enumerate(at) if a == axis} for axis in axes}
 
 
 def _unbalance(
     loop: ClosedLoop, axis: str, free: Mapping[str, float], machine: Machine | None
 ) -> tuple[float | None, str | None, float | None]:
     """Return the largest unbalance in the plane of an axis' magnet, the quantity at its limit, and where in Hz."""
-    of, f = loop.plant.model, speeds_of(loop)
+    plant_model, f = loop.plant.model, speeds_of(loop)
     rows = quantity_rows(loop, axis)
-    if isinstance(of, RotorModel):
-        bearing, plane = of.placed[of.axes.index(axis)]
+    if isinstance(plant_model, RotorModel):
+        bearing, plane = plant_model.placed[plant_model.axes.index(axis)]
         if machine is None or plane == 2:
             return _MISSING
-        n_u = len(of.inputs)
+        n_u = len(plant_model.inputs)
         answer = synchronous(loop, machine, f, machine.shape(f"{bearing.name}.z")[:, None], None)[:, :, 0]
-        rows["position"] = n_u + loop.plant.sensors[of.axes.index(axis)][0]
+        rows["position"] = n_u + loop.plant.sensors[plant_model.axes.index(axis)][0]
     else:
         at = loop.at(f)
-        answer = _answers(at)[:, :, len(of.disturbances)] * (2.0 * np.pi * f[:, None]) ** 2
+        answer = _answers(at)[:, :, len(plant_model.disturbances)] * (2.0 * np.pi * f[:, None]) ** 2
     most = {q: x / np.abs(answer[:, rows[q]]) for q, x in free.items()}
     first = min(most, key=lambda q: float(np.min(most[q])))
     k = int(np.argmin(most[first]))
@@ -181,8 +184,8 @@ def _unbalance(
 
 def speeds_of(loop: ClosedLoop) -> Array:
     """Return speeds of rotation in Hz: up to somewhat above that of the model, else where rotors may turn."""
-    of = loop.plant.model
-    speed = abs(of.speed) / (2.0 * np.pi) if isinstance(of, RotorModel) else 0.0
+    plant_model = loop.plant.model
+    speed = abs(plant_model.speed) / (2.0 * np.pi) if isinstance(plant_model, RotorModel) else 0.0
     if speed:
         return np.linspace(_ABOVE / _SPEEDS, _ABOVE, _SPEEDS) * speed
     return np.geomspace(*_SPEED_BAND, _SPEEDS) * loop.plant.rate_hz
@@ -197,15 +200,15 @@ def synchronous(
     columns), m.
     """
     K, rate = loop.at(frequency_hz).K, loop.plant.rate_hz
-    found = []
+    motions = []
     for f, k in zip(frequency_hz, K, strict=True):
         omega = 2.0 * np.pi * float(f)
         pushed = machine.forced(omega, unbalance)
         H = machine.transfer(np.array([omega]), omega, rate)[0]
         read = 0.0 if runout is None else runout
         y = np.linalg.solve(np.eye(H.shape[0]) + H @ k, pushed + read)
-        found.append(np.vstack([-k @ y, y - read]))
-    return np.array(found)
+        motions.append(np.vstack([-k @ y, y - read]))
+    return np.array(motions)
 
 
 SCHEMA = "ambid.margins/1"
@@ -380,18 +383,18 @@ def sensitivity_by_axis(
     loop: ClosedLoop, measured: Sequence[MeasuredSensitivity | None] = ()
 ) -> dict[str, AxisSensitivity]:
     """Return the peak of the sensitivity of each axis."""
-    found: dict[str, AxisSensitivity] = {}
+    result: dict[str, AxisSensitivity] = {}
     measured = measured or (None,) * len(loop.plant.axes)
-    for axis, peak, S, seen in zip(loop.plant.axes, loop.peaks(), loop.of_axes.T, measured, strict=True):
-        top = None if seen is None else seen.peak
-        found[axis] = AxisSensitivity(
+    for axis, peak, S, of_record in zip(loop.plant.axes, loop.peaks(), loop.of_axes.T, measured, strict=True):
+        top = None if of_record is None else of_record.peak
+        result[axis] = AxisSensitivity(
             peak_db=EstimatedNumber.of(peak.decibel, peak.sd_db, size=1.0), frequency_hz=peak.frequency_hz,
             zone=zone_of(peak.ratio), measured_peak_db=None if top is None else float(20.0 * np.log10(top[0])),
             measured_frequency_hz=None if top is None else top[1],
             measured_sd_db=None if top is None else DECIBEL * top[2] / top[0],
             bandwidth_hz=_bandwidth(loop.frequency_hz, S),
         )  # fmt: skip
-    return found
+    return result
 
 
 def _bandwidth(frequency_hz: Array, S: Complex) -> float | None:
@@ -424,13 +427,13 @@ def curves_of(loop: ClosedLoop, measured: Sequence[MeasuredSensitivity | None]) 
     f, axes, S, G = loop.frequency_hz, loop.plant.axes, loop.of_axes, loop.compliance
     even = loop.shown[np.linspace(0, loop.shown.size - 1, _KEPT).round().astype(int)]
     near = [k for x in (S, G) for k in np.argmax(np.abs(x), axis=0)]
-    kept = np.unique(np.clip(np.concatenate([even, *(np.arange(k - 3, k + 4) for k in near)]), 0, f.size - 1))
-    stiff = 1.0 / G[kept]
-    damping = stiff.imag / (2.0 * np.pi * f[kept, None])
+    places = np.unique(np.clip(np.concatenate([even, *(np.arange(k - 3, k + 4) for k in near)]), 0, f.size - 1))
+    stiff = 1.0 / G[places]
+    damping = stiff.imag / (2.0 * np.pi * f[places, None])
     return Curves(
-        frequency_hz=f[kept],
-        sensitivity={axis: S[kept, j] for j, axis in enumerate(axes)},
-        compliance={axis: np.abs(G[kept, j]) for j, axis in enumerate(axes)},
+        frequency_hz=f[places],
+        sensitivity={axis: S[places, j] for j, axis in enumerate(axes)},
+        compliance={axis: np.abs(G[places, j]) for j, axis in enumerate(axes)},
         measured={axis: m for axis, m in zip(axes, measured, strict=True) if m is not None},
         stiffness={axis: stiff[:, j].real for j, axis in enumerate(axes)},
         damping={axis: damping[:, j] for j, axis in enumerate(axes)},
@@ -439,36 +442,37 @@ def curves_of(loop: ClosedLoop, measured: Sequence[MeasuredSensitivity | None]) 
 
 def checks_of(
     loop: ClosedLoop,
-    found: Mapping[str, AxisSensitivity],
+    sensitivity: Mapping[str, AxisSensitivity],
     measured: Sequence[MeasuredSensitivity | None],
     band_hz: tuple[float, float] | None,
 ) -> dict[str, Check]:
     """Judge the controller, the model against the measured sensitivity, the band, and the zone."""
     checks = {"controller": _controller(loop)}
-    seen = [(j, m) for j, m in enumerate(measured) if m is not None and np.all(m.sd > 0.0)]
-    if seen:
-        checks["agreement"] = _agreement(loop, seen)
+    pairs = [(j, m) for j, m in enumerate(measured) if m is not None and np.all(m.sd > 0.0)]
+    if pairs:
+        checks["agreement"] = _agreement(loop, pairs)
     if band_hz is not None:
-        checks["band"] = _band(found, band_hz)
-    checks["zone"] = _zone(found)
+        checks["band"] = _band(sensitivity, band_hz)
+    checks["zone"] = _zone(sensitivity)
     return checks
 
 
 def _controller(loop: ClosedLoop) -> Check:
     """Judge whether a linear controller makes the inputs of the record."""
-    of = loop.controller
-    if of.source == "rig":
+    controller = loop.controller
+    if controller.source == "rig":
         return Check(passed=True, detail="the controller is the rig's [loop]")
     return Check(
-        passed=of.misfit <= MISFIT, values={"misfit": of.misfit},
-        detail=f"a controller of order {max(of.orders)} makes the inputs of the record but for {of.misfit:.1g} of them",
+        passed=controller.misfit <= MISFIT, values={"misfit": controller.misfit},
+        detail=f"a controller of order {max(controller.orders)} makes the inputs of the record but for "
+        f"{controller.misfit:.1g} of them",
     )  # fmt: skip
 
 
-def _agreement(loop: ClosedLoop, seen: Sequence[tuple[int, MeasuredSensitivity]]) -> Check:
+def _agreement(loop: ClosedLoop, pairs: Sequence[tuple[int, MeasuredSensitivity]]) -> Check:
     """Judge the predicted sensitivity by the measured one, line by line."""
     worst, where, size = 0.0, "", 0.0
-    for j, m in seen:
+    for j, m in pairs:
         left = m.ratio - np.abs(loop.at(m.frequency_hz).of_axes[:, j])
         ratio = float(np.mean(left**2 / smoothed(m.sd[:, None] ** 2)[:, 0]))
         far = (ratio - 1.0) / np.sqrt(2.0 / left.size)
@@ -483,9 +487,9 @@ def _agreement(loop: ClosedLoop, seen: Sequence[tuple[int, MeasuredSensitivity]]
     )  # fmt: skip
 
 
-def _band(found: Mapping[str, AxisSensitivity], band_hz: tuple[float, float]) -> Check:
+def _band(sensitivity: Mapping[str, AxisSensitivity], band_hz: tuple[float, float]) -> Check:
     """Judge whether the peaks lie where the record is excited."""
-    outside = [a for a, x in found.items() if not band_hz[0] <= x.frequency_hz <= band_hz[1]]
+    outside = [a for a, x in sensitivity.items() if not band_hz[0] <= x.frequency_hz <= band_hz[1]]
     band = f"{band_hz[0]:.4g} to {band_hz[1]:.4g} Hz"
     return Check(
         passed=not outside, values={"low_hz": band_hz[0], "high_hz": band_hz[1]},
@@ -495,9 +499,9 @@ def _band(found: Mapping[str, AxisSensitivity], band_hz: tuple[float, float]) ->
     )  # fmt: skip
 
 
-def _zone(found: Mapping[str, AxisSensitivity]) -> Check:
+def _zone(sensitivity: Mapping[str, AxisSensitivity]) -> Check:
     """Judge the peaks by ISO 14839-3."""
-    axis, worst = max(found.items(), key=lambda x: x[1].peak_db.value)
+    axis, worst = max(sensitivity.items(), key=lambda x: x[1].peak_db.value)
     peak = f"{worst.peak_db.value:.1f} dB at {worst.frequency_hz:.3g} Hz (axis {axis}), zone {worst.zone}"
     good = worst.zone in _LONG_TERM
     return Check(

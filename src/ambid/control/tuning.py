@@ -78,14 +78,14 @@ class AxisLoops:
     @cached_property
     def responses(self) -> tuple[Complex, ...]:
         """H_x, H_i, G_x and G_x H_i - H_x G_i, each (n_plants, n)."""
-        found = []
+        responses = []
         for plant in self.plants:
-            of = plant.model.outputs.index("position"), plant.model.outputs.index("current")
+            outputs = plant.model.outputs.index("position"), plant.model.outputs.index("current")
             loop = closed_loop_of(plant, Loop(), self.frequency_hz)
             by_forces, by_inputs = loop.pushed
-            (G_x, G_i), (H_x, H_i) = by_forces[:, of, plant.space.E.shape[1]].T, by_inputs[:, of, 0].T
-            found.append((H_x, H_i, G_x, G_x * H_i - H_x * G_i))
-        return tuple(np.array(x) for x in zip(*found, strict=True))
+            (G_x, G_i), (H_x, H_i) = by_forces[:, outputs, plant.space.E.shape[1]].T, by_inputs[:, outputs, 0].T
+            responses.append((H_x, H_i, G_x, G_x * H_i - H_x * G_i))
+        return tuple(np.array(x) for x in zip(*responses, strict=True))
 
     @cached_property
     def matrices(self) -> Array:
@@ -93,14 +93,14 @@ class AxisLoops:
         T = 1.0 / self.rate_hz
         probes = (Loop(), Loop(kp=1.0), Loop(ki=1.0 / T), Loop(kd=T), Loop(kc=1.0))
         lagged = Loop(derivative_cutoff_hz=1.0 / (2.0 * math.pi * T))  # p = 1/2
-        found = []
+        matrices = []
         for plant in self.plants:
             z = np.array([closed_loop_matrix(plant.theta, on(p, plant), self.rate_hz, of=plant.model)
                           for p in (*probes, lagged)])  # fmt: skip
-            found.append(np.concatenate([z[:1], z[1:] - z[0]]) * np.array([1, 1, 1, 1, 1, 2])[:, None, None])
-        size = max(z.shape[1] for z in found)
-        wide = np.zeros((6, len(found), size, size))
-        for k, z in enumerate(found):
+            matrices.append(np.concatenate([z[:1], z[1:] - z[0]]) * np.array([1, 1, 1, 1, 1, 2])[:, None, None])
+        size = max(z.shape[1] for z in matrices)
+        wide = np.zeros((6, len(matrices), size, size))
+        for k, z in enumerate(matrices):
             wide[:, k, : z.shape[1], : z.shape[1]] = z
         return wide
 
@@ -121,10 +121,10 @@ class AxisLoops:
     @cached_property
     def _integral(self) -> Array:
         """The place of the integral that stays, (n_plants, n, n)."""
-        found = np.zeros(self.matrices.shape[1:])
+        matrix = np.zeros(self.matrices.shape[1:])
         k, i, _ = np.nonzero(self.matrices[2])  # what ki changes is the integral's own row
-        found[k, i, i] = 1.0
-        return found
+        matrix[k, i, i] = 1.0
+        return matrix
 
     def figures(self, v: Array) -> tuple[Array, Array]:
         """Return the logarithms of peak, compliance and noise, (n_plants, 3), and their slopes, (n_plants, 3, 5)."""
@@ -134,32 +134,32 @@ class AxisLoops:
         sum_, lag = back / (1.0 - back), 1.0 / (1.0 - p * back)
         rise = (1.0 - back) * lag
         K = kp + ki * sum_ + q * rise
-        by = (1.0 + 0.0 * back, sum_, rise, None, q * rise * back * lag)  # of K
+        rises = (1.0 + 0.0 * back, sum_, rise, None, q * rise * back * lag)  # of K
         inner, lent = 1.0 + kc * H_i, G_x + kc * W
         D = inner + K * H_x
-        d = [H_i if b is None else b * H_x for b in by]  # of D
+        d = [H_i if b is None else b * H_x for b in rises]  # of D
         far = np.stack([-x / D for x in d], axis=2)
         S, soft = far.copy(), far
         S[:, :, 3] += H_i / inner
         soft = far.copy()
         soft[:, :, 3] += W / lent
-        found, slopes = [], []
+        figures, slopes = [], []
         for size, slope in ((np.abs(inner / D), S), (np.abs(lent / D), soft)):
             ln = np.log(size)
             top = ln.max(axis=1)
             weight = np.exp(_SHARP * (ln - top[:, None]))
             total = weight.sum(axis=1)
-            found.append(top + np.log(total) / _SHARP)
+            figures.append(top + np.log(total) / _SHARP)
             slopes.append(np.einsum("kf,kfj->kj", weight / total[:, None], slope.real))
         power, change = 0.0, 0.0
-        for sd, A, own in ((self.noise[0], K / D, by), (self.noise[1], kc / D, (None, None, None, 1.0, None))):
+        for sd, A, own in ((self.noise[0], K / D, rises), (self.noise[1], kc / D, (None, None, None, 1.0, None))):
             power = power + sd**2 * np.abs(A) ** 2
             rates = [A * far[:, :, j] + (0.0 if b is None else b / D) for j, b in enumerate(own)]
             change = change + sd**2 * 2.0 * np.real(np.conj(A)[:, :, None] * np.stack(rates, axis=2))
         mean = mean_over(self.frequency_hz, np.transpose(power))
-        found.append(0.5 * np.log(mean))
+        figures.append(0.5 * np.log(mean))
         slopes.append(0.5 * mean_over(self.frequency_hz, np.transpose(change, (1, 0, 2))) / mean[:, None])
-        return np.stack(found, axis=1), np.stack(slopes, axis=1)
+        return np.stack(figures, axis=1), np.stack(slopes, axis=1)
 
 
 @dataclass(kw_only=True, eq=False)
@@ -179,11 +179,11 @@ class _Search:
         key = point.tobytes()
         if self._last is None or self._last[0] != key:
             v, chain = self.pid.numbers(point)
-            found, slopes = self.loops.figures(v)
+            figures, slopes = self.loops.figures(v)
             decay, fall = self.loops.decays(v, integrates=bool(self.pid.signs[1]))
             share = np.maximum(decay / self.decay, _SLOW)
             slow = -np.log(share) + (share - decay / self.decay) / _SLOW
-            values = np.column_stack([found - np.log([self.reference[n] for n in list(FIGURES)[:3]]), slow])
+            values = np.column_stack([figures - np.log([self.reference[n] for n in list(FIGURES)[:3]]), slow])
             rates = np.concatenate([slopes, (-fall / self.decay / share[:, None])[:, None]], axis=1) * chain
             self._last = key, (values, rates)
         return self._last[1]
@@ -203,9 +203,9 @@ class _Search:
         from scipy.optimize import minimize
 
         names = list(FIGURES)
-        goals, kept = [names.index(n) for n in minimise], [names.index(n) for n in limits]
+        goals, limited = [names.index(n) for n in minimise], [names.index(n) for n in limits]
         most = np.array([*limits.values(), -math.log(_SLOW)])
-        kept.append(names.index("settling"))
+        limited.append(names.index("settling"))
         free = np.flatnonzero(self.pid.free)
 
         def point(x: Array) -> Array:
@@ -215,16 +215,16 @@ class _Search:
 
         def rest(x: Array) -> Array:
             values = self.at(point(x))[0]
-            return np.concatenate([(x[-2] - values[:, goals]).ravel(), (most + x[-1] - values[:, kept]).ravel()])
+            return np.concatenate([(x[-2] - values[:, goals]).ravel(), (most + x[-1] - values[:, limited]).ravel()])
 
         def slopes(x: Array) -> Array:
             rates = self.at(point(x))[1]
-            parts = [-rates[:, g][:, :, free].reshape(-1, free.size) for g in (goals, kept)]
+            parts = [-rates[:, g][:, :, free].reshape(-1, free.size) for g in (goals, limited)]
             ends = [np.tile(e, (p.shape[0], 1)) for e, p in zip(np.eye(2), parts, strict=True)]
             return np.vstack([np.hstack(pair) for pair in zip(parts, ends, strict=True)])
 
         values = self.at(start)[0]
-        first = [float(values[:, goals].max()), max(float((values[:, kept] - most).max()), 0.0)]
+        first = [float(values[:, goals].max()), max(float((values[:, limited] - most).max()), 0.0)]
         answer = minimize(
             lambda x: x[-2] + _PENALTY * x[-1], np.array([*start[free], *first]),
             jac=lambda _: np.array([*np.zeros(free.size), 1.0, _PENALTY]), method="SLSQP",
@@ -232,9 +232,9 @@ class _Search:
             constraints={"type": "ineq", "fun": rest, "jac": slopes}, callback=lambda _: tick(),
             options={"maxiter": _STEPS, "ftol": 1e-5},
         )  # fmt: skip
-        found = point(np.clip(answer.x, [*bounds[free, 0], -np.inf, 0.0], [*bounds[free, 1], np.inf, np.inf]))
-        values = self.at(found)[0]
-        return found, float(values[:, goals].max()), max(float((values[:, kept] - most).max()), 0.0)
+        solution = point(np.clip(answer.x, [*bounds[free, 0], -np.inf, 0.0], [*bounds[free, 1], np.inf, np.inf]))
+        values = self.at(solution)[0]
+        return solution, float(values[:, goals].max()), max(float((values[:, limited] - most).max()), 0.0)
 
 
 def tune_pid(
@@ -251,8 +251,8 @@ def tune_pid(
         raise EstimationError(
             "[loop] is a state-space law, whose structure is no PID. Give a PID in [loop] to start from"
         )
-    of = _Rotors if isinstance(plants[0].model, RotorModel) else _OneAxis
-    return _tuned(of.of(plants, rig, form, filters), goals, tick)
+    problem_class = _Rotors if isinstance(plants[0].model, RotorModel) else _OneAxis
+    return _tuned(problem_class.of(plants, rig, form, filters), goals, tick)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -334,22 +334,22 @@ class _Rotors:
 
     def looked_at(self, figures: Sequence[Figures], before: Sequence[int]) -> list[int]:
         """Return the plants of before and those that are now the worst, by much, in any figure."""
-        found = list(before) or [0]
+        chosen = list(before) or [0]
         for name in FIGURES:
             sizes = np.array([getattr(f, name) for f in figures])
             k = int(np.argmax(sizes))
-            if not before or sizes[k] > (1.0 + _SLACK) * sizes[found].max():
-                found.append(k)
-        return list(dict.fromkeys(found))
+            if not before or sizes[k] > (1.0 + _SLACK) * sizes[chosen].max():
+                chosen.append(k)
+        return list(dict.fromkeys(chosen))
 
     def loops(self, which: Sequence[int], at: Array) -> RotorLoops:
         """Return some plants in their loop."""
         return RotorLoops(plants=[self.plants[k] for k in which], noise=self.noise, sets=self.pid, around=at)
 
 
-def _tuned(of: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
+def _tuned(problem: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
     """Return the best loop: on some plants, until it does as well on all."""
-    starts, done = of.starts(), 0
+    starts, done = problem.starts(), 0
 
     def advance() -> None:
         nonlocal done
@@ -357,41 +357,46 @@ def _tuned(of: _OneAxis | _Rotors, goals: Goals, tick: Tick) -> Loop:
         tick("tune", 1.0 - 1.0 / (1.0 + done / (_STEPS * len(starts))))
 
     def figures_of(loop: Loop) -> list[Figures]:
-        return [examine(p, loop, of.noise).figures for p in of.plants]
+        return [examine(p, loop, problem.noise).figures for p in problem.plants]
 
-    kept, own = _worsened(goals), {n for n in goals.minimise if goals.limits[n] >= goals.reference[n]}
+    unworsened, own = _worsened(goals), {n for n in goals.minimise if goals.limits[n] >= goals.reference[n]}
     limits = {
-        n: math.log(x / goals.reference[n]) + (_SMOOTH if n in own else -_SLACK * (n not in kept))
+        n: math.log(x / goals.reference[n]) + (_SMOOTH if n in own else -_SLACK * (n not in unworsened))
         for n, x in goals.limits.items()
     }
-    which = of.looked_at([] if isinstance(of, _OneAxis) else figures_of(of.present), [])
+    which = problem.looked_at([] if isinstance(problem, _OneAxis) else figures_of(problem.present), [])
     first = best = starts[0]
     for k in range(_ROUNDS):
-        loops = of.loops(which, starts[0])
-        decays = loops.decays(of.pid.numbers(first)[0], integrates=bool(of.pid.signs[1]))[0]
+        loops = problem.loops(which, starts[0])
+        decays = loops.decays(problem.pid.numbers(first)[0], integrates=bool(problem.pid.signs[1]))[0]
         search = _Search(
-            loops=loops, pid=of.pid, reference=goals.reference,
+            loops=loops, pid=problem.pid, reference=goals.reference,
             decay=max(float(np.min(decays)), 1e-3 * loops.rate_hz / 1e3),
         )  # fmt: skip
-        found = [search.solve(goals.minimise, limits, x, of.bounds, advance) for x in starts]
-        point, _, excess = min(found, key=lambda f: f[1] + _PENALTY * f[2])
+        solutions = [search.solve(goals.minimise, limits, x, problem.bounds, advance) for x in starts]
+        point, _, excess = min(solutions, key=lambda f: f[1] + _PENALTY * f[2])
         if excess > _MET and not k:  # or the search stood still: what is far inside a limit is a better start
-            ways = _ways(search, limits, starts, of.bounds, advance)
-            inside = [search.solve(goals.minimise, limits, x, of.bounds, advance) for gap, _, x in ways if gap <= 0.0]
+            ways = _ways(search, limits, starts, problem.bounds, advance)
+            inside = [
+                search.solve(goals.minimise, limits, x, problem.bounds, advance) for gap, _, x in ways if gap <= 0.0
+            ]
             point, _, excess = min(inside, key=lambda f: f[1] + _PENALTY * f[2], default=(point, 0.0, excess))
             if excess > _MET:
                 raise EstimationError(_refusal(goals, ways))
         if excess > _MET:
             break
-        best, loop = point, of.pid.loop(point, of.present)
+        best, loop = point, problem.pid.loop(point, problem.present)
         figures = figures_of(loop)
-        over, more = _worst(figures).settling / goals.limits.get("settling", math.inf), of.looked_at(figures, which)
+        over, more = (
+            _worst(figures).settling / goals.limits.get("settling", math.inf),
+            problem.looked_at(figures, which),
+        )
         if over <= SAME and more == which:
             return loop
         if over > SAME and math.isfinite(over):
             limits["settling"] -= 1.5 * math.log(over) + _SLACK
         which, starts = more, [best, *starts[:1]]
-    return _between(of, (first, best), figures_of, goals)
+    return _between(problem, (first, best), figures_of, goals)
 
 
 def _worst(figures: Sequence[Figures]) -> Figures:
@@ -400,7 +405,10 @@ def _worst(figures: Sequence[Figures]) -> Figures:
 
 
 def _between(
-    of: _OneAxis | _Rotors, ends: tuple[Array, Array], figures_of: Callable[[Loop], Sequence[Figures]], goals: Goals
+    problem: _OneAxis | _Rotors,
+    ends: tuple[Array, Array],
+    figures_of: Callable[[Loop], Sequence[Figures]],
+    goals: Goals,
 ) -> Loop:
     """Return the loop farthest from the present one towards the best that meets the limits on all plants.
 
@@ -408,14 +416,14 @@ def _between(
     """
     worst = UNSTABLE
     for share in np.linspace(1.0, 0.0, _WAYS + 1):
-        loop = of.pid.loop(ends[0] + share * (ends[1] - ends[0]), of.present) if share else of.present
+        loop = problem.pid.loop(ends[0] + share * (ends[1] - ends[0]), problem.present) if share else problem.present
         worst = _worst(figures_of(loop))
         if not goals.missed(worst):
             return loop
-    asked = ", ".join(said(name, x) for name, x in goals.limits.items())
+    listed = ", ".join(said(name, x) for name, x in goals.limits.items())
     least = worst.settling if math.isfinite(worst.settling) else 2.0 * goals.limits["settling"]
     raise EstimationError(
-        f"no PID meets the limits ({asked}) on all plants: force steps take longer to settle. Give "
+        f"no PID meets the limits ({listed}) on all plants: force steps take longer to settle. Give "
         f"{raised('settling', least)}, or raise another"
     )
 
@@ -438,14 +446,14 @@ def bounds_of(rig: Rig, pid: Pid, start: Array) -> Array:
     settings = controller_settings(rig)
     steps = exact_gains(unit, (settings.duty_bias, settings.current_rest, settings.setpoint))
     for k, name in enumerate(("kp", "ki", "kd", "kc")):
-        held = np.log(np.array([FEWEST_STEPS, LARGEST_GAIN]) / abs(steps[name]))
-        bounds[k] = np.clip(bounds[k], *held)
+        representable = np.log(np.array([FEWEST_STEPS, LARGEST_GAIN]) / abs(steps[name]))
+        bounds[k] = np.clip(bounds[k], *representable)
     return bounds
 
 
 def _placed(plant: Plant, present: Loop, pid: Pid, bounds: Array) -> list[Array]:
     """Return further starts: poles placed at multiples of the plant's own rate, with the signs of the present loop."""
-    theta, found = plant.theta, []
+    theta, loops = plant.theta, []
     own = math.sqrt(max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]) / theta["m"])
     for factor in _PLACED:
         w = factor * own
@@ -455,8 +463,8 @@ def _placed(plant: Plant, present: Loop, pid: Pid, bounds: Array) -> list[Array]
         except ModelError:
             continue
         if np.array_equal(Pid.of(loop, plant.rate_hz).signs, pid.signs):
-            found.append(np.clip(pid.at(loop), bounds[:, 0], bounds[:, 1]))
-    return found
+            loops.append(np.clip(pid.at(loop), bounds[:, 0], bounds[:, 1]))
+    return loops
 
 
 _Way = tuple[float, str, Array]
@@ -479,22 +487,22 @@ def _ways(
 
 def _refusal(goals: Goals, ways: Sequence[_Way]) -> str:
     """Say which limit to move, and how far: the one that has to give way least, the others kept."""
-    asked = ", ".join(said(name, x) for name, x in goals.limits.items())
+    listed = ", ".join(said(name, x) for name, x in goals.limits.items())
     if not ways:
-        return f"no PID meets the limits ({asked}), nor where any one of them is left out. Raise several of them"
+        return f"no PID meets the limits ({listed}), nor where any one of them is left out. Raise several of them"
     gap, name, _ = min(ways, key=lambda w: w[0])
     least = goals.limits[name] * math.exp(gap)
     moved = raised(name, least)
     return (
-        f"no PID meets the limits ({asked}) on all plants; with the others kept, {said(name, least)} is the "
+        f"no PID meets the limits ({listed}) on all plants; with the others kept, {said(name, least)} is the "
         f"least. Give {moved}, or raise another"
     )
 
 
 def said(name: str, x: float) -> str:
     """Write a limit for people."""
-    shown = 20.0 * math.log10(x) if name == "peak" else x
-    return f"{name} {shown:.4g} {'dB' if name == 'peak' else FIGURES[name]}"
+    number = 20.0 * math.log10(x) if name == "peak" else x
+    return f"{name} {number:.4g} {'dB' if name == 'peak' else FIGURES[name]}"
 
 
 def raised(name: str, x: float) -> str:

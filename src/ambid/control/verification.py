@@ -144,7 +144,7 @@ def verify_all(
     seed: int = 0, tick: Tick = silent,
 ) -> tuple[Verification, ...]:  # fmt: skip
     """Try a loop on plants by name, the estimate first: all are pushed as it is, and only its traces are kept."""
-    todo, found = trials or Trials(), list[Verification]()
+    todo, results = trials or Trials(), list[Verification]()
     for k, (name, plant) in enumerate(plants.items()):
         tick("nonlinear simulation", k / len(plants))
         if not k:
@@ -154,16 +154,20 @@ def verify_all(
                 impulse=tuple(first.sizes(todo.impulse, _IMPACT_S)), speed=first.speed,
                 unbalance=first.moment if "m" in plant.theta else None,
             )  # fmt: skip
-        of = verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed)
-        found.append(of if not k else replace(of, cases=tuple(replace(case, trace=None) for case in of.cases)))
-    return tuple(found)
+        verification = verify(plant, rig, loop, name=name, trials=todo, nonlinear=nonlinear, seed=seed)
+        results.append(
+            verification
+            if not k
+            else replace(verification, cases=tuple(replace(case, trace=None) for case in verification.cases))
+        )
+    return tuple(results)
 
 
-def checks_of_verifications(found: Sequence[Verification]) -> dict[str, Check]:
+def checks_of_verifications(verifications: Sequence[Verification]) -> dict[str, Check]:
     """Return a check for each kind of case over all plants, which says what failed and where."""
     checks: dict[str, Check] = {}
     for kind in KINDS:
-        cases = [(v, case) for v in found for case in v.of_kind(kind)]
+        cases = [(v, case) for v in verifications for case in v.of_kind(kind)]
         failed = [f"{case.name} on {v.plant}: {case.detail}" for v, case in cases if not case.passed]
         if not cases:
             continue
@@ -176,8 +180,8 @@ def checks_of_verifications(found: Sequence[Verification]) -> dict[str, Check]:
     return checks
 
 
-def _share(case: Case, of: Verification) -> float:
-    return math.inf if case.peak is None else case.peak / (of.clearance or 1.0)
+def _share(case: Case, verification: Verification) -> float:
+    return math.inf if case.peak is None else case.peak / (verification.clearance or 1.0)
 
 
 def _length(x: float) -> str:
@@ -223,8 +227,8 @@ class _Trying:
 
     @property
     def speed(self) -> float:
-        given = self.trials.speed if self.trials.speed is not None else self.bench.top_speed or TOP_SPEED
-        return min(given, 2.0 * math.pi * _FASTEST * self.rate_hz)
+        speed = self.trials.speed if self.trials.speed is not None else self.bench.top_speed or TOP_SPEED
+        return min(speed, 2.0 * math.pi * _FASTEST * self.rate_hz)
 
     @property
     def moment(self) -> float:
@@ -254,42 +258,42 @@ class _Trying:
         slack = _AT_STOP * self.clearance
         return np.asarray((position <= low + slack) | (position >= high - slack))
 
-    def case(self, kind: str, name: str, answer: Answer, said: str, *, trace: Trace, **more: Any) -> Case:
+    def case(self, kind: str, name: str, answer: Answer, text: str, *, trace: Trace, **more: Any) -> Case:
         """Return a case with what is told of every one."""
         n = answer.position.shape[0]
-        found: dict[str, Any] = {
+        values: dict[str, Any] = {
             "contact": bool(self.touching(answer.position).any()),
             "peak": float(np.abs(answer.position).max()),
         } | more
-        told = [said]
-        if found["contact"]:
-            told.append("it touches a stop again" if kind == KINDS[0] else "it touches a stop")
+        texts = [text]
+        if values["contact"]:
+            texts.append("it touches a stop again" if kind == KINDS[0] else "it touches a stop")
         if answer.limited:
-            told.append(f"the command is limited in {100.0 * answer.limited / n:.2g} % of the samples")
+            texts.append(f"the command is limited in {100.0 * answer.limited / n:.2g} % of the samples")
         if answer.over:
-            told.append(f"the current is beyond its limits in {100.0 * answer.over / n:.2g} %")
+            texts.append(f"the current is beyond its limits in {100.0 * answer.over / n:.2g} %")
         return Case(
             kind=kind,
             name=name,
-            detail=", ".join(told),
+            detail=", ".join(texts),
             saturated=answer.limited / n,
             over_current=answer.over / n,
             peak_current=float(np.abs(answer.current).max(initial=0.0)),
             peak_command=float(np.abs(answer.command).max()),
             trace=trace,
-            **found,
+            **values,
         )  # fmt: skip
 
     def traced(self, answer: Answer, axis: int) -> Trace:
         """Return the trace of an axis over time."""
         n = answer.position.shape[0]
-        kept = np.unique(((n - 1) * np.linspace(0.0, 1.0, _POINTS) ** 2).round().astype(int))  # closer at first
-        kept = np.union1d(kept, np.argmax(np.abs(answer.position[:, axis])))
+        places = np.unique(((n - 1) * np.linspace(0.0, 1.0, _POINTS) ** 2).round().astype(int))  # closer at first
+        places = np.union1d(places, np.argmax(np.abs(answer.position[:, axis])))
         coil = min(axis, answer.current.shape[1] - 1)
         return Trace(
-            over="time", at=kept / self.rate_hz, position=answer.position[kept, axis],
-            command=answer.command[kept, axis],
-            current=answer.current[kept, coil] if coil >= 0 else np.zeros(kept.size),
+            over="time", at=places / self.rate_hz, position=answer.position[places, axis],
+            command=answer.command[places, axis],
+            current=answer.current[places, coil] if coil >= 0 else np.zeros(places.size),
         )  # fmt: skip
 
     def broken(self, kind: str, name: str, problem: ModelError) -> Case:
@@ -311,10 +315,10 @@ class _Trying:
 
     def lift_off(self) -> list[Case]:
         """Begin on each stop, without current: of a rotor its vertical and its axial axes."""
-        of, found = self.bench.plant.model, []
+        plant_model, cases = self.bench.plant.model, []
         lying = np.ones(len(self.axes))
-        if isinstance(of, RotorModel) and {0, 1} <= set(of.planes):
-            lying = np.array([float(plane != 0) for _, plane in of.placed])
+        if isinstance(plant_model, RotorModel) and {0, 1} <= set(plant_model.planes):
+            lying = np.array([float(plane != 0) for _, plane in plant_model.placed])
         for side, stop in zip(("lower", "upper"), self.bench.stops, strict=True):
             name = f"lift-off from the {side} stop"
             if not math.isfinite(stop):
@@ -322,10 +326,10 @@ class _Trying:
             try:
                 answer = self.bench.respond(self.samples, start=stop * lying, speed=0.0)
             except ModelError as problem:
-                found.append(self.broken("lift-off", name, problem))
+                cases.append(self.broken("lift-off", name, problem))
                 continue
-            found.append(self.lifted(name, answer, stop, lying))
-        return found
+            cases.append(self.lifted(name, answer, stop, lying))
+        return cases
 
     def lifted(self, name: str, answer: Answer, stop: float, lying: Array) -> Case:
         away = (np.abs(answer.position[:, lying > 0.0]) < (1.0 - _LIFTED) * abs(stop)).all(axis=1)
@@ -333,13 +337,13 @@ class _Trying:
         settling = self.settled(answer.position, max(_LIFTED * abs(stop), self.resolution))
         again = left is not None and bool(self.touching(answer.position)[left:].any())
         beyond = float((-np.sign(stop) * answer.position[:, lying > 0.0]).max())
-        said = (
+        text = (
             "the rotor stays on the stop" if left is None else
             f"the rotor levitates after {_time(settling)}, {100.0 * beyond / abs(stop):.0f} % beyond rest"
             if settling is not None else f"it does not come to rest in {_time(answer.position.shape[0] / self.rate_hz)}"
         )  # fmt: skip
         return self.case(
-            "lift-off", name, answer, said, trace=self.traced(answer, int(np.argmax(lying))), size=stop, unit="m",
+            "lift-off", name, answer, text, trace=self.traced(answer, int(np.argmax(lying))), size=stop, unit="m",
             peak=max(beyond, 0.0), settling_s=settling, steady=self._end(answer), contact=again,
             passed=settling is not None and not again,
         )  # fmt: skip
@@ -364,8 +368,8 @@ class _Trying:
             for j, size in enumerate(self.sizes(self.trials.impulse, _IMPACT_S))
         ]
 
-    def sizes(self, given: float | tuple[float, ...] | None, share: float) -> list[float]:
-        room = share * self.bench.room if given is None else np.broadcast_to(given, len(self.axes))
+    def sizes(self, sizes: float | tuple[float, ...] | None, share: float) -> list[float]:
+        room = share * self.bench.room if sizes is None else np.broadcast_to(sizes, len(self.axes))
         return [float(x) for x in room]
 
     def _pushed(self, kind: str, j: int, size: float, shape: Array, unit: str) -> Case:
@@ -382,13 +386,13 @@ class _Trying:
         stays = kind == "force step" and not integrates(self.bench.loop)
         moved = answer.position - answer.position[-1] if stays else answer.position
         settling = self.settled(moved, band)
-        said = f"{size:.3g} {unit} move it by {_length(peak)}"
-        said += ", it does not come to rest" if settling is None else f", at rest after {_time(settling)}"
+        text = f"{size:.3g} {unit} move it by {_length(peak)}"
+        text += ", it does not come to rest" if settling is None else f", at rest after {_time(settling)}"
         if stays or steady > band:
-            said += f", {_length(steady)} away"
+            text += f", {_length(steady)} away"
         good = not contact and settling is not None and (stays or steady <= band)
         return self.case(
-            kind, name, answer, said, trace=self.traced(answer, j), size=size, unit=unit, settling_s=settling,
+            kind, name, answer, text, trace=self.traced(answer, j), size=size, unit=unit, settling_s=settling,
             steady=steady, passed=good,
         )  # fmt: skip
 
@@ -415,7 +419,7 @@ class _Trying:
 
     def _speeds(self) -> list[Case]:
         """Turn steadily at many speeds, on the linear plant; then at the worst one and the highest with all magnets."""
-        found: list[Case] = []
+        cases: list[Case] = []
         speeds = self._looked_at()
         for kind, weights in self._shares().items():
             linear = [self._turned(w, weights, linear=True) for w in speeds]
@@ -427,8 +431,8 @@ class _Trying:
                 for q in range(3):
                     most[q][k] = np.abs(answer[q]).max()
             at = max(answers, key=lambda k: np.abs(answers[k].position).max())
-            found.append(self._orbit(answers[at], speeds[at], f"{kind} unbalance", np.array(speeds), most))
-        return found
+            cases.append(self._orbit(answers[at], speeds[at], f"{kind} unbalance", np.array(speeds), most))
+        return cases
 
     def run_up(self) -> list[Case]:
         """Run up from rest with the static unbalance, the commands of one law handed over to the next."""
@@ -452,11 +456,11 @@ class _Trying:
     ) -> Case:
         peak = float(np.abs(answer.position).max())
         share = peak / self.clearance if math.isfinite(self.clearance) else 0.0
-        said = f"at most {_length(peak)} at {speed * _RPM:.0f} rpm"
-        said += f", {100.0 * share:.3g} % of the clearance" if share else ""
-        said += f", more than the {100.0 * ORBIT:g} % of ISO 14839-2 zone B" if share > ORBIT else ""
+        text = f"at most {_length(peak)} at {speed * _RPM:.0f} rpm"
+        text += f", {100.0 * share:.3g} % of the clearance" if share else ""
+        text += f", more than the {100.0 * ORBIT:g} % of ISO 14839-2 zone B" if share > ORBIT else ""
         return self.case(
-            kind, name, answer, said, size=self.moment, unit="kg m", passed=share <= ORBIT,
+            kind, name, answer, text, size=self.moment, unit="kg m", passed=share <= ORBIT,
             trace=Trace(over="speed", at=at, position=most[0], current=most[1], command=most[2]),
         )  # fmt: skip
 
@@ -470,15 +474,15 @@ class _Trying:
 
     def _shares(self) -> dict[str, Array]:
         """Return how the unbalance is split among the axes: statically by the levers, and as a couple."""
-        of, theta = self.bench.plant.model, self.bench.plant.theta
-        assert isinstance(of, RotorModel)
-        z = {b.name: theta[f"{b.name}.z"] - theta["z_cg"] for b in of.bearings if not b.axial}
+        plant_model, theta = self.bench.plant.model, self.bench.plant.theta
+        assert isinstance(plant_model, RotorModel)
+        z = {b.name: theta[f"{b.name}.z"] - theta["z_cg"] for b in plant_model.bearings if not b.axial}
         names, far = list(z), max(z.values(), default=0.0) - min(z.values(), default=0.0)
         part = {name: 1.0 / len(names) for name in names}
         if len(names) == 2 and far > 0.0:
             part = {name: abs(z[other]) / (abs(z[name]) + abs(z[other])) for name, other in (names, names[::-1])}
-        static = np.array([part.get(b.name, 0.0) for b, _ in of.placed])
-        signs = np.array([-1.0 if names and b.name == names[-1] else 1.0 for b, _ in of.placed])
+        static = np.array([part.get(b.name, 0.0) for b, _ in plant_model.placed])
+        signs = np.array([-1.0 if names and b.name == names[-1] else 1.0 for b, _ in plant_model.placed])
         return {"static": static, "couple": static * signs} if len(names) > 1 else {"static": static}
 
     def _turned(self, speed: float, weights: Array, *, linear: bool) -> Answer:
@@ -487,39 +491,39 @@ class _Trying:
         n = settle + math.ceil(2.0 * math.pi * rate / speed)
         angle: Array = speed * (np.arange(n, dtype=np.float64) + 0.5) / rate
         load = self._whirl(weights, speed * np.ones(n), angle)
-        found = self.bench.respond(n, load=load, speed=speed, linear=linear)
-        return found._replace(**{q: getattr(found, q)[settle:] for q in ("position", "current", "command")})
+        answer = self.bench.respond(n, load=load, speed=speed, linear=linear)
+        return answer._replace(**{q: getattr(answer, q)[settle:] for q in ("position", "current", "command")})
 
     def _whirl(self, weights: Array, speed: Array, angle: Array) -> Array:
         """Return the forces of the unbalance on the axes, (n, n_axes)."""
-        of = self.bench.plant.model
-        assert isinstance(of, RotorModel)
+        plant_model = self.bench.plant.model
+        assert isinstance(plant_model, RotorModel)
         turn = {0: np.cos(angle), 1: np.sin(angle), 2: np.zeros(angle.size)}
-        each = [w * turn[p] for w, (_, p) in zip(weights, of.placed, strict=True)]
+        each = [w * turn[p] for w, (_, p) in zip(weights, plant_model.placed, strict=True)]
         return np.asarray(self.moment * (speed**2)[:, None] * np.column_stack(each))
 
     def noise(self) -> list[Case]:
         """Leave the loop alone with its noise."""
-        of = self.bench.plant.model
+        plant_model = self.bench.plant.model
         n = min(max(round(0.5 * self.rate_hz), 2000), _LONGEST[self.many])
         try:
             answer = self.bench.respond(n, seed=self.seed)
         except ModelError as problem:
             return [self.broken("noise", "noise", problem)]
         rms = tuple(float(np.std(x[n // 5 :], axis=0).max(initial=0.0)) for x in answer[:3])
-        said = f"rms {_length(rms[0])}, {1e3 * rms[1]:.3g} mA, {rms[2]:.3g} V"
+        text = f"rms {_length(rms[0])}, {1e3 * rms[1]:.3g} mA, {rms[2]:.3g} V"
         contact = bool(self.touching(answer.position).any())
         axis = int(np.argmax(np.std(answer.position, axis=0)))
         return [
-            self.case("noise", "noise", answer, said, trace=self.traced(answer, axis), steady=rms[0],
-                      unit=of.units[of.inputs[0]], rms=rms, passed=not contact)
+            self.case("noise", "noise", answer, text, trace=self.traced(answer, axis), steady=rms[0],
+                      unit=plant_model.units[plant_model.inputs[0]], rms=rms, passed=not contact)
         ]  # fmt: skip
 
     @cached_property
     def limit_cycle(self) -> list[Case]:
         """Let quantisation alone keep the rotor moving."""
-        of = self.bench.noise
-        if not any((of.position_resolution, of.current_resolution, of.voltage_resolution)):
+        noise = self.bench.noise
+        if not any((noise.position_resolution, noise.current_resolution, noise.voltage_resolution)):
             return []
         load = np.zeros((self.samples, len(self.axes)))
         load[0] = self.rate_hz * _IMPACT_S * _STEP * self.bench.room
@@ -529,8 +533,8 @@ class _Trying:
             return [self.broken("limit cycle", "limit cycle", problem)]
         last = answer.position[-answer.position.shape[0] // 4 :]
         size, axis = float(0.5 * np.ptp(last, axis=0).max()), int(np.argmax(np.ptp(last, axis=0)))
-        said = f"quantisation keeps it moving by {_length(size)}"
+        text = f"quantisation keeps it moving by {_length(size)}"
         return [
-            self.case("limit cycle", "limit cycle", answer, said, trace=self.traced(answer, axis), peak=size,
+            self.case("limit cycle", "limit cycle", answer, text, trace=self.traced(answer, axis), peak=size,
                       steady=float(np.std(last, axis=0).max()), passed=size <= _CYCLE * self.clearance)
         ]  # fmt: skip

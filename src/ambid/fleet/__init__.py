@@ -28,10 +28,10 @@ def __getattr__(name: str) -> object:
 class _Room(ModuleType):
     """The room as `ambid` shows it, whose name is also that of its function."""
 
-    def __call__(self, *given: Any, **named: Any) -> Any:
+    def __call__(self, *arguments: Any, **settings: Any) -> Any:
         from ambid.fleet.run import fleet
 
-        return fleet(*given, **named)
+        return fleet(*arguments, **settings)
 
 
 sys.modules[__name__].__class__ = _Room

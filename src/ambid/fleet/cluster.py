@@ -56,7 +56,7 @@ def _answers(
 ) -> Iterator[Done]:
     suspects: deque[Any] = deque()
     on_their_way: dict[Any, tuple[Any, bool]] = {}  # with whether they are run alone
-    seen = time.monotonic()  # when there was a worker
+    last_s = time.monotonic()  # when there was a worker
     n_workers = 0 if client.cluster is None else len(client.cluster.worker_spec)
     while True:
         room = _AHEAD * max(1, len(client.nthreads() or (1,))) - len(on_their_way)
@@ -72,13 +72,13 @@ def _answers(
             ready = distributed.wait(list(on_their_way), timeout=_LOOK_S, return_when="FIRST_COMPLETED").done
         except TimeoutError:
             if client.nthreads() or client.cluster is None:
-                seen = time.monotonic()
-            elif time.monotonic() - seen > _GONE_S:  # a worker that dies as it starts is not started again
+                last_s = time.monotonic()
+            elif time.monotonic() - last_s > _GONE_S:  # a worker that dies as it starts is not started again
                 if client.cluster.workers:
                     client.cluster.scale(0)  # which forgets them, after a while
                 else:
                     client.cluster.scale(n_workers)
-                    seen = time.monotonic()
+                    last_s = time.monotonic()
             continue
         for future in ready:
             task, alone = on_their_way.pop(future)
@@ -128,9 +128,9 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
             try:
                 client = distributed.Client(scheduler, timeout=10)
             except (OSError, ValueError) as failure:
-                said = str(failure).splitlines()[0]
+                text = str(failure).splitlines()[0]
                 raise AmbidError(
-                    f"{setting('scheduler', scheduler)} cannot be reached: {said}. Start it, or correct it"
+                    f"{setting('scheduler', scheduler)} cannot be reached: {text}. Start it, or correct it"
                 ) from None
             with client:
                 yield client

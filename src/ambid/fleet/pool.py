@@ -181,8 +181,8 @@ class _Pool:
 
     def _next(self, most: int) -> list[tuple[int, Any]]:
         """Take tasks from what waits, then from what comes."""
-        kept = [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
-        return kept or list(islice(self._tasks, most))
+        tasks = [self._waiting.popleft() for _ in range(min(most, len(self._waiting)))]
+        return tasks or list(islice(self._tasks, most))
 
     def _start(self) -> None:
         context = get_context("spawn")
@@ -209,16 +209,16 @@ class _Pool:
         """Take all that a worker has said."""
         try:
             while worker.line.poll():
-                told = worker.line.recv()
-                if isinstance(told, str):
-                    raise AmbidError(told)
-                if told is None:
+                message = worker.line.recv()
+                if isinstance(message, str):
+                    raise AmbidError(message)
+                if message is None:
                     worker.ready, self._stillborn = True, 0
                     continue
                 _, task = worker.given.popleft()
                 worker.since = time.monotonic()
-                self._mean_s = 0.8 * self._mean_s + 0.2 * told.seconds
-                yield Done(task=task, value=told.value, failure=told.failure, seconds=told.seconds)
+                self._mean_s = 0.8 * self._mean_s + 0.2 * message.seconds
+                yield Done(task=task, value=message.value, failure=message.failure, seconds=message.seconds)
         except (EOFError, OSError):
             self._workers.remove(worker)
             yield from self._bury(worker, _cause(worker.gone()))

@@ -110,31 +110,31 @@ def function_of(job: Job) -> Callable[..., Any]:
         raise AmbidError(
             f"{setting('job', job)} is unknown; jobs are {', '.join(JOBS)}.{nearest(job, JOBS)} Correct it"
         )
-    found: Callable[..., Any] = getattr(import_module("ambid.job"), job)
-    return found
+    function: Callable[..., Any] = getattr(import_module("ambid.job"), job)
+    return function
 
 
 def job_of(job: Job, settings: Mapping[str, Any], *, stored: bool = False) -> JobOf:
     """Return a job with its settings; those that it does not take are refused."""
     function = function_of(job)
     if isinstance(job, str):
-        known = inspect.signature(function).parameters
-        takes = [name for name in known if name not in _OWN]
+        parameters = inspect.signature(function).parameters
+        takes = [name for name in parameters if name not in _OWN]
         for name in settings:
             if name not in takes:
                 raise AmbidError(
                     f"{job} takes no {name!r}; it takes {', '.join(takes)}.{nearest(name, takes)} Correct it"
                 )
-        lacks = [n for n in takes if n not in settings and known[n].default is inspect.Parameter.empty]
+        lacks = [n for n in takes if n not in settings and parameters[n].default is inspect.Parameter.empty]
         if lacks:
             raise AmbidError(f"{job} needs {lacks[0]}. Give {setting('set', f'{lacks[0]}=…')}")
-    told = {n: f"{x} {sha_of(Path(x))}" if isinstance(x, (str, Path)) and Path(x).is_file() else x
+    values = {n: f"{x} {sha_of(Path(x))}" if isinstance(x, (str, Path)) and Path(x).is_file() else x
             for n, x in settings.items()}  # fmt: skip
     if not isinstance(job, str):  # another function under the same name is another job; what it calls is not seen
         with suppress(OSError, TypeError):
-            told["its code"] = hashlib.sha256(inspect.getsource(job).encode()).hexdigest()[:16]
-    made = JobOf(job=job, settings=dict(settings), said="", stored=stored)
-    return JobOf(job=job, settings=dict(settings), said=settings_text(made.name, **told), stored=stored)
+            values["its code"] = hashlib.sha256(inspect.getsource(job).encode()).hexdigest()[:16]
+    result = JobOf(job=job, settings=dict(settings), said="", stored=stored)
+    return JobOf(job=job, settings=dict(settings), said=settings_text(result.name, **values), stored=stored)
 
 
 def numbers_of(result: Any) -> tuple[dict[str, tuple[float | None, float | None]], dict[str, str]]:
@@ -149,9 +149,9 @@ def numbers_of(result: Any) -> tuple[dict[str, tuple[float | None, float | None]
             units[p.name] = p.unit
     for axis, s in (getattr(result, "sensitivity", None) or {}).items() if not values else ():
         values[f"{axis}.sensitivity"], units[f"{axis}.sensitivity"] = (s.peak_db.value, s.peak_db.sd), "dB"
-    for output, found in (getattr(result, "fit", None) or {}).items() if not values else ():
+    for output, numbers in (getattr(result, "fit", None) or {}).items() if not values else ():
         for kind in ("one_step", "simulation"):
-            share = getattr(found, kind, None)
+            share = getattr(numbers, kind, None)
             if share is not None:
                 values[f"{output}.{kind}"], units[f"{output}.{kind}"] = (float(share), None), "1"
     return values, units
@@ -232,12 +232,12 @@ class _Run:
         """Take the answer to a record."""
         task: _Task = done.task
         if done.failure is None:
-            found: _Found = done.value
-            self.units |= found.units
-            values = {sys.intern(name): x for name, x in found.values.items()}
-            self.put(task.at, task.item, "done", values=values, seconds=done.seconds, **found.judged)
-            if found.entry is not None:
-                self._entries.append(found.entry)
+            outcome: _Found = done.value
+            self.units |= outcome.units
+            values = {sys.intern(name): x for name, x in outcome.values.items()}
+            self.put(task.at, task.item, "done", values=values, seconds=done.seconds, **outcome.judged)
+            if outcome.entry is not None:
+                self._entries.append(outcome.entry)
         else:
             self.put(task.at, task.item, "failed", reason=done.failure, seconds=done.seconds)
             if task.sha:
@@ -291,18 +291,18 @@ def run_fleet(
     for name, n in (("workers", workers), ("dask", dask)):
         if n is not None:
             check_whole({name: n}, 1, 1024)
-    made = job_of(job, settings or {}, stored=ledger is not None)
+    job_made = job_of(job, settings or {}, stored=ledger is not None)
     fleet, begin, say = items(records, rigs, taken_at), time.monotonic(), tick or silent
-    kept = None if ledger is None else open_ledger(ledger)
+    store = None if ledger is None else open_ledger(ledger)
     try:
-        run = _Run(made, fleet, kept, again=again)
+        run = _Run(job_made, fleet, store, again=again)
         if scheduler is None and dask is None:
-            answers = work(made, run.tasks(), workers=workers, limit_s=limit_s, stopped=stopped)
+            answers = work(job_made, run.tasks(), workers=workers, limit_s=limit_s, stopped=stopped)
         else:
             from ambid.fleet.cluster import work_on_cluster
 
             answers = work_on_cluster(
-                made, run.tasks(), scheduler=scheduler, local=dask, limit_s=limit_s, stopped=stopped
+                job_made, run.tasks(), scheduler=scheduler, local=dask, limit_s=limit_s, stopped=stopped
             )
         try:
             for n, done in enumerate(answers, 1):
@@ -312,10 +312,10 @@ def run_fleet(
             answers.close()
             run.store()
     finally:
-        if kept is not None:
-            kept.close()
+        if store is not None:
+            store.close()
     return FleetRun(
-        job=made.name, settings=made.said, ledger=None if kept is None else kept.shown,
+        job=job_made.name, settings=job_made.said, ledger=None if store is None else store.shown,
         workers=dask or workers or cores(), seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
         rows=tuple(run.rows[at] for at in sorted(run.rows)),
     )  # fmt: skip

@@ -93,11 +93,11 @@ def _system(url: str) -> tuple[Any, str]:
     except ImportError:
         raise AmbidError(f"fsspec is not installed, and {url} needs it. Install ambid[fleet]") from None
     try:
-        found: tuple[Any, str] = url_to_fs(url)
+        system: tuple[Any, str] = url_to_fs(url)
     except (ImportError, ValueError) as failure:
-        said = " ".join(str(failure).split()).rstrip(".")
-        raise AmbidError(f"{url} cannot be reached: {said}. Install its reader, or correct it") from None
-    return found
+        text = " ".join(str(failure).split()).rstrip(".")
+        raise AmbidError(f"{url} cannot be reached: {text}. Install its reader, or correct it") from None
+    return system
 
 
 @contextmanager
@@ -116,30 +116,32 @@ def items(records: Source | Sequence[Source], rigs: Rigs, taken_at: str | None =
 
     `taken_at`: where neither name nor table says it; ``"file"``: the time of the file.
     """
-    given = list(records) if isinstance(records, (list, tuple)) else [records]
+    sources = list(records) if isinstance(records, (list, tuple)) else [records]
     apart = list(rigs) if isinstance(rigs, (list, tuple)) else None
-    if apart is not None and len(apart) != len(given):
-        raise AmbidError(f"{counted(len(apart), 'rig')} for {counted(len(given), 'record')}. Give one for each, or one")
+    if apart is not None and len(apart) != len(sources):
+        raise AmbidError(
+            f"{counted(len(apart), 'rig')} for {counted(len(sources), 'record')}. Give one for each, or one"
+        )
     table = None if apart is not None else _Table.of(rigs)
-    found: list[Item] = []
+    result: list[Item] = []
     loaded: dict[Any, Rig] = {}
-    for k, source in enumerate(given):
+    for k, source in enumerate(sources):
         for one, words in _matches(source):
-            name = str(one) if isinstance(one, (str, Path)) else f"record {len(found) + 1}"
+            name = str(one) if isinstance(one, (str, Path)) else f"record {len(result) + 1}"
             row = {"rig": apart[k]} if apart is not None else table.row(name) if table else {}
             rig, bearing, at = (_filled(row.get(x), words, name) or words.get(x) for x in _COLUMNS[1:])
             at = at or taken_at
-            known = rig if isinstance(rig, (str, Path)) or rig is None else id(rig)
-            if known not in loaded:
-                loaded[known] = known_rig(rig)
-            found.append(
+            rig_key = rig if isinstance(rig, (str, Path)) or rig is None else id(rig)
+            if rig_key not in loaded:
+                loaded[rig_key] = known_rig(rig)
+            result.append(
                 Item(
-                    source=one, name=name, rig=loaded[known], bearing=bearing or loaded[known].name,
+                    source=one, name=name, rig=loaded[rig_key], bearing=bearing or loaded[rig_key].name,
                     taken_at=None if at in (None, "file") else moment(str(at), f"taken_at of {name}"),
                     by_file=at == "file",
                 )
             )  # fmt: skip
-    return found
+    return result
 
 
 def _matches(source: Any) -> Iterator[tuple[Any, dict[str, str]]]:
@@ -182,12 +184,12 @@ def _readable(path: str) -> Any:
 
 def _expression(pattern: str) -> re.Pattern[str]:
     """Return what a pattern of paths means: stars and words in one component, ``**`` over any number."""
-    parts, seen = [], set[str]()
+    parts, names = [], set[str]()
     for part in re.split(r"(\*\*/|\*|\?|\[[^]]+\]|\{\w+\})", pattern.removeprefix("./")):
         word = _WORD.fullmatch(part)
         if word:
-            parts.append(f"(?P={word[1]})" if word[1] in seen else f"(?P<{word[1]}>[^/]+)")
-            seen.add(word[1])
+            parts.append(f"(?P={word[1]})" if word[1] in names else f"(?P<{word[1]}>[^/]+)")
+            names.add(word[1])
         elif part in ("**/", "*", "?"):
             parts.append({"**/": "(?:.*/)?", "*": "[^/]*", "?": "[^/]"}[part])
         else:
@@ -238,20 +240,20 @@ class _Table:
             cells = {name: (cell or "").strip() for name, cell in zip(names, line.values(), strict=False)}
             if None in line or not cells["pattern"] or not cells["rig"]:
                 raise AmbidError(f"table {path}, row {number}: a cell is missing or too many. Correct it")
-            told = {n: x for n, x in cells.items() if x and n != "pattern"}
-            told["rig"] = str(path.parent / told["rig"])
-            rows.append((_expression("**/" + cells["pattern"].removeprefix("/")), told))
+            settings = {n: x for n, x in cells.items() if x and n != "pattern"}
+            settings["rig"] = str(path.parent / settings["rig"])
+            rows.append((_expression("**/" + cells["pattern"].removeprefix("/")), settings))
         return cls(where=str(path), rows=rows)
 
     def row(self, name: str) -> Mapping[str, Any]:
         """Return the one row that a record matches, the words of its pattern put in."""
-        found = [(fit, told) for shape, told in self.rows if (fit := shape.fullmatch(name))]
-        if len(found) != 1:
-            what = "no pattern" if not found else "several patterns"
+        matches = [(fit, told) for shape, told in self.rows if (fit := shape.fullmatch(name))]
+        if len(matches) != 1:
+            what = "no pattern" if not matches else "several patterns"
             raise AmbidError(
                 f"record {name} matches {what} of {self.where}. Correct the table: each must match one row"
             )
-        fit, told = found[0]
+        fit, told = matches[0]
         words = fit.groupdict()
         filled = {n: _filled(x, words, name) if words else x for n, x in told.items()}
         return {**{n: words[n] for n in ("bearing", "taken_at") if n in words}, **filled}

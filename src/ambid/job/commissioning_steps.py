@@ -313,7 +313,7 @@ def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> t
     """
     resting = resting_at(room, hover)
     trial = plan.trial(rate_hz, plan.longest_trial_s(rate_hz))
-    found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=plan.use, given=plan.amplitude_v)
+    found = find_amplitude(look, room, trial, resting, rate_hz=rate_hz, use=plan.use, amplitude_v=plan.amplitude_v)
     numbers = {"amplitude_v": found.amplitude_v, "used": found.used}
     trips = room.trips
     seen = (trials_picture(found.trials, plan.use, found.last, rate_hz, trips),) if found.trials else ()

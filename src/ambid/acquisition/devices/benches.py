@@ -36,12 +36,12 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
     truth = _named(rig) if bench is None else bench
     if isinstance(truth, Preset) and truth.rotor is None and model(truth.model).inputs != ("voltage",):
         raise DeviceError(f"bench {truth.name!r} is not driven by a voltage; a controller drives one. Give another")
-    found = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
-    plant = found.plant
+    result = Bench.of(truth, 1.0, None, nonlinear=isinstance(truth, Preset) and truth.plant is not None)
+    plant = result.plant
     if truth is rig and rig.loop is not None and rig.loop.pull and isinstance(plant, LinearPlant):
-        held = math.copysign(plant.parameters["k_i"], rig.loop.pull)
-        found = replace(found, plant=replace(plant, parameters={**plant.parameters, "k_i": held}))
-    return replace(found, name=truth.name or "rig")
+        k_i = math.copysign(plant.parameters["k_i"], rig.loop.pull)
+        result = replace(result, plant=replace(plant, parameters={**plant.parameters, "k_i": k_i}))
+    return replace(result, name=truth.name or "rig")
 
 
 def instruments(rig: Rig, bench: Preset | Rig | None) -> dict[str, Scale]:
@@ -52,13 +52,13 @@ def instruments(rig: Rig, bench: Preset | Rig | None) -> dict[str, Scale]:
     `rig`: with calibrations; `bench`: as `bench_of`.
     """
     truth = _named(rig) if bench is None else bench
-    found = {}
+    scales = {}
     for c in rig.channels:
         if c.role in ("voltage", "current", "position"):
             own = truth if isinstance(truth, Rig) and truth is not rig else None
-            known = own is not None and any(t.role == c.role and t.calibration is not None for t in own.channels)
-            found[c.role] = scale_of(own, c.role) if own is not None and known else _rising(scale_of(rig, c.role))
-    return found
+            calibrated = own is not None and any(t.role == c.role and t.calibration is not None for t in own.channels)
+            scales[c.role] = scale_of(own, c.role) if own is not None and calibrated else _rising(scale_of(rig, c.role))
+    return scales
 
 
 def _rising(scale: Scale) -> Scale:
@@ -79,10 +79,10 @@ def _named(rig: Rig) -> Preset | Rig:
         return preset(name)
     path = Path(name) if rig.source is None else rig.source.parent / name
     if path.suffix != ".toml":
-        known = preset_names(rotors=False)
+        names = preset_names(rotors=False)
         raise DeviceError(
-            f"rig {rig.name!r}: daq.bench is {name!r}; it is a preset ({', '.join(known)}) or a rig file (.toml)."
-            f"{nearest(name, known)} Correct it"
+            f"rig {rig.name!r}: daq.bench is {name!r}; it is a preset ({', '.join(names)}) or a rig file (.toml)."
+            f"{nearest(name, names)} Correct it"
         )
     return load_rig(path)
 
@@ -97,8 +97,8 @@ def plant_text(rig: Rig, *, bench: Preset | Rig | None = None) -> str:
     """
     truth = bench_of(rig, bench)
     body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name
-    found = instruments(rig, bench)
-    voltage = found["voltage"]
+    scales = instruments(rig, bench)
+    voltage = scales["voltage"]
     if voltage.raw.size > 2:
         raise DeviceError(
             f"rig {rig.name!r}: channels.voltage is calibrated by a table; the emulated power stage is a straight line"
@@ -110,12 +110,14 @@ def plant_text(rig: Rig, *, bench: Preset | Rig | None = None) -> str:
         f"# {truth.name}",
         *body,
         *_numbers(stage),
-        *_numbers({f"{of}_noise": getattr(truth.noise, of) for of in ("position", "current", "force", "voltage")}),
+        *_numbers(
+            {f"{signal}_noise": getattr(truth.noise, signal) for signal in ("position", "current", "force", "voltage")}
+        ),
         *_numbers(_THIRD),
     ]
     # A rig without position leaves that input alone: it shows half of the supply.
-    position = _sensor("position", found["position"]) if has_position(rig) else _numbers(_NO_POSITION)
-    lines += [*position, *_sensor("current", found["current"])]
+    position = _sensor("position", scales["position"]) if has_position(rig) else _numbers(_NO_POSITION)
+    lines += [*position, *_sensor("current", scales["current"])]
     lines += _numbers({"start_position": _resting_place(truth)})
     # A single transistor with its diode: no current the other way, and a coil that is switched off runs out slowly.
     one_way = min(low, high) >= 0.0

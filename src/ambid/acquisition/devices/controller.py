@@ -135,9 +135,9 @@ def candidate_ports() -> Sequence[str]:
         from serial.tools import list_ports
     except ImportError:
         return ()
-    found = sorted(list_ports.comports(), key=lambda p: (p.vid is None, p.device))
+    ports = sorted(list_ports.comports(), key=lambda p: (p.vid is None, p.device))
     # A PC announces serial ports that have no connector: they have no hardware id.
-    return tuple(f"{p.device} ({p.description})" for p in found if p.vid is not None or p.hwid not in (None, "n/a"))
+    return tuple(f"{p.device} ({p.description})" for p in ports if p.vid is not None or p.hwid not in (None, "n/a"))
 
 
 def _lost(*others: type[Exception]) -> tuple[type[Exception], ...]:
@@ -178,12 +178,12 @@ def _refusal(name: str, baud: int, failure: Exception) -> str:
             " program, e.g. a serial monitor"
         )
     if code in (errno.ENOENT, errno.ENODEV, errno.ENXIO) or "FileNotFoundError" in text:
-        known = candidate_ports()
+        ports = candidate_ports()
         meant = "" if "/" in name else nearest(name.lower(), ("emulated", "simulated", "replay:FILE"))
-        if not known:
+        if not ports:
             return f"port {name} does not exist; no serial port with a device is there.{meant} Plug the board in"
         return (
-            f"port {name} does not exist; there are {'; '.join(known)}.{meant} Plug the board in, or give one of these"
+            f"port {name} does not exist; there are {'; '.join(ports)}.{meant} Plug the board in, or give one of these"
         )
     if isinstance(failure, ValueError) or "baud" in text.lower():
         return f"port {name} cannot go at {baud} baud ({text}). Give the daq.baud of the firmware, or another adapter"
@@ -239,10 +239,10 @@ class Reader:
         """
         with self._news:
             self._news.wait_for(lambda: self._chunks or self._over, timeout_s)
-            found = list(self._chunks)
+            chunks = list(self._chunks)
             self._chunks.clear()
             self._held = 0
-        return found
+        return chunks
 
     @property
     def over(self) -> bool:
@@ -364,8 +364,8 @@ class Controller:
         """
         with self._asking:
             number = self._next_id()
-            asked = message(name, values=values, id=number, **fields)
-            data, waiting = encode(asked), _Waiting(name)
+            command = message(name, values=values, id=number, **fields)
+            data, waiting = encode(command), _Waiting(name)
             self._waiting[number] = waiting
             try:
                 answer = self._answered(data, waiting)
@@ -379,7 +379,7 @@ class Controller:
                 f" answered. Look at cable and supply, and open the port again; {_LOST}"
             )
         if answer.name == "ack" and answer["code"]:
-            raise DeviceError(f"{self._port.name}: {refusal(asked, answer)}")
+            raise DeviceError(f"{self._port.name}: {refusal(command, answer)}")
         return answer
 
     def pace(self, rate_hz: float) -> None:
@@ -517,14 +517,14 @@ class Controller:
 
     def _nobody(self) -> str:
         """Say what may stand behind a port that gives no identity."""
-        seen, name = self.counters, self._port.name
-        if seen.frames:
+        counters, name = self.counters, self._port.name
+        if counters.frames:
             return (
                 f"port {name}: sound frames come, but no answer to 'identify'; the controller does not hear the host."
                 " Check its receive line, and reset the board"
             )
-        if seen.discarded_bytes or seen.empty or seen.damaged:
-            total = seen.discarded_bytes + seen.empty
+        if counters.discarded_bytes or counters.empty or counters.damaged:
+            total = counters.discarded_bytes + counters.empty
             return (
                 f"port {name}: {total} bytes came, and no sound frame among them; this is another speed or another"
                 " program. Give the firmware's baud (daq.baud), or put the firmware amb_daq on the board"
@@ -545,38 +545,38 @@ _REMEDY = {
 }
 
 
-def refusal(asked: Message, answer: Message) -> str:
+def refusal(command: Message, answer: Message) -> str:
     """Return what was refused, why, and what to do.
 
-    `asked`: the command; `answer`: its ``ack`` with a code that is not 0. Returns one line.
+    `command`: the command; `answer`: its ``ack`` with a code that is not 0. Returns one line.
     """
-    known = table()
-    code = known.name("code", answer["code"])
-    about = next((e.about for e in known.enums["code"] if e.value == answer["code"]), "an unknown code")
+    protocol = table()
+    code = protocol.name("code", answer["code"])
+    about = next((e.about for e in protocol.enums["code"] if e.value == answer["code"]), "an unknown code")
     return (
-        f"the controller refuses {asked.name!r}: {_why(asked, code, answer['detail'], about)}."
+        f"the controller refuses {command.name!r}: {_why(command, code, answer['detail'], about)}."
         f" {_REMEDY.get(code, 'Put the firmware of this ambid on the board')}"
     )
 
 
-def _why(asked: Message, code: str, detail: int, about: str) -> str:
-    known = table()
-    if code == "range" and asked.name == "start":
+def _why(command: Message, code: str, detail: int, about: str) -> str:
+    protocol = table()
+    if code == "range" and command.name == "start":
         return (
-            f"mode {known.name('mode', asked['mode'])!r} does not go with what it was told: with the output on, a tick"
-            " is neither very short nor very long (daq.rate_hz), and set point and bias are within the limits"
+            f"mode {protocol.name('mode', command['mode'])!r} does not go with what it was told: with the output on, a"
+            " tick is neither very short nor very long (daq.rate_hz), and set point and bias are within the limits"
         )
     if code == "range":
-        fields = known.messages[asked.name].fields
+        fields = protocol.messages[command.name].fields
         if 1 <= detail <= len(fields):
             field = fields[detail - 1]
-            value = asked.fields.get(field.name, asked.values)
+            value = command.fields.get(field.name, command.values)
             return f"{field.name} = {value} is outside what it allows ({field.about})"
         return f"a value is outside what it allows (field {detail})"
     if code == "state":
-        return f"not in state {known.name('state', detail)}"
+        return f"not in state {protocol.name('state', detail)}"
     if code == "unready":
-        there = known.names_of_bits("ready", detail)
-        missing = [e.name for e in known.bits["ready"] if e.name not in there]
+        there = protocol.names_of_bits("ready", detail)
+        missing = [e.name for e in protocol.bits["ready"] if e.name not in there]
         return f"it has not been given {', '.join(missing)} yet"
     return about

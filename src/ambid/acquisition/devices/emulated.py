@@ -131,10 +131,10 @@ class Emulator:
             options["trajectory"] = str(self.trajectory_path)
         command = [str(program), *(word for name, x in options.items() for word in (f"--{name}", x))]
         atexit.register(self.close)
-        with self._said_path().open("wb") as said:
+        with self._said_path().open("wb") as errors:
             try:
                 self._process = subprocess.Popen(
-                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=said, start_new_session=True
+                    command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=errors, start_new_session=True
                 )
             except OSError as failure:
                 raise DeviceError(
@@ -174,7 +174,7 @@ class Emulator:
             code = self._process.wait(timeout_s)
         except subprocess.TimeoutExpired:
             return None
-        return f"{_way(code)}: {said}" if (said := self.said()) else _way(code)
+        return f"{_way(code)}: {errors}" if (errors := self.said()) else _way(code)
 
     def events(self, name: str | None = None) -> list[dict[str, Any]]:
         """Return what the log says so far.
@@ -185,8 +185,8 @@ class Emulator:
         if self._folder is None or not self.log_path.exists():
             return []
         lines = self.log_path.read_text(encoding="utf-8").splitlines(keepends=True)
-        found = [json.loads(line) for line in lines if line.endswith("\n")]
-        return [e for e in found if name is None or e["event"] == name]
+        events = [json.loads(line) for line in lines if line.endswith("\n")]
+        return [e for e in events if name is None or e["event"] == name]
 
     def said(self) -> str:
         """Return what the program wrote on its standard error.
@@ -230,11 +230,11 @@ class Emulator:
             ) from None
 
 
-def _as_file(given: str | Path, path: Path) -> Path:
+def _as_file(source: str | Path, path: Path) -> Path:
     """Return a file as it is given, or write its lines down."""
-    if isinstance(given, Path):
-        return given
-    path.write_text(given + "\n", encoding="utf-8")
+    if isinstance(source, Path):
+        return source
+    path.write_text(source + "\n", encoding="utf-8")
     return path
 
 
@@ -275,11 +275,11 @@ def _check_firmware(path: Path) -> None:
 
 
 def _find(variable: str, name: str, target: str, sources: tuple[str, ...]) -> Path:
-    given = os.environ.get(variable)
-    if given:
-        path = Path(given)
+    setting = os.environ.get(variable)
+    if setting:
+        path = Path(setting)
         if not path.is_file():
-            raise DeviceError(f"emulated bench: {variable} names {given}; there is no such file. Correct or unset it")
+            raise DeviceError(f"emulated bench: {variable} names {setting}; there is no such file. Correct or unset it")
         return path
     firmware = Path(__file__).resolve().parents[4] / "firmware"
     built = firmware / "build" / name

@@ -82,8 +82,8 @@ class ClockDrift:
             self._origin = arrived_s - number * self._period
         t = number * self._period
         late, window = arrived_s - self._origin - t, int(t / self._width)
-        kept = self._lowest.get(window)
-        if kept is None or late < kept[1]:
+        earliest = self._lowest.get(window)
+        if earliest is None or late < earliest[1]:
             self._lowest[window] = (t, late)
         if len(self._lowest) > _WINDOWS:
             self._halve()
@@ -123,8 +123,8 @@ class ClockDrift:
         self._width *= 2.0
         merged: dict[int, tuple[float, float]] = {}
         for window, (t, late) in self._lowest.items():
-            kept = merged.get(window // 2)
-            if kept is None or late < kept[1]:
+            earliest = merged.get(window // 2)
+            if earliest is None or late < earliest[1]:
                 merged[window // 2] = (t, late)
         self._lowest = merged
 
@@ -176,8 +176,8 @@ class SampleStream:
     def events(self) -> list[DeviceEvent]:
         """Return what was told since the last call."""
         with self._lock:
-            found, self._events = self._events, []
-            return found
+            events, self._events = self._events, []
+            return events
 
     def tell(self, event: DeviceEvent) -> None:
         """Add an event."""
@@ -386,10 +386,10 @@ class LineDevice(ABC):
 
     def self_test(self) -> SelfTest:
         """As `Device.self_test`."""
-        found = self._ask("self_test")
+        answer = self._ask("self_test")
         about = {e.name: e.about for e in table().bits["failed"]}
-        failed = tuple(about[name] for name in table().names_of_bits("failed", found["failed"]))
-        numbers = {name: float(v) for name, v in found.fields.items() if name not in ("id", "failed")}
+        failed = tuple(about[name] for name in table().names_of_bits("failed", answer["failed"]))
+        numbers = {name: float(v) for name, v in answer.fields.items() if name not in ("id", "failed")}
         return SelfTest(failed=failed, numbers=MappingProxyType(numbers))
 
     def start(self, mode: Mode) -> None:
@@ -460,12 +460,12 @@ class LineDevice(ABC):
 
     def events(self) -> Sequence[DeviceEvent]:
         """As `Device.events`."""
-        found = self._stream.events()
+        events = self._stream.events()
         damaged = self._last.damaged if self._controller is None else self._damaged(self._controller)
         if damaged > self._damaged_told:
             new, self._damaged_told = damaged - self._damaged_told, damaged
-            found.append(DeviceEvent(kind="damaged", sample=None, what="frames with wrong check values", count=new))
-        return tuple(found)
+            events.append(DeviceEvent(kind="damaged", sample=None, what="frames with wrong check values", count=new))
+        return tuple(events)
 
     def counters(self) -> Counters:
         """As `Device.counters`."""
@@ -526,8 +526,8 @@ class LineDevice(ABC):
         if before["state"] == table().value("state", "fault"):
             controller.ask("clear")  # refused while the cause is there
             cause = table().name("cause", before["cause"])
-            told = f"a fault of an earlier session ({cause}) was cleared"
-            self._stream.tell(DeviceEvent(kind="link", sample=None, what=told))
+            text = f"a fault of an earlier session ({cause}) was cleared"
+            self._stream.tell(DeviceEvent(kind="link", sample=None, what=text))
         for name in ("configure", "limits", "gains"):
             controller.ask(name, self._settings.fields(name))
         if self._settings.law is not None:
@@ -546,10 +546,10 @@ class LineDevice(ABC):
         controller.ask("arm", {"period": self._settings.period, "checksum": law.checksum, **trial})
 
     def _counted(self, c: Controller) -> Counters:
-        line, kept, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
+        line, samples, frames, drift = c.counters, self._stream.counters, self._stream.frames, self._stream.drift()
         return Counters(
-            samples=kept.samples - frames.overrun_samples,
-            lost=kept.lost + frames.overrun_samples,
+            samples=samples.samples - frames.overrun_samples,
+            lost=samples.lost + frames.overrun_samples,
             damaged=self._damaged(c),
             discarded_bytes=line.discarded_bytes + c.reader.overrun_bytes - self._before[1],
             overruns=frames.overruns + c.reader.overruns,
@@ -560,8 +560,8 @@ class LineDevice(ABC):
         )
 
     def _damaged(self, c: Controller) -> int:
-        kept = self._stream.counters
-        return c.counters.damaged + kept.damaged + kept.misnumbered + kept.repeated + c.odd - self._before[0]
+        samples = self._stream.counters
+        return c.counters.damaged + samples.damaged + samples.misnumbered + samples.repeated + c.odd - self._before[0]
 
     def _end(self) -> None:
         controller, self._controller = self._controller, None

@@ -269,8 +269,8 @@ class PlayedDevice(ABC):
         """As `Device.events`."""
         with self._lock:
             self._catch_up(partly=False)
-            found, self._events = tuple(self._events), []
-            return found
+            events, self._events = tuple(self._events), []
+            return events
 
     def counters(self) -> Counters:
         """As `Device.counters`."""
@@ -434,11 +434,11 @@ def _check_units(record: Record, rig: Rig, where: str) -> None:
     """Refuse a column whose unit is not the one that the rig's calibration begins with; one without unit may pass."""
     wanted = role_units(model(rig.model))
     for c in rig.channels:
-        channel, of = record.channel(c.column), c.calibration
+        channel, calibration = record.channel(c.column), c.calibration
         if c.unit is not None or channel.unit == UNKNOWN:
             continue
         counts = "1" if rig.daq is not None else channel.unit  # a gain of a controller's rig is for counts
-        unit = wanted.get(c.role, channel.unit) if of is None else of.unit_in or counts
+        unit = wanted.get(c.role, channel.unit) if calibration is None else calibration.unit_in or counts
         if channel.unit != unit:
             raise DeviceError(
                 f"{where}: column {c.column!r} is in [{channel.source_unit or channel.unit}]; channels.{c.role} of the"

@@ -160,9 +160,9 @@ class SimulatedDevice(PlayedDevice):
 
     def _tested(self) -> SelfTest:
         self._memory[:] = 0
-        held = self._x.copy()
+        state = self._x.copy()
         counts = self._advance(16)
-        self._x[:] = held
+        self._x[:] = state
         self._memory[:] = 0
         numbers = {"position": float(counts[:, 0].mean()), "current": float(counts[:, 1].mean()), "supply_mv": 5000.0}
         about = {e.name: e.about for e in table().bits["failed"]}
@@ -184,8 +184,8 @@ class SimulatedDevice(PlayedDevice):
             self._events.append(DeviceEvent(kind="fault", sample=at, what=table().name("cause", cause)))
         wanted = [_ROLES.index(r) for r in carried(self._settings) if r in _ROLES]
         values = np.zeros((room, len(self._info.columns)))
-        kept = [j for j, r in enumerate(carried(self._settings)) if r in _ROLES]
-        values[:, kept] = counts[:, wanted]
+        places = [j for j, r in enumerate(carried(self._settings)) if r in _ROLES]
+        values[:, places] = counts[:, wanted]
         if self._si:
             values = in_si(self._rig, self._settings, values)
         return Block(first=self._next, time_s=self._next / self._rate, values=values)
@@ -227,7 +227,7 @@ class SimulatedDevice(PlayedDevice):
 def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
     """Return the plant for the compiled loop, and the whole samples of its delay."""
     standing = Standing.of(bench.plant, bench.point)
-    of, period = standing.model, 1.0 / settings.rate_hz
+    plant_model, period = standing.model, 1.0 / settings.rate_hz
     delay = LAG_S * settings.rate_hz  # the controller's own, whatever delay a loop was designed for
     whole = math.floor(delay)
     force, voltage = bench.noise.held_rms(settings.rate_hz)
@@ -243,8 +243,8 @@ def _plant_of(bench: Bench, settings: ControllerSettings) -> tuple[_Plant, int]:
         centre_input=standing.centre_input,
         equations=equations,
         stops=stops,
-        noise_size=np.array([bench.noise.position, bench.noise.current, *(size[d] for d in of.disturbances)]),
-        roles=(_place(of.states, "position"), _place(of.states, "current")),
+        noise_size=np.array([bench.noise.position, bench.noise.current, *(size[d] for d in plant_model.disturbances)]),
+        roles=(_place(plant_model.states, "position"), _place(plant_model.states, "current")),
     )
     return plant, whole
 

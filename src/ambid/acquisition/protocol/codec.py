@@ -41,9 +41,9 @@ def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
     """
     kind = _kind(name)
     wanted = [f.name for f in kind.fixed]
-    for given in fields:
-        if given not in wanted:
-            raise DeviceError(f"message {name!r} has no field {given!r}.{nearest(given, wanted)}")
+    for field_name in fields:
+        if field_name not in wanted:
+            raise DeviceError(f"message {name!r} has no field {field_name!r}.{nearest(field_name, wanted)}")
     if missing := [w for w in wanted if w not in fields]:
         raise DeviceError(f"message {name!r} lacks its field {missing[0]!r}. Give {', '.join(missing)}")
     for one in kind.fixed:
@@ -53,9 +53,9 @@ def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
                 f"message {name!r}: {one.name} = {fields[one.name]} does not fit {one.kind}. "
                 f"Give a value within {low} to {high}"
             )
-    made = Message(name=name, fields=MappingProxyType({w: int(fields[w]) for w in wanted}), values=tuple(values))
-    _check_values(made, kind)
-    return made
+    result = Message(name=name, fields=MappingProxyType({w: int(fields[w]) for w in wanted}), values=tuple(values))
+    _check_values(result, kind)
+    return result
 
 
 def pack(what: Message) -> bytes:
@@ -118,19 +118,19 @@ def refuse_other_version(version: int) -> None:
         )
 
 
-def _check_values(made: Message, kind: MessageType) -> None:
+def _check_values(what: Message, kind: MessageType) -> None:
     tail = kind.tail
     if tail is None:
-        if made.values:
-            raise DeviceError(f"message {made.name!r} ends in no array, but {len(made.values)} values are given")
+        if what.values:
+            raise DeviceError(f"message {what.name!r} ends in no array, but {len(what.values)} values are given")
         return
     low, high = tail.span
-    for i, value in enumerate(made.values):
+    for i, value in enumerate(what.values):
         if not low <= value <= high:
-            raise DeviceError(f"message {made.name!r}: {tail.name}[{i}] = {value}. Give values within {low} to {high}")
+            raise DeviceError(f"message {what.name!r}: {tail.name}[{i}] = {value}. Give values within {low} to {high}")
     most = (table().largest - CRC_BYTES - kind.length) // tail.width
-    if len(made.values) > most:
-        raise DeviceError(f"message {made.name!r} has {len(made.values)} {tail.name}. Give at most {most} in one")
+    if len(what.values) > most:
+        raise DeviceError(f"message {what.name!r} has {len(what.values)} {tail.name}. Give at most {most} in one")
 
 
 @functools.cache
@@ -139,10 +139,10 @@ def _codes(to: str) -> dict[int, MessageType]:
 
 
 def _kind(name: str) -> MessageType:
-    known = table().messages
-    if name not in known:
-        raise DeviceError(f"there is no message {name!r}.{nearest(name, list(known))}")
-    return known[name]
+    messages = table().messages
+    if name not in messages:
+        raise DeviceError(f"there is no message {name!r}.{nearest(name, list(messages))}")
+    return messages[name]
 
 
 @functools.cache
@@ -220,7 +220,7 @@ class FrameDecoder:
         tail = runs.pop()
         if self._inside_overlong:
             tail = self._leave_overlong(runs, tail)
-        found: list[bytes] = []
+        payloads: list[bytes] = []
         for run in runs:
             if not run:
                 self.counters.empty += 1
@@ -230,15 +230,15 @@ class FrameDecoder:
                 self.counters.discarded_bytes += len(run) + 1
             else:
                 self.counters.kept_bytes += len(run) + 1
-                found.append(payload)
+                payloads.append(payload)
         if len(tail) > self._longest:
             self._inside_overlong = True
             self.counters.overlong += 1
             self.counters.discarded_bytes += len(tail)
             tail = b""
         self._tail = tail
-        self.counters.frames += len(found)
-        return found
+        self.counters.frames += len(payloads)
+        return payloads
 
     def _leave_overlong(self, runs: list[bytes], tail: bytes) -> bytes:
         """Discard what still belongs to a run that was too long; return what is left of the tail."""

@@ -61,10 +61,10 @@ def columns_of(mask: int) -> tuple[StreamColumn, ...]:
 
     `mask`: field ``stream`` of ``configure``. Returns in the order of a sample's values.
     """
-    known = table().stream
-    if mask < 0 or mask >> len(known):
-        raise DeviceError(f"stream mask {mask:#x} has unknown bits. Give bits 0 to {len(known) - 1} only")
-    return tuple(c for c in known if mask >> c.bit & 1)
+    stream = table().stream
+    if mask < 0 or mask >> len(stream):
+        raise DeviceError(f"stream mask {mask:#x} has unknown bits. Give bits 0 to {len(stream) - 1} only")
+    return tuple(c for c in stream if mask >> c.bit & 1)
 
 
 class SampleDecoder:

@@ -179,10 +179,10 @@ class JournalReader:
                 if self._window.take(at + head.size, len(SYNC)) == SYNC:  # its length is checked: only values are bad
                     at += head.size
                     continue
-            found = self._window.find(SYNC, at + 1)
-            if found < 0:
+            place = self._window.find(SYNC, at + 1)
+            if place < 0:
                 return
-            at = found
+            at = place
 
 
 def _item(head: Head, data: bytes) -> Iterator[Block | DeviceEvent]:
@@ -218,9 +218,9 @@ class _Window:
         """Return the next place of a word; -1 if there is none."""
         while at + len(word) <= self._size:
             self.take(at, len(word))
-            found = self._data.find(word, at - self._at)
-            if found >= 0:
-                return self._at + found
+            place = self._data.find(word, at - self._at)
+            if place >= 0:
+                return self._at + place
             at = self._at + len(self._data) - len(word) + 1
         return -1
 
@@ -276,29 +276,29 @@ class Survey:
 
 def survey(reader: JournalReader) -> Survey:
     """Look through a journal."""
-    found = Survey()
+    content = Survey()
     rate = reader.header.rate_hz
     for item in reader.items():
         if isinstance(item, DeviceEvent):
-            found.events.append(item)
+            content.events.append(item)
             continue
         n = len(item.values)
-        if found.blocks == 0:
-            found.first = found.end = item.first
-            found.start_s = item.time_s if np.isfinite(item.time_s) else item.first / rate
-        found.blocks += 1
-        if item.first > found.end:
-            found.gaps += 1
-            found.gap_samples += item.first - found.end
-        old = min(max(found.end - item.first, 0), n)
-        found.misplaced += old
-        found.samples += n - old
-        found.end = max(found.end, item.first + n)
+        if content.blocks == 0:
+            content.first = content.end = item.first
+            content.start_s = item.time_s if np.isfinite(item.time_s) else item.first / rate
+        content.blocks += 1
+        if item.first > content.end:
+            content.gaps += 1
+            content.gap_samples += item.first - content.end
+        old = min(max(content.end - item.first, 0), n)
+        content.misplaced += old
+        content.samples += n - old
+        content.end = max(content.end, item.first + n)
         if not old and np.isfinite(item.time_s):
-            due = found.start_s + (item.first - found.first) / rate
-            found.stamp_error_s = max(found.stamp_error_s, abs(item.time_s - due))
-    found.damage = reader.damage
-    return found
+            due = content.start_s + (item.first - content.first) / rate
+            content.stamp_error_s = max(content.stamp_error_s, abs(item.time_s - due))
+    content.damage = reader.damage
+    return content
 
 
 FORMATS = (".h5", ".hdf5", ".csv", ".csv.gz")
@@ -323,7 +323,7 @@ class Recorded(Result):
     @property
     def reasons(self) -> tuple[Reason, ...]:
         """What was damaged, and what is missing."""
-        found, damage, said = self.survey, self.survey.damage, list[Reason]()
+        content, damage, reasons = self.survey, self.survey.damage, list[Reason]()
         if damage.frames or damage.places:
             others = damage.frames - damage.blocks
             what = [counted(damage.blocks, "block")] if damage.blocks else []
@@ -331,14 +331,14 @@ class Recorded(Result):
                 what.append(f"{others} {'other ' if what else ''}{'entry' if others == 1 else 'entries'}")
             where = counted(max(damage.places, 1), "place")
             text = f"{' and '.join(what)} damaged, in {where}" if what else f"bytes damaged in {where}"
-            said.append(Reason(check="journal", text=f"{text}. Keep it, and look at the disk"))
-        if found.gap_samples:
-            text = f"{counted(found.gap_samples, 'sample')} missing in {counted(found.gaps, 'place')}"
-            said.append(Reason(check="samples", text=f"{text}. Read the record with {setting('gaps')}"))
-        if found.misplaced:
-            text = f"{counted(found.misplaced, 'sample')} left out whose number had occurred before. Keep the journal"
-            said.append(Reason(check="order", text=text))
-        return tuple(said)
+            reasons.append(Reason(check="journal", text=f"{text}. Keep it, and look at the disk"))
+        if content.gap_samples:
+            text = f"{counted(content.gap_samples, 'sample')} missing in {counted(content.gaps, 'place')}"
+            reasons.append(Reason(check="samples", text=f"{text}. Read the record with {setting('gaps')}"))
+        if content.misplaced:
+            text = f"{counted(content.misplaced, 'sample')} left out whose number had occurred before. Keep the journal"
+            reasons.append(Reason(check="order", text=text))
+        return tuple(reasons)
 
 
 def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
@@ -374,27 +374,27 @@ def recorded_from(
     what else its history is to say. Returns none if there is no sample
     in the journal.
     """
-    found = survey(reader)
-    if not found.samples:
+    content = survey(reader)
+    if not content.samples:
         return None
-    _check_gaps(found, reader.path)
+    _check_gaps(content, reader.path)
     check_target(path, reader.header, force=force)
-    record = _record(reader.header, found, extra)
+    record = _record(reader.header, content, extra)
     # Named after the journal, which is locked: what a killed conversion leaves is written over by the next one.
-    beside = path.with_name(f".{reader.path.name}-{path.name}")
+    temporary = path.with_name(f".{reader.path.name}-{path.name}")
     try:
-        rows = _rows(reader, found)
-        check = write_chunks(record, found.rows, rows, beside, _texts(reader.header, found))
-        _sync_file(beside)
+        rows = _rows(reader, content)
+        check = write_chunks(record, content.rows, rows, temporary, _texts(reader.header, content))
+        _sync_file(temporary)
         check()
-        _put_in_place(beside, path, force=force)
+        _put_in_place(temporary, path, force=force)
     except (RecordError, OSError) as failure:
-        said = str(failure).replace(str(beside), str(path))
-        raise DeviceError(f"{said.rstrip('.')}. The journal {reader.path} is kept; then: ambid recover {reader.path}"
+        text = str(failure).replace(str(temporary), str(path))
+        raise DeviceError(f"{text.rstrip('.')}. The journal {reader.path} is kept; then: ambid recover {reader.path}"
                           ) from None  # fmt: skip
     finally:
-        beside.unlink(missing_ok=True)
-    return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
+        temporary.unlink(missing_ok=True)
+    return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=content)
 
 
 def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
@@ -404,16 +404,16 @@ def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
     `path`: of the record. Returns none unless the record reads back as every value, column and event that the journal
     gives.
     """
-    found = survey(reader)
-    if not found.samples or not path.is_file() or not path.name.lower().endswith(FORMATS):
+    content = survey(reader)
+    if not content.samples or not path.is_file() or not path.name.lower().endswith(FORMATS):
         return None
     try:
-        _check_gaps(found, reader.path)
-        record = _record(reader.header, found, {})
-        check_chunks(record, found.rows, _rows(reader, found), path, _texts(reader.header, found))
+        _check_gaps(content, reader.path)
+        record = _record(reader.header, content, {})
+        check_chunks(record, content.rows, _rows(reader, content), path, _texts(reader.header, content))
     except (RecordError, DeviceError):
         return None
-    return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=found)
+    return Recorded(path=path, rate_hz=reader.header.rate_hz, survey=content)
 
 
 def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[DeviceEvent, ...]]:
@@ -440,34 +440,34 @@ def read_acquisition(path: str | Path) -> tuple[JournalHeader, tuple[DeviceEvent
 
     try:
         with h5py.File(path, "r") as file:
-            found = json.loads(file["acquisition"].asstr()[()])
+            content = json.loads(file["acquisition"].asstr()[()])
     except (OSError, KeyError, ValueError) as failure:
         raise DeviceError(f"{path} holds no acquisition ({failure}). Name a file that a recorder wrote") from None
-    return JournalHeader.from_json(found["header"]), tuple(DeviceEvent(**e) for e in found["events"])
+    return JournalHeader.from_json(content["header"]), tuple(DeviceEvent(**e) for e in content["events"])
 
 
-def _texts(header: JournalHeader, found: Survey) -> dict[str, str]:
+def _texts(header: JournalHeader, content: Survey) -> dict[str, str]:
     """What a recorded HDF5 file holds beside its record."""
-    return {"acquisition": json.dumps({"header": header.as_json(), "events": [asdict(e) for e in found.events]})}
+    return {"acquisition": json.dumps({"header": header.as_json(), "events": [asdict(e) for e in content.events]})}
 
 
-def _record(header: JournalHeader, found: Survey, extra: Mapping[str, object]) -> Record:
+def _record(header: JournalHeader, content: Survey, extra: Mapping[str, object]) -> Record:
     """Everything of the record but its values."""
     settings: dict[str, object] = {
         "device": header.device.get("kind", ""),
         "port": header.device.get("port", ""),
         "started": header.started,
-        "samples": found.samples,
-        "events": len(found.events),
+        "samples": content.samples,
+        "events": len(content.events),
     }
-    if found.stamp_error_s * header.rate_hz > 1:
-        settings["stamp_error_s"] = found.stamp_error_s
+    if content.stamp_error_s * header.rate_hz > 1:
+        settings["stamp_error_s"] = content.stamp_error_s
     steps = [Step(name="acquire", settings=settings | dict(extra))]
     lacking = {
-        "lost_samples": found.gap_samples,
-        "places": found.gaps,
-        "misplaced_samples": found.misplaced,
-        "damaged_blocks": found.damage.blocks,
+        "lost_samples": content.gap_samples,
+        "places": content.gaps,
+        "misplaced_samples": content.misplaced,
+        "damaged_blocks": content.damage.blocks,
     }
     if any(lacking.values()):
         steps.append(Step(name="gaps", settings={k: v for k, v in lacking.items() if v}))
@@ -478,7 +478,7 @@ def _record(header: JournalHeader, found: Survey, extra: Mapping[str, object]) -
         provenance["rig_sha256"] = header.rig_sha256
     return Record(
         rate_hz=header.rate_hz,
-        start_s=found.start_s,
+        start_s=content.start_s,
         channels=tuple(
             Channel(name=c.name, unit=_unit(c.unit), values=none, source_unit=c.unit) for c in header.columns
         ),
@@ -491,42 +491,42 @@ def _unit(text: str) -> str:
     return text if text == UNKNOWN else parse_unit(text).si
 
 
-def _check_gaps(found: Survey, path: Path) -> None:
+def _check_gaps(content: Survey, path: Path) -> None:
     """Refuse numbers that no recording has: the record would be nothing but rows of NaN."""
-    if found.gap_samples > _GAP_ROWS + _GAP_SHARE * found.samples:
+    if content.gap_samples > _GAP_ROWS + _GAP_SHARE * content.samples:
         raise DeviceError(
-            f"journal {path}: {found.gap_samples} samples are missing between the {found.samples} that are there; the"
-            " numbers of the device cannot be right. The journal is kept; read it with JournalReader"
+            f"journal {path}: {content.gap_samples} samples are missing between the {content.samples} that are there;"
+            " the numbers of the device cannot be right. The journal is kept; read it with JournalReader"
         )
 
 
-def _rows(reader: JournalReader, found: Survey) -> Iterator[Array]:
+def _rows(reader: JournalReader, content: Survey) -> Iterator[Array]:
     """Rows in the order of their numbers, NaN where there are none, in pieces of the same length."""
-    held = np.empty((_ROWS, len(reader.header.columns)))
+    rows = np.empty((_ROWS, len(reader.header.columns)))
     n = 0
-    for values in _in_order(reader, found):
+    for values in _in_order(reader, content):
         at = 0
         while at < len(values):
-            taken = min(len(values) - at, _ROWS - n)
-            held[n : n + taken] = values[at : at + taken]
-            n, at = n + taken, at + taken
+            count = min(len(values) - at, _ROWS - n)
+            rows[n : n + count] = values[at : at + count]
+            n, at = n + count, at + count
             if n == _ROWS:
-                yield held
+                yield rows
                 n = 0
     if n:
-        yield held[:n]
+        yield rows[:n]
 
 
-def _in_order(reader: JournalReader, found: Survey) -> Iterator[Array]:
-    end = found.first
+def _in_order(reader: JournalReader, content: Survey) -> Iterator[Array]:
+    end = content.first
     nothing = np.full((_ROWS, len(reader.header.columns)), np.nan)
     for item in reader.items():
         if not isinstance(item, Block):
             continue
         while item.first > end:
-            taken = min(item.first - end, _ROWS)
-            yield nothing[:taken]
-            end += taken
+            count = min(item.first - end, _ROWS)
+            yield nothing[:count]
+            end += count
         if item.first + len(item.values) > end:
             yield item.values[end - item.first :]
             end = item.first + len(item.values)
@@ -540,17 +540,17 @@ def _sync_file(path: Path) -> None:
         os.close(fd)
 
 
-def _put_in_place(beside: Path, path: Path, *, force: bool) -> None:
+def _put_in_place(temporary: Path, path: Path, *, force: bool) -> None:
     """Give a file its name; one that came into being meanwhile is not replaced without `force`."""
     if force:
-        os.replace(beside, path)
+        os.replace(temporary, path)
     else:
         try:
-            os.link(beside, path)
+            os.link(temporary, path)
         except FileExistsError:
             raise DeviceError(f"{path} came into being while it was recorded. Give another name with -o") from None
         except OSError:  # a file system without links
             if path.exists():
                 raise DeviceError(f"{path} came into being while it was recorded. Give another name with -o") from None
-            os.replace(beside, path)
+            os.replace(temporary, path)
     sync_folder(path)

@@ -85,16 +85,16 @@ class JournalHeader:
         return {"schema": SCHEMA, **fields_json(self), "rig_sha256": self.rig_sha256}
 
     @classmethod
-    def from_json(cls, found: Mapping[str, Any]) -> Self:
+    def from_json(cls, document: Mapping[str, Any]) -> Self:
         """Read it back.
 
-        `found`: that `as_json` made.
+        `document`: that `as_json` made.
         """
-        if found.get("schema") != SCHEMA:
-            raise DeviceError(f"the journal's schema is {found.get('schema')!r}; this program reads {SCHEMA!r}."
+        if document.get("schema") != SCHEMA:
+            raise DeviceError(f"the journal's schema is {document.get('schema')!r}; this program reads {SCHEMA!r}."
                               " Recover it with the version that recorded it")  # fmt: skip
         try:
-            return read_as(cls, found)
+            return read_as(cls, document)
         except (TypeError, ValueError) as failure:
             raise DeviceError(f"the journal's header: {failure}. It was written by another version") from None
 

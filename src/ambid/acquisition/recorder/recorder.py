@@ -270,8 +270,8 @@ class JournalWriter:
             self.acknowledged = self._block
             self._wake.notify_all()
         if new and self._on_acknowledged is not None:
-            told = self._on_acknowledged
-            self._call(lambda: told(self.acknowledged))
+            callback = self._on_acknowledged
+            self._call(lambda: callback(self.acknowledged))
 
     def _close(self) -> None:
         """Say in the journal that it is complete."""
@@ -328,8 +328,8 @@ class JournalWriter:
 
     def _tell(self, error: DeviceError) -> None:
         if self._on_trouble is not None:
-            told = self._on_trouble
-            self._call(lambda: told(error))
+            callback = self._on_trouble
+            self._call(lambda: callback(error))
 
     def _call(self, callback: Callable[[], object]) -> None:
         """Call what the caller gave; its own failure is kept for the end, and does not stop the recording."""
