@@ -715,8 +715,8 @@ def _refuse_swapped(channels: dict[str, Channel], wanted: dict[str, str], rig: R
             if a != b and channels[a].unit == wanted[b] and channels[b].unit == wanted[a]:
                 raise UnitError(
                     f"swapped columns? channels.{a} is column {channels[a].name!r} in [{channels[a].unit}] "
-                    f"and channels.{b} is column {channels[b].name!r} in [{channels[b].unit}]. Swap the two, or fix the "
-                    "header"
+                    f"and channels.{b} is column {channels[b].name!r} in [{channels[b].unit}]. Swap the two, or fix "
+                    "the header"
                 )
 
 
