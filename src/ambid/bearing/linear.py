@@ -140,9 +140,9 @@ def _follow(
     """
     fit: Fit | None = None
     for candidate in candidates:
-        found = _search(candidate, tick, with_disturbances=noise != "auto")
-        fit = found if fit is None or found.criterion < fit.criterion else fit
-        if found.status == "converged":
+        fit_of_candidate = _search(candidate, tick, with_disturbances=noise != "auto")
+        fit = fit_of_candidate if fit is None or fit_of_candidate.criterion < fit.criterion else fit
+        if fit_of_candidate.status == "converged":
             break
     assert fit is not None
     if trial and fit.status != "converged":
@@ -270,22 +270,22 @@ def _with_fraction(fit: Fit, tick: Callable[[], None] | None) -> Fit:
         if neighbour is not None:
             fit = neighbour
             continue
-        found = search(free, start, tick=tick, work=work)
-        total = free.delay_samples(found.vector)
-        if found.status == "failed" or fit.criterion - found.criterion < price:
+        freed = search(free, start, tick=tick, work=work)
+        total = free.delay_samples(freed.vector)
+        if freed.status == "failed" or fit.criterion - freed.criterion < price:
             return fit
         nearest = round(total)
         if abs(total - nearest) < 0.1:  # a whole number of samples after all?
             exact = replace(free, fractional=False, delay=nearest, skip=max(free.skip, nearest + 2))
-            back = search(exact, carry(found, exact), tick=tick)
-            if back.status == "converged" and back.criterion - found.criterion < price:
+            back = search(exact, carry(freed, exact), tick=tick)
+            if back.status == "converged" and back.criterion - freed.criterion < price:
                 return back
         whole = int(np.floor(total))
         if whole == delay:
-            return found
+            return freed
         # the neighbour's interval: start again from there, so that delay + fraction is written with 0 <= fraction < 1
-        moved = replace(found.problem, delay=whole, skip=max(free.skip, whole + 2))
-        again = search(moved, carry(found, moved), tick=tick)
+        moved = replace(freed.problem, delay=whole, skip=max(free.skip, whole + 2))
+        again = search(moved, carry(freed, moved), tick=tick)
         if 0.0 <= moved.delay_samples(again.vector) - whole < 1.0:
             return again
         fit = again
@@ -298,10 +298,10 @@ def _better_neighbour(fit: Fit, tick: Callable[[], None] | None) -> Fit | None:
     for delay in (fit.problem.delay + 1, fit.problem.delay - 1):
         if delay >= 0:
             problem = replace(fit.problem, delay=delay, skip=max(fit.problem.skip, delay + 2))
-            found = search(problem, carry(fit, problem), tick=tick, work=workspace_near(fit, problem))
+            neighbour = search(problem, carry(fit, problem), tick=tick, work=workspace_near(fit, problem))
             # compared per sample, because a longer delay may leave one sample less
-            if found.criterion / found.problem.n_used < best.criterion / best.problem.n_used:
-                best = found
+            if neighbour.criterion / neighbour.problem.n_used < best.criterion / best.problem.n_used:
+                best = neighbour
     return best if best is not fit else None
 
 
@@ -311,5 +311,5 @@ def _with_gain(fit: Fit, tick: Callable[[], None] | None, *, force: bool) -> Fit
     price = (free.size - fit.problem.size) * np.log(fit.problem.n_used)
     if not force and (price <= 0 or _gain_promise(fit) <= 0):
         return fit
-    found = search(free, carry(fit, free), tick=tick, work=workspace_near(fit, free))
-    return found if force or fit.criterion - found.criterion > price else fit
+    freed = search(free, carry(fit, free), tick=tick, work=workspace_near(fit, free))
+    return freed if force or fit.criterion - freed.criterion > price else fit

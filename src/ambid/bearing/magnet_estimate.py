@@ -49,7 +49,7 @@ _LONGER = 64000  # samples of each record on which the search goes on, where the
 
 def estimate_bearing(
     records: Sequence[BearingRecord],
-    known: Mapping[str, Parameter],
+    parameters: Mapping[str, Parameter],
     *,
     laws: Sequence[MagnetLaw],
     delay: float | None = None,
@@ -62,15 +62,16 @@ def estimate_bearing(
 ) -> BearingFit:
     """Estimate one nonlinear bearing from several records at once.
 
-    `records`: at least one of a rotor that is free to move; `known`: what is known of the numbers, by name; `laws`: the
-    likelihood chooses; `delay`: of the voltage in samples of the first record; None: found; `eddy`: force behind a pole
-    a/(s + a); `drift`: a force that walks slowly: what the law leaves over; `tick`: called after each evaluation;
-    KeyboardInterrupt ends in the best so far; `seed`: of the global search, which `global_search` of the fit tells of.
+    `records`: at least one of a rotor that is free to move; `parameters`: what is known of the numbers, by name;
+    `laws`: the likelihood chooses; `delay`: of the voltage in samples of the first record; None: found; `eddy`: force
+    behind a pole a/(s + a); `drift`: a force that walks slowly: what the law leaves over; `tick`: called after each
+    iteration; KeyboardInterrupt ends in the best so far; `seed`: of the global search, which `global_search` of the fit
+    tells of.
     """
     free = [r for r in records if not r.held]
     if not free:
         raise EstimationError("the rotor is held in every record; mass and force need one in which it moves")
-    laws = [_widened(law, known) for law in laws]
+    laws = [_widened(law, parameters) for law in laws]
     short = [_short(r) for r in records]
     few, many = (float(sum(r.u.size for r in x)) for x in (short, records))
     rich = extend and any(not law.rise or (law.pair and not law.asymmetric) for law in laws)
@@ -79,9 +80,9 @@ def estimate_bearing(
     some = float(sum(r.u.size for r in longer)) * (max(r.u.size for r in records) > 2 * _LONGER)
     ticks = portions(again, [*[few] * len(laws), 2.0 * few * rich, some, many, many * (delay is None)])
     with one_thread():
-        linear = linear_start(free[0], known, delay, laws[0])
+        linear = linear_start(free[0], parameters, delay, laws[0])
         fits = [
-            _first(short, known, law, linear, delay, eddy=eddy, drift=drift, tick=t)
+            _first(short, parameters, law, linear, delay, eddy=eddy, drift=drift, tick=t)
             for law, t in zip(laws, ticks, strict=False)
         ]
         fit = min(fits, key=lambda f: f.criterion)
@@ -90,7 +91,7 @@ def estimate_bearing(
                 law = replace(fit.problem.law, rise=fit.problem.law.rise or name == "rise",
                               asymmetric=fit.problem.law.asymmetric or name == "asymmetric")  # fmt: skip
                 if law != fit.problem.law:
-                    fit = _extended(fit, law, known, short, linear, ticks[-4])
+                    fit = _extended(fit, law, parameters, short, linear, ticks[-4])
         whole, near = replace(fit.problem, records=tuple(records)), _FAR
         if some:  # a step or two over all samples will do from there
             fit = search(replace(whole, records=longer), fit.vector, tick=ticks[-3])
@@ -106,10 +107,10 @@ def estimate_bearing(
     return fit
 
 
-def _widened(law: MagnetLaw, known: Mapping[str, Parameter]) -> MagnetLaw:
+def _widened(law: MagnetLaw, parameters: Mapping[str, Parameter]) -> MagnetLaw:
     """The law with what the user says of a difference between the magnets of a pair."""
-    said = [known[n] for n in ("k_asym", "i0_asym") if n in known]
-    return replace(law, asymmetric=law.pair and (law.asymmetric or any(p.role != "fixed" or p.value for p in said)))
+    own = [parameters[n] for n in ("k_asym", "i0_asym") if n in parameters]
+    return replace(law, asymmetric=law.pair and (law.asymmetric or any(p.role != "fixed" or p.value for p in own)))
 
 
 def _remembered(tick: Tick | None) -> Tick:
@@ -136,7 +137,7 @@ def _short(record: BearingRecord) -> BearingRecord:
 
 
 def _first(
-    records: Sequence[BearingRecord], known: Mapping[str, Parameter], law: MagnetLaw, linear: LinearStart,
+    records: Sequence[BearingRecord], parameters: Mapping[str, Parameter], law: MagnetLaw, linear: LinearStart,
     delay: float | None, *, eddy: bool, drift: bool, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
     """Start values of one law, and a search from there."""
@@ -147,7 +148,7 @@ def _first(
     problem = BearingProblem(
         law=law,
         records=tuple(records),
-        numbers=_with_eddy(start_numbers(law, known, records, linear), known, on=eddy),
+        numbers=_with_eddy(start_numbers(law, parameters, records, linear), parameters, on=eddy),
         delays=delays,
         free_delay=frozenset(r for r in delays if delay is None and (r != rate or whole != round(whole))),
         eddy=eddy,
@@ -159,20 +160,20 @@ def _first(
     return search(problem, problem.start(), iterations=_TRIED, tick=tick)
 
 
-def _with_eddy(numbers: tuple[Number, ...], known: Mapping[str, Parameter], *, on: bool) -> tuple[Number, ...]:
-    free = on and ("a" not in known or known["a"].role != "fixed")
+def _with_eddy(numbers: tuple[Number, ...], parameters: Mapping[str, Parameter], *, on: bool) -> tuple[Number, ...]:
+    free = on and ("a" not in parameters or parameters["a"].role != "fixed")
     return tuple(replace(n, estimated=free) if n.name == "a" else n for n in numbers)
 
 
 def _extended(
-    fit: BearingFit, law: MagnetLaw, known: Mapping[str, Parameter], records: Sequence[BearingRecord],
+    fit: BearingFit, law: MagnetLaw, parameters: Mapping[str, Parameter], records: Sequence[BearingRecord],
     linear: LinearStart, tick: Tick | None,
 ) -> BearingFit:  # fmt: skip
     """The fit with a richer law where it pays (BIC)."""
     if fit.status == "stalled":  # else the richer law would be paid for going on
         fit = search(fit.problem, fit.vector, iterations=_LONG, tick=tick)
     values, old = fit.problem.values(fit.vector), {n.name: n for n in fit.problem.numbers}
-    fresh = {n.name: n for n in start_numbers(law, known, records, linear)}
+    fresh = {n.name: n for n in start_numbers(law, parameters, records, linear)}
     new = [n for n in law.names if fresh[n].estimated and not old[n].estimated]
     if not new:
         return fit
@@ -188,8 +189,8 @@ def _extended(
     problem, price = replace(fit.problem, law=law, numbers=numbers), len(new) * float(np.log(fit.problem.n_used))
     if "L_rise" in new and fit.status == "converged" and not _rises(fit, problem, _LIKELY * price):
         return fit
-    found = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
-    return found if fit.criterion - found.criterion > price else fit
+    richer = search(problem, _carried(fit, problem), iterations=_LONG, tick=tick)
+    return richer if fit.criterion - richer.criterion > price else fit
 
 
 def _rises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:
@@ -200,10 +201,10 @@ def _rises(fit: BearingFit, problem: BearingProblem, least: float) -> bool:
     leak = fit.problem.values(fit.vector)["L_leak"]
     start[names.index("L_leak")], start[names.index("L_rise")] = np.log(leak), np.log(_HINT * leak)
     for share in _KNEES if "i_knee" in names else (1.0,):
-        beside = start.copy()
+        hinted = start.copy()
         if "i_knee" in names:
-            beside[names.index("i_knee")] += np.log(share)
-        at = linearise(problem, beside)
+            hinted[names.index("i_knee")] += np.log(share)
+        at = linearise(problem, hinted)
         if at is None or promise(at) > least:
             return True
     return False
@@ -241,8 +242,8 @@ def _with_fraction(fit: BearingFit, tick: Tick | None) -> BearingFit:
                 free = replace(fit.problem, free_delay=fit.problem.free_delay | {rate})
                 start = _carried(fit, free)
                 start[len(free.estimated) + free.rates.index(rate)] -= 1e-9 * (gains[1] > gains[0])
-                found = search(free, start, tick=tick)
-                fit = found if fit.criterion - found.criterion > price else fit
+                freed = search(free, start, tick=tick)
+                fit = freed if fit.criterion - freed.criterion > price else fit
         if rate in fit.problem.free_delay:
             total = fit.problem.delay_at(fit.vector, rate)
             if abs(total - round(total)) < _NEAR_WHOLE:
@@ -288,7 +289,7 @@ def linear_start(
     `record`: of a rotor that is free to move; `known`: what is known of m, R and c; `delay`: in samples; None:
     searched.
     """
-    model, found, doubtful = OneAxis(), list[float](), list[LinearStart]()
+    model, wrong_signs, doubtful = OneAxis(), list[float](), list[LinearStart]()
     parameters = [
         known.get(p.name, Parameter(name=p.name, unit=p.unit, role="fixed", value=0.0))
         if p.name in ("m", "R", "c")
@@ -297,7 +298,7 @@ def linear_start(
     ]
     parts = _stretches(record)
     for (first, last), evaluations in [*((part, 0) for part in parts), (parts[0], LINEAR_EVALUATIONS)]:
-        if evaluations and found:
+        if evaluations and wrong_signs:
             break  # what was found speaks against the signs, not against the start values
         part = Signals(u=record.u[first:last, None], y=record.y[first:last], rate_hz=record.rate_hz)
         try:
@@ -315,17 +316,17 @@ def linear_start(
         if (values["k_i"] > 0) == law.pair:
             return LinearStart(values=values, delay=fit.problem.delay_samples(fit.vector))
         if _significant(fit):
-            found.append(values["k_i"])
+            wrong_signs.append(values["k_i"])
         else:  # lost in the noise: no more than a size to begin with
             turned = {**values, "k_i": -values["k_i"], "k_x": -abs(values["k_x"])}
             doubtful.append(LinearStart(values=turned, delay=fit.problem.delay_samples(fit.vector)))
     if doubtful:  # where the sign is turned, every part says so
         return doubtful[0]
-    if not found:
+    if not wrong_signs:
         raise EstimationError(f"record {record.name}: no linear model to start from. Check columns and signs")
     sign = "positive: with a pair the force grows with the current" if law.pair else "negative: position is the gap"
     raise EstimationError(
-        f"record {record.name}: the linear model finds k_i = {found[0]:.3g} N/A; it must be {sign}, and "
+        f"record {record.name}: the linear model finds k_i = {wrong_signs[0]:.3g} N/A; it must be {sign}, and "
         "grows away from a single magnet. Turn the sign of position or current in the rig, or choose the magnet"
     )
 
@@ -334,8 +335,8 @@ def _significant(fit: Fit) -> bool:
     """Whether a linear estimate knows the sign of k_i."""
     if fit.status != "converged":
         return False
-    known, values = uncertainty(fit), fit.problem.parameters(fit.vector)
-    sd = known.standard_deviations(robust=True)[known.names.index("k_i")]
+    spread, values = uncertainty(fit), fit.problem.parameters(fit.vector)
+    sd = spread.standard_deviations(robust=True)[spread.names.index("k_i")]
     return bool(abs(values["k_i"]) > _SIGNIFICANT * sd)
 
 
@@ -346,12 +347,12 @@ def _stretches(record: BearingRecord) -> list[tuple[int, int]]:
     longest = int(np.argmax(np.diff(edges)))
     first = int(edges[longest]) + 1
     last = int(min(edges[longest + 1], first + _LINEAR))
-    found = [(first, last)]
+    stretches = [(first, last)]
     for share in (2, 4):
         size = (last - first) // share
         if size >= _SHORTEST:
-            found += [(first + k * size, first + (k + 1) * size) for k in (0, share - 1)]
-    return found
+            stretches += [(first + k * size, first + (k + 1) * size) for k in (0, share - 1)]
+    return stretches
 
 
 def balance(records: Sequence[BearingRecord], law: MagnetLaw, weight: float) -> tuple[float, float]:
@@ -384,23 +385,23 @@ def balance(records: Sequence[BearingRecord], law: MagnetLaw, weight: float) -> 
 
 
 def start_numbers(
-    law: MagnetLaw, known: Mapping[str, Parameter], records: Sequence[BearingRecord], linear: LinearStart
+    law: MagnetLaw, rig: Mapping[str, Parameter], records: Sequence[BearingRecord], linear: LinearStart
 ) -> tuple[Number, ...]:
     """Put start values and roles together.
 
-    `known`: by name; what is not named takes the law's default role. Returns in the order of the law's names and
+    `rig`: by name; what is not named takes the law's default role. Returns in the order of the law's names and
     `BODY`.
     """
     lin, free = linear.values, [r for r in records if not r.held]
     position, current = np.concatenate([r.kept for r in free]).T
-    mass = known["m"].value if "m" in known and known["m"].value is not None else lin["m"]
-    gravity = known["g"].value if "g" in known and known["g"].value is not None else 0.0 if law.pair else 9.81
+    mass = rig["m"].value if "m" in rig and rig["m"].value is not None else lin["m"]
+    gravity = rig["g"].value if "g" in rig and rig["g"].value is not None else 0.0 if law.pair else 9.81
     guess = {**lin, "m": mass, "g": gravity, "a": 2.0 * np.pi * 200.0, "sigma": 0.05 / np.max(current**2)}
     guess |= dict.fromkeys(("x_offset", "i_offset", "v_offset", "v_drop", "k_asym", "i0_asym"), 0.0)
     guess |= {"i_drop": _ROUND * float(np.max(np.abs(current))), "c": 1e-3 * np.sqrt(mass * abs(lin["k_x"]))}
     if law.pair:
-        given = known["i0"].value if "i0" in known else None
-        guess["i0"] = 1.5 * float(np.max(np.abs(current))) if given is None else given
+        i0 = rig["i0"].value if "i0" in rig else None
+        guess["i0"] = 1.5 * float(np.max(np.abs(current))) if i0 is None else i0
         wide = 1.1 * float(np.max(np.abs(position)))
         guess["s"] = max(guess["i0"] * lin["k_i"] / max(-lin["k_x"], 1e-12), wide) if lin["k_x"] < 0 else 2 * wide
         guess["k"] = lin["k_i"] * guess["s"] ** 2 / (2.0 * guess["i0"])
@@ -424,30 +425,33 @@ def start_numbers(
         "v_drop": 0.1 * float(np.std(free[0].u)),
     }
     magnitude["v_offset"] = 0.1 * float(np.std(free[0].u))
-    if "i_drop" not in known and "v_drop" in known and known["v_drop"].role != "fixed":
-        known = {**known, "i_drop": Parameter(name="i_drop", unit="A")}  # a width that is wrong makes the drop wrong
+    if "i_drop" not in rig and "v_drop" in rig and rig["v_drop"].role != "fixed":
+        rig = {
+            **rig,
+            "i_drop": Parameter(name="i_drop", unit="A"),
+        }  # a width that is wrong makes the drop wrong
     return tuple(
-        _number(name, known.get(name), guess[name], law, magnitude.get(name, 1.0)) for name in (*law.names, *BODY)
+        _number(name, rig.get(name), guess[name], law, magnitude.get(name, 1.0)) for name in (*law.names, *BODY)
     )
 
 
-def _number(name: str, known: Parameter | None, guess: float, law: MagnetLaw, magnitude: float) -> Number:
+def _number(name: str, parameter: Parameter | None, guess: float, law: MagnetLaw, magnitude: float) -> Number:
     """One number: as the user says, else free where the law has it."""
     signed = name in SIGNED or (name == "s" and not law.pair)
     has = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair}
     has |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
     if not has.get(name, True):
         return Number(name=name, value=1.0 if name == "i_knee" else 0.0, estimated=False)
-    if known is None:
+    if parameter is None:
         estimated = name not in _FIXED and not (name == "x_offset" and not law.pair)
         value = guess if estimated or name in ("g", "a", "i_drop") else 0.0
         return Number(name=name, value=value, estimated=estimated, signed=signed, magnitude=magnitude)
-    value = guess if known.value is None else known.value
-    if known.role != "fixed" and not signed and not value > 0.0:
+    value = guess if parameter.value is None else parameter.value
+    if parameter.role != "fixed" and not signed and not value > 0.0:
         value = abs(guess) or 1.0
-    sd = np.inf if known.sd is None else known.sd
+    sd = np.inf if parameter.sd is None else parameter.sd
     return Number(
-        name=name, value=value, estimated=known.role != "fixed", prior_sd=sd, signed=signed, magnitude=magnitude
+        name=name, value=value, estimated=parameter.role != "fixed", prior_sd=sd, signed=signed, magnitude=magnitude
     )
 
 

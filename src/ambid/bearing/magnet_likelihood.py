@@ -77,20 +77,20 @@ def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
     `vector`: (size,); `r`: which record. Returns none where there is no predictor.
     """
     n = problem.records[r].u.size
-    found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
-    for part in sweep(problem, vector, r, found, slopes=False):
+    innovations = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    for part in sweep(problem, vector, r, innovations, slopes=False):
         if part is None:
             return None
-    return found
+    return innovations
 
 
 def sweep(
-    problem: BearingProblem, vector: Array, r: int, found: Innovations, *, slopes: bool, delays: bool = False
+    problem: BearingProblem, vector: Array, r: int, innovations: Innovations, *, slopes: bool, delays: bool = False
 ) -> Iterator[Rows | None]:
     """Run the predictor over one record block after block, so that memory does not grow with it.
 
-    `vector`: (size,); `r`: which record; `found`: gets the innovations; `slopes`: whether the likelihood's rows are
-    wanted; `delays`: with columns behind the vector's for a delay that is settled, see `Linear`. Yields None, and ends,
+    `vector`: (size,); `r`: which record; `innovations`: filled; `slopes`: whether the likelihood's rows are wanted;
+    `delays`: with columns behind the vector's for a delay that is settled, see `Linear`. Yields None, and ends,
     where there is no predictor.
     """
     from ambid.bearing.magnet_kernels import EARLY, LATE, LEVEL, ROOM, predict
@@ -105,16 +105,16 @@ def sweep(
     lanes, chain, columns = list[int](), np.zeros(0), np.zeros(0, dtype=np.int64)
     if slopes:
         names, place, levels = [n.name for n in problem.numbers], problem.noise_slices[r], problem.levels(r)
-        lanes, beside = [names.index(n.name) for n in problem.estimated], list[int]()
+        lanes, late = [names.index(n.name) for n in problem.estimated], list[int]()
         columns = np.concatenate([np.arange(n_e), np.arange(place.start, place.stop)])
         lanes += [LEVEL + level for level in levels]
         if record.rate_hz in problem.free_delay:
-            beside = [n_e + problem.rates.index(record.rate_hz)]
+            late = [n_e + problem.rates.index(record.rate_hz)]
         elif delays:
             first = problem.size + 2 * problem.settled.index(record.rate_hz)
-            beside = [first, first + 1] if whole > 0 else [first]
-        lanes, columns = lanes + [LATE, EARLY][: len(beside)], np.append(columns, beside).astype(np.int64)
-        chain = np.concatenate([problem.chain(vector), 2.0 * noise2[list(levels)], np.ones(len(beside))])
+            late = [first, first + 1] if whole > 0 else [first]
+        lanes, columns = lanes + [LATE, EARLY][: len(late)], np.append(columns, late).astype(np.int64)
+        chain = np.concatenate([problem.chain(vector), 2.0 * noise2[list(levels)], np.ones(len(late))])
     p = len(lanes)
     rows = np.zeros((4 * _BLOCK if slopes else 1, p + 1))
     steps, loose, knocks = _steps(problem, r), record.loose**2, _knocks(problem, r)
@@ -129,7 +129,7 @@ def sweep(
             end, rows[:] = min(at + _BLOCK, last), 0.0
             done = predict(
                 states, record.u, loose, knocks, record.y, valid, at, end, whole, theta, numbers, chain, noise2, flags,
-                1.0 / record.rate_hz, steps, z, P, X, found.e, found.s, rows,
+                1.0 / record.rate_hz, steps, z, P, X, innovations.e, innovations.s, rows,
             )  # fmt: skip
             if not done:
                 yield None
@@ -227,10 +227,10 @@ def criterion(problem: BearingProblem, vector: Array) -> float:
     """
     total = 0.0
     for r in range(len(problem.records)):
-        found = run(problem, vector, r)
-        if found is None:
+        innovations = run(problem, vector, r)
+        if innovations is None:
             return np.inf
-        total += _sum(found)
+        total += _sum(innovations)
     prior, _ = prior_rows(problem, vector)
     total += float(prior @ prior)
     return total if np.isfinite(total) else np.inf
@@ -265,10 +265,10 @@ def _of_record(
 ) -> tuple[Innovations, Array, list[Array]] | None:
     """Innovations of a record, the scores of its stretches, and the triangle; None without a predictor."""
     n = problem.records[r].u.size
-    found = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
+    innovations = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
     width = problem.size + 2 * len(problem.settled)
     own, blocks, columns = np.zeros((-(-n // stretch), width)), list[Array](), np.zeros(0, dtype=np.int64)
-    for part in sweep(problem, vector, r, found, slopes=True, delays=True):
+    for part in sweep(problem, vector, r, innovations, slopes=True, delays=True):
         if part is None or not np.all(np.isfinite(part.rows)):
             return None
         columns, m = part.columns, part.rows.shape[0]
@@ -278,11 +278,11 @@ def _of_record(
             own[b, columns] += rows[:, :-1].T @ rows[:, -1]
         blocks.append(triangle_of([part.rows.reshape(4 * m, -1)]))
     if not blocks:
-        return found, own[:, : problem.size], []
+        return innovations, own[:, : problem.size], []
     short = triangle_of([np.vstack(blocks)])
     triangle = np.zeros((columns.size + 1, width + 1))
     triangle[: short.shape[0], np.append(columns, width)] = short
-    return found, own[:, : problem.size], [triangle]
+    return innovations, own[:, : problem.size], [triangle]
 
 
 def promise(at: Linear, delay: int | None = None) -> float:
@@ -349,10 +349,10 @@ class _Objective:
         return self.at
 
 
-def _sum(found: Innovations) -> float:
+def _sum(innovations: Innovations) -> float:
     with np.errstate(all="ignore"):
-        used = ~np.isnan(found.s)
-        e, s = found.e[used], found.s[used]
+        measured = ~np.isnan(innovations.s)
+        e, s = innovations.e[measured], innovations.s[measured]
         return float(np.sum(np.log(s) + e * e / s))
 
 

@@ -155,11 +155,11 @@ class BearingProblem:
     @property
     def noise_slices(self) -> tuple[slice, ...]:
         """Places of each record's noise levels in the vector."""
-        found, first = [], len(self.estimated) + len(self.rates)
+        slices, first = [], len(self.estimated) + len(self.rates)
         for r in range(len(self.records)):
-            found.append(slice(first, first + len(self.levels(r))))
-            first = found[-1].stop
-        return tuple(found)
+            slices.append(slice(first, first + len(self.levels(r))))
+            first = slices[-1].stop
+        return tuple(slices)
 
     @property
     def size(self) -> int:
@@ -184,21 +184,21 @@ class BearingProblem:
 
     def upper(self) -> Array:
         """Return the largest values of the vector, in shape (size,): an eddy pole faster than a step cannot be seen."""
-        found = np.full(self.size, np.inf)
+        bounds = np.full(self.size, np.inf)
         if self.eddy:
             rate = min(r.rate_hz for r in self.records if not r.held)
-            found[[j for j, n in enumerate(self.estimated) if n.name == "a"]] = np.log(EDDY_STEPS * rate)
-        return found
+            bounds[[j for j, n in enumerate(self.estimated) if n.name == "a"]] = np.log(EDDY_STEPS * rate)
+        return bounds
 
     def values(self, vector: Array) -> dict[str, float]:
         """Return all numbers at a vector, SI.
 
         `vector`: (size,).
         """
-        found = {n.name: n.value for n in self.numbers}
+        values = {n.name: n.value for n in self.numbers}
         for n, v in zip(self.estimated, vector.tolist(), strict=False):
-            found[n.name] = v * n.magnitude if n.signed else float(np.exp(v))
-        return found
+            values[n.name] = v * n.magnitude if n.signed else float(np.exp(v))
+        return values
 
     def chain(self, vector: Array) -> Array:
         """Return d(number)/d(vector) of the estimated numbers.
@@ -238,9 +238,9 @@ class BearingProblem:
 
         `vector`: (size,); `r`: which record. Returns (5,).
         """
-        found = np.zeros(len(LEVELS))
-        found[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
-        return found
+        squares = np.zeros(len(LEVELS))
+        squares[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
+        return squares
 
 
 _NEAR = 6.0  # standard deviations of the sensor from a stop within which the rotor may lie at it
@@ -316,7 +316,7 @@ def weight_carried(law: MagnetLaw, values: Mapping[str, float], record: BearingR
     if record.knock is not None:
         free &= record.knock == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]])))
-    found, wanted = 0.0, 0.0
+    force, wanted = 0.0, 0.0
     for first, end in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True):
         if end - first < _LEAST:
             continue
@@ -325,6 +325,6 @@ def weight_carried(law: MagnetLaw, values: Mapping[str, float], record: BearingR
         before, after = ((x[-1] - x[0]) * record.rate_hz / _SPEED for x in ends)
         x, i = part[:, 0] - values.get("x_offset", 0.0), part[:, 1] - values.get("i_offset", 0.0)
         rubbed = values.get("c", 0.0) * float(part[-1, 0] - part[0, 0]) * record.rate_hz
-        found += float(np.sum(law.force(x, i, values))) - rubbed
+        force += float(np.sum(law.force(x, i, values))) - rubbed
         wanted += values["m"] * ((after - before) * record.rate_hz - values["g"] * part.shape[0])
-    return float(found / wanted) if wanted else None
+    return float(force / wanted) if wanted else None

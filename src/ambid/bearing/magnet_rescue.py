@@ -106,8 +106,8 @@ def failure(fit: BearingFit) -> str:
 def _unexplained(fit: BearingFit, r: int) -> float:
     """Part of the normalised errors' variance that a regression on past errors and voltages explains, by record."""
     assert fit.at is not None
-    found = fit.at.innovations[r]
-    e = (found.e / np.sqrt(found.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
+    innovations = fit.at.innovations[r]
+    e = (innovations.e / np.sqrt(innovations.s))[:_LOOKED, 1 if fit.problem.records[r].held else 0 :]
     u = fit.problem.records[r].u[: e.shape[0], None]
     return explained_by_past([(e, ((e, PAST), (u, _PAST)))])[0]
 
@@ -148,32 +148,32 @@ class BearingCost:
         `z`: (n_names,). Returns none where the gap would close.
         """
         low, high = np.array(self.bounds).T
-        told = dict(zip(self.names, (low + z * (high - low)).tolist(), strict=True))
+        at = dict(zip(self.names, (low + z * (high - low)).tolist(), strict=True))
         problem = self.problem
         values = {n.name: n.value for n in problem.numbers}
-        values |= {k: v if k == "s" and not problem.law.pair else np.exp(v) for k, v in told.items() if k in values}
+        values |= {k: v if k == "s" and not problem.law.pair else np.exp(v) for k, v in at.items() if k in values}
         free = [r for r in problem.records if not r.held]
         x, i, u = (float(np.mean(np.concatenate(c))) for c in zip(*((*r.kept.T, r.u) for r in free), strict=True))
         if self.weight:
             first, second = problem.law.names[:2]
             length = values[second]
             if problem.law.gap == "exponential":
-                said = 2.0 * self.weight * length * np.exp(x / length) / i**2
+                balanced = 2.0 * self.weight * length * np.exp(x / length) / i**2
             else:
                 if length + min(float(r.kept[:, 0].min()) for r in free) <= 0.0:
                     return None
-                said = 2.0 * self.weight * (length + x) ** 2 / i**2
-            values[first] = said * values[first] if first in told else values[first]
+                balanced = 2.0 * self.weight * (length + x) ** 2 / i**2
+            values[first] = balanced * values[first] if first in at else values[first]
         estimated = {n.name for n in problem.estimated}
         if "v_offset" in estimated:
             values["v_offset"] = u - values["R"] * i
         if not all(np.isfinite(v) for v in values.values()):
             return None
-        centre = _levels(problem, values, np.exp(told["force"]), np.exp(told["voltage"]))
+        centre = _levels(problem, values, np.exp(at["force"]), np.exp(at["voltage"]))
         delays = problem.delays
-        if "delay" in told:
+        if "delay" in at:
             rate = free[0].rate_hz
-            whole = float(min(int(told["delay"]), _LONGEST))
+            whole = float(min(int(at["delay"]), _LONGEST))
             delays = {r: whole / rate * r for r in delays} | {rate: whole}
         numbers = tuple(replace(n, value=float(values[n.name])) if n.estimated else n for n in problem.numbers)
         return replace(problem, numbers=numbers, noise_center=centre, delays=delays)

@@ -167,8 +167,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         float or None
             In samples; None at a rate that no record had.
         """
-        found = self.delay.get(f"{rate_hz:g} Hz")
-        return None if found is None else found.samples + found.fraction
+        delay = self.delay.get(f"{rate_hz:g} Hz")
+        return None if delay is None else delay.samples + delay.fraction
 
     def curves(self, position: ArrayLike, current: ArrayLike) -> Curves:
         """Return force, k_i, k_x and L at points, with standard deviations by the delta method.
@@ -186,7 +186,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         x, i = np.broadcast_arrays(np.atleast_1d(np.asarray(position, float)), np.asarray(current, float))
         offset = self.values.get("x_offset", 0.0), self.values.get("i_offset", 0.0)
         true_x, true_i = np.ascontiguousarray(x) - offset[0], np.ascontiguousarray(i) - offset[1]
-        found, slopes = self.law.table(true_x, true_i, self.values)
+        table, slopes = self.law.table(true_x, true_i, self.values)
         gradient = np.zeros((x.size, 4, len(self.covariance_names)))
         for j, name in enumerate(self.covariance_names):
             if name in self.law.names:
@@ -197,7 +197,7 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         variance = np.einsum("ncj,jk,nck->nc", gradient, self.covariance, gradient)
         sd = np.sqrt(np.maximum(variance, 0.0))
         force, k_x, k_i, ell = (
-            Curve(unit=unit, value=found[:, c], sd=sd[:, c]) for c, unit in enumerate(("N", "N/m", "N/A", "H"))
+            Curve(unit=unit, value=table[:, c], sd=sd[:, c]) for c, unit in enumerate(("N", "N/m", "N/A", "H"))
         )
         points = np.column_stack([x, i])
         return Curves(
@@ -287,11 +287,11 @@ def bearing_to_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
 def _at_operating_point(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
     """The linear model's parameters where the records were."""
     at = estimate.curves(estimate.operating_point["position"], estimate.operating_point["current"])
-    found = {}
+    entries = {}
     for name, c in (("k_x", at.k_x), ("k_i", at.k_i), ("L", at.L)):
         value, sd = float(c.value[0]), float(c.sd[0])
-        found[name] = {"value": value, "sd": sd, "ci95": [value - 1.96 * sd, value + 1.96 * sd], "unit": c.unit}
-    return found
+        entries[name] = {"value": value, "sd": sd, "ci95": [value - 1.96 * sd, value + 1.96 * sd], "unit": c.unit}
+    return entries
 
 
 def curves_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
@@ -304,15 +304,15 @@ def curves_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
     x = np.linspace(*estimate.usual["position"], _POSITIONS)
     i = np.linspace(*estimate.usual["current"], _CURRENTS)
     grid = np.meshgrid(x, i, indexing="ij")
-    found = estimate.curves(grid[0].ravel(), grid[1].ravel())
+    curves = estimate.curves(grid[0].ravel(), grid[1].ravel())
 
     def of(c: Curve) -> dict[str, Any]:
         return {"unit": c.unit, "value": c.value.reshape(grid[0].shape), "sd": c.sd.reshape(grid[0].shape)}
 
     return {
-        "position": x, "current": i, "force": of(found.force), "k_i": of(found.k_i), "k_x": of(found.k_x),
-        "L": of(found.L), "inside": found.inside.reshape(grid[0].shape),
-        "coil_inside": found.coil_inside.reshape(grid[0].shape),
+        "position": x, "current": i, "force": of(curves.force), "k_i": of(curves.k_i), "k_x": of(curves.k_x),
+        "L": of(curves.L), "inside": curves.inside.reshape(grid[0].shape),
+        "coil_inside": curves.coil_inside.reshape(grid[0].shape),
     }  # fmt: skip
 
 
@@ -321,7 +321,7 @@ def fit_over_all(estimate: NonlinearBearingEstimate) -> dict[str, dict[str, floa
 
     Returns by output: ``one_step``; ``simulation``, None; ``innovation_sd``, SI.
     """
-    found: dict[str, dict[str, float | None]] = {}
+    fits_by_role: dict[str, dict[str, float | None]] = {}
     for role in _ROLES:
         n = error = spread = 0.0
         for record, fits in zip(estimate.records, estimate.fit.values(), strict=True):
@@ -330,10 +330,10 @@ def fit_over_all(estimate: NonlinearBearingEstimate) -> dict[str, dict[str, floa
             samples, f = float(str(record["samples"])), fits[role]
             n, error = n + samples, error + samples * f.innovation_sd**2
             spread += samples * (f.innovation_sd / max(1.0 - f.one_step, 1e-12)) ** 2
-        found[role] = {
+        fits_by_role[role] = {
             "one_step": 1.0 - math.sqrt(error / spread), "simulation": None, "innovation_sd": math.sqrt(error / n)
         }  # fmt: skip
-    return found
+    return fits_by_role
 
 
 def bearing_from_json(document: Mapping[str, Any], where: str) -> NonlinearBearingEstimate:
@@ -375,9 +375,9 @@ def _check_consistent(e: NonlinearBearingEstimate) -> None:
     for levels in e.noise.values():
         if not levels or set(levels) - set(LEVELS) or not all(0 < x < math.inf for x in levels.values()):
             raise ValueError("the noise levels are not those of a predictor")
-    for record, of in zip(e.records, e.fit.values(), strict=True):
-        sizes = [f.innovation_sd for f in of.values()]
-        if set(of) != (set(_ROLES) - ({"position"} if record["held"] else set())) or not all(x > 0 for x in sizes):
+    for record, fits in zip(e.records, e.fit.values(), strict=True):
+        sizes = [f.innovation_sd for f in fits.values()]
+        if set(fits) != (set(_ROLES) - ({"position"} if record["held"] else set())) or not all(x > 0 for x in sizes):
             raise ValueError("the fits are not those of position and current")
     if not isinstance(e.rig, Mapping):
         raise ValueError("the rig is none")

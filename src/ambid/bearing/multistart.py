@@ -51,18 +51,18 @@ def weak_form_values(
     noise: Mapping[str, float],
     delays: Sequence[float],
     rate_hz: float,
-    known: Mapping[str, float],
+    fixed: Mapping[str, float],
 ) -> Iterator[tuple[float, dict[str, float]]]:
     """Yield start values for the named model, one set for each band and delay.
 
-    `model_name`: ``"one-axis"``, ``"coil"`` or ``"rotor"``; `delays`: of the input, in samples; `known`: fixed values,
+    `model_name`: ``"one-axis"``, ``"coil"`` or ``"rotor"``; `delays`: of the input, in samples; `fixed`: fixed values,
     SI; they are used, and returned unchanged. Yields the delay with all parameters of the model, SI.
     """
-    damping = known.get("c", 0.0)
+    damping = fixed.get("c", 0.0)
     steps = np.diff(delays, prepend=0.0).tolist()  # mostly one sample: products cost less than exponentials
     turns = {d: np.exp(-1j * m.omega * d / rate_hz) for d in set(steps)}
     delayed = np.stack(list(accumulate((turns[d] for d in steps), np.multiply)), axis=1)
-    rate = damping / known.get("m", np.inf) if damping else 0.0
+    rate = damping / fixed.get("m", np.inf) if damping else 0.0
     for part, errors_in_variables in _BANDS:
         lines = slice(_LOWEST_LINE, int(part * m.omega.size))
         omega = m.omega[lines]
@@ -87,13 +87,13 @@ def weak_form_values(
                 motion.append(rotor.regress(("position", jw**2 + rate * jw, x2 + rate * x1))[0])
             motion *= len(delays) // len(motion)
         for j, d in enumerate(delays):
-            found = {**dict(zip(("R", "L", "k_i"), electric[j], strict=False)), **known}
+            start = {**dict(zip(("R", "L", "k_i"), electric[j], strict=False)), **fixed}
             if model_name != "coil":
                 stiffness, current = motion[j]
-                if "m" not in known:  # its sign may come out wrong where the motional voltage is lost in the noise
-                    found["m"] = abs(found["k_i"] / current) if "k_i" in found and current != 0 else 1.0
-                found = {**found, "k_x": stiffness * found["m"], "k_i": current * found["m"], "c": damping, **known}
-            yield d, {name: float(value) for name, value in found.items()}
+                if "m" not in fixed:  # its sign may come out wrong where the motional voltage is lost in the noise
+                    start["m"] = abs(start["k_i"] / current) if "k_i" in start and current != 0 else 1.0
+                start = {**start, "k_x": stiffness * start["m"], "k_i": current * start["m"], "c": damping, **fixed}
+            yield d, {name: float(value) for name, value in start.items()}
 
 
 class Regressors:
@@ -259,12 +259,12 @@ def starts(
 
 def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
     """Those of the best, which come first, that differ in more than their criterion says is chance."""
-    found: list[Candidate] = []
+    unlike: list[Candidate] = []
     for candidate in scored:
         close = candidate.criterion <= scored[0].criterion + _CLOSE * candidate.problem.n_used
-        if close and not any(candidate.like(r) for r in found):
-            found.append(candidate)
-    return found
+        if close and not any(candidate.like(r) for r in unlike):
+            unlike.append(candidate)
+    return unlike
 
 
 def _widen(candidate: Candidate, signals: Signals, tick: Callable[[], None] | None) -> Candidate:
@@ -318,17 +318,17 @@ def _scored(
     part = replace(centred, u=centred.u[stretch], y=centred.y[stretch])
     columns = dict(zip((*model.inputs, *model.outputs), np.hstack([part.u, part.y]).T, strict=True))
     moments = take_moments(columns, model.inputs, signals.rate_hz)
-    found, work = [], None
-    kept = _unlike(_coarse(model, centred, parameters, moments, delays))[:_KEPT]
-    for candidate in sorted(kept, key=lambda c: c.problem.delay):
+    candidates, work = [], None
+    coarse = _unlike(_coarse(model, centred, parameters, moments, delays))[:_KEPT]
+    for candidate in sorted(coarse, key=lambda c: c.problem.delay):
         problem = replace(candidate.problem, u=part.u, y=part.y)
         work = Workspace(problem) if work is None else work.of(problem)
         for level in _LEVELS:
             vector = at_first_sample(problem, _with_level(problem, candidate.vector, level))
             value, _ = evaluate(problem, vector, work)
             if np.isfinite(value):
-                found.append(Candidate(criterion=value, problem=problem, vector=vector, work=work))
-    return found
+                candidates.append(Candidate(criterion=value, problem=problem, vector=vector, work=work))
+    return candidates
 
 
 def _coarse(
@@ -363,12 +363,12 @@ def _coarse(
     if not problems:
         return []
     vectors = [_vector(problem, values) for problem, (_, values, _) in zip(problems, possible, strict=True)]
-    found, work = list[Candidate](), Workspace(problems[0])
+    candidates, work = list[Candidate](), Workspace(problems[0])
     for problem, vector, predictor in zip(problems, vectors, assemble_all(problems, vectors), strict=True):
         work = work.of(problem)  # the scaled data are the same for all candidates of a delay
         value = np.inf if predictor is None else evaluate(problem, vector, work, predictor)[0]
-        found.append(Candidate(criterion=value, problem=problem, vector=vector))
-    return sorted(found, key=lambda c: c.criterion)
+        candidates.append(Candidate(criterion=value, problem=problem, vector=vector))
+    return sorted(candidates, key=lambda c: c.criterion)
 
 
 def fixed_values(parameters: Sequence[Parameter]) -> dict[str, float]:
@@ -380,9 +380,9 @@ def _possible(
     model: LinearModel, from_data: list[dict[str, float]], parameters: Sequence[Parameter]
 ) -> Iterator[tuple[dict[str, float], dict[str, float]]]:
     """Yield start values that make a plant, and sizes: from the data, and with the values given (which may be zero)."""
-    given = {p.name: p.value for p in parameters if p.value is not None}
-    bases = (from_data or [given])[:3] if given != fixed_values(parameters) else []
-    for values, sizes in [*((v, v) for v in from_data), *(({**v, **given}, v) for v in bases)]:
+    values_of_rig = {p.name: p.value for p in parameters if p.value is not None}
+    bases = (from_data or [values_of_rig])[:3] if values_of_rig != fixed_values(parameters) else []
+    for values, sizes in [*((v, v) for v in from_data), *(({**v, **values_of_rig}, v) for v in bases)]:
         finite = all(np.isfinite(v) for v in values.values())
         if finite and len(values) == len(model.parameters) and values.get("m", 1.0) > 0 and values.get("L", 1.0) > 0:
             yield values, {k: max(abs(v), abs(sizes.get(k, 0.0))) for k, v in values.items()}

@@ -264,8 +264,8 @@ def global_candidates(
     `signals`: the whole record, which they are places of.
     """
     low = np.array([-1.0 if c.signed else 0.0 for c in cost.coordinates])
-    found = global_search(cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick)
-    return candidates_at(cost, signals, (found.vector, *cost.best.vectors(), *found.best[: _TRIED // 5]))[:_TRIED]
+    end = global_search(cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick)
+    return candidates_at(cost, signals, (end.vector, *cost.best.vectors(), *end.best[: _TRIED // 5]))[:_TRIED]
 
 
 def candidates_at(cost: LikelihoodCost, signals: Signals, vectors: Sequence[Array]) -> list[Candidate]:

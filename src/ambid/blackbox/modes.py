@@ -591,7 +591,7 @@ def find_modes(
     for c in candidates:  # the larger of the likelihood's interval and the jackknife's over outputs
         spreads = [(c.likelihood, NORMAL_95)]
         spreads += [(c.jackknife, student(data.n_outputs - 1))] if data.n_outputs > 1 else []
-        modes.append(mode_of(c.pole, spreads, data.outputs, c.shape, c.shape_variance, shown=c.misfit < _LOST))
+        modes.append(mode_of(c.pole, spreads, data.outputs, c.shape, c.shape_variance, visible=c.misfit < _LOST))
     checks = modes_checks(tuple(modes), count, limits, f"Excite more, longer, or give {setting('band')}")
     return Modal(
         status="converged" if candidates else "failed",

@@ -120,7 +120,7 @@ def operational_modes(
     limits = float(f[0]), float(f[-1])
     interval = student(_STRETCHES - 1)
     modes = tuple(
-        mode_of(x.pole, [(x.covariance, interval)], data.outputs, x.shape, x.variance, shown=not x.harmonic)
+        mode_of(x.pole, [(x.covariance, interval)], data.outputs, x.shape, x.variance, visible=not x.harmonic)
         for x in estimates
     )
     steady = ", ".join(f"{x.frequency_hz:.4g} Hz" for x in estimates if x.harmonic)

@@ -58,13 +58,13 @@ class EstimatedParameter:
         p: Parameter,
         theta: Mapping[str, float],
         sd: Mapping[str, float],
-        seen: Mapping[str, bool],
+        identifiable: Mapping[str, bool],
         alone: Mapping[str, float] | None = None,
     ) -> EstimatedParameter:
         """Return a parameter as estimated.
 
-        `theta`, `sd`, `seen`: by name, value, standard deviation and whether the data show it; `alone`: standard
-        deviations that the data alone would give, for the share of a prior.
+        `theta`, `sd`, `identifiable`: by name; `alone`: standard deviations that the data alone would give, for the
+        share of a prior.
         """
         value, spread, share = theta[p.name], sd.get(p.name, 0.0), None
         if alone is not None and p.role == "prior" and p.sd:
@@ -76,7 +76,7 @@ class EstimatedParameter:
             sd=spread,
             ci95=(value - NORMAL_95 * spread, value + NORMAL_95 * spread),
             role=p.role,
-            identifiable=seen.get(p.name, True),
+            identifiable=identifiable.get(p.name, True),
             data_share=share,
         )
 
@@ -259,15 +259,15 @@ def plain_json(value: Any) -> Any:
 def fields_json(value: Any, *, without: tuple[str, ...] = ()) -> dict[str, Any]:
     """Return the fields of a dataclass as JSON values, by name, and the verdict of a result that has one."""
     written = (f.name for f in fields(value) if f.name not in without and f.metadata.get("written", True))
-    found = {name: plain_json(getattr(value, name)) for name in written}
-    return {"verdict": plain_json(value.verdict), **found} if isinstance(value, Result) else found
+    entries = {name: plain_json(getattr(value, name)) for name in written}
+    return {"verdict": plain_json(value.verdict), **entries} if isinstance(value, Result) else entries
 
 
 def covariance_together(document: dict[str, Any]) -> dict[str, Any]:
     """Return a document whose fields of the covariance stand together as one entry."""
-    found = {key: document[name] for key, name in COVARIANCE.items() if name in document}
+    entry = {key: document[name] for key, name in COVARIANCE.items() if name in document}
     rest = {key: value for key, value in document.items() if key not in COVARIANCE.values()}
-    return {**rest, "covariance": found}
+    return {**rest, "covariance": entry}
 
 
 def covariance_apart(document: Mapping[str, Any]) -> dict[str, Any]:
@@ -279,10 +279,10 @@ def covariance_apart(document: Mapping[str, Any]) -> dict[str, Any]:
 def by_output(document: dict[str, Any]) -> dict[str, Any]:
     """Return a document whose ``fit`` and ``validation``, where there is one output, stand at their top as well."""
     for entry in ("fit", "validation"):
-        found = document[entry]
-        if found is not None and len(found) == 1:
-            first = next(iter(found.values()))
-            document[entry] = {**first, **{o: v for o, v in found.items() if o not in first}}
+        entry_by_output = document[entry]
+        if entry_by_output is not None and len(entry_by_output) == 1:
+            first = next(iter(entry_by_output.values()))
+            document[entry] = {**first, **{o: v for o, v in entry_by_output.items() if o not in first}}
     return document
 
 
@@ -327,9 +327,9 @@ def json_text(document: Mapping[str, Any]) -> str:
 
 def check_schema(document: object, schema: str, where: str, what: str, job: str) -> None:
     """Refuse a document of another schema."""
-    found = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
-    if found != schema:
-        raise EstimationError(f"{where} has schema {found!r}; {what} has {schema!r}. Give {saved(job)}")
+    own = document.get("schema") if isinstance(document, Mapping) else type(document).__name__
+    if own != schema:
+        raise EstimationError(f"{where} has schema {own!r}; {what} has {schema!r}. Give {saved(job)}")
 
 
 def read_whole(read: Callable[[], T], where: str, what: str, job: str) -> T:
@@ -377,14 +377,14 @@ def _read(kind: Any, value: Any, at: str) -> Any:
 def _dataclass(kind: Any, value: Any, at: str) -> Any:
     if not isinstance(value, Mapping):
         _refuse(value, at, "an object")
-    hints, found = _hints(kind), {}
+    hints, entries = _hints(kind), {}
     for f in fields(kind):
         place = f"{at}.{f.name}".lstrip(".")
         if f.name in value:
-            found[f.name] = _read(hints[f.name], value[f.name], place)
+            entries[f.name] = _read(hints[f.name], value[f.name], place)
         elif f.default is MISSING and f.default_factory is MISSING:
             raise ValueError(f"{place!r} is missing")
-    return kind(**found)
+    return kind(**entries)
 
 
 @lru_cache(maxsize=64)
@@ -421,17 +421,17 @@ def _array(dtype: Any, value: Any, at: str) -> Any:
     """Read numbers, null as NaN; text and truth values are no numbers. An array is taken as it is."""
     if isinstance(value, np.ndarray):
         return value
-    found, kinds = np.array(value), get_args(dtype)
-    if kinds == (np.bool_,) and found.dtype.kind == "b":
-        return found
-    if found.size and found.dtype.kind == "O":
-        found = np.array(value, dtype=np.float64)  # null becomes NaN; anything else raises
-    if found.size and found.dtype.kind not in "iuf":
+    array, kinds = np.array(value), get_args(dtype)
+    if kinds == (np.bool_,) and array.dtype.kind == "b":
+        return array
+    if array.size and array.dtype.kind == "O":
+        array = np.array(value, dtype=np.float64)  # null becomes NaN; anything else raises
+    if array.size and array.dtype.kind not in "iuf":
         _refuse(value, at, "numbers")
     if kinds == (np.complex128,):
-        pairs = found.astype(np.float64).reshape(-1, 2)
+        pairs = array.astype(np.float64).reshape(-1, 2)
         return pairs[:, 0] + 1j * pairs[:, 1]
-    return found.astype(np.int64 if kinds == (np.int64,) and found.dtype.kind in "iu" else np.float64)
+    return array.astype(np.int64 if kinds == (np.int64,) and array.dtype.kind in "iu" else np.float64)
 
 
 def _number(value: Any, at: str) -> float:
@@ -451,8 +451,8 @@ def _exactly(kind: type, what: str) -> Callable[[Any, str], Any]:
 
 
 def _check(value: Any, at: str) -> Check:
-    named = ("passed", "detail", "p")
-    numbers = {name: x for name, x in value.items() if name not in named}
+    own_fields = ("passed", "detail", "p")
+    numbers = {name: x for name, x in value.items() if name not in own_fields}
     return cast("Check", _dataclass(Check, {**value, "values": numbers}, at))
 
 
@@ -688,12 +688,12 @@ def warnings_of(fit: Any, checks: Mapping[str, Check], inflated_by: str) -> tupl
 
     `fit`: of either estimator; `inflated_by`: where its robust standard deviations come from; empty if not used.
     """
-    found = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
-    found += [] if fit.global_search is None else [describe_search(fit.global_search)]
-    found += [c.detail for c in checks.values() if not c.passed]
+    warnings = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
+    warnings += [] if fit.global_search is None else [describe_search(fit.global_search)]
+    warnings += [c.detail for c in checks.values() if not c.passed]
     if inflated_by:
-        found.append(
+        warnings.append(
             f"the model does not fully fit; standard errors are inflated ({inflated_by}) but cannot cover a systematic "
             "bias"
         )
-    return tuple(found)
+    return tuple(warnings)

@@ -506,10 +506,10 @@ def free_one(fit: Fit, name: str) -> tuple[float, float]:
     rows = extend(fit, problem, vector)
     if rows is None:
         return 0.0, value
-    found, residual = directions(rows[0]), rows[1]
-    if not found.seen.all():  # the data cannot tell it from the others
+    axes, residual = directions(rows[0]), rows[1]
+    if not axes.seen.all():  # the data cannot tell it from the others
         return 0.0, value
-    return found.explain(residual), value - float(found.solve(residual)[n]) * size
+    return axes.explain(residual), value - float(axes.solve(residual)[n]) * size
 
 
 def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:
@@ -626,8 +626,8 @@ def sparse_gain(fit: Fit, stride: int) -> Array:
     Q = sum((p @ K @ S @ K.T @ p.T for p in powers), np.zeros_like(A))
     cross, whole = powers[0] @ K @ S, A @ powers[0]
     # what the innovation says of the noise that comes after it is known, and leaves noises that do not correlate
-    shown = np.linalg.solve(S, cross.T).T
-    return np.asarray(predictor_gain(whole - shown @ C, C, Q - shown @ cross.T, S).K + shown)
+    correction = np.linalg.solve(S, cross.T).T
+    return np.asarray(predictor_gain(whole - correction @ C, C, Q - correction @ cross.T, S).K + correction)
 
 
 def simulation_error(fit: Fit) -> Array | None:

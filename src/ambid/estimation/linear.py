@@ -69,8 +69,8 @@ class Directions:
         return np.asarray(half @ half.T)
 
     def _inverse_values(self) -> Array:
-        seen = self.seen
-        return np.where(seen, 1.0 / np.where(seen, self.s, 1.0), 0.0)
+        visible = self.seen
+        return np.where(visible, 1.0 / np.where(visible, self.s, 1.0), 0.0)
 
 
 def directions(A: Array) -> Directions:
@@ -95,8 +95,8 @@ def least_squares(A: Array, b: Array) -> Array:
     if A.shape[0] > n + right.shape[1]:
         R = triangle_of([np.hstack([A, right])])
         A, right = R[:, :n], R[:, n:]
-    found = directions(A).solve(right)
-    return found if b.ndim > 1 else found[:, 0]
+    x = directions(A).solve(right)
+    return x if b.ndim > 1 else x[:, 0]
 
 
 def triangle_of(rows: Sequence[Array]) -> Array:
@@ -119,11 +119,11 @@ def information_inverse(R: Array) -> tuple[Array | None, float]:
     """
     if R.shape[0] < R.shape[1] or not np.all(np.isfinite(R)) or not np.all(np.linalg.norm(R, axis=0) > _TINY):
         return None, np.inf
-    found = directions(R)
-    if found.condition > 1.0 / BLIND:
-        return None, found.condition
-    inverse = found.inverse()
-    return (inverse + inverse.T) / 2.0, found.condition
+    axes = directions(R)
+    if axes.condition > 1.0 / BLIND:
+        return None, axes.condition
+    inverse = axes.inverse()
+    return (inverse + inverse.T) / 2.0, axes.condition
 
 
 @contextmanager

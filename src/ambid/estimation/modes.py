@@ -89,10 +89,10 @@ def trial_poles(order: int, poles: Complex, shapes: Complex) -> list[TrialPole]:
 
 def followed(rows: Sequence[Sequence[TrialPole]], near: Tolerance) -> list[TrialPole]:
     """Return the poles of all models, lowest order first, each compared with those of the order below."""
-    found = list(rows[0])
+    marked = list(rows[0])
     for before, after in pairwise(rows):
-        found += [_mark(p, before, near) for p in after]
-    return found
+        marked += [_mark(p, before, near) for p in after]
+    return marked
 
 
 def _mark(p: TrialPole, before: Sequence[TrialPole], near: Tolerance) -> TrialPole:
@@ -156,11 +156,11 @@ class EstimatedNumber:
 
     @classmethod
     def of(
-        cls, value: float, sd: float, *, quantile: float = NORMAL_95, size: float | None = None, shown: bool = True
+        cls, value: float, sd: float, *, quantile: float = NORMAL_95, size: float | None = None, visible: bool = True
     ) -> EstimatedNumber:
         """Return a number with its interval, value -+ quantile sd.
 
-        `size`: what the standard deviation is judged against where that is not the value itself; `shown`: False where
+        `size`: what the standard deviation is judged against where that is not the value itself; `visible`: False where
         something else says that the data do not show it.
         """
         judged = abs(value) if size is None else size
@@ -169,7 +169,7 @@ class EstimatedNumber:
             value=float(value),
             sd=float(sd),
             ci95=(float(value - quantile * sd), float(value + quantile * sd)),
-            identifiable=shown and sound and sd <= _SEEN * judged,
+            identifiable=visible and sound and sd <= _SEEN * judged,
         )
 
 
@@ -202,25 +202,25 @@ def mode_of(
     shape: Complex,
     variance: Array,
     *,
-    shown: bool = True,
+    visible: bool = True,
 ) -> Mode:
     """Return a pole, rad/s, as a mode, its shape scaled so that the largest output is 1.
 
     `spreads`: covariances of real and imaginary part, (2, 2), with the quantile that makes an interval of a standard
-    deviation; the widest counts; `shape`, `variance`: (n_outputs,), variance of the complex number; `shown`: False
+    deviation; the widest counts; `shape`, `variance`: (n_outputs,), variance of the complex number; `visible`: False
     where something says that the data do not show the mode.
     """
     size = abs(pole)
     of_frequency = np.array([pole.real, pole.imag]) / (2 * np.pi * size)
     of_damping = np.array([-(pole.imag**2), pole.real * pole.imag]) / size**3
     wide = 4 * abs(pole.real) / (2 * np.pi)  # a frequency is known where its sd is less than half a bandwidth
-    asked = (size / (2 * np.pi), of_frequency, wide), (-pole.real / size, of_damping, None)
+    quantities = (size / (2 * np.pi), of_frequency, wide), (-pole.real / size, of_damping, None)
     numbers = list[EstimatedNumber]()
-    for value, slope, width in asked:
-        found = [(max(float(slope @ C @ slope), 0.0) ** 0.5, q) for C, q in spreads]
-        sd, half = max(s for s, _ in found), max(s * q for s, q in found)
+    for value, slope, width in quantities:
+        spreads_of_one = [(max(float(slope @ C @ slope), 0.0) ** 0.5, q) for C, q in spreads]
+        sd, half = max(s for s, _ in spreads_of_one), max(s * q for s, q in spreads_of_one)
         quantile = half / sd if sd > 0 else NORMAL_95
-        numbers.append(EstimatedNumber.of(value, sd, quantile=quantile, size=width, shown=shown))
+        numbers.append(EstimatedNumber.of(value, sd, quantile=quantile, size=width, visible=visible))
     largest = int(np.argmax(np.abs(shape)))
     scaled = shape / shape[largest]
     spread = np.sqrt((variance + np.abs(scaled) ** 2 * variance[largest]) / 2) / abs(shape[largest])
@@ -264,12 +264,12 @@ def plant_modes(
     """
     poles, vectors = np.linalg.eig(A)
     none, still = np.zeros((2, 2)), np.zeros(len(outputs))
-    found, (low, high) = list[Mode](), (2 * np.pi * f for f in band_hz)
+    modes, (low, high) = list[Mode](), (2 * np.pi * f for f in band_hz)
     for k in np.argsort(poles.imag):
         p = complex(poles[k])
         if low <= p.imag <= high and abs(p.real) <= most_damped * abs(p):
-            found.append(mode_of(p, [(none, NORMAL_95)], outputs, C @ vectors[:, k], still))
-    return tuple(found)
+            modes.append(mode_of(p, [(none, NORMAL_95)], outputs, C @ vectors[:, k], still))
+    return tuple(modes)
 
 
 def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | None = None) -> Array:
@@ -278,7 +278,7 @@ def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | N
     `outputs`: those that count; default all. Returns (n_ones, n_others), 0 to 1. EstimationError where fewer than two
     outputs have the same name: with one, all shapes are alike.
     """
-    found = np.zeros((len(ones), len(others)))
+    criteria = np.zeros((len(ones), len(others)))
     for i, a in enumerate(ones):
         for j, b in enumerate(others):
             own, other = a.complex_shape, b.complex_shape
@@ -288,8 +288,8 @@ def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | N
                     f"two lists of modes share {len(both)} outputs ({', '.join(own)}; {', '.join(other)}); a "
                     "comparison of shapes needs two of the same name. Name the outputs alike"
                 )
-            found[i, j] = assurance([own[k] for k in both], [other[k] for k in both])
-    return found
+            criteria[i, j] = assurance([own[k] for k in both], [other[k] for k in both])
+    return criteria
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False, repr=False)

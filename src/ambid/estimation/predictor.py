@@ -293,8 +293,8 @@ def _newton(A: Array, C: Array, Q: Array, R: Array, K: Array, before: Array | No
 
 def _gain_of(A: Array, C: Array, P: Array, R: Array) -> Array:
     """Predictor gain A P C^T (C P C^T + R)^-1."""
-    seen = C @ P
-    return np.asarray(_turned(np.linalg.solve(seen @ C.T + R, seen @ _turned(A))), dtype=np.float64)
+    CP = C @ P
+    return np.asarray(_turned(np.linalg.solve(CP @ C.T + R, CP @ _turned(A))), dtype=np.float64)
 
 
 def solve_lyapunov(F: Array, Q: Array) -> Array:
@@ -419,12 +419,12 @@ def assemble_all(problems: Sequence[PredictorProblem], vectors: Sequence[Array])
         noise, n_d = np.array([v[sl["noise"]] for v in vectors]), plants.E.shape[-1]
         Q = (plants.E * np.exp(2 * noise[:, None, :n_d])) @ np.swapaxes(plants.E, 1, 2)
         sensor = np.exp(2 * np.hstack([np.zeros((len(pairs), 1)), noise[:, n_d:]]))
-        gains, found = predictor_gains(plants.A, C, Q, sensor[:, :, None] * np.eye(C.shape[0]))
+        gains, settled = predictor_gains(plants.A, C, Q, sensor[:, :, None] * np.eye(C.shape[0]))
     except (np.linalg.LinAlgError, ValueError, ArithmeticError):
         return [assemble(p, v, with_derivatives=False) for p, v in pairs]
     out = list[Predictor | None]()
     for k, (problem, vector) in enumerate(pairs):
-        if found[k]:
+        if settled[k]:
             plant = DiscreteSpace(A=plants.A[k], B=plants.B[k], B_late=plants.B_late[k], E=plants.E[k], C=C)
             out.append(_recursion(problem, vector, lag, plant, gains[k]))
         else:
@@ -533,10 +533,10 @@ def _sampled(
         if fraction is None:
             plant, slopes = discretise(space, period, derivatives=derivatives)
         else:
-            found = {f: discretise(space, period, fraction=f, derivatives=derivatives) for f in set(fraction.tolist())}
-            plant, slopes = found[fraction[0]]
-            if len(found) > 1:
-                each = [(p, *d) for p, d in (found[f] for f in fraction.tolist())]
+            pairs = {f: discretise(space, period, fraction=f, derivatives=derivatives) for f in set(fraction.tolist())}
+            plant, slopes = pairs[fraction[0]]
+            if len(pairs) > 1:
+                each = [(p, *d) for p, d in (pairs[f] for f in fraction.tolist())]
                 plant, *more = (_by_input(same) for same in zip(*each, strict=True))
                 slopes = tuple(more)
             slopes = (*slopes[:-1], *(_alone(slopes[-1], j) for j in problem.late))

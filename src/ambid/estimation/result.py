@@ -213,8 +213,8 @@ class Predicting:
         dict of str to ndarray, shape (n_samples,), SI
             By output; NaN where nothing precedes.
         """
-        found: dict[str, Array] = _predicted("predict")(self, record, ahead, rate_hz=rate_hz, units=units)
-        return found
+        outputs: dict[str, Array] = _predicted("predict")(self, record, ahead, rate_hz=rate_hz, units=units)
+        return outputs
 
     def validate(self, record: Any, *, rate_hz: float | None = None, units: Mapping[str, str] | None = None) -> Any:
         """Judge the model on a further record, as ``ambid validate`` does.
@@ -251,8 +251,8 @@ class Simulating:
         dict of str to ndarray, shape (n_samples,), SI
             By output. An unstable plant runs away.
         """
-        found: dict[str, Array] = _predicted("simulate")(self, u)
-        return found
+        outputs: dict[str, Array] = _predicted("simulate")(self, u)
+        return outputs
 
 
 class Linear:

@@ -155,8 +155,8 @@ def search(
         theta = solved(theta)
     cost = problem.cost(theta)
     seconds, costs = [0.0], [cost]
-    held = [held_out(theta)] if held_out is not None else []
-    best_held, best_theta, worse = (held[0] if held else np.inf), theta, 0
+    errors = [held_out(theta)] if held_out is not None else []
+    best_held, best_theta, worse = (errors[0] if errors else np.inf), theta, 0
     steps = _Steps(
         problem=problem, control=_Region(bounded) if bounded else _Damping(damping), upper=upper, longest=longest,
         move=move, solved=solved, n_linear=n_linear, settled=settled, enough=enough, judged=judged,
@@ -178,10 +178,10 @@ def search(
             seconds.append(perf_counter() - began)
             costs.append(cost)
             if held_out is not None:
-                held.append(held_out(theta))
-                worse = 0 if held[-1] < best_held else worse + 1
-                if held[-1] < best_held:
-                    best_held, best_theta = held[-1], theta
+                errors.append(held_out(theta))
+                worse = 0 if errors[-1] < best_held else worse + 1
+                if errors[-1] < best_held:
+                    best_held, best_theta = errors[-1], theta
             converged = not judged and gained <= max(tolerance * abs(cost), enough)
             if converged or worse >= _PATIENCE:
                 break
@@ -189,7 +189,7 @@ def search(
         if not keep_best:
             raise
         interrupted = True
-    early = bool(held) and held[-1] > (1.0 + slack) * best_held
+    early = bool(errors) and errors[-1] > (1.0 + slack) * best_held
     if early:
         theta, cost, converged = best_theta, problem.cost(best_theta), True
     return Found(
@@ -200,7 +200,7 @@ def search(
         interrupted=interrupted,
         seconds=tuple(seconds),
         costs=tuple(costs),
-        held_out=tuple(held),
+        held_out=tuple(errors),
     )
 
 
@@ -244,8 +244,8 @@ class _Region:
         rows = np.column_stack([J[:, : self.n], r])
         rows = rows - easy.U @ (easy.U.T @ rows)
         U, s, Vt = np.linalg.svd(rows[:, :-1], full_matrices=False)
-        seen = s > _ROUNDING * np.max(s, initial=0.0)
-        s, pull = s[seen], (U.T @ rows[:, -1])[seen]
+        nonzero = s > _ROUNDING * np.max(s, initial=0.0)
+        s, pull = s[nonzero], (U.T @ rows[:, -1])[nonzero]
         damping, along = 0.0, pull / s
         for _ in range(_SECULAR):  # Newton's method on 1 / length, which is nearly linear in the damping
             self.length = float(np.linalg.norm(along))
@@ -255,7 +255,7 @@ class _Region:
             damping += self.length**2 / slope * (self.length / self.radius - 1.0)
             along = s * pull / (s**2 + damping)
         self.bound = damping > 0.0
-        step = Vt[seen].T @ along
+        step = Vt[nonzero].T @ along
         promise = float(2.0 * pull @ (s * along) - np.sum((s * along) ** 2)) + easy.explain(r)
         return np.concatenate([step, easy.solve(r - J[:, : self.n] @ step)]), promise
 

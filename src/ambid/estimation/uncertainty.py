@@ -57,20 +57,20 @@ def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
     rounding; `n_estimated`: numbers estimated, offsets and initial states not counted. Returns ``aic``, ``aicc``,
     ``bic``, ``mdl``, ``fpe``; ``aicc`` and ``fpe`` are left out where the samples are too few for them.
     """
-    used = e[skipped(e.shape[0]) :]
-    N, n_y = used.shape
-    log_det = log_determinant(used, y)
+    settled = e[skipped(e.shape[0]) :]
+    N, n_y = settled.shape
+    log_det = log_determinant(settled, y)
     per_output = n_estimated / n_y
     k = n_estimated + n_y * (n_y + 1) / 2
     deviance = N * (log_det + n_y * (1 + np.log(2 * np.pi)))
-    found = {
+    values = {
         "aic": deviance + 2 * k,
         "aicc": deviance + 2 * k * N / (N - per_output - n_y - 1) if per_output + n_y + 1 < N else np.inf,
         "bic": deviance + k * np.log(N),
         "mdl": np.exp(log_det + n_y * np.log1p(per_output * np.log(N) / N)),
         "fpe": np.exp(log_det + n_y * np.log((N + per_output) / (N - per_output))) if per_output < N else np.inf,
     }
-    return {name: float(x) for name, x in found.items() if np.isfinite(x)}
+    return {name: float(x) for name, x in values.items() if np.isfinite(x)}
 
 
 def log_determinant(e: Array, y: Array) -> float:
@@ -143,9 +143,9 @@ def explained_by_past(
     says nothing; 0 where rows are fewer.
     """
     rows, targets = [], []
-    for e, known in parts:
-        first, n = max(most for _, most in known), e.shape[0]
-        past = [x[first - k : max(n, first) - k] for x, most in known for k in range(1, most + 1)]
+    for e, signals in parts:
+        first, n = max(most for _, most in signals), e.shape[0]
+        past = [x[first - k : max(n, first) - k] for x, most in signals for k in range(1, most + 1)]
         rows.append(np.hstack([*past, np.ones((max(n - first, 0), 1))]))
         targets.append(e[first:])
     Z, E = np.concatenate(rows), np.concatenate(targets)
@@ -193,16 +193,16 @@ def score_covariance(scores: Sequence[Array], part: float = 0.0, slopes: Sequenc
     begins = [0] if by_record else [(k * max(lengths)) // _BEGINS for k in range(min(_BEGINS, max(lengths)))]
     out = np.zeros((scores[0].shape[1],) * 2)
     for begin in begins:
-        found = []
+        sums_of_blocks = []
         for k, (own, length) in enumerate(zip(scores, lengths, strict=True)):
             n = own.shape[0]
             edges = [0, *range(begin % length or length, n - length // 2, length), n]
             for a, b in pairwise(edges):
                 block = own[a:b].sum(axis=0)
-                found.append(block if slopes is None else _left_out(slopes[k][a:b], block))
-        sums = np.array(found)
+                sums_of_blocks.append(block if slopes is None else _left_out(slopes[k][a:b], block))
+        sums = np.array(sums_of_blocks)
         sums -= sums.mean(axis=0)
-        out += sums.T @ sums * (len(found) / max(len(found) - 1.0, 1.0))
+        out += sums.T @ sums * (len(sums_of_blocks) / max(len(sums_of_blocks) - 1.0, 1.0))
     mean: Array = out / len(begins)
     return mean
 
@@ -216,8 +216,8 @@ def _lengths(scores: Sequence[Array], part: float) -> list[int]:
 def _left_out(slopes: Array, score: Array) -> Array:
     """(I - Q'Q)^-1 Q'e of a block; along what the block alone shows (its record's first state) nothing is blown up."""
     Q = slopes.reshape(-1, slopes.shape[-1])
-    held, V = np.linalg.eigh(Q.T @ Q)
-    out: Array = V @ ((V.T @ score) / np.maximum(1.0 - held, _SHOWN_ALONE))
+    leverage, V = np.linalg.eigh(Q.T @ Q)
+    out: Array = V @ ((V.T @ score) / np.maximum(1.0 - leverage, _SHOWN_ALONE))
     return out
 
 
@@ -277,7 +277,7 @@ def bootstrapped(
     blocks = [_triangles(r, r.shape[0] if whole else block_length(r.shape[0])) for r in rows]
     _lift(blocks, priors)
     rng = np.random.default_rng([seed, 1])
-    found = []
+    estimates = []
     for k in range(repeats):
         if tick is not None:
             tick("bootstrap", k / repeats)
@@ -290,8 +290,8 @@ def bootstrapped(
                 times[0] = 1
                 drawn += [np.sqrt(t) * b for t, b in zip(times, own, strict=True) if t]
         R = triangle_of([np.concatenate([*drawn, priors])])
-        found.append(least_squares(R[:, :-1], R[:, -1]))
-    return np.atleast_2d(np.cov(np.array(found), rowvar=False)) * widening([r[:, 0] for r in rows])
+        estimates.append(least_squares(R[:, :-1], R[:, -1]))
+    return np.atleast_2d(np.cov(np.array(estimates), rowvar=False)) * widening([r[:, 0] for r in rows])
 
 
 def _lift(blocks: list[list[Array]], priors: Array) -> None:
@@ -300,10 +300,10 @@ def _lift(blocks: list[list[Array]], priors: Array) -> None:
     root = directions(R).root(BLIND)
     for own in blocks:
         for k, block in enumerate(own):
-            U, held, _ = np.linalg.svd(block[:, :-1] @ root, full_matrices=False)
+            U, leverage, _ = np.linalg.svd(block[:, :-1] @ root, full_matrices=False)
             along = U.T @ block[:, -1]
             own[k] = block.copy()
-            own[k][:, -1] += U @ (along / np.maximum(1.0 - held**2, _SHOWN_ALONE) - along)
+            own[k][:, -1] += U @ (along / np.maximum(1.0 - leverage**2, _SHOWN_ALONE) - along)
 
 
 def _triangles(rows: Array, length: int) -> list[Array]:

@@ -61,12 +61,12 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> 
             f"the rig's model is {bench.model!r}; a nonlinear bearing needs 'one-axis'. Correct model, or use "
             "another rig"
         )
-    known = bench.magnet or RigMagnet()
-    known = replace(
-        known, kind=words.get("magnet") or known.kind, eddy=known.eddy or words.get("eddy", False),
-        drift=known.drift or words.get("drift", False), off_below=known.off_below if off_below is None else off_below,
+    magnet = bench.magnet or RigMagnet()
+    magnet = replace(
+        magnet, kind=words.get("magnet") or magnet.kind, eddy=magnet.eddy or words.get("eddy", False),
+        drift=magnet.drift or words.get("drift", False), off_below=magnet.off_below if off_below is None else off_below,
     )  # fmt: skip
-    return replace(bench, magnet=known)
+    return replace(bench, magnet=magnet)
 
 
 def numbers_of(rig: Rig) -> dict[str, Parameter]:
@@ -78,27 +78,27 @@ def numbers_of(rig: Rig) -> dict[str, Parameter]:
     return {**{n: rig.parameter(n) for n in _LINEAR}, **{p.name: p for p in rig.magnet.parameters}}
 
 
-def laws_of(known: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
+def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
     """Return the laws between which the likelihood is to decide.
 
     `records`: in which the rotor moves. Returns `extend`: whether a rising leakage, and unequal magnets of a pair, are
     to be tried beyond them.
     """
-    kind = known.kind
-    if kind == "auto" and known.gap == "exponential":
+    kind = magnet.kind
+    if kind == "auto" and magnet.gap == "exponential":
         kind = "single"
     if kind == "auto" and records:
         low, high = min(r.kept[:, 1].min() for r in records), max(r.kept[:, 1].max() for r in records)
         kind = "pair" if low < -_REVERSED * high else "single"
-    rise, pair = bool(known.rise), kind == "pair"
+    rise, pair = bool(magnet.rise), kind == "pair"
     gaps: tuple[Literal["hyperbolic", "exponential"], ...] = ("hyperbolic", "exponential")
-    if known.gap or pair:
-        gaps = (known.gap or "hyperbolic",)
+    if magnet.gap or pair:
+        gaps = (magnet.gap or "hyperbolic",)
     laws = [
-        MagnetLaw(gap=gap, pair=pair, asymmetric=bool(known.asymmetric), saturation=known.saturation, rise=rise)
+        MagnetLaw(gap=gap, pair=pair, asymmetric=bool(magnet.asymmetric), saturation=magnet.saturation, rise=rise)
         for gap in gaps
     ]
-    return laws, known.rise is None and known.asymmetric is None
+    return laws, magnet.rise is None and magnet.asymmetric is None
 
 
 def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
@@ -124,20 +124,20 @@ def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -
     y = np.column_stack([bench["position"].values, bench["current"].values])
     loose = np.zeros(u.size) if off is None else np.where(u <= off, _OFF_SD, 0.0)
     valid = np.ones(y.shape, dtype=np.bool_)
-    taken = BearingRecord(name=name, rate_hz=bench.rate_hz, u=u, loose=loose, y=y, valid=valid, held=held)
-    _check_moves(taken)
+    reading = BearingRecord(name=name, rate_hz=bench.rate_hz, u=u, loose=loose, y=y, valid=valid, held=held)
+    _check_moves(reading)
     if rig.limits is not None:
-        taken = touching(taken, rig.limits.position)
-        warnings += _stops(taken)
-    found = {**origin(bench), "held": held}
-    return TakenRecord(record=taken, remembered=found, warnings=tuple(warnings), start_s=bench.start_s)
+        reading = touching(reading, rig.limits.position)
+        warnings += _stops(reading)
+    provenance = {**origin(bench), "held": held}
+    return TakenRecord(record=reading, remembered=provenance, warnings=tuple(warnings), start_s=bench.start_s)
 
 
 def _stops(record: BearingRecord) -> list[str]:
     """Say where the rotor touched its stops and where it lay on them; refuse where too little is left."""
-    found = list[str]()
+    warnings = list[str]()
     if record.knock is not None and record.knock.any():
-        found.append(
+        warnings.append(
             f"{record.name}: the rotor touches a stop (loop.limits.position) in {np.count_nonzero(record.knock)} "
             "samples; the force there is treated as unknown"
         )
@@ -148,11 +148,11 @@ def _stops(record: BearingRecord) -> list[str]:
                 f"{record.name}: the rotor rests on a stop (loop.limits.position) in {lies:.0%} of the record and "
                 f"is nowhere free for {_LEAST} samples. Correct the limits, or record with the rotor levitated"
             )
-        found.append(
+        warnings.append(
             f"{record.name}: the rotor rests on a stop (loop.limits.position) in {lies:.1%} of the record; that "
             f"part was cut out, and {left} samples in {counted(len(record.parts), 'part')} remain"
         )
-    return found
+    return warnings
 
 
 def _check_moves(record: BearingRecord) -> None:
@@ -185,41 +185,41 @@ def take_all(
         raise EstimationError(
             "no record with a moving rotor was given; forces cannot be estimated without one. Give one"
         )
-    taken: list[TakenRecord] = []
+    readings: list[TakenRecord] = []
     for source, is_held in [*((r, False) for r in records), *((r, True) for r in held)]:
         say("read")
-        taken.append(take_record(source, rig, how, held=is_held))
+        readings.append(take_record(source, rig, how, held=is_held))
     second = None if validate is None else take_record(validate, rig, how)
-    rates = {t.record.rate_hz for t in taken if not t.record.held}
+    rates = {t.record.rate_hz for t in readings if not t.record.held}
     if second is not None and second.record.rate_hz not in rates:  # the predictor could not judge it: say so now
-        known = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
+        rates_text = ", ".join(f"{rate:g} Hz" for rate in sorted(rates))
         raise EstimationError(
             f"{second.record.name}, for validation, is sampled at {second.record.rate_hz:g} Hz, the records at "
-            f"{known}; the rates must agree. Resample it, or omit {setting('validate')}"
+            f"{rates_text}; the rates must agree. Resample it, or omit {setting('validate')}"
         )
-    return check_together(taken, second), second
+    return check_together(readings, second), second
 
 
-def check_together(taken: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
+def check_together(readings: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
     """Check what shows only in values or between records.
 
-    `taken`: to identify from; `second`: to judge on. Returns `taken`, with a warning where a held rotor moves.
+    `readings`: to identify from; `second`: to judge on. Returns `readings`, with a warning where a held rotor moves.
     """
-    for j, one in enumerate(taken):
+    for j, one in enumerate(readings):
         _refuse_senseless(one.record)
-        for other in taken[:j]:
+        for other in readings[:j]:
             if _overlap(one, other):
                 raise EstimationError(
                     f"{other.record.name} and {one.record.name} hold the same samples and would count twice. Omit one"
                 )
-    for one in taken:
+    for one in readings:
         if second is not None and _overlap(one, second):
             raise EstimationError(
                 f"{second.record.name}, for validation, holds samples that the estimate is fitted to. Give another "
                 f"record, or omit {setting('validate')}"
             )
-    moving = max((float(t.record.y[:, 0].std()) for t in taken if not t.record.held), default=0.0)
-    return tuple(_warn_moving(t, moving) for t in taken)
+    moving = max((float(t.record.y[:, 0].std()) for t in readings if not t.record.held), default=0.0)
+    return tuple(_warn_moving(t, moving) for t in readings)
 
 
 def _refuse_senseless(record: BearingRecord) -> None:
@@ -252,8 +252,8 @@ def _warn_moving(one: TakenRecord, moving: float) -> TakenRecord:
     rocks = float(one.record.y[:, 0].std())
     if not one.record.held or rocks <= _ROCKS * moving:
         return one
-    said = (
+    warning = (
         f"{one.record.name}: the rotor is declared held, but its position scatters by {1e6 * rocks:.3g} um, "
         f"{rocks / moving:.0%} of its motion in the other records; R and L are biased if it moved"
     )
-    return replace(one, warnings=(*one.warnings, said))
+    return replace(one, warnings=(*one.warnings, warning))

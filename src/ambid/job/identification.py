@@ -105,12 +105,12 @@ def identify(
     if bench.rotor is not None:
         from ambid.job.rotor import identify_rotor, validated
 
-        found = identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
-        found = replace(found, checks={**found.checks, **_reached(planned, found)})
+        rotor = identify_rotor(sources, bench, speed_rpm=speed_rpm, tick=tick, **reading)
+        rotor = replace(rotor, checks={**rotor.checks, **_reached(planned, rotor)})
         if validate is None:
-            return found
-        second = validated(found, (load_bench(validate, bench, **reading),))
-        return replace(found, validation={**second, "checks": plain_json(second["checks"])})
+            return rotor
+        second = validated(rotor, (load_bench(validate, bench, **reading),))
+        return replace(rotor, validation={**second, "checks": plain_json(second["checks"])})
     if speed_rpm is not None:
         raise EstimationError(f"{setting('speed_rpm')} is of a rotor's records; the rig has no [bearings.X]. Omit it")
     if len(sources) != 1:
@@ -126,12 +126,12 @@ def _planned(experiment: Experiment | str | Path) -> Experiment:
     """Return the experiment that is meant."""
     from ambid.job.results import experiment_of
 
-    found = experiment_of(experiment)
-    if found is None:
+    plan = experiment_of(experiment)
+    if plan is None:
         raise EstimationError(
             f"{setting('experiment', experiment)} is no experiment. Give {saved('design_experiment')}"
         )
-    return found
+    return plan
 
 
 def _reached(planned: Experiment | None, estimate: Estimate | RotorEstimate) -> dict[str, Check]:
@@ -206,13 +206,13 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         raise EstimationError(
             "the search found no stable predictor for this record. Check columns, signs and fixed values"
         )
-    found = physical.innovation_products(fit, e)
-    known, moved = uncertainty(fit, found.scores), physical.agreement(fit)
-    checks = physical.innovation_checks(fit, found, known, moved)
+    products = physical.innovation_products(fit, e)
+    spread, moved = uncertainty(fit, products.scores), physical.agreement(fit)
+    checks = physical.innovation_checks(fit, products, spread, moved)
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
-    known = replace(known, disagreement=moved.disagreement() if robust else np.zeros(len(known.names)))
-    checks |= physical.assumption_checks(fit, known, delay_how)
-    checks |= physical.physical_checks(fit, known, bench, robust=robust)
+    spread = replace(spread, disagreement=moved.disagreement() if robust else np.zeros(len(spread.names)))
+    checks |= physical.assumption_checks(fit, spread, delay_how)
+    checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     signals = signals_of(bench, problem.model)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
@@ -224,16 +224,16 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
             loop = loop_agrees(rig, theta, bench.rate_hz)
             checks |= {} if loop is None else {"loop_agrees": loop}
             if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
-                checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, known.names, known.information)
+                checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, spread.names, spread.information)
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import curvature_check
 
-            curved = curvature_check(fit, e, rig, means, known.standard_deviations(robust=robust))
+            curved = curvature_check(fit, e, rig, means, spread.standard_deviations(robust=robust))
             checks |= {} if curved is None else {"curvature": curved}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
-        fit, known, rig.parameters, robust=robust, delay_how=delay_how,
+        fit, spread, rig.parameters, robust=robust, delay_how=delay_how,
         means=means, one_step=fit_of(e * problem.scales.output, y),
         simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
@@ -250,10 +250,10 @@ def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
     from ambid.bearing.sizes import check_units
 
     check = check_units(fit.problem.parameters(fit.vector), rig.parameters, signals, fit.problem.model)
-    known = [p for p in rig.parameters if p.role != "free" and p.value]
-    if not known or not (doubt or check.values["unusual"]):
+    constrained = [p for p in rig.parameters if p.role != "free" and p.value]
+    if not constrained or not (doubt or check.values["unusual"]):
         return check
-    free = [replace(p, role="free", value=None, sd=None) if p in known else p for p in rig.parameters]
+    free = [replace(p, role="free", value=None, sd=None) if p in constrained else p for p in rig.parameters]
     with contextlib.suppress(EstimationError, np.linalg.LinAlgError):
         alone = greybox(fit.problem.model, signals, free, delay=fit.problem.delay, evaluations=0)
         again = check_units(alone.problem.parameters(alone.vector), rig.parameters, signals, fit.problem.model)
@@ -327,13 +327,13 @@ def identify_nonlinear(
         gaps=gaps, units=units, layout=layout,
     )  # fmt: skip
     say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
-    taken, second = take_all(sources_of(records), sources_of(held), validate, bench, words, say)
+    readings, second = take_all(sources_of(records), sources_of(held), validate, bench, words, say)
     clock.lap("read")
     assert bench.magnet is not None
-    laws, extend = laws_of(bench.magnet, [t.record for t in taken if not t.record.held])
+    laws, extend = laws_of(bench.magnet, [t.record for t in readings if not t.record.held])
     wanted = bench.channel("voltage").delay
     fit = estimate_bearing(
-        [t.record for t in taken], numbers_of(bench), laws=laws, delay=None if wanted == "auto" else float(wanted),
+        [t.record for t in readings], numbers_of(bench), laws=laws, delay=None if wanted == "auto" else float(wanted),
         extend=extend, eddy=bench.magnet.eddy, drift=bench.magnet.drift, tick=say,
     )  # fmt: skip
     if fit.status == "failed":
@@ -343,9 +343,9 @@ def identify_nonlinear(
         )
     clock.lap("fit")
     say("check")
-    estimate = judge_bearing(fit, uncertainty(fit), taken, delay_given=wanted != "auto")
+    estimate = judge_bearing(fit, uncertainty(fit), readings, delay_given=wanted != "auto")
     clock.lap("checks")
-    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=taken)
+    estimate = replace(estimate, timing_s=clock.laps, rig=rig_entry(bench), used=readings)
     if second is not None:
         estimate = replace(estimate, validation=validation(estimate, second.record))
     return estimate

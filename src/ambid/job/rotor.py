@@ -56,38 +56,38 @@ def identify_rotor(
 
     say, clock, model = tick or silent, Clock(), rig.rotor
     assert model is not None
-    taken = read_records(records, rig, speed_rpm, say, **reading)
-    benches = [r.bench for r in taken]
+    readings = read_records(records, rig, speed_rpm, say, **reading)
+    benches = [r.bench for r in readings]
     for bench in benches:
         _check(bench, rig)
     clock.lap("read")
     say("periods")
-    turning = [separate(r.bench, model, r.speed) for r in taken]
-    warnings = [said for r in taken for said in r.warnings]
-    for r, x in zip(taken, turning, strict=True):
-        given = model.speed if len(taken) == 1 else 0.0  # the rig's is that of one record
-        warnings += x.warnings(r.name, given if r.speed is None else r.speed)
+    turning = [separate(r.bench, model, r.speed) for r in readings]
+    warnings = [said for r in readings for said in r.warnings]
+    for r, x in zip(readings, turning, strict=True):
+        rig_speed = model.speed if len(readings) == 1 else 0.0  # the rig's is that of one record
+        warnings += x.warnings(r.name, rig_speed if r.speed is None else r.speed)
     clean, speeds, excitations = ([getattr(x, q) for x in turning] for q in ("record", "speed", "excitation"))
-    _check_speeds(taken, speeds)
+    _check_speeds(readings, speeds)
     rig = _turning_rig(rig, max(speeds, key=abs))
     clock.lap("periods")
     with one_thread():
         periodic = [x for x in excitations if x is not None]
         if len(periodic) == len(benches):
-            found = _from_periods(clean, speeds, periodic, rig, say, clock)
+            outcome = _from_periods(clean, speeds, periodic, rig, say, clock)
         else:
-            found = _from_innovations(clean, speeds, excitations, rig, say, clock)
+            outcome = _from_innovations(clean, speeds, excitations, rig, say, clock)
         estimate = conclude(
-            found.fit, found.evidence, rig.parameters, found.records,
+            outcome.fit, outcome.evidence, rig.parameters, outcome.records,
             delay_how=["given" if d is not None else "estimated" for d in _delays(rig)],
-            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=found.why)},
-            rig=rig_entry(rig), warnings=[*warnings, *found.warnings],
+            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=outcome.why)},
+            rig=rig_entry(rig), warnings=[*warnings, *outcome.warnings],
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
-        loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], found.seen[fastest], estimate.speed)
+        loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], outcome.seen[fastest], estimate.speed)
         try:
-            synchronous = _synchronous(estimate, turning, found.seen, loop, rig)
+            synchronous = _synchronous(estimate, turning, outcome.seen, loop, rig)
         except np.linalg.LinAlgError:  # an estimate far from a rotor, such as one that did not converge
             synchronous = {}
             said = (*said, "unbalance was not worked out: the estimated rotor has no finite response at the speed")
@@ -197,8 +197,8 @@ def _from_innovations(
 def _delays(rig: Rig) -> list[float | None]:
     """Return the delay of each input in samples, None where it is to be estimated."""
     assert rig.rotor is not None
-    given = [rig.channel(role).delay for role in rig.rotor.inputs]
-    return [None if d == "auto" else float(d) for d in given]
+    delays = [rig.channel(role).delay for role in rig.rotor.inputs]
+    return [None if d == "auto" else float(d) for d in delays]
 
 
 def _synchronous(
@@ -233,24 +233,24 @@ def balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, 
 
     Shapes are the rig's, else those of its drawing, each turned to the side of the identified mode.
     """
-    modes, known = range(1, estimate.n_modes + 1), rig.modes.numbers
+    modes, numbers = range(1, estimate.n_modes + 1), rig.modes.numbers
     places = estimate.plant.places
     z = {p: estimate.numbers[p] for p in places}
     drawn = rig.shaft.free_rotor(estimate.n_modes, planes=list(z.values())) if rig.shaft and estimate.n_modes else None
-    found = {}
+    planes = {}
     for u in rig.unbalance:
         shapes = []
         for r in modes:
             own = np.array([estimate.numbers[f"mode{r}.{p}"] for p in places])
             if drawn is not None:
-                given = drawn.deflection(np.array([*z.values(), u.z]))[:, r + 1]
-            elif f"mode{r}.unbalance.{u.name}" in known:
-                given = np.array([known[f"mode{r}.{p}"] for p in (*places, f"unbalance.{u.name}")])
+                shape = drawn.deflection(np.array([*z.values(), u.z]))[:, r + 1]
+            elif f"mode{r}.unbalance.{u.name}" in numbers:
+                shape = np.array([numbers[f"mode{r}.{p}"] for p in (*places, f"unbalance.{u.name}")])
             else:
                 return {}
-            shapes.append(float(given[-1] * np.sign(own @ given[:-1])))
-        found[u.name] = (u.z, *shapes)
-    return found
+            shapes.append(float(shape[-1] * np.sign(own @ shape[:-1])))
+        planes[u.name] = (u.z, *shapes)
+    return planes
 
 
 def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[RotorReplay, ...]:
@@ -262,10 +262,10 @@ def replays_of(estimate: RotorEstimate, benches: Sequence[Record]) -> tuple[Roto
 
     found, own = [], benches is estimate.used
     for k, bench in enumerate(benches):
-        of = separate(bench, estimate.plant, float(str(estimate.records[k]["speed"])) if own else None)
-        if of.excitation is not None:
-            spectra = period_spectra(of.record, estimate.plant, of.excitation, of.speed)
-            found.append(Experiment(spectra=spectra, speed=of.speed))
+        separated = separate(bench, estimate.plant, float(str(estimate.records[k]["speed"])) if own else None)
+        if separated.excitation is not None:
+            spectra = period_spectra(separated.record, estimate.plant, separated.excitation, separated.speed)
+            found.append(Experiment(spectra=spectra, speed=separated.speed))
     return replays(estimate, found)
 
 
@@ -301,9 +301,9 @@ def _check(bench: Record, rig: Rig) -> None:
             )
 
 
-def _check_speeds(taken: Sequence[RotorRecord], speeds: Sequence[float]) -> None:
+def _check_speeds(readings: Sequence[RotorRecord], speeds: Sequence[float]) -> None:
     """Refuse a speed that no record of its rate shows."""
-    for one, speed in zip(taken, speeds, strict=True):
+    for one, speed in zip(readings, speeds, strict=True):
         if abs(speed) >= np.pi * one.bench.rate_hz:
             raise EstimationError(
                 f"{one.name}: a speed of {speed * 30.0 / np.pi:.4g} rpm is more than half of its sampling rate, "

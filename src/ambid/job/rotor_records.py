@@ -49,37 +49,37 @@ def read_records(
     from ambid.rotor.spectra import experiments_of
 
     speeds = _speeds(speed_rpm, len(records))
-    taken = []
+    readings = []
     for source, speed in zip(records, speeds, strict=True):
         say("read")
-        taken.append(RotorRecord(bench=_read(source, rig, speed, len(records), reading), speed=speed))
-    _check_together(taken)
+        readings.append(RotorRecord(bench=_read(source, rig, speed, len(records), reading), speed=speed))
+    _check_together(readings)
     assert rig.rotor is not None
-    taken = [replace(r, bench=part) for r in taken for part in experiments_of(r.bench, rig.rotor)]
-    turning = [r for r in taken if any(role in r.bench for role in _TURNING)]
-    if not turning or len(turning) == len(taken) or speed_rpm is not None:
-        return taken
-    said = (
+    readings = [replace(r, bench=part) for r in readings for part in experiments_of(r.bench, rig.rotor)]
+    turning = [r for r in readings if any(role in r.bench for role in _TURNING)]
+    if not turning or len(turning) == len(readings) or speed_rpm is not None:
+        return readings
+    warning = (
         "has no column of the angle or speed that other records have: it is taken to be at rest. Else give "
         f"{setting('speed_rpm')}"
     )
-    return [r if r in turning else replace(r, speed=0.0, warnings=(f"{r.name} {said}",)) for r in taken]
+    return [r if r in turning else replace(r, speed=0.0, warnings=(f"{r.name} {warning}",)) for r in readings]
 
 
 def _speeds(speed_rpm: float | Sequence[float] | None, n: int) -> list[float | None]:
     if speed_rpm is None:
         return [None] * n
-    given = [speed_rpm] if isinstance(speed_rpm, (int, float)) else list(speed_rpm)
-    if len(given) != n:
+    speeds = [speed_rpm] if isinstance(speed_rpm, (int, float)) else list(speed_rpm)
+    if len(speeds) != n:
         raise EstimationError(
-            f"{counted(n, 'record')} and {counted(len(given), 'speed')} are given. Give {setting('speed_rpm')} once "
+            f"{counted(n, 'record')} and {counted(len(speeds), 'speed')} are given. Give {setting('speed_rpm')} once "
             "for each record, "
             "in their order"
         )
-    wrong = next((x for x in given if not isfinite(x)), None)
+    wrong = next((x for x in speeds if not isfinite(x)), None)
     if wrong is not None:
         raise EstimationError(f"{setting('speed_rpm')} is {wrong}; it must be a speed in rpm. Give a number")
-    return [x * 2.0 * pi / 60.0 for x in given]
+    return [x * 2.0 * pi / 60.0 for x in speeds]
 
 
 def _read(source: Source, rig: Rig, speed: float | None, n: int, reading: Reading) -> Record:
@@ -96,17 +96,17 @@ def _read(source: Source, rig: Rig, speed: float | None, n: int, reading: Readin
             raise error from None
 
 
-def _check_together(taken: Sequence[RotorRecord]) -> None:
+def _check_together(readings: Sequence[RotorRecord]) -> None:
     """Refuse what cannot be one machine at one rate, or would count twice."""
-    first = taken[0]
-    for k, one in enumerate(taken):
+    first = readings[0]
+    for k, one in enumerate(readings):
         rate, other = one.bench.rate_hz, first.bench.rate_hz
         if abs(rate / other - 1.0) > _SAME_RATE:
             raise EstimationError(
                 f"{one.name} is sampled at {rate:g} Hz, {first.name} at {other:g} Hz; delays count in samples of one "
                 "rate. Identify them apart"
             )
-        twice = next((r for r in taken[:k] if _same(r.bench, one.bench)), None)
+        twice = next((r for r in readings[:k] if _same(r.bench, one.bench)), None)
         if twice is not None:
             raise EstimationError(f"{twice.name} and {one.name} hold the same samples and would count twice. Omit one")
 

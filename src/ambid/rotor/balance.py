@@ -49,11 +49,11 @@ class Machine:
     beside: Mapping[str, tuple[float, ...]] = field(default_factory=lambda: _NO_PLANES)  # planes: z, shape of each mode
 
     @classmethod
-    def of(cls, estimate: RotorEstimate, beside: Mapping[str, tuple[float, ...]] = _NO_PLANES) -> Machine:
-        """Return the machine of an estimate; `beside`: planes in which unbalance may stand."""
+    def of(cls, estimate: RotorEstimate, planes: Mapping[str, tuple[float, ...]] = _NO_PLANES) -> Machine:
+        """Return the machine of an estimate; `planes`: planes in which unbalance may stand."""
         return cls(
             model=estimate.plant, at=point_of(estimate), names=estimate.covariance_names,
-            covariance=estimate.covariance, beside=beside,
+            covariance=estimate.covariance, beside=planes,
         )  # fmt: skip
 
     @property
@@ -105,20 +105,20 @@ class Machine:
 
     def forced(self, speed: float, shapes: Array) -> Complex:
         """Return the response (n_y, n) of the outputs to unbalances of 1 kg m; `shapes`: (n_coordinates a plane, n)."""
-        of = self.model.at_speed(speed)
-        space, (mass, _, _) = of.matrices(self.theta), of.rotor_matrices(self.theta)
+        turning = self.model.at_speed(speed)
+        space, (mass, _, _) = turning.matrices(self.theta), turning.rotor_matrices(self.theta)
         F = np.zeros((space.A.shape[0], shapes.shape[1]), dtype=complex)
         n = mass.size
         for plane, factor in ((0, 1.0), (1, -1j)):
-            at = [k for k, q in enumerate(of.coordinates) if q.endswith("xy"[plane]) and plane in of.planes]
+            at = [k for k, q in enumerate(turning.coordinates) if q.endswith("xy"[plane]) and plane in turning.planes]
             if at:
                 F[[n + k for k in at]] = factor * speed**2 * shapes / mass[at, None]
         return np.asarray(space.C @ np.linalg.solve(1j * speed * np.eye(space.A.shape[0]) - space.A, F))
 
     def shape(self, place: str) -> Array:
         """Return what an unbalance in a plane does to the coordinates of a plane of motion."""
-        named = [f"mode{r}.{place}" for r in range(1, self.model.n_modes + 1)]
-        modes = self.beside[place][1:] if place in self.beside else [self.theta[name] for name in named]
+        names = [f"mode{r}.{place}" for r in range(1, self.model.n_modes + 1)]
+        modes = self.beside[place][1:] if place in self.beside else [self.theta[name] for name in names]
         return np.array([1.0, self.z(place) - self.theta["z_cg"], *modes])
 
     @property
@@ -173,10 +173,10 @@ def estimate_unbalance(
     `runout`: of sensor planes where it is known, m; the others' is estimated. What modes see beyond the planes has a
     wide prior, by the mass times the largest motion.
     """
-    given = dict(runout or {})
-    free = [place for place in read_by(machine.model) if place not in given]
+    offsets = dict(runout or {})
+    free = [place for place in read_by(machine.model) if place not in offsets]
     names = (*machine.planes, *(f"mode{r}" for r in range(1, machine.beyond + 1)), *free)
-    parts = [_Part.of(machine, r, free, given) for r in responses]
+    parts = [_Part.of(machine, r, free, offsets) for r in responses]
     A, b = (np.concatenate(x) for x in zip(*((_real_rows(p.X), _real(p.left)) for p in parts), strict=True))
     noise = _block([p.noise_half for p in parts])
     prior, n = _prior(machine, responses, names), len(names)
@@ -185,8 +185,8 @@ def estimate_unbalance(
         common = np.concatenate([p.plant_half(machine, u) for p in parts])
         factor = np.linalg.cholesky(noise + common @ common.T)
         rows, right = (np.linalg.solve(factor, x) for x in (A, b))
-        found = directions(np.vstack([rows, prior]))
-        x = found.solve(np.concatenate([right, np.zeros(prior.shape[0])]))
+        axes = directions(np.vstack([rows, prior]))
+        x = axes.solve(np.concatenate([right, np.zeros(prior.shape[0])]))
         u = x[:n] + 1j * x[n:]
     freedom = max(b.size - x.size + prior.shape[0], 0)
     misfit = float(np.sum((right - rows @ x) ** 2)) / freedom if freedom else 0.0
@@ -194,7 +194,7 @@ def estimate_unbalance(
     for row in prior:  # what a prior says alone is not identified
         k = int(np.argmax(row)) % n
         most[k] = min(most[k], 0.5 / row.max())
-    return Unbalance(names=names, value=u, half=found.root(1e-9), most=most, misfit=misfit, freedom=freedom)
+    return Unbalance(names=names, value=u, half=axes.root(1e-9), most=most, misfit=misfit, freedom=freedom)
 
 
 def _prior(machine: Machine, responses: Sequence[SynchronousResponse], names: Sequence[str]) -> Array:
@@ -218,13 +218,13 @@ def _sizes(A: Array, b: Array, u: Complex) -> Array:
 
 def read_by(model: RotorModel) -> dict[str, Complex]:
     """Return by sensor plane what its runout exp(j phase) does to the outputs: cos(angle + phase) in x, sin in y."""
-    found: dict[str, Complex] = {}
+    readings: dict[str, Complex] = {}
     for row, (j, k) in enumerate(model.sensors):
         bearing, plane = model.placed[j]
         if plane < 2:
-            read = found.setdefault(bearing.sensor_parameter(k), np.zeros(len(model.outputs), dtype=complex))
+            read = readings.setdefault(bearing.sensor_parameter(k), np.zeros(len(model.outputs), dtype=complex))
             read[row] = 1.0 if plane == 0 else -1j
-    return found
+    return readings
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -243,7 +243,7 @@ class _Part:
         machine: Machine,
         response: SynchronousResponse,
         free: Sequence[str],
-        known: Mapping[str, complex],
+        runout: Mapping[str, complex],
     ) -> _Part:
         model, W, rate = machine.model, response.speed, response.rate_hz
         V, Y = (np.array([response.of(role) for role in roles]) for roles in (model.inputs, model.outputs))
@@ -257,7 +257,7 @@ class _Part:
         real = 0.5 * np.block([[C.real, -C.imag], [C.imag, C.real]])
         read = read_by(model)
         X = np.column_stack([machine.forced(W, machine.shapes), *(read[place] for place in free)])
-        offset = sum((x * read[place] for place, x in known.items()), np.zeros(len(model.outputs), dtype=complex))
+        offset = sum((x * read[place] for place, x in runout.items()), np.zeros(len(model.outputs), dtype=complex))
         return cls(
             response=response, V=V, X=X, left=Y - H[0] @ V - offset,
             noise_half=np.asarray(np.linalg.cholesky(real + 1e-12 * np.diag(np.diag(real)))),
@@ -268,9 +268,9 @@ class _Part:
         W = self.response.speed
 
         def expected(step: Array) -> Complex:
-            of = machine.moved(step)
-            H = of.transfer(np.array([W]), W, self.response.rate_hz)[0]
-            return np.asarray(H @ self.V + of.forced(W, of.shapes) @ u[: machine.shapes.shape[1]])
+            moved = machine.moved(step)
+            H = moved.transfer(np.array([W]), W, self.response.rate_hz)[0]
+            return np.asarray(H @ self.V + moved.forced(W, moved.shapes) @ u[: machine.shapes.shape[1]])
 
         slopes = [0.5 * (expected(s) - expected(-s)) for s in machine.steps]
         return np.column_stack([_real(x) for x in slopes]) if slopes else np.zeros((2 * self.left.size, 0))
@@ -286,11 +286,11 @@ def _real_rows(X: Complex) -> Array:
 
 def _block(halves: Sequence[Array]) -> Array:
     size = sum(h.shape[0] for h in halves)
-    found, at = np.zeros((size, size)), 0
+    matrix, at = np.zeros((size, size)), 0
     for h in halves:
-        found[at : at + h.shape[0], at : at + h.shape[0]] = h @ h.T
+        matrix[at : at + h.shape[0], at : at + h.shape[0]] = h @ h.T
         at += h.shape[0]
-    return found
+    return matrix
 
 
 def _spread(half: Array) -> float:
@@ -364,21 +364,21 @@ def balance_rotor(
     `clearance`: radius in m within which the rotor may move.
     """
     marked = [t for t in turned if t.response.rotation.marked]
-    used = marked or [max(turned, key=lambda t: abs(t.response.speed))]
-    u = estimate_unbalance(machine, [t.response for t in used], runout=runout)
+    runs = marked or [max(turned, key=lambda t: abs(t.response.speed))]
+    u = estimate_unbalance(machine, [t.response for t in runs], runout=runout)
     planes = machine.planes
-    found: dict[str, Any] = {
+    document: dict[str, Any] = {
         "records": [_record(machine.model, t, clearance) for t in turned],
-        "used": [t.record for t in used],
-        "unbalance": _unbalance(machine, u, max(abs(t.response.speed) for t in used)),
+        "used": [t.record for t in runs],
+        "unbalance": _unbalance(machine, u, max(abs(t.response.speed) for t in runs)),
         "runout": {place: u.entry(place) for place in read_by(machine.model) if place in u.names},
         "misfit": u.misfit, "freedom": u.freedom,
     }  # fmt: skip
-    unseen = [p for p in planes if not found["unbalance"]["planes"][p]["identifiable"]]
-    found["hint"] = _hint(unseen, u, machine, marked=bool(marked), records=len(used))
+    unseen = [p for p in planes if not document["unbalance"]["planes"][p]["identifiable"]]
+    document["hint"] = _hint(unseen, u, machine, marked=bool(marked), records=len(runs))
     if not unseen:
-        found |= _proposal(machine, used, u)
-    return found
+        document |= _proposal(machine, runs, u)
+    return document
 
 
 def _record(model: RotorModel, t: Turned, clearance: float | None) -> dict[str, Any]:
@@ -419,7 +419,7 @@ def _unbalance(machine: Machine, u: Unbalance, speed: float) -> dict[str, Any]:
     n, z = len(planes), np.array([machine.z(p) for p in planes])
     static = polar(complex(value.sum()), _through(np.ones((1, n), dtype=complex), half))
     static["grade_mm_s"] = 1e3 * static["value"] * speed / machine.theta["m"]
-    found: dict[str, Any] = {
+    entry: dict[str, Any] = {
         "planes": {p: {"z": float(z[k]), **u.entry(p)} for k, p in enumerate(planes)},
         "static": static,
         "modes": {name: u.entry(name) for name in u.names if name.startswith("mode")},
@@ -429,18 +429,18 @@ def _unbalance(machine: Machine, u: Unbalance, speed: float) -> dict[str, Any]:
         at = complex(z @ value / value.sum())
         spread = _through(((z - at) / value.sum())[None, :], half)
         sd = [float(np.linalg.norm(row)) for row in spread]
-        found["one_plane"] = {"z": at.real, "sd": sd[0], "fits": bool(abs(at.imag) < _ONE_PLANE * sd[1])}
-    return found
+        entry["one_plane"] = {"z": at.real, "sd": sd[0], "fits": bool(abs(at.imag) < _ONE_PLANE * sd[1])}
+    return entry
 
 
-def _proposal(machine: Machine, used: Sequence[Turned], u: Unbalance) -> dict[str, Any]:
+def _proposal(machine: Machine, runs: Sequence[Turned], u: Unbalance) -> dict[str, Any]:
     """Return influence coefficients, and the masses that leave least vibration, with what they leave."""
     model, planes, sensors = machine.model, machine.planes, read_by(machine.model)
     rows = [k for k in range(len(model.sensors)) if any(x[k] for x in sensors.values())]
     free = [place for place in sensors if place in u.names]
     n = len(u.names) - len(free)
     moved, influence, roles = [], [], []
-    for t in used:
+    for t in runs:
         loop = t.loop(machine)
         if loop is None:  # a rigid rotor is balanced whatever holds it, by as much as is known
             opposite = {p: polar(-complex(u.value[j]), u.part([p])[1]) for j, p in enumerate(planes)}
@@ -547,17 +547,17 @@ def balance_by_trials(
     """
     runs = [base, *(run for run, _, _ in trials.values())]
     if any(abs(run["speed"] / base["speed"] - 1.0) > _SAME_SPEED for run in runs):
-        said = ", ".join(f"{run['speed'] * 30.0 / np.pi:.5g}" for run in runs)
+        speeds_text = ", ".join(f"{run['speed'] * 30.0 / np.pi:.5g}" for run in runs)
         raise EstimationError(
-            f"the runs are at {said} rpm; influence holds at one speed. Repeat them at the same speed"
+            f"the runs are at {speeds_text} rpm; influence holds at one speed. Repeat them at the same speed"
         )
     roles = [x for x in base["response"] if "_position" in x and all(x in run["response"] for run in runs)]
     if not roles:
         raise EstimationError("the runs have no position in common. Take them with the same sensors")
     weights = np.array([size * np.exp(1j * phase) for _, size, phase in trials.values()])
-    seen = [[run["response"][role] for role in roles] for run in runs]
-    Y = np.array([[x["amplitude"][0] * np.exp(1j * x["phase"][0]) for x in row] for row in seen])
-    sd = np.array([[x["sd"][0] for x in row] for row in seen])
+    responses = [[run["response"][role] for role in roles] for run in runs]
+    Y = np.array([[x["amplitude"][0] * np.exp(1j * x["phase"][0]) for x in row] for row in responses])
+    sd = np.array([[x["sd"][0] for x in row] for row in responses])
 
     def solve(Y: Complex) -> tuple[Complex, Complex, Complex]:
         A = ((Y[1:] - Y[0]) / weights[:, None]).T

@@ -45,16 +45,16 @@ class Numbers:
 def numbers_of(fit: Ending) -> Numbers:
     """Return numbers and covariance by the names of the model."""
     unknowns, point = fit.unknowns, fit.point
-    named, chain = unknowns.chain(fit.vector)
+    names, chain = unknowns.chain(fit.vector)
     roles = [f"{role}.delay" for role in unknowns.model.inputs]
-    keep = [*range(len(named)), *(len(named) + k for k in unknowns.free_delays)]
+    keep = [*range(len(names)), *(len(names) + k for k in unknowns.free_delays)]
     data = fit.seen
     half = chain[keep] @ data.root()
     last = data.Vt[-1] if data.Vt.size else np.zeros(0)
     heavy = np.argsort(-np.abs(last))[:4]
     return Numbers(
         theta=point.theta,
-        names=(*named, *(roles[k] for k in unknowns.free_delays)),
+        names=(*names, *(roles[k] for k in unknowns.free_delays)),
         covariance=half @ half.T,
         weakest={unknowns.names[k]: float(last[k]) for k in heavy},
         condition=data.condition,
@@ -94,8 +94,8 @@ def conclude(
 ) -> RotorEstimate:
     """Return the estimate of a search; `delay_how`: by input, "given" or "estimated"."""
     numbers, model = numbers_of(fit), fit.model
-    found = _parameters(model, parameters, numbers)
-    checks = {**evidence.checks, "identifiable": _identifiable(found, numbers), **more_checks}
+    estimated = _parameters(model, parameters, numbers)
+    checks = {**evidence.checks, "identifiable": _identifiable(estimated, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)
     turned = model.at_speed(speed)
     modes, above = _modes(model, numbers, fit.band_hz)
@@ -105,7 +105,7 @@ def conclude(
         method=evidence.method,
         record=records[0],
         records=tuple(records),
-        parameters=found,
+        parameters=estimated,
         modes=modes,
         plant=turned,
         numbers={p.name: numbers.theta[p.name] for p in turned.parameters},
@@ -124,16 +124,18 @@ def conclude(
 
 def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Numbers) -> tuple[EstimatedParameter, ...]:
     sizes = model.references(numbers.theta)
-    found = []
+    estimated = []
     for p in parameters:
         sd = numbers.sd(p.name)
         value = numbers.theta[p.name]
         size = sizes.get(p.name, abs(value))
-        seen = {p.name: p.role == "fixed" or bool(sd <= _LENGTH_SEEN * size)}
+        shows = {p.name: p.role == "fixed" or bool(sd <= _LENGTH_SEEN * size)}
         # of independent information 1/sd² = 1/alone² + 1/prior²
         left = max(1.0 - (sd / p.sd) ** 2, 1e-12) if p.role == "prior" and p.sd else 1.0
-        found.append(EstimatedParameter.of(p, numbers.theta, {p.name: sd}, seen, {p.name: sd / float(np.sqrt(left))}))
-    return tuple(found)
+        estimated.append(
+            EstimatedParameter.of(p, numbers.theta, {p.name: sd}, shows, {p.name: sd / float(np.sqrt(left))})
+        )
+    return tuple(estimated)
 
 
 def _delays(model: RotorModel, delays: Array, numbers: Numbers, how: Sequence[str]) -> dict[str, Delay]:
@@ -147,7 +149,7 @@ def _delays(model: RotorModel, delays: Array, numbers: Numbers, how: Sequence[st
 
 def _modes(model: RotorModel, numbers: Numbers, band: tuple[float, float]) -> tuple[tuple[Mode, ...], tuple[int, ...]]:
     """Return the modes within the band, and which stand above it."""
-    found, above = [], []
+    modes, above = [], []
     for r in range(1, model.n_modes + 1):
         f = numbers.theta[f"mode{r}.omega"] / (2.0 * np.pi)
         if not f <= band[1]:
@@ -157,14 +159,14 @@ def _modes(model: RotorModel, numbers: Numbers, band: tuple[float, float]) -> tu
             place: EstimatedNumber.of(numbers.theta[f"mode{r}.{place}"], numbers.sd(f"mode{r}.{place}"))
             for place in model.places
         }
-        found.append(
+        modes.append(
             Mode(
                 frequency_hz=EstimatedNumber.of(f, numbers.sd(f"mode{r}.omega") / (2.0 * np.pi)),
                 damping=EstimatedNumber.of(numbers.theta[f"mode{r}.zeta"], numbers.sd(f"mode{r}.zeta")),
                 shape=shape,
             )
         )
-    return tuple(found), tuple(above)
+    return tuple(modes), tuple(above)
 
 
 def _noise(fit: RotorFit) -> dict[str, float]:
@@ -179,8 +181,8 @@ def _fits(fit: RotorFit) -> dict[str, OutputFit]:
     """Return by output how much of the excited lines the model explains, over all experiments."""
     left, whole = np.zeros(len(fit.model.outputs)), np.zeros(len(fit.model.outputs))
     for e in fit.problem.experiments:
-        of = sampled(e, fit.model, fit.point)
-        difference = e.spectra.mean_y - np.einsum("kyu,ku->ky", of.transfer(), e.spectra.mean_u)
+        response = sampled(e, fit.model, fit.point)
+        difference = e.spectra.mean_y - np.einsum("kyu,ku->ky", response.transfer(), e.spectra.mean_u)
         left += np.sum(np.abs(difference) ** 2, axis=0)
         whole += np.sum(np.abs(e.spectra.mean_y) ** 2, axis=0)
     rms = np.sqrt(2.0 * left / len(fit.problem.experiments))
@@ -246,9 +248,9 @@ def line_checks(
     }  # fmt: skip
 
 
-def _identifiable(found: Sequence[EstimatedParameter], numbers: Numbers) -> Check:
+def _identifiable(estimated: Sequence[EstimatedParameter], numbers: Numbers) -> Check:
     """Name what the data do not show, and the experiment that would."""
-    unseen = [p.name for p in found if not p.identifiable]
+    unseen = [p.name for p in estimated if not p.identifiable]
     if not unseen:
         return Check(passed=True, detail="the data show all parameters", values={"condition": numbers.condition})
     return Check(
@@ -274,17 +276,17 @@ def _hint(unseen: Sequence[str]) -> str:
 
 def _mode_checks(modes: Sequence[Mode], above: Sequence[int]) -> dict[str, Check]:
     """Judge the modes within the band."""
-    found: dict[str, Check] = {}
+    checks: dict[str, Check] = {}
     weak = [m for m in modes if not m.identifiable]
     if modes:
         names = ", ".join(f"{m.frequency_hz.value:.5g} Hz" for m in weak)
-        found["modes"] = Check(
+        checks["modes"] = Check(
             passed=not weak,
             detail=f"bending modes at {', '.join(f'{m.frequency_hz.value:.5g}' for m in modes)} Hz" if not weak else
             f"the data hardly show the bending mode at {names}. Excite around it, or set modes.count",
             values={"above_band": float(len(above))},
         )  # fmt: skip
-    return found
+    return checks
 
 
 def experiments_hint(experiments: Sequence[Experiment], model: RotorModel) -> str | None:

@@ -137,7 +137,7 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
     @property
     def mode_parameters(self) -> tuple[EstimatedParameter, ...]:
         """Frequency and damping of each bending mode as parameters, ``mode1.frequency_hz``, ``mode1.damping`` …"""
-        named = [
+        entries = [
             (f"mode{r}.{what}", unit, number)
             for r, m in enumerate(self.modes, 1)
             for what, unit, number in (("frequency_hz", "Hz", m.frequency_hz), ("damping", "1", m.damping))
@@ -146,7 +146,7 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
             EstimatedParameter(
                 name=name, unit=unit, value=x.value, sd=x.sd, ci95=x.ci95, role="free", identifiable=x.identifiable
             )
-            for name, unit, x in named
+            for name, unit, x in entries
         )
 
     def dumps(self) -> str:
@@ -169,12 +169,12 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
         -------
         ndarray, shape (n, n), SI
         """
-        found = np.zeros((len(names), len(names)))
+        matrix = np.zeros((len(names), len(names)))
         at = {name: k for k, name in enumerate(self.covariance_names)}
-        known = [k for k, name in enumerate(names) if name in at]
-        index = [at[names[k]] for k in known]
-        found[np.ix_(known, known)] = self.covariance[np.ix_(index, index)]
-        return found
+        rows = [k for k, name in enumerate(names) if name in at]
+        index = [at[names[k]] for k in rows]
+        matrix[np.ix_(rows, rows)] = self.covariance[np.ix_(index, index)]
+        return matrix
 
 
 def rotor_estimate_from_json(document: Mapping[str, Any], where: str) -> RotorEstimate:
@@ -182,19 +182,19 @@ def rotor_estimate_from_json(document: Mapping[str, Any], where: str) -> RotorEs
     check_schema(document, SCHEMA, where, "an estimate", "identify")
 
     def read() -> RotorEstimate:
-        found = read_as(RotorEstimate, covariance_apart(document))
-        size = len(found.covariance_names)
-        if found.covariance.shape != (size, size):
+        estimate = read_as(RotorEstimate, covariance_apart(document))
+        size = len(estimate.covariance_names)
+        if estimate.covariance.shape != (size, size):
             raise ValueError("the covariance is not of the numbers")
-        if found.continuous.A.shape != (len(found.continuous.states),) * 2:
+        if estimate.continuous.A.shape != (len(estimate.continuous.states),) * 2:
             raise ValueError("the continuous plant is not of its states' size")
-        for spec in found.plant.parameters:
-            if spec.name not in found.numbers:
+        for spec in estimate.plant.parameters:
+            if spec.name not in estimate.numbers:
                 raise ValueError(f"numbers.{spec.name} is missing")
-            if spec.positive and not found.numbers[spec.name] > 0.0:
+            if spec.positive and not estimate.numbers[spec.name] > 0.0:
                 raise ValueError(f"numbers.{spec.name} is not positive")
-        if any(p.sd < 0 for p in found.parameters):
+        if any(p.sd < 0 for p in estimate.parameters):
             raise EstimationError("a standard deviation is negative")
-        return found
+        return estimate
 
     return read_whole(read, where, "estimate", "identify")

@@ -180,8 +180,8 @@ class _Work:
         for _ in range(2):  # the weights follow the scatter at the model
             weights = [rough_weight(e, model, at, relative) for e in experiments]
             problem = self.problem(experiments, model, at, weights)
-            at, found = minimise(problem, at, most=most, tolerance=1e-3)
-            cost = found.cost / problem.n_real
+            at, end = minimise(problem, at, most=most, tolerance=1e-3)
+            cost = end.cost / problem.n_real
         return at, cost
 
     def start(self, ordered: Sequence[Experiment]) -> tuple[RotorModel, Point]:
@@ -206,8 +206,8 @@ class _Work:
             band = [e.between(0.0, edge * (1.0 + 1e-9)) for e in experiments]
             for eddy in eddies:
                 start = rigid_start(band[0], self.model, self.parameters, eddy=eddy)
-                known = [s if d is None else d for d, s in zip(self.delays, start.delays, strict=True)]
-                start = replace(start, delays=np.array(known, dtype=np.float64))
+                delays = [s if d is None else d for d, s in zip(self.delays, start.delays, strict=True)]
+                start = replace(start, delays=np.array(delays, dtype=np.float64))
                 at, cost = self.rough(band, self.model, start, most=8)
                 if np.isfinite(cost):
                     tried.append((edge, cost, at))
@@ -231,14 +231,14 @@ class _Work:
             at, cost = self.rough(band, model, at)
             while cost > _FITS:
                 weight = rough_weight(band[0], model, at, _RELATIVE)
-                found = self.missing(band[0], model, at, weight, _ABOVE, last)
-                if found is None:
+                missing = self.missing(band[0], model, at, weight, _ABOVE, last)
+                if missing is None:
                     break
-                unclear = found.gain < _CLEAR * cost * 2 * band[0].spectra.mean_y.size
-                if unclear and self._sensors(band, model, at, [weight]) > found.gain:
+                unclear = missing.gain < _CLEAR * cost * 2 * band[0].spectra.mean_y.size
+                if unclear and self._sensors(band, model, at, [weight]) > missing.gain:
                     break
                 more = model.with_modes(model.n_modes + 1)
-                trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
+                trial = replace(at, theta=_with_mode(at.theta, more, missing.named(more.n_modes)))
                 trial, lower = self.rough(band, more, trial)
                 if not lower < 0.9 * cost:
                     break
@@ -267,11 +267,11 @@ class _Work:
         spectra, n_real = slowest.spectra, sum(2 * e.spectra.mean_y.size for e in experiments)
         price *= float(np.log(n_real)) * (3 + len(model.places))
         weight, last = rough_weight(slowest, model, at, _REFINED), float(spectra.frequency_hz.max())
-        found = self.missing(slowest, model, at, weight, _ABOVE, last)
-        if found is None or found.gain < price:
+        missing = self.missing(slowest, model, at, weight, _ABOVE, last)
+        if missing is None or missing.gain < price:
             return None
         more = model.with_modes(model.n_modes + 1)
-        trial = replace(at, theta=_with_mode(at.theta, more, found.named(more.n_modes)))
+        trial = replace(at, theta=_with_mode(at.theta, more, missing.named(more.n_modes)))
         try:
             trial, lower = self.rough(experiments, more, trial, relative=_REFINED)
         except np.linalg.LinAlgError:  # ran off
@@ -306,8 +306,8 @@ class _Work:
         whole = self._whole(fit)
         if whole is not None:
             delays = tuple(float(x) for x in whole)
-            held = replace(self, delays=delays)
-            fit = held.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)), fit)
+            settled = replace(self, delays=delays)
+            fit = settled.likely(experiments, fit.model, replace(fit.point, delays=np.array(delays)), fit)
         return fit
 
     def likely(
@@ -316,15 +316,15 @@ class _Work:
         """Search with the noise model, which follows it, and correct for feedback; `before`: at a point nearby."""
         self.tick("fit", 0.0)
         converged, cost = False, np.inf if before is None else before.cost
-        known: Sequence[Weight | None] = [None] * len(experiments) if before is None else before.problem.weights
+        earlier: Sequence[Weight | None] = [None] * len(experiments) if before is None else before.problem.weights
         for k in range(3):
-            weights = [noise_weight(e, model, at, w) for e, w in zip(experiments, known, strict=True)]
-            known = weights
+            weights = [noise_weight(e, model, at, w) for e, w in zip(experiments, earlier, strict=True)]
+            earlier = weights
             problem = self.problem(experiments, model, at, weights)
             self.tick("fit", 0.3 * (k + 1))
-            at, found = minimise(problem, at, most=40, tolerance=1e-7)
-            changed = abs(found.cost / cost - 1.0) if np.isfinite(cost) else np.inf
-            converged, cost = found.converged, found.cost
+            at, end = minimise(problem, at, most=40, tolerance=1e-7)
+            changed = abs(end.cost / cost - 1.0) if np.isfinite(cost) else np.inf
+            converged, cost = end.converged, end.cost
             if changed < 1e-3:
                 break
         v, triangle, last = problem.corrected(problem.pack(at))
@@ -341,12 +341,12 @@ class _Work:
         slowest = _slowest(experiments)
         e = _together(slowest)
         w = Weight(whiten=np.concatenate([w.whiten for w in fit.problem.weights[: len(slowest)]]))
-        found = self.missing(e, fit.model, fit.point, w, _FAR_ABOVE, float(e.spectra.frequency_hz.max()))
+        missing = self.missing(e, fit.model, fit.point, w, _FAR_ABOVE, float(e.spectra.frequency_hz.max()))
         price = np.log(fit.problem.n_real) * (3 + len(fit.model.places))
-        if found is None or found.gain < max(price, sensor_gain(fit.problem, fit.vector)):
+        if missing is None or missing.gain < max(price, sensor_gain(fit.problem, fit.vector)):
             return None
         more = fit.model.with_modes(fit.model.n_modes + 1)
-        theta = _with_mode(fit.point.theta, more, found.named(more.n_modes))
+        theta = _with_mode(fit.point.theta, more, missing.named(more.n_modes))
         try:
             trial = self.likely(experiments, *_in_order(more, replace(fit.point, theta=theta)), fit)
         except np.linalg.LinAlgError:  # ran off
@@ -378,17 +378,17 @@ class _Work:
         Where as many modes as the rig says are within the excited band, up to `last` Hz, only those above are sought:
         they stand for the rest of the shaft.
         """
-        known = [at.theta[f"mode{r}.omega"] / (2.0 * np.pi) for r in range(1, model.n_modes + 1)]
+        frequencies = [at.theta[f"mode{r}.omega"] / (2.0 * np.pi) for r in range(1, model.n_modes + 1)]
         low, high = float(e.spectra.frequency_hz.min()), above * float(e.spectra.frequency_hz.max())
-        if self.modes.count is not None and sum(f <= last for f in known) >= self.modes.count:
+        if self.modes.count is not None and sum(f <= last for f in frequencies) >= self.modes.count:
             low = max(low, _BESIDE * last)
         if low >= high or model.n_modes >= _MOST_MODES:
             return None
         for f in self.modes.frequency_hz:
-            if low <= f <= high and not any(f / _BESIDE < x < f * _BESIDE for x in known):
-                found = scan(e, model, at, weight, (f / _BESIDE, f * _BESIDE))
-                if found is not None:
-                    return found
+            if low <= f <= high and not any(f / _BESIDE < x < f * _BESIDE for x in frequencies):
+                candidate = scan(e, model, at, weight, (f / _BESIDE, f * _BESIDE))
+                if candidate is not None:
+                    return candidate
         return scan(e, model, at, weight, (low, high))
 
 
@@ -403,10 +403,10 @@ def _together(experiments: Sequence[Experiment]) -> Experiment:
     return replace(experiments[0], spectra=joined([e.spectra for e in experiments]))
 
 
-def _with_mode(theta: Mapping[str, float], model: RotorModel, named: Mapping[str, float]) -> dict[str, float]:
+def _with_mode(theta: Mapping[str, float], model: RotorModel, numbers: Mapping[str, float]) -> dict[str, float]:
     """Return the numbers with those of one more mode; gyroscopic terms with others begin at zero."""
     missing = {p.name: 0.0 for p in model.mode_parameters if p.name not in theta}
-    return {**theta, **missing, **{n: x for n, x in named.items() if n in missing}}
+    return {**theta, **missing, **{n: x for n, x in numbers.items() if n in missing}}
 
 
 def _in_order(model: RotorModel, at: Point) -> tuple[RotorModel, Point]:

@@ -80,11 +80,11 @@ def rough_weight(experiment: Experiment, model: RotorModel, at: Point, relative:
 
 def noise_weight(experiment: Experiment, model: RotorModel, at: Point, before: Weight | None = None) -> Weight:
     """Return weights by the noise model, with the feedback; `before`: those at a point nearby."""
-    of, spectra = sampled(experiment, model, at), experiment.spectra
-    beside, H = sampled(experiment, model, at, between=True), of.transfer()
-    noise = fit_noise(spectra.between, beside, of, None if before is None else before.noise)
+    at_lines, spectra = sampled(experiment, model, at), experiment.spectra
+    between, H = sampled(experiment, model, at, between=True), at_lines.transfer()
+    noise = fit_noise(spectra.between, between, at_lines, None if before is None else before.noise)
     factor = np.linalg.cholesky(noise.covariance / spectra.n_periods)
-    back = feedback(spectra, H, beside.transfer(), measured=not all(of.held))
+    back = feedback(spectra, H, between.transfer(), measured=not all(at_lines.held))
     return Weight(whiten=np.linalg.inv(factor).astype(np.complex128), back=back, noise=noise)
 
 
@@ -123,8 +123,8 @@ class Likelihood:
                 parts = [2.0 * float(np.sum(np.abs(e) ** 2)) for e in self.residuals(theta)]
             except np.linalg.LinAlgError:
                 return np.inf
-        found = sum(parts) + float(np.sum(self.unknowns.priors(theta)[1] ** 2))
-        return found if np.isfinite(found) else np.inf
+        total = sum(parts) + float(np.sum(self.unknowns.priors(theta)[1] ** 2))
+        return total if np.isfinite(total) else np.inf
 
     def triangle(self, theta: Array) -> Array:
         """Return the triangle of slopes and residuals."""
@@ -133,24 +133,24 @@ class Likelihood:
     def rows(self, v: Array, *, corrected: bool) -> list[Array]:
         """Return [J | r] of each experiment; `corrected`: slopes are those at inputs freed of what feedback put in."""
         at, model = self.point(v), self.unknowns.model
-        named, chain = self.unknowns.chain(v)
-        n_d = chain.shape[0] - len(named)
-        found = []
+        names, chain = self.unknowns.chain(v)
+        n_d = chain.shape[0] - len(names)
+        blocks = []
         for e, w in zip(self.experiments, self.weights, strict=True):
-            of, turned = sampled(e, model, at), model.at_speed(e.speed)
+            response, turned = sampled(e, model, at), model.at_speed(e.speed)
             mean = e.spectra.mean_u
-            left = e.spectra.mean_y - _applied(of.transfer(), mean)
+            left = e.spectra.mean_y - _applied(response.transfer(), mean)
             if corrected and w.back is not None:
                 mean = mean - _applied(w.back, left)
             of_turned = {p.name for p in turned.parameters}  # a record at rest shows no gyroscopic term
-            seen = [k for k, name in enumerate(named) if name in of_turned]
-            steps = [turned.derivative(at.theta, named[k]) for k in seen]
-            moved = chain[[*seen, *range(len(named), len(named) + n_d)]]
-            slopes = w.whiten @ (of.slopes(mean, steps, n_d) @ moved)
+            columns = [k for k, name in enumerate(names) if name in of_turned]
+            steps = [turned.derivative(at.theta, names[k]) for k in columns]
+            moved = chain[[*columns, *range(len(names), len(names) + n_d)]]
+            slopes = w.whiten @ (response.slopes(mean, steps, n_d) @ moved)
             r = _whitened(w, left)
             block = np.concatenate([slopes, r[:, :, None]], axis=2).reshape(-1, chain.shape[1] + 1)
-            found.append(_ROOT_2 * np.concatenate([block.real, block.imag]))
-        return found
+            blocks.append(_ROOT_2 * np.concatenate([block.real, block.imag]))
+        return blocks
 
     def _prior_rows(self, v: Array) -> Array:
         slopes, left = self.unknowns.priors(v)
@@ -164,11 +164,11 @@ class Likelihood:
         length = np.inf
         for k in range(_CORRECTIONS):
             R = triangle_of([*self.rows(v, corrected=True), self._prior_rows(v)])
-            found = directions(R[:, :-1])
-            length = found.explain(R[:, -1])
+            axes = directions(R[:, :-1])
+            length = axes.explain(R[:, -1])
             if length < _SETTLED or k == _CORRECTIONS - 1:
                 break
-            moved = v + found.solve(R[:, -1]) * min(1.0, 10.0 / np.sqrt(length))
+            moved = v + axes.solve(R[:, -1]) * min(1.0, 10.0 / np.sqrt(length))
             if not np.isfinite(self.cost(moved)):
                 break
             v = moved
@@ -184,10 +184,8 @@ def minimise(
     problem: Likelihood, at: Point, *, most: int = 40, tolerance: float = 1e-6, damping: float = 1e-3
 ) -> tuple[Point, Found]:
     """Search from a point; return where it ended."""
-    found = search(
-        problem, problem.pack(at), most=most, tolerance=tolerance, damping=damping, settled=1e-3, longest=1.0
-    )
-    return problem.point(found.theta), found
+    end = search(problem, problem.pack(at), most=most, tolerance=tolerance, damping=damping, settled=1e-3, longest=1.0)
+    return problem.point(end.theta), end
 
 
 def _applied(H: Complex, U: Complex) -> Complex:

@@ -79,7 +79,7 @@ def scan(
                 best = float(gains[k]), float(omega[middle[k]]), zeta, split, products[k]
     if best is None or not best[0] > 0.0:
         return None
-    gain, seen, zeta, split, product = best
+    gain, omega_of_mode, zeta, split, product = best
     U, size, Vt = np.linalg.svd(product)  # (n_sensors, n_bearings)
     shape_b, shape_s = Vt[0] * np.sqrt(size[0]), U[:, 0] * np.sqrt(size[0])
     at_b, at_s = places
@@ -87,11 +87,11 @@ def scan(
     for b, x in zip(at_b, shape_b, strict=True):
         axis = next(j for j, (bearing, plane) in enumerate(model.placed) if f"{bearing.name}.z" == b and plane < 2)
         pulled += at.theta[f"{model.axes[axis]}.k_x"] * x**2
-    own = seen**2 - pulled
-    own = own if 0.5 * seen**2 < own < 2.0 * seen**2 else seen**2
+    own = omega_of_mode**2 - pulled
+    own = own if 0.5 * omega_of_mode**2 < own < 2.0 * omega_of_mode**2 else omega_of_mode**2
     return Candidate(
         omega=float(np.sqrt(own)), zeta=float(np.clip(zeta, *_START_DAMPING)),
-        gyro=split * seen / abs(experiment.speed) if turning else 0.0,
+        gyro=split * omega_of_mode / abs(experiment.speed) if turning else 0.0,
         bearings=dict(zip(at_b, shape_b.tolist(), strict=True)), sensors=dict(zip(at_s, shape_s.tolist(), strict=True)),
         gain=gain,
     )  # fmt: skip
@@ -102,9 +102,9 @@ def _motions(
 ) -> tuple[list[_Motion], tuple[Sequence[str], Sequence[str]]]:
     """Return residuals and forces by direction of whirl, and the places of bearings and sensors."""
     spectra, turned = experiment.spectra, model.at_speed(experiment.speed)
-    of = sampled(experiment, model, at)
-    x = of.states(spectra.mean_u)
-    left = spectra.mean_y - x @ of.space.C.T
+    response = sampled(experiment, model, at)
+    x = response.states(spectra.mean_u)
+    left = spectra.mean_y - x @ response.space.C.T
     variance = np.real(
         np.diagonal(np.linalg.inv(np.conj(np.swapaxes(weight.whiten, 1, 2)) @ weight.whiten), axis1=1, axis2=2)
     )

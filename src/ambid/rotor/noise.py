@@ -45,13 +45,13 @@ def residuals(spectra: PeriodSpectra, H: Complex) -> Complex:
     return np.asarray(spectra.Y - np.einsum("kyu,pku->pky", H, spectra.U))
 
 
-def fit_noise(between: Between, beside: Sampled, sampled: Sampled, before: Noise | None = None) -> Noise:
+def fit_noise(between: Between, response_between: Sampled, sampled: Sampled, before: Noise | None = None) -> Noise:
     """Return the noise at a model: levels by maximum likelihood between the lines, covariance at each line.
 
-    `beside`, `sampled`: the model between the lines and at them; `before`: at a model nearby.
+    `response_between`, `sampled`: the model between the lines and at them; `before`: at a model nearby.
     """
-    e = between.Y - (beside.transfer() @ between.U[:, :, None])[:, :, 0]
-    g = _sources(beside)  # (n_between, n_y, n_sources)
+    e = between.Y - (response_between.transfer() @ between.U[:, :, None])[:, :, 0]
+    g = _sources(response_between)  # (n_between, n_y, n_sources)
     power = np.real(np.einsum("kij,kij->kj", g.conj(), g))
     pulled = np.abs(np.einsum("kis,ki->ks", g.conj(), e)) ** 2 / np.maximum(power, 1e-300) ** 2
     alone = np.maximum(np.median(pulled, axis=0) / 2.0, 1e-300)
@@ -60,11 +60,11 @@ def fit_noise(between: Between, beside: Sampled, sampled: Sampled, before: Noise
     for _ in range(_STEPS):
         back = np.linalg.solve(_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
         back, whitened = back[:, :, :-1], back[:, :, -1]
-        seen = np.sum(np.abs(np.einsum("kis,ki->ks", g.conj(), whitened)) ** 2, axis=0)
+        power_of_sources = np.sum(np.abs(np.einsum("kis,ki->ks", g.conj(), whitened)) ** 2, axis=0)
         products = np.conj(np.swapaxes(g, 1, 2)) @ back
         present = np.real(np.einsum("kss->s", products))
         information = np.sum(np.abs(products) ** 2, axis=0) * np.outer(levels, levels)
-        step = least_squares(information + 1e-9 * np.diag(np.diag(information)), levels * (seen - present))
+        step = least_squares(information + 1e-9 * np.diag(np.diag(information)), levels * (power_of_sources - present))
         step = np.clip(step, -2.0, 2.0)
         levels = np.maximum(levels * np.exp(step), least)
         if float(np.max(np.abs(step) * (levels > 2.0 * least))) < _SETTLED:
@@ -83,16 +83,16 @@ def _covariance(g: Complex, levels: Array) -> Complex:
     return np.asarray((g * levels) @ np.conj(np.swapaxes(g, 1, 2)))
 
 
-def feedback(spectra: PeriodSpectra, H: Complex, beside: Complex, *, measured: bool) -> Complex | None:
+def feedback(spectra: PeriodSpectra, H: Complex, H_between: Complex, *, measured: bool) -> Complex | None:
     """Return Q(k), what goes with the residuals in the inputs, (n_lines, n_u, n_y); None: too few lines.
 
     K (or Q) is constant with a slope over as many neighbouring lines as its rows have unknowns, three equations for
-    each. `H`, `beside`: the model at the lines and between them; `measured`: some inputs are no commands of a
+    each. `H`, `H_between`: the model at the lines and between them; `measured`: some inputs are no commands of a
     controller.
     """
-    of = spectra.between
-    at, n_u, n_y = of.frequency_hz, of.U.shape[1], of.Y.shape[1]
-    y = of.Y - (beside @ of.U[:, :, None])[:, :, 0] if measured else of.Y
+    spectrum_between = spectra.between
+    at, n_u, n_y = spectrum_between.frequency_hz, spectrum_between.U.shape[1], spectrum_between.Y.shape[1]
+    y = spectrum_between.Y - (H_between @ spectrum_between.U[:, :, None])[:, :, 0] if measured else spectrum_between.Y
     window = _LINES_PER_UNKNOWN * 2 * n_y
     if window > at.size:
         return None
@@ -107,8 +107,8 @@ def feedback(spectra: PeriodSpectra, H: Complex, beside: Complex, *, measured: b
         near = slice(c - window // 2, c - window // 2 + window)
         run = (at[near] - at[c]) / np.ptp(at[near])
         x = y[near] / size
-        found = np.linalg.lstsq(np.hstack([x, x * run[:, None]]), -of.U[near], rcond=1e-10)[0]
-        K[j] = (found[:n_y] / size[:, None]).T
+        solution = np.linalg.lstsq(np.hstack([x, x * run[:, None]]), -spectrum_between.U[near], rcond=1e-10)[0]
+        K[j] = (solution[:n_y] / size[:, None]).T
     lines = spectra.frequency_hz
     every = np.stack([np.interp(lines, at[centres], x) for x in K.reshape(centres.size, -1).T], axis=1)
     smooth: Complex = np.asarray(every.reshape(lines.size, n_u, n_y), dtype=np.complex128)

@@ -96,10 +96,10 @@ class Searched:
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
         """Return the rotor's derivative by the chain rule."""
         v = self.vector(theta)
-        named, chain = self.unknowns.chain(v)
+        names, chain = self.unknowns.chain(v)
         at, _ = self.unknowns.unpack(v, self.base.theta, self.base.delays)
-        column = chain[: len(named), self.unknowns.names.index(parameter)]
-        parts = [(x, self.rotor.derivative(at, name)) for name, x in zip(named, column.tolist(), strict=True) if x]
+        column = chain[: len(names), self.unknowns.names.index(parameter)]
+        parts = [(x, self.rotor.derivative(at, name)) for name, x in zip(names, column.tolist(), strict=True) if x]
         A, B, E, C = (sum(x * getattr(d, which) for x, d in parts) for which in "ABEC")
         return StateSpace(A=A, B=B, E=E, C=C)
 
@@ -241,25 +241,25 @@ def _with_delays(fit: Fit, free: tuple[int, ...], problem_at: _ProblemAt, tick: 
     price = len(free) * float(np.log(fit.problem.n_used))
     if score_statistic(fit, loose, vector) < price:
         return fit
-    found = search(loose, vector, tick=tick)
-    if found.status == "failed" or not fit.criterion - found.criterion > price:
+    freed = search(loose, vector, tick=tick)
+    if freed.status == "failed" or not fit.criterion - freed.criterion > price:
         return fit
-    at = _point_of(found)
+    at = _point_of(freed)
     delays, whole = at.delays.copy(), np.round(at.delays)
-    sd = np.sqrt(np.diag(directions(found.J).inverse()))[loose.slices["fraction"]]
-    held = [k for k, s in zip(free, sd.tolist(), strict=True) if abs(delays[k] - whole[k]) < max(3.0 * s, _WHOLE)]
-    if not held:
-        return found
-    delays[held] = whole[held]
-    rest = [k for k in free if k not in held]
-    settled = search(*problem_at(rotor, replace(at, delays=delays), rest, found), tick=tick)
-    return settled if settled.criterion - found.criterion < price else found
+    sd = np.sqrt(np.diag(directions(freed.J).inverse()))[loose.slices["fraction"]]
+    near = [k for k, s in zip(free, sd.tolist(), strict=True) if abs(delays[k] - whole[k]) < max(3.0 * s, _WHOLE)]
+    if not near:
+        return freed
+    delays[near] = whole[near]
+    rest = [k for k in free if k not in near]
+    settled = search(*problem_at(rotor, replace(at, delays=delays), rest, freed), tick=tick)
+    return settled if settled.criterion - freed.criterion < price else freed
 
 
-def _late(u: Array, by: NDArray[np.intp]) -> Array:
+def _late(u: Array, delays: NDArray[np.intp]) -> Array:
     """Return inputs, each later by whole samples; before the first they stand still."""
     out = u.copy()
-    for j, k in enumerate(by.tolist()):
+    for j, k in enumerate(delays.tolist()):
         if k:
             out[k:, j], out[:k, j] = u[:-k, j], u[0, j]
     return out

@@ -55,8 +55,8 @@ class RotorReplay:
     def covariance(self) -> Complex:
         """Covariance of `left` by noise alone, (n_lines, n_y, n_y)."""
         spectra = self.experiment.spectra
-        beside = sampled(self.experiment, self.model, point_of(self.estimate), between=True)
-        return np.asarray(fit_noise(spectra.between, beside, self.sampled).covariance / spectra.n_periods)
+        between = sampled(self.experiment, self.model, point_of(self.estimate), between=True)
+        return np.asarray(fit_noise(spectra.between, between, self.sampled).covariance / spectra.n_periods)
 
     @cached_property
     def whitened(self) -> tuple[Complex, Array]:
@@ -72,17 +72,17 @@ def validation(runs: Sequence[RotorReplay]) -> tuple[dict[str, dict[str, Any]], 
 
     The tests allow for the estimate's own error: C_e + J P Jᴴ, with P its covariance.
     """
-    found: dict[str, dict[str, Any]] = {}
+    outcomes: dict[str, dict[str, Any]] = {}
     for k, role in enumerate(runs[0].model.outputs):
         left = sum(float(np.sum(np.abs(run.left[:, k]) ** 2)) for run in runs)
         whole = sum(float(np.sum(np.abs(run.experiment.spectra.mean_y[:, k]) ** 2)) for run in runs)
         noise = sum(float(np.sum(np.real(run.covariance[:, k, k]))) for run in runs)
-        found[role] = {
+        outcomes[role] = {
             "one_step": 1.0 - float(np.sqrt(left / max(whole, 1e-300))), "simulation": None,
             "innovation_rms": float(np.sqrt(2.0 * left / len(runs))), "over_noise": float(np.sqrt(left / noise)),
         }  # fmt: skip
     parts = [(run.experiment, *run.whitened) for run in runs]
-    return found, line_checks(runs[0].model.outputs, parts)
+    return outcomes, line_checks(runs[0].model.outputs, parts)
 
 
 def at_speed(estimate: RotorEstimate, speed: float) -> RotorModel:
@@ -103,16 +103,16 @@ def point_of(estimate: RotorEstimate) -> Point:
     return Point(theta=estimate.numbers, delays=np.array([d.samples + d.fraction for d in late]))
 
 
-def slopes(estimate: RotorEstimate, of: Sampled, model: RotorModel, U: Complex) -> Complex:
+def slopes(estimate: RotorEstimate, response: Sampled, model: RotorModel, U: Complex) -> Complex:
     """Return the derivative of H U by the numbers of the covariance, (n_lines, n_y, n); `U`: (n_lines, n_u)."""
-    known, late = {p.name for p in model.parameters}, [f"{role}.delay" for role in model.inputs]
-    named = [name for name in estimate.covariance_names if name in known]
-    found = of.slopes(U, [model.derivative(estimate.numbers, name) for name in named], len(late))
-    at = {name: k for k, name in enumerate([*named, *late])}
-    whole = np.zeros((*found.shape[:2], len(estimate.covariance_names)), dtype=complex)
+    names_of_model, late = {p.name for p in model.parameters}, [f"{role}.delay" for role in model.inputs]
+    names = [name for name in estimate.covariance_names if name in names_of_model]
+    rows = response.slopes(U, [model.derivative(estimate.numbers, name) for name in names], len(late))
+    at = {name: k for k, name in enumerate([*names, *late])}
+    whole = np.zeros((*rows.shape[:2], len(estimate.covariance_names)), dtype=complex)
     for k, name in enumerate(estimate.covariance_names):
         if name in at:
-            whole[:, :, k] = found[:, :, at[name]]
+            whole[:, :, k] = rows[:, :, at[name]]
     return whole
 
 

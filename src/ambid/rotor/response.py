@@ -157,12 +157,12 @@ class Sampled:
         if len(directions):
             moved = np.matmul(weights.transpose(1, 0, 2), d_A.transpose(1, 2, 0))  # (n, n_lines, n_directions)
             through[:, :, : len(directions)] += moved.transpose(1, 0, 2)
-        found = np.tensordot(through, left, axes=(1, 1)).transpose(0, 2, 1)
+        slopes_of_response = np.tensordot(through, left, axes=(1, 1)).transpose(0, 2, 1)
         x = modal @ V.T
         for k, direction in enumerate(directions):
             if np.any(direction.C):
-                found[:, :, k] += x @ direction.C.T
-        return np.asarray(found)
+                slopes_of_response[:, :, k] += x @ direction.C.T
+        return np.asarray(slopes_of_response)
 
 
 def _ramp(s: Complex, T: float) -> tuple[tuple[Complex, Complex], tuple[Complex, Complex]]:

@@ -138,14 +138,14 @@ def joined(spectra: Sequence[PeriodSpectra]) -> PeriodSpectra:
     first, n = spectra[0], min(s.n_periods for s in spectra)
     if len(spectra) == 1:
         return first
-    references, known = [s.R for s in spectra], [s.known_scatter for s in spectra if s.known_scatter is not None]
+    references, other = [s.R for s in spectra], [s.known_scatter for s in spectra if s.known_scatter is not None]
     logged = [r for r in references if r is not None]
     return PeriodSpectra(
         frequency_hz=np.concatenate([s.frequency_hz for s in spectra]),
         U=np.concatenate([s.U[-n:] for s in spectra], axis=1), Y=np.concatenate([s.Y[-n:] for s in spectra], axis=1),
         R=np.concatenate(logged) if len(logged) == len(references) else None, rate_hz=first.rate_hz,
         period=first.period, dropped=first.dropped, left_out_hz=np.concatenate([s.left_out_hz for s in spectra]),
-        known_scatter=(np.concatenate([k[0] for k in known]), np.concatenate([k[1] for k in known])) if known else None,
+        known_scatter=(np.concatenate([k[0] for k in other]), np.concatenate([k[1] for k in other])) if other else None,
         between=Between.of([s.between for s in spectra]),
     )  # fmt: skip
 
@@ -217,26 +217,26 @@ def _excitations(record: Record, model: LinearModel) -> list[Array]:
     return [record[role].values for role in (roles or model.inputs) if np.ptp(record[role].values) > 0.0]
 
 
-def period_spectra(record: Record, model: LinearModel, found: Excitation, speed: float = 0.0) -> PeriodSpectra:
+def period_spectra(record: Record, model: LinearModel, run: Excitation, speed: float = 0.0) -> PeriodSpectra:
     """Return the spectra of a record's periods at its excited lines, those beside harmonics of the speed left out.
 
     `speed`: rad/s.
     """
-    n, rate = found.period, record.rate_hz
+    n, rate = run.period, record.rate_hz
 
     def spectra(roles: Sequence[str]) -> Complex:
-        x = np.column_stack([record[role].values for role in roles])[found.first : found.first + found.count * n]
-        return np.fft.rfft(x.reshape(found.count, n, -1), axis=1) / n
+        x = np.column_stack([record[role].values for role in roles])[run.first : run.first + run.count * n]
+        return np.fft.rfft(x.reshape(run.count, n, -1), axis=1) / n
 
     U, Y = spectra(model.inputs), spectra(model.outputs)
-    named = references_of(model)
-    logged = [role for role in named if role in record]
-    R = np.zeros((U.shape[1], len(named)), dtype=complex)
+    references = references_of(model)
+    logged = [role for role in references if role in record]
+    R = np.zeros((U.shape[1], len(references)), dtype=complex)
     if logged:
-        R[:, [named.index(role) for role in logged]] = spectra(logged).mean(axis=0)
+        R[:, [references.index(role) for role in logged]] = spectra(logged).mean(axis=0)
     within = slice(1, (n + 1) // 2)
     clean = (R if logged else U.mean(axis=0))[None, within]
-    scatter = None if logged else np.var(U, axis=0, ddof=1)[within].sum(axis=1) / found.count
+    scatter = None if logged else np.var(U, axis=0, ddof=1)[within].sum(axis=1) / run.count
     lines = excited_lines(clean, scatter, least=LEAST_LINES)[0] + 1
     frequency: Array = np.asarray(lines * (rate / n), dtype=np.float64)
     near = beside_harmonics(frequency, speed / (2.0 * np.pi), rate / n)
@@ -248,8 +248,8 @@ def period_spectra(record: Record, model: LinearModel, found: Excitation, speed:
     keep = lines[~near]
     return PeriodSpectra(
         frequency_hz=frequency[~near], U=U[:, keep], Y=Y[:, keep], R=R[keep] if logged else None, rate_hz=rate,
-        period=n, dropped=found.first, left_out_hz=frequency[near],
-        between=_between(record, model, found, keep, speed / (2.0 * np.pi)),
+        period=n, dropped=run.first, left_out_hz=frequency[near],
+        between=_between(record, model, run, keep, speed / (2.0 * np.pi)),
     )  # fmt: skip
 
 
@@ -272,15 +272,15 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
     frequency: Array = np.arange(U.shape[0], dtype=np.float64) * (rate / n)
     half = max(2, U.shape[0] // 2000)
     n_x = len(model.sensors)
-    seen = np.max(smoothed(np.abs(Y[:, :n_x]) ** 2, half) / noise[:, :n_x], axis=1) > _CLEAR
+    visible = np.max(smoothed(np.abs(Y[:, :n_x]) ** 2, half) / noise[:, :n_x], axis=1) > _CLEAR
     logged = [role for role in references_of(model) if role in record]
     if logged:
         excited = smoothed(np.abs(spectra(logged)) ** 2, half).sum(axis=1)
-        seen &= excited > _FLOOR * np.max(excited[_FIRST_LINE:])
-    seen = smoothed(seen[:, None].astype(np.float64), half)[:, 0] > 1.0 - 1e-9  # no edge within reach
-    seen[:_FIRST_LINE] = False
-    seen &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
-    lines = np.flatnonzero(seen)
+        visible &= excited > _FLOOR * np.max(excited[_FIRST_LINE:])
+    visible = smoothed(visible[:, None].astype(np.float64), half)[:, 0] > 1.0 - 1e-9  # no edge within reach
+    visible[:_FIRST_LINE] = False
+    visible &= ~beside_harmonics(frequency, speed / (2.0 * np.pi), 3.0 * rate / n)
+    lines = np.flatnonzero(visible)
     if lines.size < LEAST_LINES:
         raise EstimationError(
             f"the record shows motion above its noise at {lines.size} lines; a rotor needs 20. Excite more, and more "
@@ -313,10 +313,10 @@ def _scatter(U: Complex, Y: Complex) -> Array:
 
 
 def _between(
-    record: Record, model: LinearModel, found: Excitation, lines: NDArray[np.intp], speed_hz: float
+    record: Record, model: LinearModel, excitation: Excitation, lines: NDArray[np.intp], speed_hz: float
 ) -> Between:
     """Return the spectra between the excited lines, thinned where they are many."""
-    count, n = found.count, found.period
+    count, n = excitation.count, excitation.period
     bins = (lines[:, None] * count + np.arange(1, count)).ravel()
     bins = bins[bins <= n * count // 2]  # none above half the rate, where the highest line may be
     frequency = np.asarray(bins * (record.rate_hz / (n * count)), dtype=np.float64)
@@ -325,7 +325,7 @@ def _between(
     bins, frequency = bins[clean][::every], frequency[clean][::every]
 
     def spectra(roles: Sequence[str]) -> Complex:
-        signals = (record[role].values[found.first : found.first + count * n] for role in roles)
+        signals = (record[role].values[excitation.first : excitation.first + count * n] for role in roles)
         stacked: Complex = np.stack([np.fft.rfft(x)[bins] for x in signals], axis=1)
         return stacked / (n * float(np.sqrt(count)))
 

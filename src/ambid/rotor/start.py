@@ -40,41 +40,41 @@ class _Seen:
     noise_i: Array
 
 
-def planes_known(model: RotorModel, known: Mapping[str, float]) -> dict[str, float]:
+def planes_known(model: RotorModel, values: Mapping[str, float]) -> dict[str, float]:
     """Return every plane of the rotor; a sensor's that is not known is taken to be its bearing's."""
-    found: dict[str, float] = {}
+    planes: dict[str, float] = {}
     for b in model.bearings:
         if b.axial:
             continue
-        found[f"{b.name}.z"] = z = known.get(f"{b.name}.z", 0.0)
+        planes[f"{b.name}.z"] = z = values.get(f"{b.name}.z", 0.0)
         for k in range(len(b.z_sensors)):
-            found[b.sensor_parameter(k)] = known.get(b.sensor_parameter(k), z)
-    return found
+            planes[b.sensor_parameter(k)] = values.get(b.sensor_parameter(k), z)
+    return planes
 
 
 def rigid_start(
     experiment: Experiment, model: RotorModel, parameters: Sequence[Parameter], *, eddy: float | None = None
 ) -> Point:
     """Return start values of the rigid rotor from one band of lines; values that are fixed or given are kept."""
-    known = {p.name: p.value for p in parameters if p.value is not None}
-    planes = planes_known(model, known)
+    values = {p.name: p.value for p in parameters if p.value is not None}
+    planes = planes_known(model, values)
     amplifiers = {
-        p.name: known.get(p.name, 1.0 if p.unit == "A/V" else np.pi * experiment.spectra.rate_hz)
+        p.name: values.get(p.name, 1.0 if p.unit == "A/V" else np.pi * experiment.spectra.rate_hz)
         for p in model.parameters
         if ".amplifier_" in p.name
     }
-    seen = _see(experiment.spectra, model, planes, amplifiers)
-    electric = {n: v for n, v in known.items() if n.split(".")[-1] in ("R", "L", "k_i")}
-    delays, coils = _coils(experiment.spectra, model, seen, electric)
+    motion = _see(experiment.spectra, model, planes, amplifiers)
+    electric = {n: v for n, v in values.items() if n.split(".")[-1] in ("R", "L", "k_i")}
+    delays, coils = _coils(experiment.spectra, model, motion, electric)
     theta = {**planes, **coils, **amplifiers}
     if "a" in model.extras:
-        theta["a"] = known.get("a", eddy or 2.0 * np.pi * 1000.0)
+        theta["a"] = values.get("a", eddy or 2.0 * np.pi * 1000.0)
     for name in model.extras:
         if name != "a":
             default = 1.0 if name.endswith(".gain") else np.pi * experiment.spectra.rate_hz
-            theta[name] = known.get(name, default)
-    theta |= _mechanics(model, seen, theta, known, experiment.speed, theta.get("a"))
-    return Point(theta={**theta, **known}, delays=delays)
+            theta[name] = values.get(name, default)
+    theta |= _mechanics(model, motion, theta, values, experiment.speed, theta.get("a"))
+    return Point(theta={**theta, **values}, delays=delays)
 
 
 def _see(
@@ -108,8 +108,8 @@ def _see(
             current[:, j], noise_i[:, j] = spectra.mean_u[:, j], spectra.scatter[0][:, j] / spectra.n_periods
             if j in model.amplified:
                 gain, pole = (amplifiers[f"{model.axes[j]}.amplifier_{q}"] for q in ("gain", "pole"))
-                made = gain * pole / (1j * spectra.omega + pole)
-                current[:, j], noise_i[:, j] = current[:, j] * made, noise_i[:, j] * np.abs(made) ** 2
+                response = gain * pole / (1j * spectra.omega + pole)
+                current[:, j], noise_i[:, j] = current[:, j] * response, noise_i[:, j] * np.abs(response) ** 2
     return _Seen(
         omega=spectra.omega, at_magnets=at, of_planes=of_planes, current=current, noise_x=noise_x, noise_i=noise_i
     )
@@ -121,73 +121,73 @@ def _sensor_place(model: RotorModel, row: int) -> str:
 
 
 def _coils(
-    spectra: PeriodSpectra, model: RotorModel, seen: _Seen, known: Mapping[str, float]
+    spectra: PeriodSpectra, model: RotorModel, motion: _Seen, values_of_rig: Mapping[str, float]
 ) -> tuple[Array, dict[str, float]]:
     """Return the delays in samples, and R, L, k_i of each coil; where there is none, k_i alone as a first guess."""
-    delays, found = np.zeros(len(model.axes)), dict[str, float]()
-    jw = 1j * seen.omega
-    x = seen.omega / spectra.rate_hz
-    held = np.sinc(x / (2.0 * np.pi)) * np.exp(-0.5j * x)  # fundamental of a voltage that is held
+    delays, coils = np.zeros(len(model.axes)), dict[str, float]()
+    jw = 1j * motion.omega
+    x = motion.omega / spectra.rate_hz
+    hold = np.sinc(x / (2.0 * np.pi)) * np.exp(-0.5j * x)  # fundamental of a voltage that is held
     for j, axis in enumerate(model.axes):
         if j not in model.coils:
-            found[f"{axis}.k_i"] = known.get(f"{axis}.k_i", 1.0)
+            coils[f"{axis}.k_i"] = values_of_rig.get(f"{axis}.k_i", 1.0)
             continue
-        terms = np.column_stack([seen.current[:, j], jw * seen.current[:, j], jw * seen.at_magnets[:, j]])
+        terms = np.column_stack([motion.current[:, j], jw * motion.current[:, j], jw * motion.at_magnets[:, j]])
         names = [f"{axis}.{q}" for q in ("R", "L", "k_i")]
         values, delay = np.array([1.0, 1e-2, 0.0]), 0.0
         for _ in range(_ROUNDS):
             tried: list[tuple[float, float, Array]] = []
             for delay in _DELAYS:
-                v = spectra.mean_u[:, j] * held * np.exp(-1j * x * delay)
+                v = spectra.mean_u[:, j] * hold * np.exp(-1j * x * delay)
                 weight = 1.0 / np.sqrt(
-                    (_RELATIVE * np.abs(v)) ** 2 + np.abs(values[0] + jw * values[1]) ** 2 * seen.noise_i[:, j]
-                    + (values[2] * seen.omega) ** 2 * seen.noise_x[:, j] + 1e-300
+                    (_RELATIVE * np.abs(v)) ** 2 + np.abs(values[0] + jw * values[1]) ** 2 * motion.noise_i[:, j]
+                    + (values[2] * motion.omega) ** 2 * motion.noise_x[:, j] + 1e-300
                 )  # fmt: skip
-                free = [k for k, name in enumerate(names) if name not in known]
-                rest = v - terms @ np.array([known.get(name, 0.0) for name in names])
-                got = np.array([known.get(name, 0.0) for name in names])
+                free = [k for k, name in enumerate(names) if name not in values_of_rig]
+                rest = v - terms @ np.array([values_of_rig.get(name, 0.0) for name in names])
+                got = np.array([values_of_rig.get(name, 0.0) for name in names])
                 if free:
                     got[free] = _real_solution(terms[:, free], rest, weight)
                 left = float(np.sum(np.abs((v - terms @ got) * weight) ** 2))
                 tried.append((left, float(delay), got))
             _, delay, values = min(tried, key=lambda t: t[0])
         delays[j] = delay
-        found |= {names[0]: max(values[0], 1e-3), names[1]: max(values[1], 1e-6), names[2]: values[2] or 1.0}
-    return delays, {n: float(v) for n, v in found.items()}
+        coils |= {names[0]: max(values[0], 1e-3), names[1]: max(values[1], 1e-6), names[2]: values[2] or 1.0}
+    return delays, {n: float(v) for n, v in coils.items()}
 
 
 def _mechanics(
     model: RotorModel,
-    seen: _Seen,
+    motion: _Seen,
     theta: Mapping[str, float],
-    known: Mapping[str, float],
+    own: Mapping[str, float],
     speed: float,
     eddy: float | None,
 ) -> dict[str, float]:
     """Return m, Id, Ip, z_cg and k_x from currents, motion and force factors."""
-    jw = 1j * seen.omega
-    pull = seen.current * (eddy / (jw + eddy))[:, None] if eddy else seen.current
+    jw = 1j * motion.omega
+    pull = motion.current * (eddy / (jw + eddy))[:, None] if eddy else motion.current
     k_i = np.array([theta[f"{axis}.k_i"] for axis in model.axes])
     force = pull * k_i
     radial = [p for p in model.planes if p < 2]
     rigid = ["m", *(["S", "J"] if radial else []), *(["Ip"] if model.turning and model.polar else [])]
     names = [*rigid, *(f"{axis}.k_x" for axis in model.axes)]
     column = {name: k for k, name in enumerate(names)}
-    free_force = [j for j in range(len(model.axes)) if j not in model.coils and f"{model.axes[j]}.k_i" not in known]
+    free_force = [j for j in range(len(model.axes)) if j not in model.coils and f"{model.axes[j]}.k_i" not in own]
     if free_force:  # only ratios to m are seen: with a mass the force factors follow
         names += [f"{model.axes[j]}.k_i" for j in free_force]
         column = {name: k for k, name in enumerate(names)}
         force = force.copy()
         force[:, free_force] = 0.0
-    mass = known.get("m", 1.0) if free_force else known.get("m")
+    mass = own.get("m", 1.0) if free_force else own.get("m")
     rows, right, weights = [], [], []
     reach = model.span(theta)
     for plane in model.planes:
         axes = [j for j in range(len(model.axes)) if model.placed[j][1] == plane]
-        x0, slope = seen.of_planes[plane].T
+        x0, slope = motion.of_planes[plane].T
         z = np.array([theta[f"{model.placed[j][0].name}.z"] if plane < 2 else 0.0 for j in axes])
         for arm in (np.ones(z.size), z) if plane < 2 else (np.ones(z.size),):
-            block = np.zeros((seen.omega.size, len(names)), dtype=complex)
+            block = np.zeros((motion.omega.size, len(names)), dtype=complex)
             turning = arm is not z
             if turning:
                 block[:, column["m"]] = jw**2 * x0
@@ -196,40 +196,41 @@ def _mechanics(
             else:
                 block[:, column["S"]], block[:, column["J"]] = jw**2 * x0, jw**2 * slope
                 if "Ip" in column:
-                    other = seen.of_planes[1 - plane][:, 1]
+                    other = motion.of_planes[1 - plane][:, 1]
                     block[:, column["Ip"]] = (1.0 if plane == 0 else -1.0) * speed * jw * other
             for j, a in zip(axes, arm, strict=True):
-                block[:, column[f"{model.axes[j]}.k_x"]] = a * seen.at_magnets[:, j]
+                block[:, column[f"{model.axes[j]}.k_x"]] = a * motion.at_magnets[:, j]
                 if j in free_force:
                     block[:, column[f"{model.axes[j]}.k_i"]] = -a * pull[:, j]
             total = force[:, axes] @ arm
             size = np.sqrt(np.sum((np.abs(force[:, axes]) * np.abs(arm)) ** 2, axis=1))
-            inertia = (mass or 1.0) * seen.omega**2 * (1.0 if turning else reach)
+            inertia = (mass or 1.0) * motion.omega**2 * (1.0 if turning else reach)
             noise = (
-                np.sum(seen.noise_x[:, axes], axis=1) * inertia**2 + (k_i[axes] ** 2 * seen.noise_i[:, axes]) @ arm**2
+                np.sum(motion.noise_x[:, axes], axis=1) * inertia**2
+                + (k_i[axes] ** 2 * motion.noise_i[:, axes]) @ arm**2
             )
             rows.append(block)
             right.append(total)
             weights.append(1.0 / np.sqrt((_RELATIVE * size) ** 2 + noise + 1e-300))
-    fixed = {n: v for n, v in known.items() if n in column}
+    fixed = {n: v for n, v in own.items() if n in column}
     if free_force:
         fixed["m"] = float(mass or 1.0)
-    if "m" in fixed and "z_cg" in known:
-        fixed["S"] = fixed["m"] * known["z_cg"]
+    if "m" in fixed and "z_cg" in own:
+        fixed["S"] = fixed["m"] * own["z_cg"]
     A, b, w = np.concatenate(rows), np.concatenate(right), np.concatenate(weights)
     values = np.array([fixed.get(n, 0.0) for n in names])
     free = [k for k, n in enumerate(names) if n not in fixed]
     values[free] = _real_solution(A[:, free], b - A @ values, w)
     got = dict(zip(names, values.tolist(), strict=True))
     m = abs(got["m"]) or 1.0
-    found = {"m": m, **{n: v for n, v in got.items() if n.endswith((".k_x", ".k_i"))}}
+    mechanics = {"m": m, **{n: v for n, v in got.items() if n.endswith((".k_x", ".k_i"))}}
     if radial:
-        z_cg = known.get("z_cg", got["S"] / m)
+        z_cg = own.get("z_cg", got["S"] / m)
         inertia = got["J"] - m * z_cg**2
-        found |= {"z_cg": z_cg, "Id": inertia if inertia > 0.0 else m * reach**2 / 10.0}
+        mechanics |= {"z_cg": z_cg, "Id": inertia if inertia > 0.0 else m * reach**2 / 10.0}
         if model.polar:
-            found["Ip"] = abs(got.get("Ip", 0.0)) or 0.2 * found["Id"]
-    return found
+            mechanics["Ip"] = abs(got.get("Ip", 0.0)) or 0.2 * mechanics["Id"]
+    return mechanics
 
 
 def _real_solution(A: Complex, b: Complex, weight: Array) -> Array:

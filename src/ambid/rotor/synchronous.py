@@ -189,14 +189,14 @@ def _by_lines(
     Coarsely by spectra, then by Gauss-Newton on frequency and its drift: with a exp(j angle) also b t exp(j angle) and
     c t² exp(j angle) are fitted; b/a and c/a are the phase that the angle lacks.
     """
-    rate, used, periods = record.rate_hz, _used(record, excitation), 1 if excitation is None else excitation.count
-    y = np.column_stack([record[r].values[used] for r in model.outputs if "_position" in r])
+    rate, lines_used, periods = record.rate_hz, _used(record, excitation), 1 if excitation is None else excitation.count
+    y = np.column_stack([record[r].values[lines_used] for r in model.outputs if "_position" in r])
     y = y - y.mean(axis=0)
-    start = _line_beside(y, model, first[used], rate, periods, near)
+    start = _line_beside(y, model, first[lines_used], rate, periods, near)
     if start is None:
         return None
     t = np.linspace(-1.0, 1.0, y.shape[0])
-    begun = first[used] + (start * y.shape[0] / (2.0 * rate)) * t
+    begun = first[lines_used] + (start * y.shape[0] / (2.0 * rate)) * t
     ramps = np.arange(-1.5, 1.51, 0.25) * np.pi  # lines of the whole record
     powers = [_power(y, begun + ramp * t, periods) for ramp in ramps]
     ramp, bend = float(ramps[int(np.argmax(powers))]), 0.0
@@ -210,7 +210,7 @@ def _by_lines(
         ramp, bend = ramp + share * b, bend + share * c
         if max(abs(b), abs(c)) < 1e-6:
             break
-    late = 2.0 * (np.arange(record.n_samples) - used.start) / (y.shape[0] - 1) - 1.0
+    late = 2.0 * (np.arange(record.n_samples) - lines_used.start) / (y.shape[0] - 1) - 1.0
     slope = start * y.shape[0] / (2.0 * rate) + ramp
     return _checked(first + slope * (late + 1.0) + bend * late**2, rate, "lines")
 
@@ -276,24 +276,24 @@ class Separated:
         """Mean speed, rad/s."""
         return 0.0 if self.response is None else self.response.speed
 
-    def warnings(self, name: str, given: float) -> list[str]:
-        """Return what is doubtful of the rotation; `given`: speed that the rig says, rad/s."""
+    def warnings(self, name: str, speed: float) -> list[str]:
+        """Return what is doubtful of the rotation; `speed`: speed that the rig says, rad/s."""
         if self.response is None:
             return []
-        turned, found = self.response.rotation, []
+        turned, warnings = self.response.rotation, []
         if turned.drift > DRIFT_LIMIT:
-            found.append(
+            warnings.append(
                 f"{name}: the speed changes by {turned.drift:.2%}, more than {DRIFT_LIMIT:.1%}; numbers at one speed "
                 "are doubtful. Hold the speed, or use a shorter part"
             )
         if turned.source == "rig":
-            found.append(f"{name}: no synchronous line near the given speed, which is taken as it is")
-        elif given and abs(self.speed / given - 1.0) > 10.0 * DRIFT_LIMIT:
-            found.append(
+            warnings.append(f"{name}: no synchronous line near the given speed, which is taken as it is")
+        elif speed and abs(self.speed / speed - 1.0) > 10.0 * DRIFT_LIMIT:
+            warnings.append(
                 f"{name}: the speed is {30 / np.pi * self.speed:.5g} rpm, by its {turned.source}, not "
-                f"{30 / np.pi * given:.5g} rpm as given"
+                f"{30 / np.pi * speed:.5g} rpm as given"
             )
-        return found
+        return warnings
 
 
 def separate(record: Record, model: RotorModel, speed: float | None = None) -> Separated:
@@ -302,8 +302,8 @@ def separate(record: Record, model: RotorModel, speed: float | None = None) -> S
     `speed`: roughly, rad/s, where it is known of this record; 0: at rest.
     """
     excitation = find_excitation(record, model)
-    known = model if speed is None else replace(model, speed=speed)
-    rotation = None if speed == 0.0 else rotation_of(record, known, excitation)
+    turning = model if speed is None else replace(model, speed=speed)
+    rotation = None if speed == 0.0 else rotation_of(record, turning, excitation)
     if rotation is None:
         return Separated(record=record, excitation=excitation, response=None)
     references = [f"{axis}_reference" for axis in model.axes if f"{axis}_reference" in record]
@@ -321,9 +321,9 @@ def synchronous_response(
     record: Record, roles: Sequence[str], rotation: Rotation, excitation: Excitation | None = None
 ) -> SynchronousResponse:
     """Return the response of some channels at harmonics of the speed, with what remains of them."""
-    rate, used = record.rate_hz, _used(record, excitation)
-    y = np.column_stack([record[role].values[used] for role in roles])
-    periods, angle = 1 if excitation is None else excitation.count, rotation.angle[used]
+    rate, segment = record.rate_hz, _used(record, excitation)
+    y = np.column_stack([record[role].values[segment] for role in roles])
+    periods, angle = 1 if excitation is None else excitation.count, rotation.angle[segment]
     highest = max(1, min(_HARMONICS, int(_TOP * rate * 2.0 * np.pi / abs(rotation.speed))))
     orders = tuple(range(1, highest + 1))
     lines = _coincident(angle, orders, periods)
@@ -366,15 +366,15 @@ def _coincident(angle: Array, orders: Sequence[int], periods: int) -> NDArray[np
 
 
 def _amplitudes(
-    y: Array, waves: Sequence[Complex], kept: NDArray[np.intp], periods: int
+    y: Array, waves: Sequence[Complex], samples: NDArray[np.intp], periods: int
 ) -> tuple[Complex, Array, Array]:
-    """Fit Re Σ a_k wave_k in least squares beside all periodic signals but the `kept` lines.
+    """Fit Re Σ a_k wave_k in least squares beside all periodic signals but the `samples` lines.
 
     Returns amplitudes (n_waves, n_channels), of each wave the share of its power that is its own, what is left.
     """
     n = y.shape[0]
     columns = np.column_stack([part for w in waves for part in (w.real, -w.imag)])
-    own, target = (_aperiodic(x, kept, periods) for x in (columns, y))
+    own, target = (_aperiodic(x, samples, periods) for x in (columns, y))
     size = np.linalg.norm(own, axis=0) + 1e-300
     solved, *_ = np.linalg.lstsq(own / size, target, rcond=1e-9)
     solved = solved / size[:, None]
@@ -383,11 +383,11 @@ def _amplitudes(
     return solved[0::2] + 1j * solved[1::2], share, y - columns @ solved
 
 
-def _aperiodic(x: Array, kept: NDArray[np.intp], periods: int) -> Array:
-    """Return signals (n, n_channels) without the mean over their periods, `kept` lines of which stay."""
+def _aperiodic(x: Array, samples: NDArray[np.intp], periods: int) -> Array:
+    """Return signals (n, n_channels) without the mean over their periods, `samples` lines of which stay."""
     if periods < 2:
         return x
     parts = x.reshape(periods, -1, x.shape[1])
     mean = np.fft.rfft(parts.mean(axis=0), axis=0)
-    mean[kept[kept < mean.shape[0]]] = 0.0
+    mean[samples[samples < mean.shape[0]]] = 0.0
     return np.asarray((parts - np.fft.irfft(mean, parts.shape[1], axis=0)).reshape(x.shape))

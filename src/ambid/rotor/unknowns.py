@@ -75,43 +75,43 @@ class Unknowns:
 
     def unpack(self, v: Array, theta: Mapping[str, float], delays: Array) -> tuple[dict[str, float], Array]:
         """Return numbers by name and delays; those that do not move are taken from `theta` and `delays`."""
-        found, k = dict(theta), len(self.logs)
-        found |= {n: float(np.exp(x)) for n, x in zip(self.logs, v[:k], strict=True)}
+        numbers, k = dict(theta), len(self.logs)
+        numbers |= {n: float(np.exp(x)) for n, x in zip(self.logs, v[:k], strict=True)}
         for n in self.linear:
-            found[n] = float(v[k] * self.scales[n])
+            numbers[n] = float(v[k] * self.scales[n])
             k += 1
         for r, at, read in self.shapes:
             split = float(v[k + len(at) + len(read)])
             for places, sign in ((at, 1.0), (read, -1.0)):
                 for x in places:
-                    found[f"mode{r}.{x}"] = float(v[k] * np.exp(sign * split))
+                    numbers[f"mode{r}.{x}"] = float(v[k] * np.exp(sign * split))
                     k += 1
             k += 1
         moved = delays.copy()
         moved[list(self.free_delays)] = v[k:]
-        return found, moved
+        return numbers, moved
 
     def chain(self, v: Array) -> tuple[tuple[str, ...], Array]:
         """Return names of the model, and the derivatives of these, then of all delays, by the vector."""
         shaped = [f"mode{r}.{x}" for r, at, read in self.shapes for x in (*at, *read)]
-        named = (*self.logs, *self.linear, *shaped)
+        names = (*self.logs, *self.linear, *shaped)
         n_d = len(self.model.inputs)
-        found = np.zeros((len(named) + n_d, v.size))
+        slopes = np.zeros((len(names) + n_d, v.size))
         k = len(self.logs)
-        found[np.arange(k), np.arange(k)] = np.exp(v[:k])
+        slopes[np.arange(k), np.arange(k)] = np.exp(v[:k])
         sizes = [self.scales[n] for n in self.linear]
-        found[k + np.arange(len(sizes)), k + np.arange(len(sizes))] = sizes
+        slopes[k + np.arange(len(sizes)), k + np.arange(len(sizes))] = sizes
         row = k = k + len(sizes)
         for _, at, read in self.shapes:
             l_at = k + len(at) + len(read)
             for places, sign in ((at, 1.0), (read, -1.0)):
                 long = np.exp(sign * v[l_at])
                 for _ in places:
-                    found[row, k], found[row, l_at] = long, sign * long * v[k]
+                    slopes[row, k], slopes[row, l_at] = long, sign * long * v[k]
                     row, k = row + 1, k + 1
             k += 1
-        found[row + np.array(self.free_delays, dtype=int), k + np.arange(len(self.free_delays))] = 1.0
-        return named, found
+        slopes[row + np.array(self.free_delays, dtype=int), k + np.arange(len(self.free_delays))] = 1.0
+        return names, slopes
 
     def priors(self, v: Array) -> tuple[Array, Array]:
         """Return the rows of priors, slopes (n, n_v) and residuals (n,), both over their standard deviations."""
