@@ -90,7 +90,7 @@ def commission_document(
     c, title = commissioned, f"Commissioning: {commissioned.rig.name}"
     count = len(c.names)
 
-    told = [part for k, step in enumerate(c.steps, 1) for part in step_section(step, f"{k}/{count}").parts]
+    parts = [part for k, step in enumerate(c.steps, 1) for part in step_section(step, f"{k}/{count}").parts]
 
     def pages() -> list[Section]:
         recorded = any(step.name == "record" for step in c.steps)
@@ -105,7 +105,7 @@ def commission_document(
 
     return Document(
         title=title, subtitle=device,
-        sections=[Section(parts=told, page=False)],
+        sections=[Section(parts=parts, page=False)],
         figure=lambda width: stacked(title, [p.block for step in c.steps for p in step.pictures], width),
         frame=lambda: ("step", {"step": [s.name for s in c.steps], "passed": [s.passed for s in c.steps]}),
         drawings=pages,
@@ -171,9 +171,13 @@ class Picture:
     block: Block
 
 
-def rest_picture(seen: Mapping[str, Array], rate_hz: float) -> Picture:
+def rest_picture(signals: Mapping[str, Array], rate_hz: float) -> Picture:
     """Traces of the sensors with the output off, about their means, and the density of their noise."""
-    about = {role: seen[role] - seen[role].mean() for role in ("position", "current") if seen.get(role, _NONE).size > 1}
+    about = {
+        role: signals[role] - signals[role].mean()
+        for role in ("position", "current")
+        if signals.get(role, _NONE).size > 1
+    }
     traces = [panel(_trace, role, values, rate_hz, (), height=_ROW) for role, values in about.items()]
     spectra = [panel(_spectrum, role, values, rate_hz, height=_ROW) for role, values in about.items()]
     return Picture(
@@ -186,30 +190,36 @@ def rest_picture(seen: Mapping[str, Array], rate_hz: float) -> Picture:
 def pulses_picture(pulses: Sequence[Pulse]) -> Picture:
     """The first pulses and the last ones, with what the current and the position did."""
     numbered = list(enumerate(pulses, 1))
-    shown = [*numbered[: _PULSES // 2], *numbered[max(_PULSES // 2, len(pulses) - _PULSES // 2) :]]
+    panels_of = [*numbered[: _PULSES // 2], *numbered[max(_PULSES // 2, len(pulses) - _PULSES // 2) :]]
     reach = {role: max(float(np.max(np.abs(_about_begin(p, role)), initial=0.0)) for p in pulses) for role in UNITS}
     columns = [
         [panel(_pulse, k, p, role, reach[role], height=_ROW) for role in ("voltage", "current", "position")]
-        for k, p in shown
+        for k, p in panels_of
     ]
     return Picture(
         title="Polarity pulses",
-        caption=f"{len(shown)} of {len(pulses)} pulses without feedback, each about what was before it; shaded while"
-        " the voltage is ordered. They grow until the rotor leaves its stop.",
+        caption=f"{len(panels_of)} of {len(pulses)} pulses without feedback, each about what was before it; shaded"
+        " while the voltage is ordered. They grow until the rotor leaves its stop.",
         block=Block(columns=columns),
     )
 
 
 def trace_picture(
-    title: str, caption: str, seen: Mapping[str, Array], rate_hz: float, trips: Bounds, *, from_s: float | None = None
+    title: str,
+    caption: str,
+    signals: Mapping[str, Array],
+    rate_hz: float,
+    trips: Bounds,
+    *,
+    from_s: float | None = None,
 ) -> Picture:
     """Traces by role over time with the controller's trips; the beginning closer, and shaded, up to `from_s`."""
-    kept = {role: seen[role][:_MOST] for role in UNITS if seen.get(role, _NONE).size}
-    whole = [panel(_trace, role, y, rate_hz, trips.get(role, ()), from_s, height=_ROW) for role, y in kept.items()]
+    drawn = {role: signals[role][:_MOST] for role in UNITS if signals.get(role, _NONE).size}
+    whole = [panel(_trace, role, y, rate_hz, trips.get(role, ()), from_s, height=_ROW) for role, y in drawn.items()]
     if from_s is None:
         return Picture(title=title, caption=caption, block=Block(columns=[whole]))
     n = round(_BEGIN_S * rate_hz)
-    begin = [panel(_trace, role, y[:n], rate_hz, trips.get(role, ()), height=_ROW) for role, y in kept.items()]
+    begin = [panel(_trace, role, y[:n], rate_hz, trips.get(role, ()), height=_ROW) for role, y in drawn.items()]
     return Picture(title=title, caption=caption, block=Block(columns=[begin, whole], widths=(2.0, 3.0)))
 
 
@@ -243,16 +253,16 @@ def margins_picture(loops: Mapping[str, LoopMargins]) -> Picture:
     )
 
 
-def design_picture(found: Design) -> Picture:
+def design_picture(design: Design) -> Picture:
     """Both loops of a redesign, as predicted."""
     caption = "On the estimate, and shaded up to the worst of the plants around it; the step is of 1 N."
-    return Picture(title="The loop before and after", caption=caption, block=loops_block(found))
+    return Picture(title="The loop before and after", caption=caption, block=loops_block(design))
 
 
 def measured_picture(loops: Mapping[str, Margins]) -> Picture:
     """Sensitivity of loops by name, by plant and controller, and as measured."""
     caption = "Lines: by the plant and the controller; dots: as the records show it. Zones of ISO 14839-3."
-    panels = [[panel(sensitivity_panel, of, "x", height=2.6)] for of in loops.values()]
+    panels = [[panel(sensitivity_panel, margins, "x", height=2.6)] for margins in loops.values()]
     return Picture(
         title=f"Measured: {', '.join(loops)}", caption=caption,
         block=Block(columns=panels, widths=(1.0,) * len(panels), shared=False),
@@ -280,13 +290,13 @@ def _trace(
 
 def _spectrum(axes: Axes, role: str, values: Array, rate_hz: float) -> None:
     """Draw the amplitude density of a noise."""
-    found = power_spectrum(values, rate_hz)
-    size = np.sqrt(found.density[1:])
+    spectrum = power_spectrum(values, rate_hz)
+    size = np.sqrt(spectrum.density[1:])
     scale, unit = prefixed(float(size.max()), UNITS[role])
-    axes.plot(found.frequency_hz[1:], size / scale, color=PREDICTED, linewidth=1.0)
+    axes.plot(spectrum.frequency_hz[1:], size / scale, color=PREDICTED, linewidth=1.0)
     if size.min() > 0.0:
         log_axis(axes.yaxis, float(size.min()) / scale, float(size.max()) / scale)
-    log_axis(axes.xaxis, float(found.frequency_hz[1]), float(found.frequency_hz[-1]))
+    log_axis(axes.xaxis, float(spectrum.frequency_hz[1]), float(spectrum.frequency_hz[-1]))
     axes.set_ylabel(f"[{unit}/√Hz]")
     axes.set_xlabel("frequency [Hz]")
     head(axes, f"{sized(float(values.std()), UNITS[role])} rms")
@@ -315,9 +325,9 @@ def _pulse(axes: Axes, number: int, pulse: Pulse, role: str, reach: float) -> No
 def _trials(axes: Axes, tried: Sequence[tuple[float, float]], use: float) -> None:
     """Draw what each amplitude used."""
     if tried:
-        size, used = np.array(tried).T
+        size, currents = np.array(tried).T
         axes.axhspan(75.0 * use, 120.0 * use, color=BAND, alpha=0.6, linewidth=0, label="wanted")
-        axes.plot(size, 100.0 * used, "o-", color=PREDICTED, markersize=5, linewidth=0.8, label="trial")
+        axes.plot(size, 100.0 * currents, "o-", color=PREDICTED, markersize=5, linewidth=0.8, label="trial")
     axes.set_ylim(0.0, None)
     axes.set_xlim(0.0, None)
     axes.set_xlabel("amplitude [V]")
@@ -371,12 +381,12 @@ def step_section(step: Step, place: str) -> Section:
 
 
 def next_text(
-    passed: bool, step: str, number: int, of: int, folder: str, *, command: str = "", width: int = WIDTH
+    passed: bool, step: str, number: int, total: int, folder: str, *, command: str = "", width: int = WIDTH
 ) -> str:
     """Say where a commissioning ended, and what to do next.
 
-    `passed`: whether it came to its end; `step`: the last one; `number`, `of`: which of how many it is; `folder`: where
-    the files are; `command`: what is said to be run next, on a line of its own; `width`: columns of the terminal.
+    `passed`: whether it came to its end; `step`: the last one; `number`, `total`: which of how many it is; `folder`:
+    where the files are; `command`: what is said to be run next, on a line of its own; `width`: columns of the terminal.
     Returns lines without the last line's end.
     """
     if passed:
@@ -386,7 +396,7 @@ def next_text(
         ]
     else:
         said = [
-            f"stopped at {step}, step {number} of {of}; the output is off, and {folder} holds what was found,"
+            f"stopped at {step}, step {number} of {total}; the output is off, and {folder} holds what was found,"
             f" {folder}/report.html shows it.",
             f"Next: {_next(step, folder)}. Then commission again, into another folder.",
         ]

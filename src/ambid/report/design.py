@@ -149,38 +149,38 @@ _RPM = 30.0 / np.pi
 _SHALLOW = 1e-4  # of the largest compliance: the lowest that is drawn
 
 
-def design_figure(found: Design, title: str, width: float) -> Figure:
+def design_figure(design: Design, title: str, width: float) -> Figure:
     """Draw both loops, a row of panels an axis."""
-    blocks = [loops_block(found)]
-    if found.over_speed is not None:
-        blocks.append(Block(columns=[[panel(_over_speed, found, height=2.4)]]))
-    if found.trials:
-        blocks.append(verification_block(found.trials["before"][0], found.trials["after"][0]))
+    blocks = [loops_block(design)]
+    if design.over_speed is not None:
+        blocks.append(Block(columns=[[panel(_over_speed, design, height=2.4)]]))
+    if design.trials:
+        blocks.append(verification_block(design.trials["before"][0], design.trials["after"][0]))
     return stacked(title, blocks, width)
 
 
-def loops_block(found: Design) -> Block:
+def loops_block(design: Design) -> Block:
     """Return panels of both loops: sensitivity, compliance and force step."""
-    axes = list(found.after.sensitivity)
-    columns = [[panel(draw, found, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
+    axes = list(design.after.sensitivity)
+    columns = [[panel(draw, design, axis, height=2.4) for axis in axes] for draw in (_sensitivity, _compliance, _step)]
     return Block(columns=columns, widths=(4.0, 3.0, 3.0), shared=False)
 
 
-def _sensitivity(axes: Axes, found: Design, axis: str) -> None:
+def _sensitivity(axes: Axes, design: Design, axis: str) -> None:
     tops = []
     for name, color in _LOOPS:
-        of = found.curves[name]
-        mean, high = (20.0 * np.log10(x[axis]) if axis in x else None for x in (of.sensitivity, of.highest))
-        _between(axes, of.frequency_hz, mean, high, color, name)
+        curves = design.curves[name]
+        mean, high = (20.0 * np.log10(x[axis]) if axis in x else None for x in (curves.sensitivity, curves.highest))
+        _between(axes, curves.frequency_hz, mean, high, color, name)
         tops += [x.max() for x in (mean, high) if x is not None]
     zone_lines(axes)
-    f = found.curves["after"].frequency_hz
+    f = design.curves["after"].frequency_hz
     log_axis(axes.xaxis, float(f[0]), float(f[-1]))
     axes.set_ylim(_DB[0], max(_DB[1], min(max(tops) + 2.0, 40.0)))
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("sensitivity [dB]")
-    was, now = (s.sensitivity[axis] for s in (found.before, found.after))
-    good = found.checks["zone"].passed
+    was, now = (s.sensitivity[axis] for s in (design.before, design.after))
+    good = design.checks["zone"].passed
     head(
         axes,
         f"axis {axis}: {was.peak_db.value:.1f} → {now.peak_db.value:.1f} dB, zone {was.zone} → {now.zone}",
@@ -188,14 +188,19 @@ def _sensitivity(axes: Axes, found: Design, axis: str) -> None:
     )
 
 
-def _over_speed(axes: Axes, found: Design) -> None:
-    of = found.over_speed
-    assert of is not None
-    tops = {name: x[np.isfinite(x)] for name, x in of.peak.items()}
-    for (name, peak), color in zip(of.peak.items(), (MEASURED, PREDICTED, BOUND), strict=False):
-        shown = 20.0 * np.log10(np.where(np.isfinite(peak), peak, np.nan))
+def _over_speed(axes: Axes, design: Design) -> None:
+    speeds = design.over_speed
+    assert speeds is not None
+    tops = {name: x[np.isfinite(x)] for name, x in speeds.peak.items()}
+    for (name, peak), color in zip(speeds.peak.items(), (MEASURED, PREDICTED, BOUND), strict=False):
+        decibels = 20.0 * np.log10(np.where(np.isfinite(peak), peak, np.nan))
         axes.plot(
-            of.speed * _RPM, shown, color=color, marker=".", linestyle="--" if name == "one law" else "-", label=name
+            speeds.speed * _RPM,
+            decibels,
+            color=color,
+            marker=".",
+            linestyle="--" if name == "one law" else "-",
+            label=name,
         )
     zone_lines(axes)
     axes.set_ylim(0.0, max(_DB[1], min(20.0 * np.log10(max(x.max(initial=1.0) for x in tops.values())) + 2.0, 40.0)))
@@ -203,40 +208,42 @@ def _over_speed(axes: Axes, found: Design) -> None:
     axes.set_ylabel("peak of sensitivity [dB]")
     lost = [
         f"{name} loses plants at {np.sum(~np.isfinite(x))} speeds"
-        for name, x in of.peak.items()
+        for name, x in speeds.peak.items()
         if len(tops[name]) < x.size
     ]
     head(
-        axes, "; ".join(["worst of some plants over the speed", *lost]), good=bool(np.isfinite(of.peak["after"]).all())
+        axes,
+        "; ".join(["worst of some plants over the speed", *lost]),
+        good=bool(np.isfinite(speeds.peak["after"]).all()),
     )
 
 
-def _compliance(axes: Axes, found: Design, axis: str) -> None:
-    most = max(s.compliance[axis].largest for s in (found.before, found.after))
+def _compliance(axes: Axes, design: Design, axis: str) -> None:
+    most = max(s.compliance[axis].largest for s in (design.before, design.after))
     scale, unit = prefixed(most, "m/N")
     tops = [most / scale]
     for name, color in _LOOPS:
-        of = found.curves[name]
-        mean, high = (x[axis] / scale if axis in x else None for x in (of.compliance, of.softest))
-        _between(axes, of.frequency_hz, mean, high, color, name)
+        curves = design.curves[name]
+        mean, high = (x[axis] / scale if axis in x else None for x in (curves.compliance, curves.softest))
+        _between(axes, curves.frequency_hz, mean, high, color, name)
         tops += [x.max() for x in (mean, high) if x is not None]
-    f = found.curves["after"].frequency_hz
+    f = design.curves["after"].frequency_hz
     log_axis(axes.xaxis, float(f[0]), float(f[-1]))
     log_axis(axes.yaxis, _SHALLOW * max(tops), max(tops))
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel(f"compliance [{unit}]")
-    was, now = (sized(s.compliance[axis].largest, "m/N") for s in (found.before, found.after))
+    was, now = (sized(s.compliance[axis].largest, "m/N") for s in (design.before, design.after))
     head(axes, f"largest {was} → {now}")
 
 
-def _step(axes: Axes, found: Design, axis: str) -> None:
-    steps = [(of.time_s, of.step[axis]) for of in (found.curves[name] for name, _ in _LOOPS)]
+def _step(axes: Axes, design: Design, axis: str) -> None:
+    steps = [(curves.time_s, curves.step[axis]) for curves in (design.curves[name] for name, _ in _LOOPS)]
     scale, unit = prefixed(max(float(np.max(np.abs(x))) for _, x in steps), "m")
     for (t, x), (name, color) in zip(steps, _LOOPS, strict=True):
         axes.plot(1e3 * t, x / scale, color=color, label=f"{name}, on the estimate")
     axes.set_xlabel("time [ms]")
     axes.set_ylabel(f"deflection [{unit}]")
-    was, now = (sized(s.figures.settling, "s") for s in (found.before, found.after))
+    was, now = (sized(s.figures.settling, "s") for s in (design.before, design.after))
     head(axes, f"1 N settled in {was} → {now}")
 
 
@@ -282,9 +289,9 @@ def verification_section(loops: Pair) -> Section:
     return Section(heading=[(title, "strong")], parts=[grid(rows), Lines(lines=lines, indent=2)])
 
 
-def _worst(found: Sequence[Verification], kind: str) -> Case | None:
+def _worst(verifications: Sequence[Verification], kind: str) -> Case | None:
     """Return the case that failed, else the one that moved most."""
-    cases = [case for v in found for case in v.of_kind(kind)]
+    cases = [case for v in verifications for case in v.of_kind(kind)]
 
     def far(case: Case) -> tuple[bool, float]:
         return not case.passed, math.inf if case.peak is None else case.peak
@@ -309,8 +316,8 @@ def _cell(case: Case | None) -> str:
 
 def verification_block(before: Verification, after: Verification) -> Block:
     """Draw how the rotor moves in both loops on one plant: a panel a kind, of the axis that moves most."""
-    shown = [kind for kind in _DRAWN if _worst([after], kind) is not None]
-    panels = [panel(_moved, before, after, kind, height=2.2) for kind in shown]
+    kinds = [kind for kind in _DRAWN if _worst([after], kind) is not None]
+    panels = [panel(_moved, before, after, kind, height=2.2) for kind in kinds]
     return Block(
         columns=[panels[k::2] for k in range(min(2, len(panels)))], shared=False,
         title=f"nonlinear simulation of {after.plant}",
@@ -320,8 +327,8 @@ def verification_block(before: Verification, after: Verification) -> Block:
 def _moved(axes: Axes, before: Verification, after: Verification, kind: str) -> None:
     case = _worst([after], kind)
     assert case is not None
-    beside = next((x for x in before.of_kind(kind) if x.name == case.name), None)
-    pairs = [(beside, "before", MEASURED), (case, "after", PREDICTED)]
+    partner = next((x for x in before.of_kind(kind) if x.name == case.name), None)
+    pairs = [(partner, "before", MEASURED), (case, "after", PREDICTED)]
     curves = [(x.trace, name, color) for x, name, color in pairs if x is not None and x.trace is not None]
     if not curves:
         head(axes, f"{case.name}: breaks off", good=False)
@@ -330,7 +337,7 @@ def _moved(axes: Axes, before: Verification, after: Verification, kind: str) -> 
     scale, unit = prefixed(largest, "m")
     turning = curves[-1][0].over == "speed"
     span = max(float(trace.at[-1]) for trace, _, _ in curves)
-    rests = [x.settling_s for x in (beside, case) if x is not None and x.settling_s]
+    rests = [x.settling_s for x in (partner, case) if x is not None and x.settling_s]
     if rests and not turning and len(rests) == len(curves):
         span = min(span, _REST * max(rests))
     time, second = (_RPM, "1/min") if turning else _of_time(span)
@@ -342,7 +349,7 @@ def _moved(axes: Axes, before: Verification, after: Verification, kind: str) -> 
     axes.set_xlim(0.0, 1.02 * span * time)
     axes.set_xlabel(f"{'speed' if turning else 'time'} [{second}]")
     axes.set_ylabel(f"{'largest deflection' if turning else 'position'} [{unit}]")
-    head(axes, f"{case.name}: {_cell(beside)} → {_cell(case)}", good=case.passed)
+    head(axes, f"{case.name}: {_cell(partner)} → {_cell(case)}", good=case.passed)
 
 
 def _of_time(span: float) -> tuple[float, str]:

@@ -33,8 +33,8 @@ def progress_line(q: QualityReport, counters: Counters) -> str:
     if counters.damaged:
         parts.append(f"{counters.damaged} damaged")
     # before some periods of an excitation are over, nobody knows what is signal
-    known = [c for c in q.columns if c.role in _SHOWN and c.snr_db is not None and c.noise_by == "periods"]
-    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in known]
+    columns = [c for c in q.columns if c.role in _SHOWN and c.snr_db is not None and c.noise_by == "periods"]
+    parts += [f"{c.role} {c.snr_db:.0f} dB" for c in columns]
     saturated = max((c.saturated for c in q.columns), default=0.0)
     if saturated > 0.0:
         parts.append(f"saturated {100.0 * saturated:.1f} %")
@@ -49,15 +49,15 @@ def _rate(q: QualityReport) -> str:
     return f"{q.measured_hz:.0f} Hz" if 0.5 < pace < 2.0 else f"{q.rate_hz:g} Hz at {pace:.2g} times real time"
 
 
-def acquired_document(acquired: Acquired, used: Any) -> Document:
-    """Describe an acquisition; `used`: where its record lies."""
+def acquired_document(acquired: Acquired, source: Any) -> Document:
+    """Describe an acquisition; `source`: where its record lies."""
     a = acquired
     path = "no record" if a.recorded is None else str(a.recorded.path)
 
     def drawn(width: float) -> Figure:
         from ambid.report.record import record_figure
 
-        at = used or (a.recorded is not None and a.recorded.path)
+        at = source or (a.recorded is not None and a.recorded.path)
         record = read_record(at, gaps="interpolate") if at and Path(at).exists() else None
         return record_figure(record, f"{path}, from {a.info.kind} {a.info.port}", a.quality.columns, width)
 
@@ -67,15 +67,15 @@ def acquired_document(acquired: Acquired, used: Any) -> Document:
     )  # fmt: skip
 
 
-def recorded_document(recorded: Recorded, used: Any) -> Document:
-    """Describe what was recovered from a journal; `used`: where the record lies."""
+def recorded_document(recorded: Recorded, source: Any) -> Document:
+    """Describe what was recovered from a journal; `source`: where the record lies."""
     r = recorded
     title = f"{r.path}, {r.survey.samples} samples from a journal"
 
     def drawn(width: float) -> Figure:
         from ambid.report.record import record_figure
 
-        return record_figure(read_record(used or r.path, gaps="interpolate"), title, (), width)
+        return record_figure(read_record(source or r.path, gaps="interpolate"), title, (), width)
 
     return Document(
         title=title, sections=recorded_sections(r), figure=drawn,

@@ -84,7 +84,9 @@ class Table:
 
     def frame(self) -> Frame:
         """Return the numbers of the rows by column; the first one is the index."""
-        numbers = {name: [of(row) for row in self.rows] for column in self.columns for name, of in column.frame.items()}
+        numbers = {
+            name: [cell(row) for row in self.rows] for column in self.columns for name, cell in column.frame.items()
+        }
         return next(iter(numbers)), numbers
 
 
@@ -228,15 +230,15 @@ def part_lines(part: Part, width: int, paint: Paint = plain) -> list[str]:
 
 def page_sections(document: Document) -> list[Section]:
     """Return the sections of a page: those of the document, its figures, and what follows them."""
-    shown = list[Section]()
+    sections = list[Section]()
     for section in (s for s in document.sections if s.page and (s.parts or s.figure)):
         title = section.title or text_of(parts_of(section.heading))
-        if title or not shown:
-            shown.append(replace(section, title=title or "Result"))
+        if title or not sections:
+            sections.append(replace(section, title=title or "Result"))
         else:
-            shown[-1] = replace(shown[-1], parts=(*shown[-1].parts, *section.parts))
+            sections[-1] = replace(sections[-1], parts=(*sections[-1].parts, *section.parts))
     drawn = [Section(title="Figures", figure=document.figure)] if document.drawings is None else document.drawings()
-    return [*shown, *drawn, *document.appendix()]
+    return [*sections, *drawn, *document.appendix()]
 
 
 def ending(result: Any, *, checks: bool = True, warnings: bool = True) -> list[Section]:

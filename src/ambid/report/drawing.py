@@ -100,12 +100,12 @@ class Block:
                 column[k].draw(a)
                 if self.shared and k + 1 < len(column):
                     a.set_xlabel("")
-        named = {label: h for a in place.axes for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
-        named |= {h.get_label(): h for h in self.legend}
-        if named:
-            fitting = int(_LETTERS * width / (6 + max(map(len, named))))
+        handles = {label: h for a in place.axes for h, label in zip(*a.get_legend_handles_labels(), strict=True)}
+        handles |= {h.get_label(): h for h in self.legend}
+        if handles:
+            fitting = int(_LETTERS * width / (6 + max(map(len, handles))))
             ncols = min(max(1, fitting), 5)
-            place.legend(list(named.values()), list(named), loc="outside lower center", ncols=ncols)
+            place.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=ncols)
         if self.title:
             place.suptitle(textwrap.fill(self.title, int(11 * width)), fontsize=10)
 
@@ -126,13 +126,13 @@ def stacked(title: str, blocks: Sequence[Block], width: float = WIDE) -> Figure:
     return page
 
 
-def judged(figure: Figure, found: Verdict) -> Figure:
+def judged(figure: Figure, verdict: Verdict) -> Figure:
     """Put the verdict above a figure: its word in colour, and the names of the checks that speak against it."""
     from matplotlib.offsetbox import AnchoredOffsetbox, HPacker, TextArea
 
-    words, style = WORDS[found.word]
+    words, style = WORDS[verdict.word]
     letters = int(11 * figure.get_figwidth()) - 75  # what there is room for
-    names = textwrap.shorten(", ".join(r.check for r in found.reasons), max(letters, 12), placeholder=" …")
+    names = textwrap.shorten(", ".join(r.check for r in verdict.reasons), max(letters, 12), placeholder=" …")
     parts = [
         ("verdict: ", {}),
         (words, {"color": STYLES[style], "weight": "bold"}),
@@ -146,8 +146,8 @@ def judged(figure: Figure, found: Verdict) -> Figure:
     figure.add_artist(box)
     figure.suptitle(f"\n{figure.get_suptitle()}", fontsize=12)  # the empty line is their place
     at = (0.995, 1.0 - 0.05 / figure.get_figheight())
-    said = figure.text(*at, SPREAD, ha="right", va="top", size=8, color="#555555")
-    said.set_in_layout(False)
+    note = figure.text(*at, SPREAD, ha="right", va="top", size=8, color="#555555")
+    note.set_in_layout(False)
     return figure
 
 

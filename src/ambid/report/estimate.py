@@ -135,13 +135,13 @@ def estimate_document(estimate: AnyEstimate, evidence: Callable[[], Evidence | B
         from ambid.report.drawing import single
         from ambid.report.signals import strips_of
 
-        beside = evidence()
+        shown_evidence = evidence()
         return [
             Section(
                 title=_CAPTIONS[name][0], caption=_CAPTIONS[name][1], figure=partial(single, block),
-                signals=[strips_of(t) for t in beside.records] if name in ("signals", "records") else (),
+                signals=[strips_of(t) for t in shown_evidence.records] if name in ("signals", "records") else (),
             )
-            for name, block in beside.drawings().items()
+            for name, block in shown_evidence.drawings().items()
         ]  # fmt: skip
 
     def drawn(width: float) -> Figure:
@@ -190,16 +190,16 @@ def _about_record(e: Estimate) -> dict[str, Any]:
 
 def _about_records(e: NonlinearBearingEstimate) -> dict[str, Any]:
     """Title, subtitle and origin of a nonlinear bearing."""
-    named = list(zip(e.noise, map(RecordEntry.of, e.records), strict=True))
+    entries = list(zip(e.noise, map(RecordEntry.of, e.records), strict=True))
     name = names_words(list(e.noise))
     return {
         "texts": {
             "title": f"{name}, {e.law}",
             "headline": f"{name}: nonlinear bearing",
             "subtitle": f"{e.rig.get('name') or 'no rig'} – {e.law}, {_seconds(e):.4g} s in all, search {e.status}",
-            "history": [f"{name}: {step}" for name, record in named for step in record.history],
+            "history": [f"{name}: {step}" for name, record in entries for step in record.history],
         },
-        "provenance": [(name, f"SHA-256 {record.sha256 or '–'}") for name, record in named],
+        "provenance": [(name, f"SHA-256 {record.sha256 or '–'}") for name, record in entries],
     }
 
 
@@ -212,8 +212,8 @@ def header(estimate: AnyEstimate) -> list[Part]:
     law = ", ".join([str(e.law), *(["eddy pole"] * e.eddy), *(["drift"] * e.drift)])
     first = [(names_words(names), "strong"), f": {law}, {_seconds(e):.4g} s", *status_words(e.status)]
     groups = list[Line]()
-    for words, held in (("moving", False), ("held", True)):
-        group = [n for n, r in zip(names, e.records, strict=True) if bool(r["held"]) == held]
+    for words, at_rest in (("moving", False), ("held", True)):
+        group = [n for n, r in zip(names, e.records, strict=True) if bool(r["held"]) == at_rest]
         if group and len(names) > 1:
             groups.append(["", f"{words}: {', '.join(group)}"])
     return [Lines(lines=[first], wrap=False), Lines(lines=groups, indent=2, hang=True)]
@@ -271,10 +271,10 @@ def _cells(curve: Curve, inside: NDArray[np.bool_]) -> tuple[list[str], str]:
     """Values with standard deviations, all in the unit that suits the largest."""
     scale, unit = prefixed(float(np.max(np.abs(curve.value))), curve.unit)
     cells = []
-    for value, sd, known in zip(curve.value / scale, curve.sd / scale, inside, strict=True):
+    for value, sd, inside_range in zip(curve.value / scale, curve.sd / scale, inside, strict=True):
         digits = 1 - int(np.floor(np.log10(sd))) if sd > 0 else 4
         digits = min(max(digits, 0), 6)
-        cells.append(f"{value:.{digits}f} ± {sd:.{digits}f}{'' if known else ' *'}")
+        cells.append(f"{value:.{digits}f} ± {sd:.{digits}f}{'' if inside_range else ' *'}")
     return cells, unit
 
 

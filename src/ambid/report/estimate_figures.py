@@ -114,18 +114,18 @@ class Evidence:
 
     def drawings(self) -> dict[str, Block]:
         """Return the blocks of the figure by name."""
-        e, found = self.estimate, dict[str, Block]()
+        e, blocks = self.estimate, dict[str, Block]()
         if self.run is not None:
             traces, failed = self.traces, [name for name, c in e.checks.items() if not c.passed]
-            found = {
+            blocks = {
                 "signals": signals_panel(traces),
                 "residuals": residuals_panel(traces),
                 "whiteness": whiteness_panel(traces, failed),
             }
-        found |= {"bode": _bode(e, measured_beside(self)), "poles": _poles(e)}
+        blocks |= {"bode": _bode(e, measured_beside(self)), "poles": _poles(e)}
         if len(e.covariance_names) > 1:
-            found["correlations"] = correlations_panel(e.covariance_names, e.covariance, e.values)
-        return found
+            blocks["correlations"] = correlations_panel(e.covariance_names, e.covariance, e.values)
+        return blocks
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -185,29 +185,29 @@ def figures(evidence: Evidence | BearingEvidence, width: float = WIDE) -> dict[s
 
 
 def validation_figure(
-    found: Validation, beside: Sequence[Traces] = (), width: float = WIDE, *, more: Sequence[Block] = ()
+    validation: Validation, beside: Sequence[Traces] = (), width: float = WIDE, *, more: Sequence[Block] = ()
 ) -> Figure:
     """Draw how a result does on a further record: its predictions one and more steps ahead, and their residuals.
 
     `beside`: the record with its predictions; without it the sizes of the errors alone are drawn, and `more`.
     """
-    failed = [name for name, c in found.checks.items() if not c.passed]
-    blocks = [_sizes_ahead(found), *more]
+    failed = [name for name, c in validation.checks.items() if not c.passed]
+    blocks = [_sizes_ahead(validation), *more]
     if beside and beside[0].sd.ndim > 1:
         blocks.append(records_panel(beside))
     elif beside:
         (traces,) = beside
         blocks += [signals_panel(traces), residuals_panel(traces), whiteness_panel(traces, failed)]
-    return stacked(f"{found.record or 'record'} tested with {found.estimate or 'a result'}", blocks, width)
+    return stacked(f"{validation.record or 'record'} tested with {validation.estimate or 'a result'}", blocks, width)
 
 
-def _sizes_ahead(found: Validation) -> Block:
+def _sizes_ahead(validation: Validation) -> Block:
     """Parts of the outputs that predictions leave, and how they compare with what the model expects of itself."""
-    rows = [(o, what, left) for o, x in found.fit.items() for what, left in _left(x)]
-    ratios = {o: x["k_step_ratio"] for o, x in found.fit.items() if x.get("k_step_ratio")}
+    rows = [(o, what, left) for o, x in validation.fit.items() for what, left in _left(x)]
+    ratios = {o: x["k_step_ratio"] for o, x in validation.fit.items() if x.get("k_step_ratio")}
 
     def left(axes: Axes) -> None:
-        names = list(found.fit)
+        names = list(validation.fit)
         at = range(len(rows), 0, -1)
         colors = [CYCLE[names.index(o) % len(CYCLE)] for o, *_ in rows]
         sizes = np.array([100 * max(x, 1e-6) for *_, x in rows])
@@ -298,22 +298,22 @@ def measured_beside(evidence: Evidence) -> FrequencyResponse | None:
     reference = u - rows @ np.linalg.lstsq(rows.T @ rows, rows.T @ u, rcond=None)[0]
     try:
         with one_thread():
-            found = frf_local(
+            response = frf_local(
                 u, y - y.mean(axis=0), rate_hz, r=reference, inputs=plant.inputs, outputs=plant.outputs,
                 units=plant.units,
             )  # fmt: skip
     except EstimationError:
         return None
-    own, all_of = (sum(power_spectrum(x, rate_hz).density for x in of.T) for of in (reference, u))
+    own, all_of = (sum(power_spectrum(x, rate_hz).density for x in density.T) for density in (reference, u))
     at = power_spectrum(u[:, 0], rate_hz).frequency_hz
     share = (own / np.maximum(all_of, 1e-300))[_LOBE:]  # the first lines have lost the mean
     shares = sliding_window_view(np.pad(share, (2 * _LOBE, _LOBE), "edge"), 2 * _LOBE + 1)
-    known = np.interp(found.frequency_hz, at, shares.min(axis=-1)) > _OWN
-    plain = unsampled(evidence.estimate, found.frequency_hz, rate_hz)
+    known = np.interp(response.frequency_hz, at, shares.min(axis=-1)) > _OWN
+    plain = unsampled(evidence.estimate, response.frequency_hz, rate_hz)
     pairs = plain.reshape(plain.shape[0], -1)
-    covariance = found.covariance * pairs[:, :, None] * pairs[:, None, :].conj()
+    covariance = response.covariance * pairs[:, :, None] * pairs[:, None, :].conj()
     covariance = np.where(known[:, None, None], covariance, np.inf)
-    return replace(found, G=found.G * plain, covariance=covariance, noise_covariance=None)
+    return replace(response, G=response.G * plain, covariance=covariance, noise_covariance=None)
 
 
 def unsampled(estimate: Estimate, frequency_hz: Array, rate_hz: float) -> NDArray[np.complex128]:
@@ -321,8 +321,8 @@ def unsampled(estimate: Estimate, frequency_hz: Array, rate_hz: float) -> NDArra
     space, late = model(estimate.model).matrices(estimate.values), estimate.delay[model(estimate.model).inputs[0]]
     d = discretise(space, 1.0 / rate_hz, fraction=late.fraction)[0]
     z = np.exp(2j * np.pi * frequency_hz / rate_hz)[:, None, None]
-    shown = d.C @ np.linalg.solve(z * np.eye(len(d.A)) - d.A, (d.B + d.B_late / z) / z**late.samples)
-    return np.asarray(_as_black_box(estimate)[0].frequency_response(2 * np.pi * frequency_hz) / shown)
+    response = d.C @ np.linalg.solve(z * np.eye(len(d.A)) - d.A, (d.B + d.B_late / z) / z**late.samples)
+    return np.asarray(_as_black_box(estimate)[0].frequency_response(2 * np.pi * frequency_hz) / response)
 
 
 def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
@@ -333,9 +333,9 @@ def _bode(estimate: Estimate, measured: FrequencyResponse | None) -> Block:
 
 
 def _poles(estimate: Estimate) -> Block:
-    found = poles(estimate)
-    table = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
-    return poles_panel(found, table, "poles of the identified plant")
+    spectrum = poles(estimate)
+    table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
+    return poles_panel(spectrum, table, "poles of the identified plant")
 
 
 # --- a nonlinear bearing --------------------------------------------------------------------------------------------
@@ -351,11 +351,11 @@ def _curves(e: NonlinearBearingEstimate) -> Block:
     """k_i, k_x and L over the position at some currents."""
     x, levels = _wide(e.usual["position"]), np.linspace(*e.usual["current"], _LEVELS)
     scale, unit = prefixed(float(np.max(np.abs(x))), "m")
-    found = [e.curves(x, level) for level in levels.tolist()]
+    curves = [e.curves(x, level) for level in levels.tolist()]
 
     def over_position(axes: Axes, name: str, meaning: str) -> None:
-        size, shown = _unit_of(found, name)
-        for color, level, at in zip(CYCLE, levels, found, strict=False):
+        size, shown = _unit_of(curves, name)
+        for color, level, at in zip(CYCLE, levels, curves, strict=False):
             inside = at.coil_inside if name == "L" else at.inside
             _banded(axes, x / scale, getattr(at, name), inside, size, color, f"at {sized(level, 'A')}")
         axes.set_xlabel(f"position [{unit}]")
@@ -368,9 +368,9 @@ def _curves(e: NonlinearBearingEstimate) -> Block:
     return Block(columns=[[p] for p in panels], title=title)
 
 
-def _unit_of(found: Sequence[Curves], name: str) -> tuple[float, str]:
-    largest = max(float(np.max(np.abs(getattr(at, name).value))) for at in found)
-    return prefixed(largest, getattr(found[0], name).unit)
+def _unit_of(curves: Sequence[Curves], name: str) -> tuple[float, str]:
+    largest = max(float(np.max(np.abs(getattr(at, name).value))) for at in curves)
+    return prefixed(largest, getattr(curves[0], name).unit)
 
 
 def _banded(axes: Axes, x: Array, c: Curve, inside: NDArray[np.bool_], scale: float, color: str, label: str) -> None:
@@ -425,9 +425,9 @@ def _map(evidence: BearingEvidence) -> Block:
     def where(axes: Axes) -> None:
         for color, t in zip(cycle(CYCLE), evidence.records, strict=False):
             every = max(1, t.measured.shape[0] // _CLOUD)
-            used = t.measured[np.isfinite(t.predicted[:, 1])][::every]
+            points = t.measured[np.isfinite(t.predicted[:, 1])][::every]
             mark = "." if np.any(np.isfinite(t.predicted[:, 0])) else "|"
-            axes.plot(used[:, 0] / scale, used[:, 1], mark, color=color, markersize=2.5, alpha=0.6, label=t.title)
+            axes.plot(points[:, 0] / scale, points[:, 1], mark, color=color, markersize=2.5, alpha=0.6, label=t.title)
         for hull, width in ((e.hull, 1.2), (e.coil_hull, 0.6)):
             corners = np.vstack([hull, hull[:1]])
             axes.plot(corners[:, 0] / scale, corners[:, 1], "-", color=MEASURED, linewidth=width)
@@ -438,12 +438,12 @@ def _map(evidence: BearingEvidence) -> Block:
     def inductance(axes: Axes) -> None:
         low, high = e.coil_hull[:, 1].min(), e.coil_hull[:, 1].max()
         currents, levels = np.linspace(low, high, _POINTS), np.linspace(*e.usual["position"], _LEVELS)
-        found = [e.curves(np.full(_POINTS, x), currents) for x in levels.tolist()]
-        size, shown = _unit_of(found, "L")
-        for color, x, at in zip(CYCLE, levels, found, strict=False):
+        curves = [e.curves(np.full(_POINTS, x), currents) for x in levels.tolist()]
+        size, unit = _unit_of(curves, "L")
+        for color, x, at in zip(CYCLE, levels, curves, strict=False):
             _banded(axes, currents, at.L, at.coil_inside, size, color, f"at {sized(x, 'm')}")
         axes.set_xlabel("current [A]")
-        axes.set_ylabel(f"L [{shown}]")
+        axes.set_ylabel(f"L [{unit}]")
         head(axes, "inductance L over the current")
 
     return Block(columns=[[Panel(draw=where, height=2.8)], [Panel(draw=inductance, height=2.8)]])

@@ -57,10 +57,11 @@ def experiment_sections(experiment: Experiment) -> list[Section]:
     ]
 
 
-def title_of(found: Experiment) -> str:
+def title_of(experiment: Experiment) -> str:
     """Return what was designed, in a few words."""
-    loop = "closed" if found.closed else "open"
-    return f"experiment for {_CRITERIA.get(found.criterion, found.criterion)} of model {found.model}, {loop} loop"
+    loop = "closed" if experiment.closed else "open"
+    aim = _CRITERIA.get(experiment.criterion, experiment.criterion)
+    return f"experiment for {aim} of model {experiment.model}, {loop} loop"
 
 
 def expected_table(x: Experiment) -> Table:
@@ -87,79 +88,83 @@ def _signals(x: Experiment) -> Table:
     return grid(rows)
 
 
-def experiment_figure(found: Experiment, title: str, width: float) -> Figure:
+def experiment_figure(experiment: Experiment, title: str, width: float) -> Figure:
     """Draw a design."""
-    limited = [name for name, x in found.signals.items() if x.low is not None or x.high is not None]
-    most = {kind_of(name): name for name in sorted(limited, key=lambda name: found.signals[name].drawn)}
+    limited = [name for name, x in experiment.signals.items() if x.low is not None or x.high is not None]
+    most = {kind_of(name): name for name in sorted(limited, key=lambda name: experiment.signals[name].drawn)}
     shown_of_kind = [name for name in limited if name in most.values()]  # of many axes that which uses most
-    waves = [panel(_excitation, found)] + [panel(_wave, found, name) for name in shown_of_kind]
-    shown = [
-        panel(_lines, found, height=2.4),
-        panel(_by_length, found, height=2.6),
-        panel(_by_level, found, height=2.6),
+    waves = [panel(_excitation, experiment)] + [panel(_wave, experiment, name) for name in shown_of_kind]
+    panels_shown = [
+        panel(_lines, experiment, height=2.4),
+        panel(_by_length, experiment, height=2.6),
+        panel(_by_level, experiment, height=2.6),
     ]
-    return stacked(title, [Block(columns=[waves, shown], widths=(3.0, 2.0), shared=False)], width)
+    return stacked(title, [Block(columns=[waves, panels_shown], widths=(3.0, 2.0), shared=False)], width)
 
 
-def _excitation(axes: Axes, found: Experiment) -> None:
-    t = np.arange(found.period) / found.rate_hz
-    for (name, wave), color in zip(found.excitation.items(), CYCLE, strict=False):
-        curve(axes, t, wave, color, name if len(found.excitation) > 1 else None)
-    head(axes, f"one period of the excitation of {_inputs(found)}")
+def _excitation(axes: Axes, experiment: Experiment) -> None:
+    t = np.arange(experiment.period) / experiment.rate_hz
+    for (name, wave), color in zip(experiment.excitation.items(), CYCLE, strict=False):
+        curve(axes, t, wave, color, name if len(experiment.excitation) > 1 else None)
+    head(axes, f"one period of the excitation of {_inputs(experiment)}")
     axes.set_ylabel("[V]")
 
 
-def _wave(axes: Axes, found: Experiment, name: str) -> None:
-    of, wave = found.signals[name], found.shown.waves[name]
-    ends = [e for e in (of.low, of.high) if e is not None]
-    scale, unit = prefixed(max(of.peak, *(abs(e) for e in ends)), of.unit)
-    curve(axes, np.arange(wave.size) / found.rate_hz, wave / scale, MEASURED, None)
+def _wave(axes: Axes, experiment: Experiment, name: str) -> None:
+    signal, wave = experiment.signals[name], experiment.shown.waves[name]
+    ends = [e for e in (signal.low, signal.high) if e is not None]
+    scale, unit = prefixed(max(signal.peak, *(abs(e) for e in ends)), signal.unit)
+    curve(axes, np.arange(wave.size) / experiment.rate_hz, wave / scale, MEASURED, None)
     for end in ends:
         axes.axhline(end / scale, color=BOUND, linestyle=":", label="limit")
-        inside = end - np.copysign(of.reserve, end)
+        inside = end - np.copysign(signal.reserve, end)
         axes.axhline(inside / scale, color=ORANGE, linestyle=":", linewidth=0.9, label="limit less noise")
     axes.set_ylabel(f"{name} [{unit}]")
     axes.set_xlabel("time [s]")
-    head(axes, f"{name}: {100 * max(of.steady, of.from_rest):.0f} % of the limits, drawn plants {100 * of.drawn:.0f} %",
-         good=of.drawn <= 1.001)  # fmt: skip
+    share = 100 * max(signal.steady, signal.from_rest)
+    head(
+        axes,
+        f"{name}: {share:.0f} % of the limits, drawn plants {100 * signal.drawn:.0f} %",
+        good=signal.drawn <= 1.001,
+    )
 
 
-def _inputs(found: Experiment) -> str:
-    names = list(found.excitation)
+def _inputs(experiment: Experiment) -> str:
+    names = list(experiment.excitation)
     return names[0] if len(names) == 1 else f"{len(names)} inputs"
 
 
-def _lines(axes: Axes, found: Experiment) -> None:
-    for size, color in zip(found.amplitude.values(), CYCLE, strict=False):
-        f, own = found.frequency_hz[size > 0.0], size[size > 0.0]
+def _lines(axes: Axes, experiment: Experiment) -> None:
+    for size, color in zip(experiment.amplitude.values(), CYCLE, strict=False):
+        f, own = experiment.frequency_hz[size > 0.0], size[size > 0.0]
         axes.vlines(f, 1e-3 * own.max(), own, color=color, linewidth=0.8)
         axes.plot(f, own, ".", color=color, markersize=3)
-    head(axes, f"{found.frequency_hz.size} lines of {_inputs(found)}")
-    largest = max(float(size.max()) for size in found.amplitude.values())
-    least = min(float(size[size > 0.0].min()) for size in found.amplitude.values())
-    log_axis(axes.xaxis, float(found.frequency_hz[0]), float(found.frequency_hz[-1]))
+    head(axes, f"{experiment.frequency_hz.size} lines of {_inputs(experiment)}")
+    largest = max(float(size.max()) for size in experiment.amplitude.values())
+    least = min(float(size[size > 0.0].min()) for size in experiment.amplitude.values())
+    log_axis(axes.xaxis, float(experiment.frequency_hz[0]), float(experiment.frequency_hz[-1]))
     log_axis(axes.yaxis, max(0.5 * least, 1e-3 * largest), largest)
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("amplitude [V]")
 
 
-def _by_length(axes: Axes, found: Experiment) -> None:
-    for (name, sd), color in zip(found.shown.by_length.items(), CYCLE * 2, strict=False):
-        axes.plot(found.shown.seconds, 100.0 * sd, color=color, label=name)
-    axes.axhline(100.0 * found.target, color=BOUND, linestyle=":")
-    axes.axvline(found.seconds, color=MEASURED, linewidth=0.8)
-    log_axis(axes.xaxis, float(found.shown.seconds[0]), float(found.shown.seconds[-1]))
+def _by_length(axes: Axes, experiment: Experiment) -> None:
+    for (name, sd), color in zip(experiment.shown.by_length.items(), CYCLE * 2, strict=False):
+        axes.plot(experiment.shown.seconds, 100.0 * sd, color=color, label=name)
+    axes.axhline(100.0 * experiment.target, color=BOUND, linestyle=":")
+    axes.axvline(experiment.seconds, color=MEASURED, linewidth=0.8)
+    log_axis(axes.xaxis, float(experiment.shown.seconds[0]), float(experiment.shown.seconds[-1]))
     axes.set_yscale("log")
     axes.set_xlabel("length of the record [s]")
     axes.set_ylabel("relative sd [%]")
-    head(axes, f"expected over length, aim {100 * found.target:.3g} %")
+    head(axes, f"expected over length, aim {100 * experiment.target:.3g} %")
 
 
-def _by_level(axes: Axes, found: Experiment) -> None:
-    for (name, sd), color in zip(found.shown.by_level.items(), CYCLE * 2, strict=False):
-        axes.plot(100.0 * found.shown.levels, 100.0 * sd, color=color, label=name)
-    axes.axhline(100.0 * found.target, color=BOUND, linestyle=":")
+def _by_level(axes: Axes, experiment: Experiment) -> None:
+    for (name, sd), color in zip(experiment.shown.by_level.items(), CYCLE * 2, strict=False):
+        axes.plot(100.0 * experiment.shown.levels, 100.0 * sd, color=color, label=name)
+    axes.axhline(100.0 * experiment.target, color=BOUND, linestyle=":")
     axes.set_yscale("log")
     axes.set_xlabel("amplitude [% of the design's]")
     axes.set_ylabel("relative sd [%]")
-    head(axes, f"expected over level, record of {found.seconds:.3g} s")
+    head(axes, f"expected over level, record of {experiment.seconds:.3g} s")

@@ -49,9 +49,9 @@ _SOURCES = {
 }
 
 
-def fit_document(fit: AnyFit, used: Any) -> Document:
-    """Describe a fit; `used`: its records, alone or with the second record behind them."""
-    first, second = used if isinstance(used, tuple) else (() if used is None else (used,), None)
+def fit_document(fit: AnyFit, source: Any) -> Document:
+    """Describe a fit; `source`: its records, alone or with the second record behind them."""
+    first, second = source if isinstance(source, tuple) else (() if source is None else (source,), None)
 
     def traces() -> Sequence[Traces]:
         own = [traces_of(fit, x, title=f"record {k}" if len(first) > 1 else "") for k, x in enumerate(first, 1)]
@@ -142,14 +142,14 @@ def coefficient_parts(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[
     """Return the coefficients that are not fixed by the structure, each with its standard deviation, `without` some."""
     theta, sd = fit.model.theta, fit.sd
     free = np.setdiff1d(np.nonzero(theta != np.round(theta) if sd is None else sd > 0)[0], without)
-    named: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for part in _NAMED:
-        named |= cast("Mapping[str, Any]", fit.details.get(part, {}))
+        by_name |= cast("Mapping[str, Any]", fit.details.get(part, {}))
     rows = [
         (fit.model.names[k], coefficient_text(float(theta[k]), 0.0 if sd is None else float(sd[k])))
-        for k in free[: 0 if named else _COEFFICIENTS]
+        for k in free[: 0 if by_name else _COEFFICIENTS]
     ]
-    rows += [(f"{k} [{x['unit']}]", coefficient_text(x["value"], x["sd"])) for k, x in named.items()]
+    rows += [(f"{k} [{x['unit']}]", coefficient_text(x["value"], x["sd"])) for k, x in by_name.items()]
     if not rows:
         return []
     head = ("", "value" if sd is None else "value ± sd")
@@ -158,7 +158,7 @@ def coefficient_parts(fit: BlackBoxFit, *, without: Sequence[int] = ()) -> list[
         half = -(-len(rows) // 2)
         right = [*rows[half:], ("", "")][:half]
         table = [(*a, *b) for a, b in zip([head, *rows[:half]], [head, *right], strict=True)]
-    return [grid(table), _rest(0 if named else free.size - len(rows))]
+    return [grid(table), _rest(0 if by_name else free.size - len(rows))]
 
 
 def _rest(n: int) -> Lines:
@@ -178,18 +178,18 @@ def number_parts(fit: NonlinearFit) -> list[Part]:
         parts = schedule_parts(fit)
     else:
         parts = named_parts(fit)
-    return [*parts, Lines(lines=_count(fit, shown=bool(parts)))]
+    return [*parts, Lines(lines=_count(fit, readable=bool(parts)))]
 
 
-def _count(fit: NonlinearFit, *, shown: bool) -> list[str]:
+def _count(fit: NonlinearFit, *, readable: bool) -> list[str]:
     assert fit.model is not None
-    known = "no standard deviations"
+    remark = "no standard deviations"
     if fit.sd is not None:
-        known = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
+        remark = f"standard deviations from {_SOURCES.get(fit.covariance_from, fit.covariance_from)}"
     elif "uncertainty" in fit.settings:
-        known += f" ({setting('orders', 'uncertainty=...')} gives them)"
-    size, rest = fit.model.theta.size, "" if shown else f"; {setting('json')} has them all"
-    lines = [f"{size} parameters, {fit.n_estimated} estimated, {known}{rest}"]
+        remark += f" ({setting('orders', 'uncertainty=...')} gives them)"
+    size, rest = fit.model.theta.size, "" if readable else f"; {setting('json')} has them all"
+    lines = [f"{size} parameters, {fit.n_estimated} estimated, {remark}{rest}"]
     effective = fit.details.get("effective_parameters")
     if isinstance(effective, (int, float)) and math.isfinite(effective) and round(effective, 1) < fit.n_estimated:
         lines.append(f"regularised to {effective:.3g} effective parameters")
@@ -203,14 +203,14 @@ def term_parts(fit: NonlinearFit) -> list[Part]:
     """
     assert fit.model is not None
     ratio = term_ratios(fit)
-    named = [k for k, name in enumerate(fit.model.names) if not is_weight(name)]
-    weights = fit.model.theta.size - len(named)
-    rows: list[tuple[str, ...]] = [("term", _column(fit)), *(_row(fit, k) for k in named[:_TERMS])]
+    readable = [k for k, name in enumerate(fit.model.names) if not is_weight(name)]
+    weights = fit.model.theta.size - len(readable)
+    rows: list[tuple[str, ...]] = [("term", _column(fit)), *(_row(fit, k) for k in readable[:_TERMS])]
     if any(isinstance(x, (int, float)) for x in ratio.values()):
-        shares = ["ERR", *(_percent(ratio.get(fit.model.names[k])) for k in named[:_TERMS])]
+        shares = ["ERR", *(_percent(ratio.get(fit.model.names[k])) for k in readable[:_TERMS])]
         rows = [(*r, x) for r, x in zip(rows, shares, strict=True)]
     network = [f"and a network of {weights} weights; {setting('json')} has them"] if weights else []
-    return [grid(rows, right=(2,)), _rest(len(named) - _TERMS), Lines(lines=network)]
+    return [grid(rows, right=(2,)), _rest(len(readable) - _TERMS), Lines(lines=network)]
 
 
 def named_parts(fit: NonlinearFit) -> list[Part]:
@@ -244,10 +244,10 @@ def schedule_parts(fit: NonlinearFit) -> list[Part]:
     return [head, grid([names, *rows])]
 
 
-def _poles(found: Sequence[Sequence[Any]]) -> str:
+def _poles(poles: Sequence[Sequence[Any]]) -> str:
     """Real poles one by one, pairs once."""
     out = []
-    for pole in found:
+    for pole in poles:
         real, imaginary, *sd = (math.nan if v is None else float(v) for v in pole)
         if imaginary < 0:
             continue
@@ -256,9 +256,9 @@ def _poles(found: Sequence[Sequence[Any]]) -> str:
     return ", ".join(out)
 
 
-def _number(found: Sequence[Any]) -> str:
-    value = float(found[0])
-    sd = math.nan if len(found) < 2 or found[1] is None else float(found[1])
+def _number(pole: Sequence[Any]) -> str:
+    value = float(pole[0])
+    sd = math.nan if len(pole) < 2 or pole[1] is None else float(pole[1])
     return coefficient_text(value, sd if math.isfinite(sd) and sd > 0 else None) if math.isfinite(value) else "none"
 
 
@@ -297,15 +297,15 @@ def curve_line(curve: LearningCurve) -> str:
         f"{curve.method}: {n} step{'' if n == 1 else 's'}, {sized(float(curve.seconds[-1]), 's')}, error"
         f" {curve.training[0]:.3g} -> {curve.training[-1]:.3g} of the output"
     )
-    held = curve.held_out[np.isfinite(curve.held_out)]
-    return text + (f", held out {held[0]:.3g} -> {np.min(held):.3g}" if held.size else "")
+    values = curve.held_out[np.isfinite(curve.held_out)]
+    return text + (f", held out {values[0]:.3g} -> {np.min(values):.3g}" if values.size else "")
 
 
 _INFLUENCES = 24  # coefficients of a sensitivity analysis
 
 
-def comparison_document(comparison: Comparison, used: Any) -> Document:
-    """Describe a comparison; `used`: the data that it was judged on."""
+def comparison_document(comparison: Comparison, source: Any) -> Document:
+    """Describe a comparison; `source`: the data that it was judged on."""
 
     def frame() -> Frame:
         names = ("structure", "orders", "one_step", "simulation", "seconds", "n_estimated", "bic", "failed")
@@ -316,7 +316,7 @@ def comparison_document(comparison: Comparison, used: Any) -> Document:
     name = RecordEntry.of(comparison.record).name
     return Document(
         title=f"{name}, {len(comparison.entries)} structures compared", sections=comparison_sections(comparison),
-        figure=partial(comparison_figure, comparison, used), frame=frame,
+        figure=partial(comparison_figure, comparison, source), frame=frame,
     )  # fmt: skip
 
 

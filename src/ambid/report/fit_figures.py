@@ -101,12 +101,12 @@ def fit_overview(
     return stacked(_title(fit, records, second), blocks, width)
 
 
-def comparison_figure(found: Comparison, held_out: IOData | None = None, width: float = WIDE) -> Figure:
+def comparison_figure(comparison: Comparison, held_out: IOData | None = None, width: float = WIDE) -> Figure:
     """Draw the errors of each structure on data that it has not seen, best first, and its residual tests.
 
     `held_out`: those data; then the best structure is drawn beside them.
     """
-    entries = [x for x in found.entries if x.fit is not None]
+    entries = [x for x in comparison.entries if x.fit is not None]
     at = np.arange(len(entries))
 
     def named(axes: Axes) -> None:
@@ -124,7 +124,7 @@ def comparison_figure(found: Comparison, held_out: IOData | None = None, width: 
         log_axis(axes.xaxis, float(np.nanmin(sizes)) / 1.5, 1.5 * float(np.nanmax(sizes)))
         named(axes)
         axes.set_xlabel("not explained [% of the outputs]")
-        head(axes, f"errors on the {found.judged_on}: smaller is better")
+        head(axes, f"errors on the {comparison.judged_on}: smaller is better")
 
     def tests(axes: Axes) -> None:
         for name, mark, color in (("residuals_white", "o", PREDICTED), ("residuals_uncorrelated", "D", BOUND)):
@@ -142,7 +142,7 @@ def comparison_figure(found: Comparison, held_out: IOData | None = None, width: 
     if held_out is not None and entries and entries[0].fit is not None:
         traces = traces_of(entries[0].fit, held_out, second=True)
         blocks += [signals_panel(traces), residuals_panel(traces)]
-    name, best = found.record.get("file") or "record", entries[0].structure if entries else "none"
+    name, best = comparison.record.get("file") or "record", entries[0].structure if entries else "none"
     return stacked(f"{name}: structures compared, {best} predicts unseen data best", blocks, width)
 
 
@@ -155,9 +155,9 @@ def _nonlinear_blocks(fit: NonlinearFit, records: Sequence[IOData], second: IODa
     if fit.covariance is not None and (bars is None or bars.n_others) and records:
         where, data = ("the second record", second) if second is not None else (_name(records[0], 0), records[0])
         blocks.append(_draw_band(fit, data, where))
-    shown = _correlations(fit, records) if records else []
-    if shown:
-        blocks.append(_draw_correlations(shown))
+    correlations_shown = _correlations(fit, records) if records else []
+    if correlations_shown:
+        blocks.append(_draw_correlations(correlations_shown))
     if any(c.training.size for c in fit.curves):
         blocks.append(_draw_training(fit))
     return blocks
@@ -181,14 +181,14 @@ def _signals(fit: BlackBoxFit | NonlinearFit, records: Sequence[IOData], second:
     """One record large, with a close view; several below each other."""
     if not records:
         return []
-    found = [traces_of(fit, x, _name(x, k)) for k, x in enumerate(records[:_RECORDS])]
+    traces = [traces_of(fit, x, _name(x, k)) for k, x in enumerate(records[:_RECORDS])]
     if second is not None:
         title = f"second record, not fitted: {second.record.get('file') or 'record'}"
-        found.append(traces_of(fit, second, title, second=True))
-    if len(found) > 1:
-        return [records_panel(found)]
+        traces.append(traces_of(fit, second, title, second=True))
+    if len(traces) > 1:
+        return [records_panel(traces)]
     failed = [name for name, c in fit.checks.items() if not c.passed]
-    return [signals_panel(found[0]), residuals_panel(found[0]), whiteness_panel(found[0], failed)]
+    return [signals_panel(traces[0]), residuals_panel(traces[0]), whiteness_panel(traces[0], failed)]
 
 
 def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *, second: bool = False) -> Traces:
@@ -210,9 +210,9 @@ def traces_of(fit: BlackBoxFit | NonlinearFit, data: IOData, title: str = "", *,
                 late = np.full((k - 1, data.n_outputs), np.nan)
                 ahead[k] = np.vstack([late, data.y[k - 1 :] - errors_ahead(errors, k)])
     else:
-        found = run(fit, data)
-        first, predicted = found.lag, data.y - found.one_step
-        free = None if found.simulation is None or found.diverges_at is not None else data.y - found.simulation
+        result = run(fit, data)
+        first, predicted = result.lag, data.y - result.one_step
+        free = None if result.simulation is None or result.diverges_at is not None else data.y - result.simulation
     return Traces(
         title=title,
         second=second,
@@ -251,9 +251,9 @@ def _poles(fit: BlackBoxFit) -> Block:
     poles, zeros = fit.model.poles(), fit.model.zeros()
     reach = 3 * max(1.0, float(np.max(np.abs(poles), initial=0.0)))
     near = np.abs(zeros) < reach
-    known, of_poles, of_zeros = fit.covariance, None, None
-    if known is not None:
-        of_poles, of_zeros = pole_covariance(fit.model, known), zero_covariance(fit.model, known)[near]
+    covariance, of_poles, of_zeros = fit.covariance, None, None
+    if covariance is not None:
+        of_poles, of_zeros = pole_covariance(fit.model, covariance), zero_covariance(fit.model, covariance)[near]
     far = int(zeros.size - np.count_nonzero(near))
     hidden = f"; {counted(far, 'zero')} farther out" if far else ""
     delayed = ", without the delay" if isinstance(fit.model, TransferModel) and any(fit.model.delay) else ""
@@ -274,20 +274,20 @@ def _correlations(fit: NonlinearFit, records: Sequence[IOData]) -> list[Correlat
 
     Returns over all records; empty where they are too short, or errors are not finite.
     """
-    found = [run(fit, x) for x in records]
-    if not all(x.finite for x in found):
+    results = [run(fit, x) for x in records]
+    if not all(x.finite for x in results):
         return []
-    prepared = nonlinear_residuals(fit, records, found, coloured=leaves_colour_open(fit, records, found))
+    prepared = nonlinear_residuals(fit, records, results, coloured=leaves_colour_open(fit, records, results))
     return [] if prepared is None else correlations(prepared, records[0].inputs, records[0].outputs)[:_MOST]
 
 
-def _draw_correlations(shown: list[Correlation]) -> Block:
+def _draw_correlations(correlations_shown: list[Correlation]) -> Block:
     def one(axes: Axes, c: Correlation) -> None:
         stems(axes, c.lags, c.values, c.band)
         axes.set_xlabel("lag [samples]")
         head(axes, c.title)
 
-    columns = [[panel(one, c) for c in shown[k::_ACROSS]] for k in range(_ACROSS)]
+    columns = [[panel(one, c) for c in correlations_shown[k::_ACROSS]] for k in range(_ACROSS)]
     return Block(columns=[x for x in columns if x], title="correlations of residuals (Billings and Voon 1986)")
 
 
@@ -328,20 +328,20 @@ def bars_of(fit: NonlinearFit) -> Bars | None:
     if sd is None or model is None:
         return None
     worth = estimated = np.flatnonzero(sd > 0)
-    named = term_names(fit)
-    if named:
-        worth = np.array([k for k in worth if model.names[k] in named], dtype=int)
+    names = term_names(fit)
+    if names:
+        worth = np.array([k for k in worth if model.names[k] in names], dtype=int)
     elif worth.size > MOST_COEFFICIENTS or any(map(is_weight, model.names)):
         return None
     if not worth.size:
         return None
     order = worth[np.argsort(-np.abs(model.theta[worth]) / sd[worth], kind="stable")]
-    shown = order[:MOST_COEFFICIENTS]
+    largest = order[:MOST_COEFFICIENTS]
     return Bars(
-        names=tuple(model.names[k] for k in shown),
-        theta=model.theta[shown],
-        half_width=NORMAL_95 * sd[shown],
-        n_more=int(order.size - shown.size),
+        names=tuple(model.names[k] for k in largest),
+        theta=model.theta[largest],
+        half_width=NORMAL_95 * sd[largest],
+        n_more=int(order.size - largest.size),
         n_others=int(estimated.size - order.size),
     )
 
@@ -431,8 +431,8 @@ def pole_parts(fit: BlackBoxFit) -> list[Part]:
     poles = fit.model.poles()
     spread = None if fit.covariance is None else pole_covariance(fit.model, fit.covariance)
     covariances = [None] * poles.size if spread is None else list(spread)
-    shown = [k for k in range(poles.size) if poles[k].imag >= 0][:_POLES]
-    return pole_table([(complex(poles[k]), covariances[k]) for k in shown], None if fit.model.dt is None else fit.dt)
+    upper = [k for k in range(poles.size) if poles[k].imag >= 0][:_POLES]
+    return pole_table([(complex(poles[k]), covariances[k]) for k in upper], None if fit.model.dt is None else fit.dt)
 
 
 def term_ratios(fit: NonlinearFit) -> dict[str, object]:

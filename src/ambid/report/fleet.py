@@ -28,9 +28,9 @@ _SHOWN = 3  # records of one reason
 _REASONS = 8
 
 
-def fleet_title(found: FleetRun) -> str:
+def fleet_title(fleet: FleetRun) -> str:
     """Return what a run is, in a few words."""
-    return f"{found.job} of {counted(found.records, 'record')}"
+    return f"{fleet.job} of {counted(fleet.records, 'record')}"
 
 
 def fleet_document(fleet: FleetRun, _: Any) -> Document:
@@ -78,14 +78,16 @@ def fleet_sections(fleet: FleetRun) -> list[Section]:
 _COUNTED = {"failed": "failed", "known": "known before", "left": "left"}
 
 
-def _values(found: FleetRun, name: str) -> tuple[list[int], list[float], list[float]]:
+def _values(fleet: FleetRun, name: str) -> tuple[list[int], list[float], list[float]]:
     """Return row, value and standard deviation of a number where a record shows it."""
-    shown = [(k, *row.values[name]) for k, row in enumerate(found.rows) if row.values.get(name, (None,))[0] is not None]
-    return [k for k, _, _ in shown], [float(x or 0.0) for _, x, _ in shown], [s or 0.0 for _, _, s in shown]
+    points = [
+        (k, *row.values[name]) for k, row in enumerate(fleet.rows) if row.values.get(name, (None,))[0] is not None
+    ]
+    return [k for k, _, _ in points], [float(x or 0.0) for _, x, _ in points], [s or 0.0 for _, _, s in points]
 
 
-def _names(found: FleetRun) -> list[str]:
-    return list(dict.fromkeys(name for row in found.rows for name in row.values))
+def _names(fleet: FleetRun) -> list[str]:
+    return list(dict.fromkeys(name for row in fleet.rows for name in row.values))
 
 
 def _spread(fleet: FleetRun) -> list[tuple[str, ...]]:
@@ -99,15 +101,15 @@ def _spread(fleet: FleetRun) -> list[tuple[str, ...]]:
     return rows
 
 
-def fleet_figure(found: FleetRun, title: str, width: float) -> Figure:
+def fleet_figure(fleet: FleetRun, title: str, width: float) -> Figure:
     """Draw each number over the records, with its 95 % interval."""
-    panels = [panel(_strip, found, name) for name in _names(found) if _values(found, name)[0]]
+    panels = [panel(_strip, fleet, name) for name in _names(fleet) if _values(fleet, name)[0]]
     return stacked(title, [Block(columns=[panels])] if panels else [said_panel("no record gave a number")], width)
 
 
-def _strip(axes: Axes, found: FleetRun, name: str) -> None:
-    at, x, s = (np.array(c, dtype=float) for c in _values(found, name))
-    scale, unit = prefixed(float(np.max(np.abs(x))), found.units.get(name, "1"))
+def _strip(axes: Axes, fleet: FleetRun, name: str) -> None:
+    at, x, s = (np.array(c, dtype=float) for c in _values(fleet, name))
+    scale, unit = prefixed(float(np.max(np.abs(x))), fleet.units.get(name, "1"))
     axes.errorbar(at, x / scale, 1.96 * s / scale, fmt=".", color=MEASURED, markersize=3, linewidth=0.7)
     axes.axhline(float(np.median(x)) / scale, color=BOUND, linestyle=":", label="median")
     head(axes, f"{name}: {counted(len(at), 'record')}")
@@ -118,9 +120,9 @@ def _strip(axes: Axes, found: FleetRun, name: str) -> None:
 _MOST_REASONS = 5
 
 
-def coverage_title(found: Coverage) -> str:
+def coverage_title(coverage: Coverage) -> str:
     """Return what was done, in a few words."""
-    return f"{found.job} of {counted(len(found.trials), 'simulated record')} of {found.rig}"
+    return f"{coverage.job} of {counted(len(coverage.trials), 'simulated record')} of {coverage.rig}"
 
 
 def coverage_document(coverage: Coverage, _: Any) -> Document:
@@ -164,9 +166,9 @@ def _row(r: Covered, unit: str) -> tuple[str, ...]:
     )  # fmt: skip
 
 
-def coverage_figure(found: Coverage, title: str, width: float) -> Figure:
+def coverage_figure(coverage: Coverage, title: str, width: float) -> Figure:
     """Draw how often intervals hold the truth, and the errors in standard deviations."""
-    rows = found.rows
+    rows = coverage.rows
     if not rows:
         return stacked(title, [said_panel("no run gave a number")], width)
 
@@ -184,7 +186,7 @@ def coverage_figure(found: Coverage, title: str, width: float) -> Figure:
     def errors(axes: Axes) -> None:
         from scipy.stats import norm
 
-        z = np.concatenate([found.z(r.name) for r in rows])
+        z = np.concatenate([coverage.z(r.name) for r in rows])
         reach = max(4.0, float(np.ceil(np.max(np.abs(z)))))
         axes.hist(z, bins=np.linspace(-reach, reach, 41).tolist(), density=True, color=BAND, label="all parameters")
         x = np.linspace(-reach, reach, 200)

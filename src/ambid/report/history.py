@@ -101,29 +101,29 @@ def history_sections(history: History) -> list[Section]:
 
 
 def _row(s: Series, n: int) -> tuple[str, ...]:
-    known = np.flatnonzero(np.isfinite(s.value))
-    seen = f"{known.size} of {n}"
-    if not known.size:
-        return s.name, "never identifiable", "", "", seen
-    a, z = int(known[0]), int(known[-1])
-    said = quantity(float(s.value[z]), float(s.sd[z]), s.unit).text
+    finite = np.flatnonzero(np.isfinite(s.value))
+    count = f"{finite.size} of {n}"
+    if not finite.size:
+        return s.name, "never identifiable", "", "", count
+    a, z = int(finite[0]), int(finite[-1])
+    latest = quantity(float(s.value[z]), float(s.sd[z]), s.unit).text
     change = ""
     if a != z and s.value[a]:
         change = percent(float(s.value[z] / s.value[a] - 1), math.hypot(s.sd[a], s.sd[z]) / abs(float(s.value[a])))
-    return s.name, said, day(float(s.taken_at[z])), change, seen
+    return s.name, latest, day(float(s.taken_at[z])), change, count
 
 
-def bearings_text(found: Sequence[KnownBearing], failures: Iterable[Failure], *, paint: Paint = plain) -> str:
+def bearings_text(bearings: Sequence[KnownBearing], failures: Iterable[Failure], *, paint: Paint = plain) -> str:
     """Write what a ledger holds: its bearings, and the records that gave no estimate."""
     rows = [("bearing", "rig", "estimates", "first", "last")]
-    rows += [(b.name, b.plant, str(b.estimates), day(b.first), day(b.last)) for b in found]
+    rows += [(b.name, b.plant, str(b.estimates), day(b.first), day(b.last)) for b in bearings]
     failed = list(failures)
     lines = [f"{f.record or f.sha[:12]} ({f.bearing}): {f.reason}" for f in failed[:_SHOWN]]
     rest = len(failed) - _SHOWN
     title = paint(f"{counted(len(failed), 'record')} without an estimate", "strong")
     return joined(
         [
-            columns(rows, right=(2,)) if found else ["no estimates yet"],
+            columns(rows, right=(2,)) if bearings else ["no estimates yet"],
             [title, *lines, *([f"… and {rest} more"] if rest > 0 else [])] if failed else [],
         ]
     )
@@ -180,14 +180,14 @@ def _trend(t: Trend) -> tuple[str, ...]:
     return t.bearing, t.parameter, f"{percent(t.per_month or 0.0, t.per_month_sd or 0.0)} a month", reach
 
 
-def watch_figure(found: Watched, title: str, width: float) -> Figure:
+def watch_figure(watched: Watched, title: str, width: float) -> Figure:
     """Draw the parameters with alarms, with limit, date and its interval."""
-    if found.used is None:
+    if watched.used is None:
         return stacked(title, [said_panel("figures need the histories, which a file of alarms does not hold")], width)
-    histories = {h.bearing: h for h in found.used}
-    first = {(a.bearing, a.parameter): a for a in reversed(found.alarms)}
-    shown = list(reversed(first.values()))[:_PANELS]
-    if not shown:
+    histories = {h.bearing: h for h in watched.used}
+    first = {(a.bearing, a.parameter): a for a in reversed(watched.alarms)}
+    alarms = list(reversed(first.values()))[:_PANELS]
+    if not alarms:
         return stacked(title, [said_panel("no alarm")], width)
 
     def draw(axes: Axes, a: Alarm) -> None:
@@ -202,7 +202,7 @@ def watch_figure(found: Watched, title: str, width: float) -> Figure:
         axes.set_ylim(min(low, limit - room), max(high, limit + room))
         head(axes, f"{a.bearing}: {a.cause}", good=a.cleared is not None)
 
-    return stacked(title, [Block(columns=[[panel(draw, a, height=2.0) for a in shown]], shared=False)], width)
+    return stacked(title, [Block(columns=[[panel(draw, a, height=2.0) for a in alarms]], shared=False)], width)
 
 
 _MANY = 6  # parameters from which panels stand in two columns
@@ -214,14 +214,14 @@ _KINDS = {"rig": (GREEN, "--")}  # others: an event's
 _EVENT = (PURPLE, ":")
 
 
-def history_figure(found: History, title: str, width: float) -> Figure:
+def history_figure(history: History, title: str, width: float) -> Figure:
     """Draw a history, a panel a parameter."""
-    names = list(found.measured)
+    names = list(history.measured)
     if not names:
         return stacked(title, [said_panel("no parameter was estimated")], width)
     split = -(-len(names) // 2) if len(names) > _MANY else len(names)
     groups = [names[:split], names[split:]] if len(names) > split else [names]
-    columns = [[panel(draw_parameter, found, name, height=1.7) for name in group] for group in groups]
+    columns = [[panel(draw_parameter, history, name, height=1.7) for name in group] for group in groups]
     return stacked(title, [Block(columns=columns, widths=(1.0,) * len(columns))], width)
 
 
@@ -230,33 +230,33 @@ def dates(at: Array) -> NDArray[np.datetime64]:
     return (1000.0 * at).astype("datetime64[ms]")
 
 
-def draw_parameter(axes: Axes, found: History, name: str) -> float:
+def draw_parameter(axes: Axes, history: History, name: str) -> float:
     """Draw a parameter over time, and return the scale of the drawing."""
     from matplotlib import dates as calendar
 
-    s = found.measured[name]
-    known = np.isfinite(s.value)
+    s = history.measured[name]
+    finite = np.isfinite(s.value)
     t, half = dates(s.taken_at), NORMAL_95 * s.sd
-    scale, unit = prefixed(float(np.max(np.abs(s.value[known]), initial=0.0)), s.unit)
+    scale, unit = prefixed(float(np.max(np.abs(s.value[finite]), initial=0.0)), s.unit)
     x: Any = t
     axes.fill_between(x, (s.value - half) / scale, (s.value + half) / scale, color=BAND, linewidth=0, label="95 % band")
     axes.plot(x, s.value / scale, color=PREDICTED, linewidth=0.9)
-    if known.sum() <= _POINTS:
-        doubt = np.array([found.estimates[k].verdict == "caution" for k in s.estimate], dtype=bool)
+    if finite.sum() <= _POINTS:
+        doubt = np.array([history.estimates[k].verdict == "caution" for k in s.estimate], dtype=bool)
         for which, colour, label in (
-            (known & ~doubt, PREDICTED, "usable"),
-            (known & doubt, ORANGE, "use with caution"),
+            (finite & ~doubt, PREDICTED, "usable"),
+            (finite & doubt, ORANGE, "use with caution"),
         ):
             if which.any():
                 axes.errorbar(
                     x[which], s.value[which] / scale, half[which] / scale, fmt="o", color=colour, markersize=3.5,
                     elinewidth=0.9, label=label,
                 )  # fmt: skip
-    _limits(axes, s.value[known] / scale, half[known] / scale)
+    _limits(axes, s.value[finite] / scale, half[finite] / scale)
     _gaps(axes, x, s)
-    for note in found.events:
+    for note in history.events:
         _mark(axes, note, name)
-    first, last = found.estimates[0].taken_at, found.estimates[-1].taken_at
+    first, last = history.estimates[0].taken_at, history.estimates[-1].taken_at
     room = 0.02 * (last - first) or 43200.0
     axes.set_xlim(*dates(np.array([first - room, last + room])))
     place: Any = calendar.AutoDateLocator(tz=UTC)  # type: ignore[no-untyped-call]
@@ -264,8 +264,8 @@ def draw_parameter(axes: Axes, found: History, name: str) -> float:
     axes.xaxis.set_major_formatter(calendar.ConciseDateFormatter(place, tz=UTC))  # type: ignore[no-untyped-call]
     axes.set_xlabel("record taken (UTC)")
     axes.set_ylabel(f"{name} [{unit}]" if unit not in ("", "1") else name)
-    out = int(known.size - known.sum())
-    head(axes, f"{counted(int(known.sum()), 'value')}{f', {out} not known' if out else ''}", good=bool(known.any()))
+    out = int(finite.size - finite.sum())
+    head(axes, f"{counted(int(finite.sum()), 'value')}{f', {out} not known' if out else ''}", good=bool(finite.any()))
     return scale
 
 

@@ -43,14 +43,14 @@ def margins_document(margins: Margins, _: Any) -> Document:
 def margins_sections(margins: Margins) -> list[Section]:
     """Say the margins of a loop."""
     m, record = margins, RecordEntry.of(margins.record)
-    of = "the rig's [loop]"
+    origin = "the rig's [loop]"
     if m.controller["source"] == "record":
         orders = m.controller["order"]
         assert isinstance(orders, list | tuple)
-        of = f"identified from the record, order {max(int(str(n)) for n in orders)}"
+        origin = f"identified from the record, order {max(int(str(n)) for n in orders)}"
     turning = f", at {m.speed * TURN:.6g} 1/min" if m.speed else ""
     head = title_line(record, f"loop of {'a record' if m.of == 'record' else 'an estimate'}", m.status)
-    about = f"model {m.model}{turning}; controller: {of}"
+    about = f"model {m.model}{turning}; controller: {origin}"
     opened = [
         (axis if k == 0 else "", name, *opening_cells(opening))
         for axis, of_axis in m.margins.items()
@@ -98,14 +98,14 @@ def _measured(s: AxisSensitivity) -> str:
     return f"{pure(s.measured_peak_db, s.measured_sd_db or 0.0)} dB at {sized(s.measured_frequency_hz, 'Hz')}"
 
 
-def opening_cells(of: Opening) -> tuple[str, ...]:
+def opening_cells(opening: Opening) -> tuple[str, ...]:
     """Write gain, phase, delay, disk margin and peak of a loop that is opened."""
-    gain = f"{_number(of.gain_down)} … {_number(of.gain_up)}"
-    phase = _NONE if of.phase_deg is None else f"{of.phase_deg:.0f}°"
-    delay = _NONE if of.delay_s is None else sized(of.delay_s, "s")
-    d = of.disk
+    gain = f"{_number(opening.gain_down)} … {_number(opening.gain_up)}"
+    phase = _NONE if opening.phase_deg is None else f"{opening.phase_deg:.0f}°"
+    delay = _NONE if opening.delay_s is None else sized(opening.delay_s, "s")
+    d = opening.disk
     disk = _NONE if d is None else f"{_number(d.gain_down)} … {_number(d.gain_up)}, {d.phase_deg:.0f}°"
-    return (gain, phase, delay, disk, f"{of.peak_db:.2f} dB")
+    return (gain, phase, delay, disk, f"{opening.peak_db:.2f} dB")
 
 
 def _number(x: float | None) -> str:
@@ -134,29 +134,29 @@ def _room(m: Margins) -> list[Section]:
     return [Section(heading=[(title, "strong")], parts=[grid(rows), Lines(lines=lines, wrap=False)])]
 
 
-def _demand(of: Demand | None, unit: str) -> str:
-    if of is None or (of.rms is None and of.room is None):
+def _demand(demand: Demand | None, unit: str) -> str:
+    if demand is None or (demand.rms is None and demand.room is None):
         return _NONE
-    if of.room is None:
-        return sized(of.rms or 0.0, unit)
-    share = "" if of.rms is None or not of.room else f"{100.0 * of.rms / of.room:.2g} % of "
-    return f"{share}{sized(of.room, unit)}"
+    if demand.room is None:
+        return sized(demand.rms or 0.0, unit)
+    share = "" if demand.rms is None or not demand.room else f"{100.0 * demand.rms / demand.room:.2g} % of "
+    return f"{share}{sized(demand.room, unit)}"
 
 
 _DB = (-12.0, 16.0)
 
 
-def margins_figure(found: Margins, title: str, width: float) -> Figure:
+def margins_figure(margins: Margins, title: str, width: float) -> Figure:
     """Draw sensitivity and compliance, a row an axis."""
-    axes = list(found.sensitivity)
+    axes = list(margins.sensitivity)
     block = Block(
         columns=[
-            [panel(sensitivity_panel, found, axis, height=2.2) for axis in axes],
-            [panel(_compliance, found, axis, height=2.2) for axis in axes],
+            [panel(sensitivity_panel, margins, axis, height=2.2) for axis in axes],
+            [panel(_compliance, margins, axis, height=2.2) for axis in axes],
         ],
         widths=(3.0, 2.0),
     )
-    blocks, curves = [block], found.curves
+    blocks, curves = [block], margins.curves
     if curves.stiffness:
         dynamic = [
             panel(_signed, curves.frequency_hz, values, name, unit, height=2.2)
@@ -165,8 +165,8 @@ def margins_figure(found: Margins, title: str, width: float) -> Figure:
             )
         ]  # fmt: skip
         blocks.append(Block(columns=[[x] for x in dynamic], widths=(1.0, 1.0), shared=False))
-    if found.vibration is not None:
-        blocks.append(Block(columns=[[panel(_vibration, found.vibration, height=2.2)]], shared=False))
+    if margins.vibration is not None:
+        blocks.append(Block(columns=[[panel(_vibration, margins.vibration, height=2.2)]], shared=False))
     return stacked(title, blocks, width)
 
 
@@ -182,9 +182,9 @@ def zone_lines(axes: Axes) -> None:
         )  # fmt: skip
 
 
-def sensitivity_panel(axes: Axes, found: Margins, axis: str) -> None:
+def sensitivity_panel(axes: Axes, margins: Margins, axis: str) -> None:
     """Draw the sensitivity of an axis, predicted and measured, within the zones."""
-    curves, s = found.curves, found.sensitivity[axis]
+    curves, s = margins.curves, margins.sensitivity[axis]
     measured = curves.measured.get(axis)
     if measured is not None:
         size = 20.0 * np.log10(np.maximum(measured.ratio, 1e-12))
@@ -196,20 +196,20 @@ def sensitivity_panel(axes: Axes, found: Margins, axis: str) -> None:
     axes.set_ylim(_DB[0], max(_DB[1], s.peak_db.value + 2.0))
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel("sensitivity [dB]")
-    good = found.checks["zone"].passed or s.zone in "AB"
+    good = margins.checks["zone"].passed or s.zone in "AB"
     head(axes, f"axis {axis}: {s.peak_db.value:.2f} dB at {s.frequency_hz:.3g} Hz, zone {s.zone}", good=good)
 
 
-def _compliance(axes: Axes, found: Margins, axis: str) -> None:
-    size, of = found.curves.compliance[axis], found.compliance[axis]
-    scale, unit = prefixed(of.largest, "m/N")
-    axes.plot(found.curves.frequency_hz, size / scale, color=PREDICTED)
-    f = found.curves.frequency_hz
+def _compliance(axes: Axes, margins: Margins, axis: str) -> None:
+    size, compliance = margins.curves.compliance[axis], margins.compliance[axis]
+    scale, unit = prefixed(compliance.largest, "m/N")
+    axes.plot(margins.curves.frequency_hz, size / scale, color=PREDICTED)
+    f = margins.curves.frequency_hz
     log_axis(axes.xaxis, float(f[0]), float(f[-1]))
-    log_axis(axes.yaxis, max(float(size.min()), 1e-5 * of.largest) / scale, of.largest / scale)
+    log_axis(axes.yaxis, max(float(size.min()), 1e-5 * compliance.largest) / scale, compliance.largest / scale)
     axes.set_xlabel("frequency [Hz]")
     axes.set_ylabel(f"compliance [{unit}]")
-    head(axes, f"least stiffness {sized(1.0 / of.largest, 'N/m')} at {of.frequency_hz:.3g} Hz")
+    head(axes, f"least stiffness {sized(1.0 / compliance.largest, 'N/m')} at {compliance.frequency_hz:.3g} Hz")
 
 
 def _signed(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], name: str, unit: str) -> None:
@@ -226,17 +226,17 @@ def _signed(axes: Axes, frequency_hz: Array, values: Mapping[str, Array], name: 
     axes.set_ylabel(f"{name} [{unit}]")
 
 
-def _vibration(axes: Axes, found: Vibration) -> None:
+def _vibration(axes: Axes, vibration: Vibration) -> None:
     """Draw the vibration over the speed, and the clearance where it is near."""
-    top = max(float(x.max()) for x in found.amplitude.values())
+    top = max(float(x.max()) for x in vibration.amplitude.values())
     scale, unit = prefixed(top, "m")
-    for role, x in found.amplitude.items():
-        axes.plot(60.0 * found.frequency_hz, x / scale, label=role.replace("_", " "))
-    if found.clearance is not None and found.clearance < 3.0 * top:
-        axes.axhline(found.clearance / scale, color=BOUND, linestyle="--", label="clearance")
+    for role, x in vibration.amplitude.items():
+        axes.plot(60.0 * vibration.frequency_hz, x / scale, label=role.replace("_", " "))
+    if vibration.clearance is not None and vibration.clearance < 3.0 * top:
+        axes.axhline(vibration.clearance / scale, color=BOUND, linestyle="--", label="clearance")
     axes.set_ylim(0.0, None)
     axes.margins(x=0.0)
     axes.set_xlabel("speed [1/min]")
     axes.set_ylabel(f"vibration [{unit}]")
-    clear = "no clearance is given" if found.clearance is None else f"clearance {sized(found.clearance, 'm')}"
-    head(axes, f"unbalance{' and run-out' if found.runout else ''} of the rig; {clear}")
+    clear = "no clearance is given" if vibration.clearance is None else f"clearance {sized(vibration.clearance, 'm')}"
+    head(axes, f"unbalance{' and run-out' if vibration.runout else ''} of the rig; {clear}")

@@ -41,12 +41,17 @@ def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | 
     """
     lost = not math.isfinite(sd) or sd > _LOST * abs(value) > 0
     if sd == 0 or lost:  # known exactly, or not at all: digits of the value alone
-        scale, shown = prefixed(value, unit)
+        scale, shown_unit = prefixed(value, unit)
         spread = "" if sd == 0 else f"{sd / scale:.0e}" if math.isfinite(sd) else "inf"
         return Quantity(
-            value=f"{value / scale:.6g}", sd=spread, low="", high="", unit=shown, si=_with_unit(f"{value:.6g}", unit)
+            value=f"{value / scale:.6g}",
+            sd=spread,
+            low="",
+            high="",
+            unit=shown_unit,
+            si=_with_unit(f"{value:.6g}", unit),
         )
-    scale, shown = prefixed(max(abs(value), sd), unit)
+    scale, shown_unit = prefixed(max(abs(value), sd), unit)
     decimals = 1 - math.floor(math.log10(sd / scale))
     if float(f"{sd / scale:.{max(decimals, 0)}f}") >= 10.0 ** (2 - decimals):
         decimals -= 1  # 0.0996 is 0.10 in two digits
@@ -58,7 +63,7 @@ def quantity(value: float, sd: float, unit: str, *, ci95: tuple[float, float] | 
         sd=_fixed(sd / scale, decimals),
         low="" if ci95 is None else _fixed(low / scale, decimals),
         high="" if ci95 is None else _fixed(high / scale, decimals),
-        unit=shown,
+        unit=shown_unit,
         si=si_text(value, max(digits, 1), unit),
     )
 
@@ -99,8 +104,8 @@ def sized(value: float, unit: str, digits: int = 3) -> str:
 
     `value`: in `unit`; `unit`: SI unit; `digits`: significant digits. Returns such as ``"104 nm"``.
     """
-    scale, shown = prefixed(float(f"{value:.{digits}g}"), unit)
-    return _with_unit(f"{value / scale:.{digits}g}", shown)
+    scale, shown_unit = prefixed(float(f"{value:.{digits}g}"), unit)
+    return _with_unit(f"{value / scale:.{digits}g}", shown_unit)
 
 
 def response_unit(units: Mapping[str, str], output: str, source: str) -> str:

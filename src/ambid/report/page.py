@@ -69,8 +69,8 @@ def drawn_picture(section: Section, k: int) -> tuple[str, str]:
     from markupsafe import Markup
 
     assert section.figure is not None
-    shown, read = picture(section.figure(WIDE), section.title, f"f{k}-")
-    return Markup(shown), data_json(read) if read and not section.signals else ""
+    html_text, read = picture(section.figure(WIDE), section.title, f"f{k}-")
+    return Markup(html_text), data_json(read) if read and not section.signals else ""
 
 
 def origin(document: Document, made: str) -> list[tuple[str, str]]:
@@ -114,11 +114,11 @@ def page_html(document: Document, verdict: Verdict, *, made: str = "") -> str:
     )
 
 
-def data_json(found: Mapping[str, Any]) -> str:
+def data_json(data: Mapping[str, Any]) -> str:
     """Return data as JSON that may stand in a page, whatever its texts hold."""
     from markupsafe import Markup
 
-    return Markup(json.dumps(found, separators=(",", ":")).replace("<", "\\u003c"))
+    return Markup(json.dumps(data, separators=(",", ":")).replace("<", "\\u003c"))
 
 
 def _hash(text: str) -> str:
@@ -155,8 +155,8 @@ def page_pdf(document: Document, verdict: Verdict, *, made: str = "") -> bytes:
         lines += _wrapped(f"{reason.check}: {reason.text}", {"size": 9})
     for warning in warnings_of(document):
         lines += _wrapped(warning, {"size": 9, "color": STYLES["doubt"]})
-    kept = io.BytesIO()
-    with PdfPages(kept, metadata={"Title": title, "Creator": "ambid", "CreationDate": None}) as book:
+    buffer = io.BytesIO()
+    with PdfPages(buffer, metadata={"Title": title, "Creator": "ambid", "CreationDate": None}) as book:
         for section in page_sections(document):
             drawn = section.figure is not None
             if section.signals and not drawn:  # their figure stands in another section
@@ -170,7 +170,7 @@ def page_pdf(document: Document, verdict: Verdict, *, made: str = "") -> bytes:
         parts: list[Part] = [grid([("", ""), *origin(document, made)]), Preformatted(text="\n".join(document.history))]
         lines += _section(Section(title="Where it comes from", parts=parts))
         _write(book, lines)
-    return kept.getvalue()
+    return buffer.getvalue()
 
 
 def _section(section: Section) -> Iterator[Said]:
@@ -240,7 +240,7 @@ def _draw(book: Any, section: Section) -> None:
     top = _HEAD + 0.1
     for text, how in lines:
         top -= _STEP * how["size"] / 72
-        said = figure.text(0.0, (height + top - 0.35) / height, text, va="baseline", parse_math=False, **how)
-        said.set_in_layout(False)
+        drawn_text = figure.text(0.0, (height + top - 0.35) / height, text, va="baseline", parse_math=False, **how)
+        drawn_text.set_in_layout(False)
     whole = next((x for x in (_LEAF[1], _TALL) if x >= height + _HEAD + _FOOT), height + _HEAD + _FOOT)
     book.savefig(figure, bbox_inches=Bbox([[-_EDGE, height + _HEAD - whole], [width + _EDGE, height + _HEAD]]))

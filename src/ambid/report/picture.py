@@ -76,12 +76,12 @@ def image(figure: Figure, title: str) -> str:
     """Return a figure as the address of an image, whose colours follow light and dark as those of a page do."""
     from importlib.resources import files
 
-    shown, _ = picture(figure, title, "i")
-    if shown.startswith("<img"):
-        return shown.rpartition('src="')[2].removesuffix('">')
+    html_text, _ = picture(figure, title, "i")
+    if html_text.startswith("<img"):
+        return html_text.rpartition('src="')[2].removesuffix('">')
     sheet = files("ambid").joinpath("data", "report.css").read_text(encoding="utf-8")
     colours = sheet[: sheet.index("* {")] + "text { font-family: system-ui, sans-serif; }"
-    whole = shown.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).replace(
+    whole = html_text.replace("<svg ", '<svg xmlns="http://www.w3.org/2000/svg" ', 1).replace(
         ">", f"><style>{colours}</style>", 1
     )
     return "data:image/svg+xml;base64," + base64.b64encode(whole.encode()).decode()
@@ -89,8 +89,8 @@ def image(figure: Figure, title: str) -> str:
 
 def _small(text: str, prefix: str) -> str:
     """Return the body of an SVG in fewer letters: named colours, attributes for styles, rounded paths."""
-    used = dict.fromkeys(re.findall(r"(?:url\(|href=\")#([^)\"]+)", text))
-    names = {name: f"{prefix}{k}" for k, name in enumerate(used)}
+    references = dict.fromkeys(re.findall(r"(?:url\(|href=\")#([^)\"]+)", text))
+    names = {name: f"{prefix}{k}" for k, name in enumerate(references)}
     text = re.sub(r' id="([^"]*)"', lambda m: f' id="{names[m[1]]}"' if m[1] in names else "", text)
     text = re.sub(r"(url\(|href=\")#([^)\"]+)", lambda m: f"{m[1]}#{names[m[2]]}", text).replace("xlink:", "")
     text = re.sub(r' d="([^"]*)"', lambda m: f' d="{_path(m[1])}"', text)
@@ -114,25 +114,25 @@ def _merged(text: str) -> str:
 
 def _attributes(style: str) -> str:
     """Return a style as attributes, which need no permission of a page's security policy."""
-    found = []
+    attributes = []
     for part in filter(None, (x.strip() for x in style.split(";"))):
         name, value = (x.strip() for x in part.split(":", 1))
         if name == "font":  # of an older matplotlib
             name, value = "font-size", value.split("px")[0].split()[-1] + "px" + ("Mono" if "Mono" in value else "")
         if name == "font-family" or value.endswith("Mono"):
-            found += ['font-family="monospace"'] if "Mono" in value else []
+            attributes += ['font-family="monospace"'] if "Mono" in value else []
         if name != "font-family":
             colour = _NAMED.get(value.lower(), _grey(value.lower()))
-            found.append(f'{name}="{value.removesuffix("Mono") if colour is None else f"var(--{colour})"}"')
-    return "".join(f" {x}" for x in found)
+            attributes.append(f'{name}="{value.removesuffix("Mono") if colour is None else f"var(--{colour})"}"')
+    return "".join(f" {x}" for x in attributes)
 
 
 def _grey(value: str) -> str | None:
     """Return the nearest named colour of a grey; None for other colours, and for those that stay in the dark."""
-    found = re.fullmatch(r"#([0-9a-f]{2})\1\1", value)
-    if found is None or value in _FIXED:
+    match = re.fullmatch(r"#([0-9a-f]{2})\1\1", value)
+    if match is None or value in _FIXED:
         return None
-    return "ink" if found[1] < "60" else "edge" if found[1] < "b0" else "rule"
+    return "ink" if match[1] < "60" else "edge" if match[1] < "b0" else "rule"
 
 
 def _path(d: str) -> str:
@@ -144,8 +144,8 @@ def _path(d: str) -> str:
         if part[0] == "L" and long:
             points = points[_needed(points)]
         points = np.round(points, 1 if long else 2)
-        shown = np.diff(points, axis=0, prepend=at[None]) if part[0] == "L" else points
-        numbers = " ".join(f"{x:.2f}".rstrip("0").rstrip(".") for x in shown.ravel() + 0.0)
+        steps = np.diff(points, axis=0, prepend=at[None]) if part[0] == "L" else points
+        numbers = " ".join(f"{x:.2f}".rstrip("0").rstrip(".") for x in steps.ravel() + 0.0)
         numbers = re.sub(r"(?<![\d.])0\.", ".", numbers.replace("-0 ", "0 ")).replace(" -", "-")
         out.append(part[0].replace("L", "l") + numbers)
         at = points[-1] if points.size else at
@@ -154,8 +154,8 @@ def _path(d: str) -> str:
 
 def _needed(points: Array) -> Array:
     """Which points (n, 2) a line needs that nowhere leaves them by more than `_CLOSE` (Douglas and Peucker)."""
-    kept, open_ = np.zeros(len(points), dtype=bool), [(0, len(points) - 1)]
-    kept[[0, -1]] = True
+    needed, open_ = np.zeros(len(points), dtype=bool), [(0, len(points) - 1)]
+    needed[[0, -1]] = True
     while open_:
         first, last = open_.pop()
         across, between = points[last] - points[first], points[first + 1 : last] - points[first]
@@ -163,9 +163,9 @@ def _needed(points: Array) -> Array:
         far = np.abs(between @ [-across[1], across[0]]) / length if length > _CLOSE else np.hypot(*between.T)
         if far.size and far.max() > _CLOSE:
             k = first + 1 + int(np.argmax(far))
-            kept[k] = True
+            needed[k] = True
             open_ += [(first, k), (k, last)]
-    return kept
+    return needed
 
 
 def _read(figure: Figure) -> dict[str, Any]:
@@ -176,12 +176,12 @@ def _read(figure: Figure) -> dict[str, Any]:
         if points:
             box = axes.get_window_extent().transformed(figure.transFigure.inverted())
             across, up = 72 * figure.get_size_inches()
-            beside = axes.get_shared_x_axes().get_siblings(axes)
+            siblings = axes.get_shared_x_axes().get_siblings(axes)
             panels.append({
                 "box": [round(x, 2) for x in (box.x0 * across, (1 - box.y1) * up, box.width * across, box.height * up)],
                 "x": [*axes.get_xlim(), axes.get_xscale() == "log"],
                 "y": [*axes.get_ylim(), axes.get_yscale() == "log"],
-                "names": [next((a.get_xlabel() for a in beside if a.get_xlabel()), ""), axes.get_ylabel()],
+                "names": [next((a.get_xlabel() for a in siblings if a.get_xlabel()), ""), axes.get_ylabel()],
                 "points": points,
             })  # fmt: skip
     return {"arrays": arrays.packed, "panels": panels} if panels else {}
@@ -193,9 +193,9 @@ def _points(axes: Axes) -> Iterator[tuple[str, Array, Array]]:
     from matplotlib.container import ErrorbarContainer
 
     bars = [c for c in axes.containers if isinstance(c, ErrorbarContainer)]
-    named = {c[0]: str(c.get_label()) for c in bars}
+    labels = {c[0]: str(c.get_label()) for c in bars}
     for line in axes.lines:
-        label, (x, y) = named.get(line, str(line.get_label())), (np.asarray(v, dtype=float) for v in line.get_data())
+        label, (x, y) = labels.get(line, str(line.get_label())), (np.asarray(v, dtype=float) for v in line.get_data())
         aside = label[:1] == "_" and any(
             str(x.get_label())[:1] != "_" for x in axes.lines
         )  # belongs to one with a name

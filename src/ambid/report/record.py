@@ -54,25 +54,25 @@ def record_figure(record: Record | None, title: str, looks: Sequence[Any] = (), 
     `looks`: with ``name``, ``unit``, ``least``, ``most``, ``mean`` and ``sd`` of each channel.
     """
     channels: Sequence[Any] = looks if record is None else record.channels
-    shown = [c.name for c in channels[:_MOST]]
+    names = [c.name for c in channels[:_MOST]]
     hidden = f" (the first {_MOST} of {len(channels)} channels)" if len(channels) > _MOST else ""
-    if not shown:
+    if not names:
         return stacked(title, [said_panel("no channels")], width)
     if record is None:
         block = Block(columns=[[panel(_range, c, height=0.9) for c in looks[:_MOST]]], shared=False)
     else:
         views: Sequence[Callable[..., object]] = (_whole, _close, _spectrum)
-        columns = [[panel(view, record, name, height=_ROW) for name in shown] for view in views]
+        columns = [[panel(view, record, name, height=_ROW) for name in names] for view in views]
         block = Block(columns=columns, widths=(4, 3, 3))
     return stacked(f"{title}{hidden}", [block], width)
 
 
-def inspection_document(inspection: Inspection, used: Record | None) -> Document:
+def inspection_document(inspection: Inspection, source: Record | None) -> Document:
     """Describe what a record holds."""
     i, name = inspection, RecordEntry.of(inspection.record).name
     return Document(
         title=f"{name}, {i.record['samples']} samples at {i.record['rate_hz']:g} Hz", sections=inspection_sections(i),
-        figure=partial(record_figure, used, f"{name}: channels", i.channels),
+        figure=partial(record_figure, source, f"{name}: channels", i.channels),
         frame=lambda: ("name", numbers_of(i.channels)),
     )  # fmt: skip
 
@@ -155,9 +155,11 @@ def _close(axes: Axes, record: Record, name: str) -> None:
     axes.plot(record.time_s[at], x[at] / scale, ".-", color=MEASURED, markersize=2.5, linewidth=0.7)
     axes.set_xlabel("time [s]")
     steps = _found(resolution, record, name)
-    known = record.channel(name).unit not in (UNKNOWN, "1")
+    physical = record.channel(name).unit not in (UNKNOWN, "1")
     quantised = steps is not None and steps.quantised and steps.step > 0
-    size = sized(steps.step, record.channel(name).unit) if quantised and known else f"{steps.step:.3g}" if steps else ""
+    size = (
+        sized(steps.step, record.channel(name).unit) if quantised and physical else f"{steps.step:.3g}" if steps else ""
+    )
     head(axes, f"{name}, {min(x.size, _CLOSE)} samples" + (f", steps of {size}" if quantised else ""))
 
 
@@ -168,12 +170,12 @@ def _spectrum(axes: Axes, record: Record, name: str) -> None:
     if not np.ptp(x) > 0:
         head(axes, f"{name} is constant", good=False)
         return
-    found = power_spectrum(x, rate_hz)
-    size = np.sqrt(found.density[1:])
+    spectrum = power_spectrum(x, rate_hz)
+    size = np.sqrt(spectrum.density[1:])
     unit = record.channel(name).unit
     top = float(size.max())
-    scale, shown = (1.0, "1") if unit in (UNKNOWN, "1") else prefixed(top, unit)
-    axes.semilogx(found.frequency_hz[1:], size / scale, color=MEASURED, linewidth=0.9, label="spectrum")
+    scale, shown_unit = (1.0, "1") if unit in (UNKNOWN, "1") else prefixed(top, unit)
+    axes.semilogx(spectrum.frequency_hz[1:], size / scale, color=MEASURED, linewidth=0.9, label="spectrum")
     noise, steps = _found(snr, record, name), _found(resolution, record, name)
     levels = [(noise.noise_sd, GREEN, "noise, unpredictable part")] if noise else []
     levels += [(steps.noise_sd, ORANGE, "rounding to steps")] if steps else []
@@ -184,7 +186,7 @@ def _spectrum(axes: Axes, record: Record, name: str) -> None:
             lowest = min(lowest, level)
             axes.axhline(level / scale, color=color, linewidth=1.2, linestyle="--", label=label)
     log_axis(axes.yaxis, max(lowest / 2, 1e-9 * top) / scale, 2 * top / scale)
-    axes.set_ylabel(f"[{shown}/√Hz]")
+    axes.set_ylabel(f"[{shown_unit}/√Hz]")
     head(
         axes, f"{name}, signal over noise {noise.db:.0f} dB" if noise and np.isfinite(noise.db) else f"{name}, spectrum"
     )
@@ -192,8 +194,8 @@ def _spectrum(axes: Axes, record: Record, name: str) -> None:
 
 def _range(axes: Axes, c: Any) -> None:
     """Smallest, largest and mean value of a channel and its standard deviation."""
-    known = c.unit not in (UNKNOWN, "1")
-    scale, unit = prefixed(max(abs(c.least), abs(c.most)), c.unit) if known else (1.0, c.unit)
+    physical = c.unit not in (UNKNOWN, "1")
+    scale, unit = prefixed(max(abs(c.least), abs(c.most)), c.unit) if physical else (1.0, c.unit)
     axes.plot(np.array([c.least, c.most]) / scale, [0, 0], "|-", color=MEASURED, label="range")
     axes.errorbar(c.mean / scale, 0, xerr=c.sd / scale, fmt="o", color=PREDICTED, capsize=4, label="mean ± sd")
     axes.set_yticks([])
@@ -207,8 +209,8 @@ _COLORS = {"voltage": BOUND, "current": PREDICTED, "position": GREEN}
 
 def roles_figure(record: Record, ranked: Mapping[str, Sequence[Candidate]], width: float = WIDE) -> Figure:
     """Return a row for each candidate: its signal, and its coherence with the columns chosen for the other roles."""
-    rows = [(x, x is found[0]) for found in ranked.values() for x in found]
-    chosen = {role: found[0].channel.name for role, found in ranked.items() if found}
+    rows = [(x, x is candidates[0]) for candidates in ranked.values() for x in candidates]
+    chosen = {role: candidates[0].channel.name for role, candidates in ranked.items() if candidates}
     names = list(dict.fromkeys([x.channel.name for x, _ in rows]))
     signals = np.column_stack([record[name] for name in names]) if names else None
     spectra = None if signals is None else cross_spectra(signals, record.rate_hz, segment=min(len(signals), _SEGMENT))

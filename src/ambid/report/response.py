@@ -136,8 +136,8 @@ def pair_parts(measured: Measured) -> list[Part]:
 
     def apart(width: int) -> list[Part]:
         head, *values = grid([("  ", *row[2:]) for row in rows], right=(1, 2, 3, 4)).lines(_ANY, plain)
-        named = [[*wrapped([row[0]], width), line] for row, line in zip(rows[1:], values, strict=True)]
-        return [Lines(lines=[head, *(line for pair in named for line in pair)], wrap=False)]
+        labelled = [[*wrapped([row[0]], width), line] for row, line in zip(rows[1:], values, strict=True)]
+        return [Lines(lines=[head, *(line for pair in labelled for line in pair)], wrap=False)]
 
     separated = "; noise and distortion were not separated" if distortion is None else ""
     return [
@@ -148,8 +148,8 @@ def pair_parts(measured: Measured) -> list[Part]:
 
 def _range(g: Array, unit: str) -> str:
     low, high = float(np.min(g)), float(np.max(g))
-    scale, shown = (1.0, unit) if unit.startswith((UNKNOWN, "1/")) else prefixed(high, unit)
-    return f"{low / scale:.3g} … {high / scale:.3g} {shown}".removesuffix(" 1")
+    scale, shown_unit = (1.0, unit) if unit.startswith((UNKNOWN, "1/")) else prefixed(high, unit)
+    return f"{low / scale:.3g} … {high / scale:.3g} {shown_unit}".removesuffix(" 1")
 
 
 def _share(sd: Array | None, g: Array, j: int, k: int) -> str:
@@ -230,18 +230,18 @@ def _first_entry(fit: BlackBoxFit) -> tuple[BlackBoxFit, list[int]]:
 
 def warnings_of(measured: Measured) -> list[str]:
     """Return all warnings, each once, without what only repeats a failed check; those of the response first."""
-    found = [*measured.response.warnings]
+    warnings = [*measured.response.warnings]
     for x in (measured.fit, measured.estimate):
         if x is None:
             continue
-        said = [c.detail for c in x.checks.values() if not c.passed]
+        details = [c.detail for c in x.checks.values() if not c.passed]
         for whole in x.warnings:
             warning = whole
-            for detail in said:  # it stands with the checks
+            for detail in details:  # it stands with the checks
                 warning = warning.replace(f"{detail}; ", "")
-            if not warning.endswith(tuple(said)):
-                found.append(warning)
-    return list(dict.fromkeys(found))
+            if not warning.endswith(tuple(details)):
+                warnings.append(warning)
+    return list(dict.fromkeys(warnings))
 
 
 # --- modes ----------------------------------------------------------------------------------------------------------
@@ -417,8 +417,8 @@ def _magnitude(axes: Axes, measured: Measured, models: Sequence[ModelResponse], 
     dot = _marker(f.size)
     axes.plot(f, size, ".", color=MEASURED, markersize=dot, label="measured", zorder=1.8)
     for x, color, label in levels:
-        seen = np.where(x > 0, x, np.nan)
-        axes.plot(f, seen, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
+        positive = np.where(x > 0, x, np.nan)
+        axes.plot(f, positive, ".", color=color, markersize=0.8 * dot, label=label, zorder=1.7)
     axes.set_xscale("linear" if measured.modal else "log")  # modes want room above, where they lie
     axes.set_yscale("log")
     if f.size > 1:
@@ -455,10 +455,10 @@ def _phase(axes: Axes, measured: Measured, models: Sequence[ModelResponse], pair
     angle_ticks(axes, np.concatenate([angle, *lines]))
 
 
-def _angle(G: Complex, f: Array, known: NDArray[np.bool_], models: Sequence[ModelResponse], pair: Pair) -> Array:
+def _angle(G: Complex, f: Array, valid: NDArray[np.bool_], models: Sequence[ModelResponse], pair: Pair) -> Array:
     """Phase of the lines in rad: the turn nearest to a model's, which noise does not make jump."""
     if not models:
-        return unwrapped(G, known=known)
+        return unwrapped(G, valid=valid)
     near = np.interp(f, models[0].frequency_hz, unwrapped(models[0].G[:, *pair]))
     return np.asarray(near + np.angle(G * np.exp(-1j * near)))
 
@@ -470,27 +470,29 @@ def _marker(n: int) -> float:
 # --- a stabilisation diagram ----------------------------------------------------------------------------------------
 
 
-def stabilisation_figure(found: Stabilisation, width: float = WIDE) -> Figure:
+def stabilisation_figure(stabilisation: Stabilisation, width: float = WIDE) -> Figure:
     """Draw poles by order over frequency, above them damping over frequency, beside them the singular values."""
-    seen = np.array([p.frequency_hz for p in found.poles if p.frequency_hz > 0])
-    logarithmic = bool(seen.size and seen.max() > _WIDE * seen.min())
+    frequencies = np.array([p.frequency_hz for p in stabilisation.poles if p.frequency_hz > 0])
+    logarithmic = bool(frequencies.size and frequencies.max() > _WIDE * frequencies.min())
 
-    damping, diagram = pole_panels(found.poles, found.modes, logarithmic=logarithmic)
+    damping, diagram = pole_panels(stabilisation.poles, stabilisation.modes, logarithmic=logarithmic)
 
     def values(axes: Axes) -> None:
-        size = np.asarray(found.singular_values)
-        axes.semilogx(size / max(float(size.max(initial=0.0)), 1e-300), found.orders, "o-", color=_NEW, markersize=4)
-        axes.axhline(found.suggested, color=_MODE, linewidth=1.0, linestyle="--")
+        size = np.asarray(stabilisation.singular_values)
+        axes.semilogx(
+            size / max(float(size.max(initial=0.0)), 1e-300), stabilisation.orders, "o-", color=_NEW, markersize=4
+        )
+        axes.axhline(stabilisation.suggested, color=_MODE, linewidth=1.0, linestyle="--")
         axes.set_xlabel("singular value")
         _orders(axes)
-        head(axes, f"least BIC: order {found.suggested}")
+        head(axes, f"least BIC: order {stabilisation.suggested}")
 
     empty = Panel(draw=lambda axes: axes.axis("off"), height=0.2)
     block = Block(
         columns=[[damping, diagram], [empty, Panel(draw=values)]],
         widths=(4, 1),
     )
-    return stacked(f"stabilisation diagram, {found.method}", [block], width)
+    return stacked(f"stabilisation diagram, {stabilisation.method}", [block], width)
 
 
 def pole_panels(
@@ -550,11 +552,11 @@ def _orders(axes: Axes) -> None:
 
 def modal_panel(modal: Modal, title: str = "") -> Block:
     """Return the poles that the search for modes began from, with the modes it ended in, and the modes' shapes."""
-    found = [
+    curves = [
         PoleCluster(pole=2 * np.pi * m.frequency_hz.value * complex(-m.damping.value, 1.0), orders=())
         for m in modal.modes
     ]
-    damping, diagram = pole_panels(modal.poles, found, most=2 * max((c.damping for c in found), default=0.5))
+    damping, diagram = pole_panels(modal.poles, curves, most=2 * max((c.damping for c in curves), default=0.5))
     columns = [[damping, diagram]]
     if modal.modes and len(modal.outputs) > 1:
         empty = Panel(draw=lambda axes: axes.axis("off"), height=2.0)

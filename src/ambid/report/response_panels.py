@@ -67,8 +67,8 @@ def frequency_grid(poles: Complex | Array, lowest_hz: float, nyquist_hz: float, 
         for p in poles
         if p.imag > 0 and lowest_hz < abs(p) / (2 * np.pi) < nyquist_hz
     ]
-    found = np.unique(np.concatenate([np.geomspace(lowest_hz, nyquist_hz, n_frequencies), *extra]))
-    return np.asarray(found[(found >= lowest_hz) & (found <= nyquist_hz)])
+    grid = np.unique(np.concatenate([np.geomspace(lowest_hz, nyquist_hz, n_frequencies), *extra]))
+    return np.asarray(grid[(grid >= lowest_hz) & (grid <= nyquist_hz)])
 
 
 def bode_panel(
@@ -107,7 +107,7 @@ def pairs_panel(
 ) -> Block:
     """Return a column of magnitude and phase for each of the first pairs (output, input), with titles and units."""
     pairs = [(o, i) for o in range(len(outputs)) for i in range(len(inputs))]
-    shown = pairs[:MOST_PAIRS]
+    first_pairs = pairs[:MOST_PAIRS]
 
     def above(axes: Axes, pair: Pair) -> None:
         source, output = inputs[pair[1]], outputs[pair[0]]
@@ -120,8 +120,10 @@ def pairs_panel(
         axes.set_ylabel("phase [°]")
         axes.set_xlabel("frequency [Hz]")
 
-    columns = [[panel(above, x, height=2.5), panel(below, x, height=1.8)] for x in shown]
-    return Block(columns=columns, title=f"{len(shown)} of {len(pairs)} pairs" if len(pairs) > len(shown) else "")
+    columns = [[panel(above, x, height=2.5), panel(below, x, height=1.8)] for x in first_pairs]
+    return Block(
+        columns=columns, title=f"{len(first_pairs)} of {len(pairs)} pairs" if len(pairs) > len(first_pairs) else ""
+    )
 
 
 def magnitude_axis(
@@ -150,11 +152,11 @@ def marks(
     whose turn they take, phases.
     """
     radius = frf.confidence_radius()[:, *pair]
-    known = np.flatnonzero(np.isfinite(radius) & (frf.frequency_hz > 0))
-    if not known.size:
+    finite = np.flatnonzero(np.isfinite(radius) & (frf.frequency_hz > 0))
+    if not finite.size:
         return
-    f = frf.frequency_hz[known]
-    at = known[
+    f = frf.frequency_hz[finite]
+    at = finite[
         np.unique(
             np.searchsorted(f, np.geomspace(f[0], f[-1], 2 + int(per_decade * np.log10(f[-1] / f[0])))).clip(
                 max=f.size - 1
@@ -167,22 +169,22 @@ def marks(
         angle = unwrapped(guide.G[:, *pair])
         near = np.interp(np.log(x), np.log(guide.frequency_hz), angle)
         half = np.rad2deg(np.arcsin(np.minimum(radius / np.maximum(size, 1e-300), 1.0)))
-        seen = half < 90
-        x, half = x[seen], half[seen]
-        size, spread = np.rad2deg(near + np.angle(G * np.exp(-1j * near)))[seen], [half, half]
+        visible = half < 90
+        x, half = x[visible], half[visible]
+        size, spread = np.rad2deg(near + np.angle(G * np.exp(-1j * near)))[visible], [half, half]
         angle_ticks(axes, np.concatenate([np.rad2deg(angle), size]))
     axes.errorbar(
         x, size, spread, fmt="o", markersize=2.4, color=MEASURED, elinewidth=0.8, label="measured, 95 %", zorder=1.9
     )
 
 
-def unwrapped(value: Complex, near: float = 0.0, known: NDArray[np.bool_] | None = None) -> Array:
+def unwrapped(value: Complex, near: float = 0.0, valid: NDArray[np.bool_] | None = None) -> Array:
     """Phase in rad without jumps, shape (n_frequencies,), begun within half a turn of `near`.
 
-    `known`: where noise leaves the phase known; elsewhere it stands within half a turn of its neighbours, since noise
+    `valid`: where noise leaves the phase known; elsewhere it stands within half a turn of its neighbours, since noise
     that is unwrapped walks away.
     """
-    at = np.arange(value.size) if known is None or not known.any() else np.flatnonzero(known)
+    at = np.arange(value.size) if valid is None or not valid.any() else np.flatnonzero(valid)
     line = np.unwrap(np.angle(value[at]))
     guide = np.interp(np.arange(value.size), at, line - 2 * np.pi * np.round((line[0] - near) / (2 * np.pi)))
     return np.asarray(guide + np.angle(value * np.exp(-1j * guide)))
@@ -333,8 +335,8 @@ def correlations_panel(names: Sequence[str], covariance: Array, values: Mapping[
             for m, x in enumerate(row):
                 color = "#fefefe" if abs(x) > 0.75 else "#1b1b1b"  # of no name: cells stay as they are in the dark
                 if not small or abs(x) > _TOLD:
-                    said = f"{x:.1f}" if small else f"{x:.2f}"
-                    axes.text(m, k, said, ha="center", va="center", color=color, fontsize=7.0)
+                    text = f"{x:.1f}" if small else f"{x:.2f}"
+                    axes.text(m, k, text, ha="center", va="center", color=color, fontsize=7.0)
         axes.set_xticks(range(len(names)), names, rotation=45 if small else 0)
         axes.set_yticks(range(len(names)), names)
         axes.grid(False)

@@ -103,12 +103,12 @@ def rotor_document(estimate: RotorEstimate, shaft: Shaft | None, evidence: Calla
         from ambid.report.drawing import single
         from ambid.report.signals import record_strips
 
-        beside = evidence()
+        shown_evidence = evidence()
         drawn = [
             Section(title=title, caption=caption, figure=partial(single, block))
-            for block, title, caption in _titles(beside.drawings(), e)
+            for block, title, caption in _titles(shown_evidence.drawings(), e)
         ]
-        signals = [record_strips(r, len(beside.records)) for r in beside.records]
+        signals = [record_strips(r, len(shown_evidence.records)) for r in shown_evidence.records]
         close = Section(title="Signals", caption=_SIGNALS, signals=signals, folded=True)
         return [*drawn, *([close] if signals else [])]
 
@@ -163,10 +163,10 @@ def mode_rows(estimate: RotorEstimate, shaft: Shaft | None = None) -> list[tuple
     rows: list[tuple[str, ...]] = [("bending mode", "frequency", "damping ratio", *expected, "")]
     for r, (m, k) in enumerate(zip(estimate.modes, partners_of(estimate.modes, rotor), strict=True), 1):
         f, z = m.frequency_hz, m.damping
-        shown = "" if m.identifiable else f"{_UNSEEN} not identifiable"
+        remark = "" if m.identifiable else f"{_UNSEEN} not identifiable"
         cells = [] if rotor is None else ["–" if k is None else f"{rotor.omega[k + 2] / (2 * math.pi):.5g} Hz"]
         ratio = f"{pure(100 * z.value, 100 * z.sd)} %"
-        rows.append((f"  {r}", quantity(f.value, f.sd, "Hz").text, ratio, *cells, shown))
+        rows.append((f"  {r}", quantity(f.value, f.sd, "Hz").text, ratio, *cells, remark))
     return rows
 
 
@@ -195,8 +195,8 @@ def bearing_rows(estimate: RotorEstimate, bearing: Bearing, axes: Sequence[str])
     rows: list[tuple[str, ...]] = [(f"bearing {bearing.name}", *axes)]
     own = {axis: [p for p in e.parameters if p.name.startswith(f"{axis}.")] for axis in axes}
     for what in dict.fromkeys(p.name.split(".", 1)[1] for axis in axes for p in own[axis]):
-        of = {p.name: p for axis in axes for p in own[axis]}
-        rows.append((what, *(_cell(of.get(f"{axis}.{what}")) for axis in axes)))
+        by_name = {p.name: p for axis in axes for p in own[axis]}
+        rows.append((what, *(_cell(by_name.get(f"{axis}.{what}")) for axis in axes)))
     delays = [next((d for role, d in e.delay.items() if role.startswith(f"{axis}_")), None) for axis in axes]
     rows.append(
         ("delay", *("" if d is None else f"{late(d, rate)}{', given' if d.how == 'given' else ''}" for d in delays))
@@ -231,11 +231,11 @@ def _fit(e: RotorEstimate, role: str) -> str:
     return f"{e.fit[role].one_step:.4f}, {sized(e.fit[role].innovation_sd, unit)} rms left"
 
 
-def _loop(found: dict[str, object]) -> str:
+def _loop(sensitivity: dict[str, object]) -> str:
     """The peak of an axis' sensitivity and its zone by ISO 14839-3."""
-    peak = found["peak_db"]
+    peak = sensitivity["peak_db"]
     assert isinstance(peak, dict)
-    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, zone {found['zone']}"
+    return f"{pure(float(peak['value']), float(peak['sd'] or 0.0))} dB, zone {sensitivity['zone']}"
 
 
 def _plane(what: str) -> str:

@@ -45,14 +45,14 @@ def shapes_block(
     """
     drawn = None if shaft is None else expected_rotor(modes, shaft, list(planes.values()))
     partners = partners_of(modes, drawn)
-    shown: list[tuple[Mode | None, int | None]] = list(zip(modes, partners, strict=True))
+    pairs: list[tuple[Mode | None, int | None]] = list(zip(modes, partners, strict=True))
     if drawn is not None:
         top = max((k for k in partners if k is not None), default=_EXPECTED - 1)
-        shown += [(None, k) for k in range(top + 1) if k not in partners]
-        shown.sort(key=lambda pair: _hertz(drawn, pair[1]) if pair[0] is None else pair[0].frequency_hz.value)
+        pairs += [(None, k) for k in range(top + 1) if k not in partners]
+        pairs.sort(key=lambda pair: _hertz(drawn, pair[1]) if pair[0] is None else pair[0].frequency_hz.value)
     ends = _ends(planes, shaft)
     rows = [panel(_side, planes, shaft, drawn, ends, height=1.7)]
-    rows += [panel(_shape, mode, k, planes, drawn, ends, modes, height=1.35) for mode, k in shown]
+    rows += [panel(_shape, mode, k, planes, drawn, ends, modes, height=1.35) for mode, k in pairs]
     return Block(columns=[rows], title=title)
 
 
@@ -68,14 +68,14 @@ def partners_of(modes: Sequence[Mode], drawn: FreeRotor | None) -> list[int | No
     """
     from scipy.optimize import linear_sum_assignment
 
-    found: list[int | None] = [None] * len(modes)
+    partners: list[int | None] = [None] * len(modes)
     if drawn is None or not modes:
-        return found
+        return partners
     own = np.log([mode.frequency_hz.value for mode in modes])
     apart = np.abs(own[:, None] - np.log(drawn.omega[2:] / (2 * np.pi)))
     for row, k in zip(*linear_sum_assignment(apart), strict=True):
-        found[row] = int(k)
-    return found
+        partners[row] = int(k)
+    return partners
 
 
 def campbell_panel(
@@ -141,8 +141,8 @@ def _side(
     else:
         axes.set_ylabel("radius [mm]")
     axes.grid(visible=False)
-    said = "" if shaft is None or drawn is None else f", {drawn.mass[0]:.3g} kg, {1e3 * shaft.length:.0f} mm long"
-    head(axes, f"rotor from the side{said}")
+    total = "" if shaft is None or drawn is None else f", {drawn.mass[0]:.3g} kg, {1e3 * shaft.length:.0f} mm long"
+    head(axes, f"rotor from the side{total}")
 
 
 def _body(axes: Axes, shaft: Shaft) -> float:
@@ -184,14 +184,14 @@ def _shape(
     modes: Sequence[Mode],
 ) -> None:
     """One mode along the shaft, identified, from the drawing (its mode `k`), or both; the drawing takes its sign."""
-    said = ["not identified"]
+    words = ["not identified"]
     at = [name for name in planes if mode is not None and name in mode.shape]
     z = np.array([planes[name] for name in at])
     value = np.array([mode.shape[name].value for name in at]) if mode is not None else np.zeros(0)
     if mode is not None:
         number = 1 + next(i for i, x in enumerate(modes) if x is mode)
         f, damping = mode.frequency_hz, mode.damping
-        said = [f"mode {number}: {f.value:.5g} Hz ± {NORMAL_95 * f.sd:.2g}, damping {100 * damping.value:.3g} %"]
+        words = [f"mode {number}: {f.value:.5g} Hz ± {NORMAL_95 * f.sd:.2g}, damping {100 * damping.value:.3g} %"]
         sd = np.array([mode.shape[name].sd for name in at])
         axes.errorbar(
             1e3 * z, value, NORMAL_95 * sd, fmt="o", color=PREDICTED, markersize=4.5, elinewidth=1.0, capsize=2.5,
@@ -204,14 +204,14 @@ def _shape(
         axes.plot(
             1e3 * along, math.copysign(1.0, side) * line, color=MEASURED, linestyle="--", label="from the drawing"
         )
-        said.append(f"drawing {_hertz(drawn, k):.5g} Hz")
+        words.append(f"drawing {_hertz(drawn, k):.5g} Hz")
     for name, plane in planes.items():
         axes.axvline(1e3 * plane, color=BOUND if name.endswith(".z") else GREEN, linewidth=0.7, linestyle=":", zorder=1)
     axes.axhline(0, color=MEASURED, linewidth=0.6)
     axes.set_xlim(*(1e3 * x for x in ends))
     axes.set_ylabel("shape [kg$^{-1/2}$]")
     axes.set_xlabel("along the shaft, from the datum [mm]")
-    head(axes, "; ".join(said))
+    head(axes, "; ".join(words))
 
 
 def _campbell(
@@ -222,14 +222,14 @@ def _campbell(
     speeds: Sequence[float],
 ) -> None:
     """Frequencies in Hz over speed in 1/min."""
-    given = [x for x in (identified, drawn) if x is not None]
-    most = max(float(x.speed[-1]) for x in given)
+    diagrams = [x for x in (identified, drawn) if x is not None]
+    most = max(float(x.speed[-1]) for x in diagrams)
     if identified is not None:
         _lines(axes, identified, sd, {})
     if drawn is not None:
         apart = {"color": MEASURED, "label": "from the drawing", "linewidth": 1.0} if identified is not None else {}
         _lines(axes, drawn, None, {"linestyle": "--", **apart})
-    criticals = _criticals(axes, given[0])
+    criticals = _criticals(axes, diagrams[0])
     at = np.array([0.0, most])
     axes.plot(at * 30 / np.pi, at / (2 * np.pi), color=MEASURED, linewidth=0.9, label="speed itself (1x)")
     for speed in speeds:
@@ -239,18 +239,18 @@ def _campbell(
     axes.set_xlabel("speed [1/min]")
     axes.set_ylabel("frequency of whirl [Hz]")
     many = "speed" if len(criticals) == 1 else "speeds"
-    said = f"critical {many} {', '.join(criticals)} 1/min" if criticals else "no critical speed up to here"
-    head(axes, f"{said}, without bearings")
+    remark = f"critical {many} {', '.join(criticals)} 1/min" if criticals else "no critical speed up to here"
+    head(axes, f"{remark}, without bearings")
 
 
 def _lines(axes: Axes, which: Campbell, sd: Array | None, style: Mapping[str, Any]) -> None:
     """The lines of one diagram with bands, in the colour of their direction over the upper half of the speeds."""
     x, f = which.speed * 30 / np.pi, which.frequency / (2 * np.pi)
     for k in range(f.shape[1]):
-        known = np.isfinite(f[:, k])
-        if not known.any():
+        finite = np.isfinite(f[:, k])
+        if not finite.any():
             continue
-        way = float(np.mean(which.direction[known, k][-max(1, int(known.sum()) // 2) :]))
+        way = float(np.mean(which.direction[finite, k][-max(1, int(finite.sum()) // 2) :]))
         color, label = (_FORWARD, "forward") if way > _PLANAR else (_BACKWARD, "backward")
         color, label = (SKY, "in a plane") if abs(way) <= _PLANAR else (color, label)
         axes.plot(x, f[:, k], **{"color": color, "label": label, "linewidth": 1.6, **style})
@@ -261,7 +261,7 @@ def _lines(axes: Axes, which: Campbell, sd: Array | None, style: Mapping[str, An
 
 def _criticals(axes: Axes, which: Campbell) -> list[str]:
     """Mark where lines meet the speed; return the forward ones, which unbalance excites, in 1/min."""
-    found = []
+    criticals = []
     for c in which.critical_speeds():
         forward = c.direction > -_PLANAR
         axes.plot(
@@ -270,8 +270,8 @@ def _criticals(axes: Axes, which: Campbell) -> list[str]:
             label="critical speed" if forward else "backward whirl at 1x",
         )  # fmt: skip
         if forward:
-            found.append(f"{c.speed * 30 / np.pi:.0f}")
-    return found
+            criticals.append(f"{c.speed * 30 / np.pi:.0f}")
+    return criticals
 
 
 _RPM = 30.0 / np.pi
@@ -299,13 +299,13 @@ def synchronous_sections(estimate: RotorEstimate) -> list[Section]:
 def unbalance_rows(s: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a table of what turns with the rotor; 1 g mm is 1e-6 kg m."""
     whole, one = s["unbalance"]["static"], s["unbalance"].get("one_plane")
-    known = all(p["identifiable"] for p in s["unbalance"]["planes"].values())
+    identifiable = all(p["identifiable"] for p in s["unbalance"]["planes"].values())
     rows: list[tuple[str, ...]] = [("turns with the rotor", "value ± sd", "phase ± sd", "")]
     rows += [
         _row(f"unbalance, {_plane(name)}", p, f"at {sized(p['z'], 'm', 5)}", 1e6, "g mm")
         for name, p in s["unbalance"]["planes"].items()
     ]
-    if known:
+    if identifiable:
         rows.append(_row("unbalance, static", {**whole, "identifiable": True}, _grade(whole), 1e6, "g mm"))
         if one and one["fits"]:
             rows.append(("  all in one plane", quantity(one["z"], one["sd"], "m").text, "", ""))
@@ -321,24 +321,24 @@ def unbalance_rows(s: Mapping[str, Any]) -> list[tuple[str, ...]]:
 
 def vibration_rows(s: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """Return a table of the synchronous vibration before and after the correction; empty where none is proposed."""
-    found = s.get("balancing", {}).get("vibration", [])
-    if not found:
+    vibration = s.get("balancing", {}).get("vibration", [])
+    if not vibration:
         return []
     speed = {r["record"]: r["speed"] * _RPM for r in s["records"]}
     rows: list[tuple[str, ...]] = [("synchronous motion", "now", "corrected", "at most (95 %)")]
-    for x in found:
-        of = f"{x['sensor']} at {speed[x['record']]:.5g} rpm"
-        rows.append((of, *(sized(x[q], "m") for q in ("before", "after", "at_most"))))
+    for x in vibration:
+        label = f"{x['sensor']} at {speed[x['record']]:.5g} rpm"
+        rows.append((label, *(sized(x[q], "m") for q in ("before", "after", "at_most"))))
     return rows
 
 
-def _row(what: str, x: Mapping[str, Any], said: str, scale: float, unit: str) -> tuple[str, ...]:
+def _row(what: str, x: Mapping[str, Any], text: str, scale: float, unit: str) -> tuple[str, ...]:
     if not x["identifiable"]:
         return f"  {what}", f"{scale * x['value']:.3g} {unit}".rstrip(), "", _UNSEEN
     size = f"{pure(scale * x['value'], scale * x['sd'])} {unit}".rstrip()
     certain = x["phase_sd"] < 1.0
     degrees = float(np.degrees(x["phase"]) % 360.0), float(np.degrees(x["phase_sd"]))
-    return f"  {what}", size, f"{pure(*degrees)} deg" if certain else "any", said
+    return f"  {what}", size, f"{pure(*degrees)} deg" if certain else "any", text
 
 
 def _grade(whole: Mapping[str, Any]) -> str:
@@ -357,7 +357,7 @@ def _plane(name: str) -> str:
 
 def orbit_blocks(estimate: RotorEstimate) -> list[Block]:
     """Return a block for each record at speed: orbits of the bearings, synchronous alone and all against clearance."""
-    found = []
+    blocks = []
     for r in estimate.synchronous.get("records", []):
         sides = [
             [
@@ -368,8 +368,8 @@ def orbit_blocks(estimate: RotorEstimate) -> list[Block]:
         ]
         said = estimate.records[r["record"]].get("file") or "record"
         if sides:
-            found.append(Block(columns=sides, title=f"{said}: orbits at {r['speed'] * _RPM:.6g} rpm", shared=False))
-    return found
+            blocks.append(Block(columns=sides, title=f"{said}: orbits at {r['speed'] * _RPM:.6g} rpm", shared=False))
+    return blocks
 
 
 def balance_block(s: Mapping[str, Any]) -> Block | None:
@@ -385,12 +385,12 @@ def balance_block(s: Mapping[str, Any]) -> Block | None:
 def _turns(r: Mapping[str, Any], axes: Sequence[str]) -> tuple[Array, Array]:
     """Return the synchronous orbit of a bearing over one turn, x and y in m."""
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    found = []
+    turns = []
     for axis in axes:
         x = r["response"][f"{axis}_position"]
         waves = zip(r["orders"], x["amplitude"], x["phase"], x["sd"], strict=True)
-        found.append(sum((a * np.cos(k * angle + p) for k, a, p, sd in waves if a > 3.0 * sd), np.zeros(angle.size)))
-    return found[0], found[1]
+        turns.append(sum((a * np.cos(k * angle + p) for k, a, p, sd in waves if a > 3.0 * sd), np.zeros(angle.size)))
+    return turns[0], turns[1]
 
 
 def _bearing_axes(estimate: RotorEstimate, name: str) -> tuple[str, ...]:
@@ -424,14 +424,14 @@ def _whole_orbit(axes: Axes, r: Mapping[str, Any], name: str, estimate: RotorEst
     axes.plot(*own, ".", color=MEASURED, markersize=2.5, alpha=0.6, label="non-synchronous", linestyle="none")
     axes.plot(x / scale, y / scale, color=PREDICTED, linewidth=1.6, label="synchronous")
     angle = np.linspace(0.0, 2.0 * np.pi, 361)
-    said = f"rest up to {sized(rest, 'm')}"
+    remark = f"rest up to {sized(rest, 'm')}"
     good = True
     if clearance:
         axes.plot(clearance / scale * np.cos(angle), clearance / scale * np.sin(angle), color=BOUND, label="clearance")
         share = (rest + orbit["major"]) / clearance
-        said, good = f"{said}; together {share:.0%} of the clearance", share < 1.0
+        remark, good = f"{remark}; together {share:.0%} of the clearance", share < 1.0
     _round(axes, unit)
-    head(axes, f"bearing {name}: {said}", good=good)
+    head(axes, f"bearing {name}: {remark}", good=good)
 
 
 def _round(axes: Axes, unit: str) -> None:
@@ -478,20 +478,20 @@ def _unbalance(axes: Axes, s: Mapping[str, Any]) -> None:
 
 def _vibration(axes: Axes, s: Mapping[str, Any]) -> None:
     """The synchronous motion at each sensor before and after the correction, with its 95 % bound."""
-    found = s["balancing"]["vibration"]
+    vibration = s["balancing"]["vibration"]
     speed = {r["record"]: r["speed"] * _RPM for r in s["records"]}
-    many = len({x["record"] for x in found}) > 1
-    scale, unit = prefixed(max(max(x["before"], x["at_most"]) for x in found), "m")
-    at = np.arange(len(found))
-    axes.bar(at - 0.2, [x["before"] / scale for x in found], 0.36, color=ORANGE, label="now")
-    after = np.array([x["after"] / scale for x in found])
-    bound = np.array([x["at_most"] / scale for x in found])
+    many = len({x["record"] for x in vibration}) > 1
+    scale, unit = prefixed(max(max(x["before"], x["at_most"]) for x in vibration), "m")
+    at = np.arange(len(vibration))
+    axes.bar(at - 0.2, [x["before"] / scale for x in vibration], 0.36, color=ORANGE, label="now")
+    after = np.array([x["after"] / scale for x in vibration])
+    bound = np.array([x["at_most"] / scale for x in vibration])
     axes.bar(at + 0.2, after, 0.36, color=GREEN, label="corrected")
     axes.errorbar(
         at + 0.2, after, [np.zeros(at.size), bound - after], fmt="none", ecolor="black", capsize=3, elinewidth=1.0,
         label="at most, 95 %",
     )  # fmt: skip
-    names = [x["sensor"].removesuffix("_position") + (f"\n{speed[x['record']]:.0f}" if many else "") for x in found]
+    names = [x["sensor"].removesuffix("_position") + (f"\n{speed[x['record']]:.0f}" if many else "") for x in vibration]
     axes.set_xticks(at, names)
     axes.set_ylabel(f"amplitude [{unit}]")
     head(axes, "synchronous motion at the sensors, runout taken off")

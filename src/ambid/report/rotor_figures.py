@@ -76,33 +76,33 @@ class RotorEvidence:
     def drawings(self) -> dict[str, Block]:
         """Return the blocks of the figure by name."""
         e, plant = self.estimate, self.estimate.plant
-        found: dict[str, Block] = {}
+        blocks: dict[str, Block] = {}
         first = self.runs[0] if self.runs else None
         r = response_of(e, first)
         for p in plant.planes:
             at = [j for j, (_, plane) in enumerate(plant.placed) if plane == p]
-            found[f"response_{_PLANE_NAMES[p]}"] = _matrix(e, r, first, _positions(plant, p), at)
+            blocks[f"response_{_PLANE_NAMES[p]}"] = _matrix(e, r, first, _positions(plant, p), at)
         if (plant if first is None else first.model).turning:
             at = [j for j, (_, plane) in enumerate(plant.placed) if plane == 0]
-            found["response_across"] = _matrix(e, r, first, _positions(plant, 1), at)
+            blocks["response_across"] = _matrix(e, r, first, _positions(plant, 1), at)
         if plant.coils:
-            found["coils"] = _coils(e, r, first)
+            blocks["coils"] = _coils(e, r, first)
         for k, run in enumerate(self.runs):
-            found["residuals" if k == 0 else f"residuals_{k + 1}"] = residuals_block(run)
+            blocks["residuals" if k == 0 else f"residuals_{k + 1}"] = residuals_block(run)
         if e.modes or self.shaft is not None:
             planes = {place: e.numbers[place] for place in plant.places}
-            found["shapes"] = shapes_block(planes, e.modes, shaft=self.shaft)
+            blocks["shapes"] = shapes_block(planes, e.modes, shaft=self.shaft)
         whirl = _whirl(e, self.shaft)
         if whirl is not None:
-            found["campbell"] = Block(columns=[[whirl]])
+            blocks["campbell"] = Block(columns=[[whirl]])
         for k, block in enumerate(orbit_blocks(e)):
-            found["orbits" if k == 0 else f"orbits_{k + 1}"] = block
+            blocks["orbits" if k == 0 else f"orbits_{k + 1}"] = block
         unbalance = balance_block(e.synchronous) if e.synchronous else None
         if unbalance is not None:
-            found["unbalance"] = unbalance
-        found["poles"] = _poles(e)
-        found["correlations"] = _correlations(e)
-        return found
+            blocks["unbalance"] = unbalance
+        blocks["poles"] = _poles(e)
+        blocks["correlations"] = _correlations(e)
+        return blocks
 
 
 def rotor_overview(evidence: RotorEvidence, width: float = WIDE) -> Figure:
@@ -124,11 +124,11 @@ def response_of(estimate: RotorEstimate, run: RotorReplay | None = None, *, n_fr
     space, at = model.matrices(estimate.numbers), point_of(estimate)
     poles = np.linalg.eigvals(space.A).astype(np.complex128)
     f = frequency_grid(poles, lines[0] / _AROUND, min(_AROUND * lines[-1], 0.499 * rate), n_frequencies)
-    of = Sampled(space=space, omega=2 * np.pi * f, rate_hz=rate, delays=at.delays, held=model.held)
+    sampled = Sampled(space=space, omega=2 * np.pi * f, rate_hz=rate, delays=at.delays, held=model.held)
     n_u = len(model.inputs)
     unit = np.eye(n_u, dtype=complex)
-    moved = [slopes(estimate, of, model, np.tile(unit[j], (f.size, 1))) for j in range(n_u)]
-    return with_spread("rotor", f, of.transfer(), np.stack(moved, axis=2), estimate.covariance)
+    moved = [slopes(estimate, sampled, model, np.tile(unit[j], (f.size, 1))) for j in range(n_u)]
+    return with_spread("rotor", f, sampled.transfer(), np.stack(moved, axis=2), estimate.covariance)
 
 
 def measured_pairs(run: RotorReplay, outputs: Sequence[int], inputs: Sequence[int]) -> FrequencyResponse:
@@ -196,17 +196,17 @@ def _pair(
     one = ModelResponse(
         source=r.source, frequency_hz=r.frequency_hz, G=r.G[at], log_sd=r.log_sd[at], phase_sd=r.phase_sd[at]
     )
-    seen = None if run is None else measured_pairs(run, [pair[0]], [pair[1]])
+    measured = None if run is None else measured_pairs(run, [pair[0]], [pair[1]])
     if part == "magnitude":
         magnitude_axis(axes, one, (0, 0), label="identified rotor")
-        if seen is not None:
-            marks(axes, seen, (0, 0), per_decade=_MARKS)
+        if measured is not None:
+            marks(axes, measured, (0, 0), per_decade=_MARKS)
         axes.set_ylabel(f"[{response_unit(plant.units, output, source)}]")
         head(axes, f"{source} → {output}")
         return
     phase_axis(axes, one, (0, 0))
-    if seen is not None:
-        marks(axes, seen, (0, 0), guide=one, per_decade=_MARKS)
+    if measured is not None:
+        marks(axes, measured, (0, 0), guide=one, per_decade=_MARKS)
     axes.set_ylabel("phase [°]")
     axes.set_xlabel("frequency [Hz]")
 
@@ -224,13 +224,13 @@ def _whirl(e: RotorEstimate, shaft: Shaft | None) -> Panel | None:
         return None
     speeds = np.linspace(0.0, most, _SPEEDS)
     drawn = None if shaft is None else campbell(shaft, speeds, lines=2 * max(n, 1) + 1)
-    found = sd = None
+    diagram = sd = None
     if n and e.plant.turning:
         free = e.plant.with_modes(n)  # those above the band are a guess
-        found = campbell(free_rotor_of(free, e.numbers), speeds)
-        sd = whirl_sd(free, e.numbers, e.covariance_names, e.covariance, found)
+        diagram = campbell(free_rotor_of(free, e.numbers), speeds)
+        sd = whirl_sd(free, e.numbers, e.covariance_names, e.covariance, diagram)
     at = sorted({abs(float(str(r["speed"]))) for r in e.records} - {0.0})
-    return campbell_panel(found, drawn=drawn, sd=sd, speeds=at)
+    return campbell_panel(diagram, drawn=drawn, sd=sd, speeds=at)
 
 
 # --- residuals ------------------------------------------------------------------------------------------------------
@@ -275,10 +275,10 @@ def rotor_poles(estimate: RotorEstimate) -> list[Pole]:
     model, theta = estimate.plant, estimate.numbers
     values, V = np.linalg.eig(model.matrices(theta).A)
     inverse = np.linalg.inv(V)
-    known = {p.name for p in model.parameters}
+    physical = {p.name for p in model.parameters}
     moved: list[Complex] = [
         np.einsum("ij,jk,ki->i", inverse, model.derivative(theta, name).A, V, optimize=True)
-        if name in known
+        if name in physical
         else np.zeros(values.size, dtype=complex)
         for name in estimate.covariance_names
     ]
@@ -287,14 +287,14 @@ def rotor_poles(estimate: RotorEstimate) -> list[Pole]:
 
 
 def _poles(e: RotorEstimate) -> Block:
-    found = rotor_poles(e)
-    table = pole_table([(p.value, p.covariance) for p in found if p.value.imag >= 0], times=True)
-    return poles_panel(found, table, "poles of the identified rotor in its magnets, open loop")
+    spectrum = rotor_poles(e)
+    table = pole_table([(p.value, p.covariance) for p in spectrum if p.value.imag >= 0], times=True)
+    return poles_panel(spectrum, table, "poles of the identified rotor in its magnets, open loop")
 
 
 def _correlations(e: RotorEstimate) -> Block:
     """Correlations of the parameters, in the order of the rig, and of the modes' frequencies and dampings."""
     modes = [f"mode{r}.{what}" for r in range(1, len(e.modes) + 1) for what in ("omega", "zeta")]
-    known = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
-    shown = [name for name in (*(p.name for p in e.parameters), *modes) if known.get(name, 0.0) > 0.0]
-    return correlations_panel(shown, e.covariance_of(tuple(shown)), e.numbers)
+    variances = dict(zip(e.covariance_names, np.diag(e.covariance).tolist(), strict=True))
+    names = [name for name in (*(p.name for p in e.parameters), *modes) if variances.get(name, 0.0) > 0.0]
+    return correlations_panel(names, e.covariance_of(tuple(names)), e.numbers)

@@ -175,10 +175,10 @@ def _spectrum(axes: Axes, traces: Traces, j: int) -> None:
     """Amplitude density of the residual, beside the level that white noise of its size has."""
     e = traces.errors[:, j]
     rate_hz = (e.size - 1) / float(traces.time_s[-1] - traces.time_s[0])
-    found = power_spectrum(e, rate_hz, segment=max(min(e.size, 256), e.size // 40))
+    spectrum = power_spectrum(e, rate_hz, segment=max(min(e.size, 256), e.size // 40))
     inside = slice(1, -1)
-    f, size = found.frequency_hz[inside], np.sqrt(found.density[inside])
-    low, high = (np.sqrt(x[inside] / found.density[inside]) for x in found.confidence())
+    f, size = spectrum.frequency_hz[inside], np.sqrt(spectrum.density[inside])
+    low, high = (np.sqrt(x[inside] / spectrum.density[inside]) for x in spectrum.confidence())
     level = float(np.sqrt(2 * np.var(e) / rate_hz))
     scale, unit = prefixed(level, traces.units[j])
     axes.fill_between(
@@ -191,7 +191,7 @@ def _spectrum(axes: Axes, traces: Traces, j: int) -> None:
     head(axes, f"spectrum of the {traces.names[j]} residual")
 
 
-def records_panel(found: Sequence[Traces]) -> Block:
+def records_panel(records: Sequence[Traces]) -> Block:
     """Draw several records below each other: measured and predicted outputs, then their errors over their sd."""
 
     def outputs(axes: Axes, traces: Traces, j: int) -> None:
@@ -211,8 +211,8 @@ def records_panel(found: Sequence[Traces]) -> Block:
         else:
             axes.axis("off")
 
-    n_y = len(found[0].names)
-    columns = [[panel(draw, x, j, height=1.6) for x in found] for draw in (outputs, errors) for j in range(n_y)]
+    n_y = len(records[0].names)
+    columns = [[panel(draw, x, j, height=1.6) for x in records] for draw in (outputs, errors) for j in range(n_y)]
     return Block(columns=columns, widths=(3,) * n_y + (2,) * n_y, shared=False)
 
 
@@ -317,12 +317,12 @@ class Strips:
         arrays, near = Arrays(), slice(first, last)
 
         def shown(line: Line) -> dict[str, Any]:
-            found: dict[str, Any] = {"label": line.label, "color": line.color, "scaled": line.scaled}
+            entry: dict[str, Any] = {"label": line.label, "color": line.color, "scaled": line.scaled}
             if every == 1:
-                found["less"] = None if line.less is None else arrays.add(line.less[near])
-                return found | {"values": arrays.add(line.values[near])}
+                entry["less"] = None if line.less is None else arrays.add(line.less[near])
+                return entry | {"values": arrays.add(line.values[near])}
             x, edges = line.values if line.less is None else line.values - line.less, np.arange(0, last, every)
-            return found | {
+            return entry | {
                 "low": arrays.add(np.fmin.reduceat(x, edges)),
                 "high": arrays.add(np.fmax.reduceat(x, edges)),
             }
@@ -360,8 +360,8 @@ def record_strips(record: Record, records: int = 1) -> Strips:
 def strips_of(traces: Traces) -> Strips:
     """Return outputs beside their predictions, innovations and inputs of a record as strips."""
     strips: list[Strip] = []
-    known = [j for j in range(len(traces.names)) if np.any(np.isfinite(traces.predicted[:, j]))]
-    for j in known:
+    visible = [j for j in range(len(traces.names)) if np.any(np.isfinite(traces.predicted[:, j]))]
+    for j in visible:
         y, e, sd = traces.measured[:, j], traces.errors[:, j], traces.sd[..., j]
         lines = [
             Line(label="measured", color="measured", values=y),
@@ -383,5 +383,5 @@ def strips_of(traces: Traces) -> Strips:
         scale, unit = prefixed(float(np.max(np.abs(x))), unit)
         line = Line(label="input", color="measured", values=x)
         strips.append(Strip(title=name, unit=unit, scale=scale, lines=[line]))
-    worst = worst_stretch(np.nan_to_num(traces.errors[:, known]))
+    worst = worst_stretch(np.nan_to_num(traces.errors[:, visible]))
     return Strips(title=traces.title, time_s=traces.time_s, strips=strips, worst=worst)

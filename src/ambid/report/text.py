@@ -88,11 +88,11 @@ WORDS: dict[str, tuple[str, Style]] = {
 }
 
 
-def verdict_lines(found: Verdict, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
+def verdict_lines(verdict: Verdict, *, width: int = WIDTH, paint: Paint = plain) -> list[str]:
     """Say whether a result may be used, and what stands against it, a reason a paragraph."""
-    words, style = WORDS[found.word]
+    words, style = WORDS[verdict.word]
     lines = [f"verdict: {paint(words, style)}"]
-    for r in found.reasons:
+    for r in verdict.reasons:
         lines += hanging(f"  {paint('✗', 'bad')} {r.check}: ", r.text, width, 4, first=len(r.check) + 6)
     return lines
 
@@ -166,5 +166,5 @@ def warning_lines(warnings: Sequence[str], *, width: int = WIDTH, paint: Paint =
 
 def other_warnings(checks: Mapping[str, Check], warnings: Sequence[str]) -> list[str]:
     """Return the warnings that say more than the detail of a failed check, which stands with the checks."""
-    said = {c.detail for c in checks.values()}
-    return [warning for warning in warnings if warning not in said]
+    details = {c.detail for c in checks.values()}
+    return [warning for warning in warnings if warning not in details]

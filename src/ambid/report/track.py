@@ -48,15 +48,15 @@ def track_document(
     def drawn(width: float) -> Figure:
         from ambid.report.track_figures import track_figure
 
-        shown = lines()
-        units = {name: shown.header.units.get(name, "") for name in shown.names}
-        return track_figure(shown, truth=None if truth is None else truth(units), width=width)
+        lines_drawn = lines()
+        units = {name: lines_drawn.header.units.get(name, "") for name in lines_drawn.names}
+        return track_figure(lines_drawn, truth=None if truth is None else truth(units), width=width)
 
     def frame() -> Frame:
-        shown = TrackHistory.of(track)
-        columns: dict[str, Any] = {"t": shown.t, "state": [x.state for x in track.lines], "error": shown.error}
-        for name in shown.names:
-            columns |= dict(zip((name, f"{name} sd"), shown.values(name)[:2], strict=True))
+        history = TrackHistory.of(track)
+        columns: dict[str, Any] = {"t": history.t, "state": [x.state for x in track.lines], "error": history.error}
+        for name in history.names:
+            columns |= dict(zip((name, f"{name} sd"), history.values(name)[:2], strict=True))
         return "t", columns
 
     name = str(track.header.record.get("file") or "record")
@@ -160,13 +160,13 @@ def change_words(v: TrackedValue, start: TrackedValue | None) -> str:
 
 def event_parts(events: Sequence[Event]) -> list[Part]:
     """Return the last twenty events, one after the other: when, what, why; and how many came before."""
-    shown = events[-_MOST:]
-    earlier = [f"{len(events) - len(shown)} earlier events are omitted"] if len(shown) < len(events) else []
-    told: list[Line] = []
-    for e in shown:
+    latest = events[-_MOST:]
+    earlier = [f"{len(events) - len(latest)} earlier events are omitted"] if len(latest) < len(events) else []
+    lines: list[Line] = []
+    for e in latest:
         who = f" {e.parameter}" if e.parameter else ""
-        told.append([f"{e.t:10.3f} s  ", (f"{e.kind}{who}: ", "bad" if e.kind in _BAD else "strong"), e.why])
-    return [Lines(lines=earlier), Lines(lines=told, hang=True, indent=14)]
+        lines.append([f"{e.t:10.3f} s  ", (f"{e.kind}{who}: ", "bad" if e.kind in _BAD else "strong"), e.why])
+    return [Lines(lines=earlier), Lines(lines=lines, hang=True, indent=14)]
 
 
 def closing_parts(summary: TrackSummary) -> list[Part]:
@@ -327,12 +327,12 @@ def sparkline(values: Sequence[float], limit: float, *, width: int = _SPARK, asc
 
 def _error(state: LiveState, line: TrackLine, ascii_only: bool) -> Parts:
     error, limit, errors = line.error, state.header.limit, state.errors
-    shown = "  ?  " if math.isnan(error) else f"{error:5.3g}"
+    text = "  ?  " if math.isnan(error) else f"{error:5.3g}"
     over = (_PLAIN_BLOCKS if ascii_only else _BLOCKS)[4:]
     spark = sparkline(errors, limit, ascii_only=ascii_only)
     return [
         "model error ",
-        (shown, "bold red" if error > limit else "bold green"),
+        (text, "bold red" if error > limit else "bold green"),
         f"  limit {limit:g}  ",
         *((letter, "red" if letter in over else "green") for letter in spark),
         (f"  last {sized(len(errors) * state.header.every_s, 's')}" if len(errors) > 1 else "", "dim"),

@@ -196,10 +196,10 @@ def _parameter_panel(axes: Axes, history: TrackHistory, name: str, truth: tuple[
 
 def _limits(value: Array, sd: Array, truth: tuple[Array, Array] | None, history: TrackHistory) -> tuple[float, float]:
     """Values, truth and the band where it is usual: a band that begins wide may leave the panel."""
-    known = value[np.isfinite(value)]
+    finite = value[np.isfinite(value)]
     usual = sd[np.isfinite(sd)]
     reach = 1.15 * NORMAL_95 * float(np.median(usual)) if usual.size else 0.0
-    parts = [known - reach, known + reach]
+    parts = [finite - reach, finite + reach]
     if truth is not None:
         first, last = _extent(history)
         inside = (truth[0] >= first) & (truth[0] <= last) & np.isfinite(truth[1])
@@ -248,7 +248,7 @@ def _say(axes: Axes, text: str, where: Literal["left", "right"] = "right") -> No
 def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: TrackHistory, width: float) -> None:
     """Draw a vertical line for each, and in the panel of the parameter that moved its name."""
     first, last = _extent(history)
-    taken: list[float] = [-np.inf] * _LEVELS
+    ends: list[float] = [-np.inf] * _LEVELS
     for e in marks:
         if not first <= e.t <= last:
             continue
@@ -260,10 +260,10 @@ def _event_marks(axes: Axes, marks: Sequence[Event], name: str | None, history: 
         wide = 0.0068 * WIDE / width * len(text)
         left = at + wide > 0.99
         begin = at - wide if left else at
-        level = next((k for k, end in enumerate(taken) if end < begin), None)
+        level = next((k for k, end in enumerate(ends) if end < begin), None)
         if level is None:
             continue
-        taken[level] = begin + wide
+        ends[level] = begin + wide
         box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8}
         axes.annotate(
             text, (at, 0.96 - 0.14 * level), xycoords="axes fraction", xytext=(-4 if left else 4, 0),
@@ -289,15 +289,15 @@ def _error_panel(axes: Axes, history: TrackHistory) -> None:
     at, _, high = extremes(t, error, error)
     axes.fill_between(at, limit, high, where=list(high > limit), color=_OVER, alpha=0.55, linewidth=0, step="mid")
     axes.axhline(limit, color=_OVER, linewidth=1.2, linestyle="--")
-    known = error[np.isfinite(error)]
-    top = max(1.25 * limit, 1.05 * float(known.max(initial=0.0)))
-    if top > 10 * limit and float(known.min(initial=1.0)) > 0:
+    finite = error[np.isfinite(error)]
+    top = max(1.25 * limit, 1.05 * float(finite.max(initial=0.0)))
+    if top > 10 * limit and float(finite.min(initial=1.0)) > 0:
         axes.set_yscale("log")
-        axes.set_ylim(0.5 * float(known.min()), 3 * top)
+        axes.set_ylim(0.5 * float(finite.min()), 3 * top)
     else:
         axes.set_ylim(0, 1.2 * top)
     axes.set_ylabel("model error")
-    over = 100 * float(np.mean(known > limit)) if known.size else 0.0
+    over = 100 * float(np.mean(finite > limit)) if finite.size else 0.0
     unknown = 100 * float(np.mean(~np.isfinite(error)))
     missing = f", not known in {unknown:.2g} %" if unknown else ""
     _say(axes, f"beyond the limit in {over:.2g} % of the lines{missing}")
