@@ -49,6 +49,34 @@ def test_the_package_and_the_help_load_nothing_heavy(code):
     assert loaded_after(code, HEAVY_FOR_THE_COMMAND) == []
 
 
+# What a verb may load on a plain record of one axis, beside what it is for.
+HEAVY_FOR_VERBS = (
+    "matplotlib",
+    "h5py",
+    "jinja2",
+    "pandas",
+    "scipy.optimize",
+    "scipy.signal",
+    "scipy.stats",
+    "scipy.io",
+)
+
+VERB = """
+import os, sys, tempfile
+from ambid.cli import run
+os.chdir(tempfile.mkdtemp())
+words = ("simulate", "thesis", "-o", "r.csv", "--duration", "1", "--rate", "5000")
+assert run(words) == 0
+if {verb!r} != "simulate":
+    assert run(({verb!r}, "r.csv")) == 0
+"""
+
+
+@pytest.mark.parametrize("verb", ["identify", "info", "simulate", "track"])
+def test_a_verb_loads_no_library_that_its_record_does_not_need(verb):
+    assert loaded_after(VERB.format(verb=verb), HEAVY_FOR_VERBS) == []
+
+
 def test_what_is_loaded_is_seen():
     assert loaded_after("import h5py", HEAVY_FOR_ROOMS) == ["h5py"]
     assert PACKAGE.is_dir()

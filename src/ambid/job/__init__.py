@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from ambid.job.acquiring import acquire as acquire
     from ambid.job.commissioning import commission as commission
     from ambid.job.controller_design import design_controller as design_controller
+    from ambid.job.data import info as info
     from ambid.job.data import load_bench as load_bench
     from ambid.job.data import read_data as read_data
     from ambid.job.data import signals_of as signals_of
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
     from ambid.job.keeping import history as history
     from ambid.job.loop_margins import margins as margins
     from ambid.job.response import frf as frf
-    from ambid.job.results import info as info
     from ambid.job.results import load as load
     from ambid.job.results import validate as validate
     from ambid.job.simulation import simulate as simulate

@@ -6,28 +6,29 @@ import json
 from collections.abc import Callable, Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Unpack
+from typing import TYPE_CHECKING, Any, Unpack
 
 from ambid.bearing.magnet_result import NonlinearBearingEstimate, bearing_from_json
 from ambid.blackbox.fit import BlackBoxFit, fit_from_json
-from ambid.control.experiment import Experiment
 from ambid.errors import AmbidError, EstimationError
 from ambid.estimation.estimate import FIT_SCHEMA, Check, Estimate, estimate_from_json, read_as, read_whole
 from ambid.estimation.estimate import SCHEMA as ESTIMATE
 from ambid.job.data import Channels, Reading, Source, check_same_bench, known_rig, load_bench, signals_of
 from ambid.nonlinear.fit import NONLINEAR_STRUCTURES, NonlinearFit, nonlinear_fit_from_json
 from ambid.physics.linear_model import model
-from ambid.record import GapPolicy, read_record
+from ambid.record import GapPolicy
 from ambid.record.record import file_bytes, utf8_text
-from ambid.rig import Rig, read_bench, rig_from_text
+from ambid.rig import Rig, rig_from_text
 from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import path_of, saved, setting
 from ambid.tracking.lines_file import SCHEMA as TRACK
 from ambid.tracking.lines_file import read_track
 from ambid.validation.fits import second_check
 from ambid.validation.fits import validation as fit_validation
-from ambid.validation.inspection import Inspection, inspect
 from ambid.validation.second_record import Validation, validation
+
+if TYPE_CHECKING:
+    from ambid.control.experiment import Experiment
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate | RotorEstimate
@@ -149,6 +150,8 @@ _READERS: Mapping[str, Callable[[Mapping[str, Any], str], Any]] = {
 def experiment_of(excitation: object) -> Experiment | None:
     """Return the experiment that an excitation is, or the file of one; None for the name of another excitation."""
     if not isinstance(excitation, (str, Path)):
+        from ambid.control.experiment import Experiment
+
         return excitation if isinstance(excitation, Experiment) else None
     if str(excitation).isalpha():
         return None
@@ -264,50 +267,6 @@ def validate(
         used=(known, data), estimate=name, record=str(source.get("file") or ""), model=model_name,
         samples=found["samples"], fit=found["fit"], checks=checks,
     )  # fmt: skip
-
-
-def info(
-    record: Source,
-    rig: Rig | str | Path | None = None,
-    *,
-    rate_hz: float | None = None,
-    gaps: GapPolicy | None = None,
-    units: Mapping[str, str] | None = None,
-    layout: Mapping[str, str] | None = None,
-) -> Inspection:
-    """Look through a record: levels, resolution, noise, saturation, drop-outs, outliers, excitation, likely roles.
-
-    Parameters
-    ----------
-    record : file, Record, DataFrame, Dataset or dict of arrays
-    rig : Rig, str or Path, optional
-        Names and calibrates the channels; what the inputs explain then does not count as noise.
-    rate_hz, gaps, units : optional
-        As `ambid.identify`.
-    layout : Mapping of str to str, optional
-        What a file leaves open, as `ambid.record.read_record` takes it.
-
-    Returns
-    -------
-    Inspection
-
-    Raises
-    ------
-    AmbidError
-        If record or rig break a rule.
-
-    Examples
-    --------
-    >>> import ambid
-    >>> found = ambid.info(ambid.simulate("thesis", duration=0.1, seed=1))
-    >>> [c.name for c in found.channels]
-    ['voltage', 'current', 'position']
-    """
-    if rig is None:
-        return inspect(read_record(record, rate_hz=rate_hz, gaps=gaps or "error", units=units, layout=layout))
-    bench = known_rig(rig)
-    found = read_bench(record, bench, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout)
-    return inspect(found, inputs=bench.plant.inputs)
 
 
 def rig_of(estimate: AnyEstimate | RotorEstimate, where: str) -> Rig:

@@ -248,8 +248,6 @@ def persistent_excitation(u: Array, order: int, *, tolerance: float = 1e-9) -> P
     EstimationError
         If the order does not fit the record or a sample is not finite.
     """
-    from scipy.linalg import hankel
-
     u = np.asarray(u, dtype=np.float64)
     if order < 1 or u.ndim != 1 or u.size < 2 * order:
         raise EstimationError(
@@ -263,7 +261,7 @@ def persistent_excitation(u: Array, order: int, *, tolerance: float = 1e-9) -> P
     if rms <= 1e-14 * float(np.max(np.abs(u), initial=0.0)):
         return PersistentExcitation(order=0, asked=order, smallest=0.0, largest=0.0)
     rows = u.size - order + 1
-    matrix = hankel(centred[:rows], centred[rows - 1 :]) / (rms * np.sqrt(rows))
+    matrix = np.lib.stride_tricks.sliding_window_view(centred, order) / (rms * np.sqrt(rows))  # a Hankel matrix
     # Each column has its own mean over its own samples: only their removal takes the constant out exactly.
     matrix -= matrix.mean(axis=0)
     # The leading n columns of the triangle are those of the Hankel matrix of order n: one QR serves all orders.

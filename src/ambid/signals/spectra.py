@@ -112,12 +112,10 @@ def cross_spectra(z: Array, rate_hz: float, *, segment: int | None = None) -> Cr
     RecordError
         If the segment does not fit the record.
     """
-    from scipy.signal import get_window
-
     length = _segment(z.shape[0], segment)
     step = length - length // 2
     count = (z.shape[0] - length) // step + 1
-    w = np.asarray(get_window("hann", length), dtype=np.float64)
+    w = 0.5 - 0.5 * np.cos(2.0 * np.pi * np.arange(length) / length)  # Hann, periodic
     segments = np.lib.stride_tricks.sliding_window_view(z, length, axis=0)[::step]
     density = np.zeros((length // 2 + 1, z.shape[1], z.shape[1]), dtype=np.complex128)
     for first in range(0, count, _CHUNK):
