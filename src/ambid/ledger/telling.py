@@ -24,7 +24,7 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
 
     Parameters
     ----------
-    found : Watched
+    watched : Watched
         From `watch`.
     path : str or Path
         ``.prom``; replaced at once.
@@ -69,7 +69,7 @@ def publish(watched: Watched, where: str) -> int:
 
     Parameters
     ----------
-    found : Watched
+    watched : Watched
         From `watch`.
     where : str
         ``[mqtts://]HOST[:PORT]/TOPIC``; with ``mqtts://`` over TLS. The topic of a bearing is ``TOPIC/its name``.
