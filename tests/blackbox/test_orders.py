@@ -81,7 +81,7 @@ def test_a_refinement_finds_its_delay_where_the_caller_says_auto() -> None:
 def test_numbers_are_spread_over_inputs_and_shown_as_one_where_they_agree() -> None:
     assert order_per_input("arx", {"nb": 2}, "nb", 1, 3) == (2, 2, 2)
     assert order_per_input("arx", {"nb": (1, np.int64(2))}, "nb", 1, 2) == (1, 2)  # type: ignore[dict-item]
-    assert order_per_input("frf-ml", {"nf": 0}, "nf", 0, 1, of="pair") == (0,)
+    assert order_per_input("frf-ml", {"nf": 0}, "nf", 0, 1, each="pair") == (0,)
     assert single_order("arx", {"na": (2, 2)}, "na", 0) == 2
     assert compact_order((2, 2)) == 2
     assert compact_order((1, 2)) == (1, 2)
