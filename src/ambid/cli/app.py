@@ -1,4 +1,4 @@
-"""All verbs under one command. The files of the verbs import nothing heavy before they run."""
+"""All verbs under one command. A verb's file is imported when the verb, or the help of all, is asked for."""
 
 from __future__ import annotations
 
@@ -6,66 +6,41 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import cache
+from importlib import import_module
 from typing import Annotated, Any
 
 import typer
 
 from ambid import compiled
-from ambid.cli import (
-    acquire,
-    commission,
-    compare,
-    console,
-    demo,
-    design,
-    export,
-    fit,
-    fleet,
-    frf,
-    history,
-    identify,
-    info,
-    init,
-    margins,
-    recover,
-    simulate,
-    track,
-    validate,
-)
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
 from ambid.settings.jobs import RENAMED
 
-app = typer.Typer(
-    rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
-    no_args_is_help=False,
-    help="Physical parameters of active magnetic bearings, with honest uncertainty, from measured voltage, current and"
-    " position.",
-    epilog="Start with 'ambid demo', then 'ambid info RECORD' and 'ambid init RECORD -o RIG' for a record of your own.",
-)
-app.command("demo", short_help="identify the embedded record, and compare with the true parameters")(demo.command)
-app.command("identify", short_help="identify physical parameters, with uncertainty, from a record")(identify.command)
-app.command("fit", short_help="fit a black-box model to a record")(fit.command)
-app.command("frf", short_help="measure a frequency response, and fit models to it")(frf.command)
-app.command("compare", short_help="compare several black-box structures")(compare.command)
-app.command("acquire", short_help="take a record from a controller, real or emulated")(acquire.command)
-app.command("commission", short_help="go from a controller to tracked parameters, step by step")(commission.command)
-app.command("console", short_help="watch, commission and judge a bearing in the browser")(console.command)
-app.command("track", short_help="track parameters through a record, as on-line")(track.command)
-app.command("margins", short_help="show the margins of the loop of a record")(margins.command)
-app.command("history", short_help="show a bearing over time, from a ledger")(history.command)
-app.add_typer(design.group, name="design", short_help="design the next experiment or the controller on a model")
-app.command("export", short_help="write an identified plant for other programs")(export.command)
-app.add_typer(fleet.group, name="fleet", short_help="do a job on many records, real or simulated")
-app.command("recover", short_help="recover a recording that was cut off")(recover.command)
-app.command("init", short_help="draft a rig file from a record")(init.command)
-app.command("simulate", short_help="simulate a record from the physics")(simulate.command)
-app.command("validate", short_help="check an estimate or a fit on another record")(validate.command)
-app.command("info", short_help="show what a record contains")(info.info)
-app.command("models", short_help="list models, parameters, units, excitations, presets")(info.models)
+VERBS = {
+    "demo": "identify the embedded record, and compare with the true parameters",
+    "identify": "identify physical parameters, with uncertainty, from a record",
+    "fit": "fit a black-box model to a record",
+    "frf": "measure a frequency response, and fit models to it",
+    "compare": "compare several black-box structures",
+    "acquire": "take a record from a controller, real or emulated",
+    "commission": "go from a controller to tracked parameters, step by step",
+    "console": "watch, commission and judge a bearing in the browser",
+    "track": "track parameters through a record, as on-line",
+    "margins": "show the margins of the loop of a record",
+    "history": "show a bearing over time, from a ledger",
+    "design": "design the next experiment or the controller on a model",
+    "export": "write an identified plant for other programs",
+    "fleet": "do a job on many records, real or simulated",
+    "recover": "recover a recording that was cut off",
+    "init": "draft a rig file from a record",
+    "simulate": "simulate a record from the physics",
+    "validate": "check an estimate or a fit on another record",
+    "info": "show what a record contains",
+    "models": "list models, parameters, units, excitations, presets",
+}
+"""What each verb does, in the order of the help."""
 
 
-@app.callback(invoke_without_command=True)
 def _global(
     context: typer.Context,
     version: Annotated[bool, typer.Option("--version", help="Print the version and exit.")] = False,
@@ -87,8 +62,24 @@ def _say_compiling() -> None:
 
 
 @cache
-def parser() -> Any:
-    """Return the parser of the words: made once, as all signatures of the verbs are read for it (60 ms)."""
+def parser(verb: str = "") -> Any:
+    """Return the parser of one verb's words, or of all: reading all their settings takes 60 ms, so made once."""
+    app = typer.Typer(
+        rich_markup_mode=None,  # plain help: it pipes well, and starts without importing rich
+        no_args_is_help=False,
+        help="Physical parameters of active magnetic bearings, with honest uncertainty, from measured voltage, current "
+        "and position.",
+        epilog="Start with 'ambid demo', then 'ambid info RECORD' and 'ambid init RECORD -o RIG' for a record of your "
+        "own.",
+    )
+    app.callback(invoke_without_command=True)(_global)
+    for name in [verb] if verb else VERBS:
+        module = import_module(f"ambid.cli.{'info' if name == 'models' else name}")
+        if hasattr(module, "group"):
+            app.add_typer(module.group, name=name, short_help=VERBS[name])
+        else:
+            function = module.command if hasattr(module, "command") else getattr(module, name)
+            app.command(name, short_help=VERBS[name])(function)
     return typer.main.get_command(app)
 
 
@@ -102,10 +93,10 @@ def run_verb(words: Sequence[str]) -> int:
     plain_where_needed(sys.stdout)
     plain_where_needed(sys.stderr)
     compiled.announce = _say_compiling if sys.stderr.isatty() else None
-    command = parser()
     _refuse_former(words)
     if "_AMBID_COMPLETE" in os.environ:  # the shell asks what may follow
-        command.main(list(words), prog_name="ambid")
+        parser().main(list(words), prog_name="ambid")
+    command = parser(words[0] if words and words[0] in VERBS else "")
     try:
         with command.make_context("ambid", list(words)) as context:
             command.invoke(context)
