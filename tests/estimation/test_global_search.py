@@ -56,11 +56,15 @@ def test_where_half_of_the_space_has_no_model_and_where_none_has() -> None:
 
 def test_an_interruption_loses_nothing_and_progress_never_falls() -> None:
     best = BestByDelay()
+    seen: list[float] = []
+    kept: list[float] = []
     shares: list[float] = []
 
     def cost(x: np.ndarray) -> float:
-        value = float(rastrigin(x))
+        value = rastrigin(x)
         best.note(0, value, x)
+        seen.append(value)
+        kept.append(rastrigin(best.vectors()[0]))
         return value
 
     def tick(stage: str, done: float | None = None, /) -> None:
@@ -74,7 +78,15 @@ def test_an_interruption_loses_nothing_and_progress_never_falls() -> None:
         global_search(cost, LOW, HIGH, seed=2, evaluations=2000, tick=tick)
     assert np.all(np.diff(shares) >= 0)
     assert shares[-1] == pytest.approx(0.25)
-    assert rastrigin(best.vectors()[0]) < 40.0
+    assert kept == np.minimum.accumulate(seen).tolist()
+    assert kept[-1] == rastrigin(best.vectors()[0]) < 40.0
+
+
+def test_the_best_of_each_delay_is_kept_and_the_best_of_all_comes_first() -> None:
+    best = BestByDelay()
+    for delay, value, x in ((0, 3.0, 1.0), (2, 1.0, 2.0), (0, 2.0, 3.0), (1, np.inf, 4.0), (2, 5.0, 5.0)):
+        best.note(delay, value, np.array([x]))
+    np.testing.assert_array_equal(best.vectors(), [[2.0], [3.0]])
 
 
 def test_bounds_that_make_no_sense_are_refused() -> None:
