@@ -258,6 +258,15 @@ def test_a_weak_or_spoiled_signal_is_still_a_signal():
         refuse_silent(bench.model, replace(noisy, y=np.column_stack([rng.standard_normal(len(x)), i])))
 
 
+@pytest.mark.parametrize(("j", "role"), [(0, "position"), (1, "current")])
+def test_a_channel_that_stands_still_where_the_record_is_busiest_is_unrelated(j, role):
+    bench = run("bearing", 3000, 1)
+    y = bench.signals.y.copy()
+    y[:, j] = 0.0
+    with pytest.raises(EstimationError, match=f"'{role}' is unrelated"):
+        refuse_silent(bench.model, replace(bench.signals, y=y))
+
+
 def late(role, samples):
     """One channel logged some samples later than the others."""
 

@@ -117,7 +117,7 @@ def _by_chance(columns: Array) -> list[float]:
     Z -= Z.mean(axis=1, keepdims=True)
     inner = Z @ Z.T
     size = np.maximum(np.sqrt(np.diag(inner)), 1e-300)
-    inner = inner / np.outer(size, size) + _RIDGE * np.eye(len(Z))
+    inner = inner / size[:, None] / size + _RIDGE * np.eye(len(Z))
     chances: list[float] = []
     for j in range(width):
         others = np.arange(len(Z)) % width != j
