@@ -25,6 +25,7 @@ from ambid.estimation.search import search as descend
 _BATCHES = 30  # stretches of all records together for the robust covariance
 _ITERATIONS = 60
 _SETTLED = 0.05  # fall of the criterion that a full step promises, below which a search has converged
+_LEFT = 1.0  # and below which it has converged where rounding leaves no way down
 _SEARCHING = "identify"
 _ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
 _BLOCK = 4096  # samples of one block: their rows stay near
@@ -310,12 +311,13 @@ def search(
     """
     objective = _Objective(problem)
     end = descend(
-        objective, start, stage=_SEARCHING, most=iterations, tolerance=0.0, settled=_SETTLED, damping=damping,
-        upper=problem.upper(), longest=_LONGEST, tick=tick, keep_best=True,
+        objective, start, stage=_SEARCHING, most=iterations, tolerance=0.0, settled=_SETTLED, left=_LEFT,
+        damping=damping, upper=problem.upper(), longest=_LONGEST, tick=tick, keep_best=True,
     )  # fmt: skip
+    at = objective.linear(end.theta)
     return BearingFit(
-        problem=problem, vector=end.theta, at=objective.linear(end.theta), criterion=end.cost, status=end.status,
-        evaluations=objective.evaluations,
+        problem=problem, vector=end.theta, at=at, criterion=end.cost, evaluations=objective.evaluations,
+        status="failed" if at is None else end.status,  # a criterion without slopes is no place to end
     )  # fmt: skip
 
 

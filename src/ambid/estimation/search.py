@@ -131,6 +131,7 @@ def search(
     n_linear: int = 0,
     bounded: int = 0,
     judged: int = 0,
+    left: float | None = None,
     keep_best: bool = False,
 ) -> Found:
     """Search for the least criterion.
@@ -139,7 +140,9 @@ def search(
     gain of a step below which the search is over; `settled`: what a full step promises below which it is over, in the
     criterion's unit (squared Newton decrement: the step's squared length in standard deviations); `judged`: with it the
     search is over where a step gains or promises no more than `enough` and a full one moves none of the first `judged`
-    numbers by more than the root of `settled` in its standard deviations, whatever the others still do; `damping`: at
+    numbers by more than the root of `settled` in its standard deviations, whatever the others still do; `left`: what
+    a full step may promise where none goes down and the search is over all the same, in the criterion's unit; default
+    1e-6 of a sum of squares (a likelihood, which has no such scale, names it); `damping`: at
     the beginning, for columns of unit length; small where the start is good; `bounded`: instead of damping, so many
     numbers, the first, stay in a trust region, of radius 1 at first in their own units, and the others, which enter
     linearly, follow; `upper`: (n_theta,), bounds; what stands at its bound and would go beyond rests; `longest`: change
@@ -159,7 +162,7 @@ def search(
     best_held, best_theta, worse = (errors[0] if errors else np.inf), theta, 0
     steps = _Steps(
         problem=problem, control=_Region(bounded) if bounded else _Damping(damping), upper=upper, longest=longest,
-        move=move, solved=solved, n_linear=n_linear, settled=settled, enough=enough, judged=judged,
+        move=move, solved=solved, n_linear=n_linear, settled=settled, enough=enough, judged=judged, left=left,
     )  # fmt: skip
     gained = np.inf
     try:
@@ -281,6 +284,7 @@ class _Steps:
     settled: float
     enough: float
     judged: int
+    left: float | None
 
     def step(self, theta: Array, cost: float, gained: float) -> tuple[Array | None, float, bool]:
         """Return a better vector, None without one, its cost, and whether there is nothing to gain.
@@ -310,7 +314,8 @@ class _Steps:
             self.control.judge((cost - trial_cost) / promise if trial_cost < cost else -1.0)
             if trial_cost < cost:
                 return trial, trial_cost, False
-        return None, cost, not self.judged and to_gain <= 1e-6 * abs(cost)
+        left = 1e-6 * abs(cost) if self.left is None else self.left  # rounding hides a way down
+        return None, cost, not self.judged and to_gain <= left
 
     def _settled(self, full: Directions, r: Array) -> bool:
         """Whether a full step hardly moves what is judged."""
