@@ -7,6 +7,7 @@ import pytest
 
 import ambid
 from ambid.errors import RecordError, RigError
+from ambid.job.sensors import _noise
 from ambid.record import Channel, Record
 from ambid.rig import rig_from_text
 from ambid.rig.rig import rig_text
@@ -88,6 +89,14 @@ def test_a_sensor_that_fails_is_excluded_in_the_line_of_its_time(bench, rig, tmp
     last = followed.lines[-1].parameters["k_i"]
     assert abs(last.value - start.values["k_i"]) < 4 * last.sd
     assert not [e for line in followed.lines for e in line.events if e.kind == "change"]
+
+
+@pytest.mark.parametrize("stopped", [0.0, 0.25, 0.6])
+def test_the_noise_of_a_sensor_that_stops_is_that_before(stopped):
+    x = 1e-7 * np.random.default_rng(2).standard_normal(4000)
+    stop = round((1.0 - stopped) * x.size)
+    x[stop:] = x[stop - 1]
+    assert _noise(x) == pytest.approx(1e-7, rel=0.1)
 
 
 def test_what_makes_no_sensors_is_refused(bench, rig):

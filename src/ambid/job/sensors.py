@@ -75,9 +75,13 @@ def _fused(record: Record, c: RigChannel, unit: str) -> Record:
 
 
 def _noise(x: Array) -> float:
-    """Standard deviation of a sensor's noise from third differences, in which motion is small; rounding included."""
+    """Standard deviation of a sensor's noise from third differences, in which motion is small; rounding included.
+
+    Where values are not on a grid, stretches without any difference are of a sensor that stopped, and tell nothing.
+    """
     third = np.diff(x, 3)
     third = np.abs(third[np.isfinite(third)])
+    third = third if _resolution(x) else third[third > 0.0]
     sd = float(np.median(third)) / (0.6745 * np.sqrt(20.0)) if third.size else 0.0
     return max(sd, 0.29 * _resolution(x), 1e-15)
 
