@@ -15,7 +15,7 @@ export PIP_CONFIG_FILE=/dev/null
 unset PIP_EXTRA_INDEX_URL PIP_FIND_LINKS || true
 
 compile() {
-    build/lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --strip-extras --no-config --no-header \
+    build/lock/bin/pip-compile --quiet --upgrade --generate-hashes --allow-unsafe --no-strip-extras --no-config --no-header \
         --no-emit-index-url --no-emit-find-links --no-emit-trusted-host -o "$@"
 }
 compile requirements/lock.txt requirements/lock.in
