@@ -34,10 +34,13 @@ def predictor(vector, period, scale):
     """
     theta, noise, offset, x0 = vector[:5] * scale["theta"], vector[5:8], vector[8:10], vector[10:13] * scale["state"]
     a, b, e, c = discrete_plant(theta, period)
-    q = (e * np.exp(2 * noise[:2]) * scale["disturbance"] ** 2) @ e.T
-    r = np.diag(scale["output"] ** 2 * [1.0, np.exp(2 * noise[2])])
-    p = solve_discrete_are(a.T, c.T, q, r)
-    gain = np.linalg.solve(c @ p @ c.T + r, c @ p @ a.T).T
+    # micrometres beside amperes: without scales the Riccati solver fails at some levels of noise
+    unit, out = scale["state"], scale["output"]
+    f, g, h = a * unit / unit[:, None], e / unit[:, None], c * unit / out[:, None]
+    q = (g * np.exp(2 * noise[:2]) * scale["disturbance"] ** 2) @ g.T
+    r = np.diag([1.0, np.exp(2 * noise[2])])
+    p = solve_discrete_are(f.T, h.T, q, r)
+    gain = unit[:, None] * np.linalg.solve(h @ p @ h.T + r, h @ p @ f.T).T / out
     return a - gain @ c, np.hstack([b, gain, (e @ (offset * scale["disturbance"]))[:, None]]), c, x0
 
 
