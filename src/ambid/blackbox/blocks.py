@@ -1,11 +1,9 @@
 """Three first-order blocks from voltage, current and position (thesis eq. 2.8-2.15, 5.4-5.6), the fast on-line form.
 
-TFa = K_a/(s + a) from voltage to its part of the current, TFb = K_b/(s + b) from position to the other part,
-TFc = K_c/(s + c) from current to position: i = TFa V + TFb x, x = TFc i. Both equations are solved by instrumental
-variables: what the voltage of an open-loop record, or the reference of a loop, makes of the channels. Columns are
-voltage, current and position, means off and scaled. The covariance of the instrumental sums comes from the residuals'
-own periodogram, averaged over a width that grows with frequency: an autoregression of moderate order misses a slow part
-that is hidden under white noise, and the instruments of a slow plant see just that part.
+TFa = K_a/(s + a), TFb = K_b/(s + b), TFc = K_c/(s + c): i = TFa V + TFb x, x = TFc i. Both equations are solved by
+instrumental variables: what the voltage (open loop) or the reference (loop) makes of the channels. The covariance of
+the instrumental sums comes from the residuals' periodogram, averaged over a width that grows with frequency: an
+autoregression of moderate order misses the slow part under white noise that instruments of a slow plant see.
 """
 
 from __future__ import annotations
@@ -39,11 +37,9 @@ _TINY = 1e-20  # complex step
 
 
 def blocks(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Identify the three blocks from one record.
-
-    `data`: voltage as the input, current and position as the outputs, in this order; without feedback, or with the
-    loop's reference; `orders`: ``nk`` (default 0), samples by which the voltage reaches the coil late. Returns a
-    TransferModel from voltage to both; ``coefficients`` of the blocks and physical ``parameters`` in its details.
+    """Identify the three blocks from `data`: voltage in, current and position out, in this order; without feedback, or
+    with the loop's reference. `orders`: ``nk`` (default 0), samples by which the voltage reaches the coil late. Returns
+    a TransferModel from voltage to both, the blocks' ``coefficients`` and physical ``parameters`` in its details.
     """
     check_order_names("blocks", orders, ("nk",))
     (nk,), n = order_per_input("blocks", {"nk": 0, **orders}, "nk", 0, 1), data.n_samples
@@ -94,11 +90,9 @@ def blocks(data: IOData, orders: Orders) -> BlackBoxFit:
 
 
 def block_parameters(coefficients: Array) -> tuple[Array, Array]:
-    """Map the three blocks to physical parameters (thesis eq. 2.8-2.15, m = 1; derivation of table 5.1).
-
-    s^2 + (b + c) s + b c - K_b K_c is read as s^2 + C s + K, and K_c/(s + c) as -k_i/(C s + k_x + K).
-    `coefficients`: (6,), K_a, a, K_b, b, K_c, c. Returns (6,), R in ohm, L in H, C, K, k_i, k_x per kilogram; (6, 6),
-    their derivative by the coefficients.
+    """Map `coefficients` K_a, a, K_b, b, K_c, c to R in ohm, L in H, C, K, k_i, k_x per kilogram (thesis eq. 2.8-2.15,
+    m = 1; table 5.1), and their (6, 6) derivative: s^2 + (b + c) s + b c - K_b K_c is read as s^2 + C s + K, and K_c/(s
+    + c) as -k_i/(C s + k_x + K).
     """
     ka, a, kb, b, kc, c = (float(x) for x in coefficients)
     big_c = b + c
@@ -115,9 +109,7 @@ def block_parameters(coefficients: Array) -> tuple[Array, Array]:
 
 def transfer_functions(coefficients: Array) -> tuple[tuple[Array, Array, Array], Array]:
     """Eliminate the loop: i/V = K_a (s + b)(s + c)/F, x/V = K_a K_c (s + b)/F, F = (s + a)((s + b)(s + c) - K_b K_c).
-
-    `coefficients`: (6,). Returns numerator of i, F and numerator of x; the derivative of the model's theta by the
-    coefficients, (13, 6), by complex steps.
+    Returns numerator of i, F, numerator of x, and the model's dtheta/dcoefficients, (13, 6), by complex steps.
     """
 
     def parts(theta: NDArray[np.inexact]) -> tuple[NDArray[np.inexact], NDArray[np.inexact], NDArray[np.inexact]]:
@@ -179,10 +171,7 @@ _LEAST, _WIDTH = 2, 0.15  # lines to either side: at least, and as a part of the
 
 
 def score_covariance_of(instruments: Sequence[Array], residuals: Sequence[Array]) -> Array:
-    """Return the covariance of Z_k' e_k of several equations, stacked.
-
-    `instruments`: (n_samples, n_k); `residuals`: (n_samples,), one for each. Returns (sum of n_k, sum of n_k).
-    """
+    """Covariance of Z_k' e_k of several equations, stacked; Z_k (n_samples, n_k) and e_k (n_samples,), one for each."""
     n = residuals[0].size
     S = _smoothed(np.stack(residuals, axis=1))  # at the lines of n samples
     size = 1 << int(np.ceil(np.log2(2 * n)))
@@ -234,9 +223,8 @@ class Equation:
 
 
 def electric(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
-    """Fit i = K_a/(s + a) V + K_b/(s + b) x + constant: Z' e = 0, Z from the clean signals, by Newton's steps.
-
-    `measured`, `clean`: (n_samples, 3). Returns whether the search settled.
+    """Fit i = K_a/(s + a) V + K_b/(s + b) x + constant by Newton's steps on Z' e = 0, Z from the clean signals
+    (n_samples, 3); returns whether it settled.
     """
     best: tuple[Equation, bool] | None = None
     n = measured.shape[0]
@@ -311,9 +299,8 @@ def _newton(measured: Array, clean: Array, theta: Array, dt: float) -> tuple[Equ
 
 
 def mechanic(measured: Array, clean: Array, dt: float) -> tuple[Equation, bool]:
-    """Fit ((s + c) x - K_c i)/(s + |c|) = 0: linear, and bounded for a magnet that pulls away (c < 0) too.
-
-    `measured`, `clean`: (n_samples, 3). Returns whether the search settled.
+    """Fit ((s + c) x - K_c i)/(s + |c|) = 0 to (n_samples, 3) signals: linear, and bounded also for a magnet that pulls
+    away (c < 0); returns whether it settled.
     """
     n = measured.shape[0]
     slowest = 1.0 / (n * dt)
@@ -363,9 +350,8 @@ def _lag(pole: float, dt: float, x: Array, *, hold: bool) -> Array:
 
 
 def spread(electric: Equation, mechanic: Equation, clean: Array) -> tuple[Array, dict[str, float]]:
-    """Return the covariance of all six coefficients, and how probable first-order blocks are (Sargan's test).
-
-    `clean`: (n_samples, 3). Returns (6, 6); ``current`` and ``position``: probability of what spare instruments show.
+    """Covariance (6, 6) of the coefficients, and how probable first-order blocks are: Sargan's test of spare
+    instruments.
     """
     from scipy.stats import chi2
 

@@ -1,9 +1,8 @@
 """Orders that are too high: poles that cannot be told from zeros, and last coefficients that may be zero.
 
-A model of too high an order puts a pole and a zero on top of each other, anywhere: their difference is then within its
-own 99.9 % region around 0 (delta method; wide, because where an order is too high the likelihood is far from a
-parabola), and their place means nothing. Which pairs could cancel depends on the structure: B with F, C with D, A with
-C and B at once (ARMAX); in ARX a factor common to A and B is a noise model.
+Too high an order puts a pole on a zero, anywhere: their difference is within its own 99.9 % region around 0 (delta
+method; wide, because the likelihood is then far from a parabola). Which pairs could cancel depends on the structure: B
+with F, C with D, A with C and B at once (ARMAX); in ARX a factor common to A and B is a noise model.
 """
 
 from __future__ import annotations

@@ -26,11 +26,10 @@ class IOData:
 
     Attributes
     ----------
-    u : ndarray, shape (n_samples, n_inputs), SI
-        No columns for a time series.
-    y : ndarray, shape (n_samples, n_outputs), SI
+    u, y : ndarray, shape (n_samples, n_inputs or n_outputs), SI
+        `u` has no columns for a time series.
     dt : float, s
-    inputs, outputs : tuple of str
+    inputs, outputs, references : tuple of str
         Names of the columns.
     units : Mapping[str, str]
         SI unit by name.
@@ -38,7 +37,6 @@ class IOData:
         Whether the user declares the record open loop. False means "not told so".
     reference : ndarray, shape (n_samples, n_references), SI
         Outer excitation of the loop, independent of the noise; no columns where there is none.
-    references : tuple of str
     record : Mapping[str, object]
         ``samples``, ``rate_hz``, ``sha256``, ``file`` of the record.
     start_s : float, s
@@ -107,7 +105,7 @@ class IOData:
         Raises
         ------
         EstimationError
-            If the part is empty or outside the record.
+            If that is empty or outside the record.
         """
         if not 0 <= first < last <= self.n_samples:
             raise EstimationError(
@@ -125,10 +123,8 @@ def io_data(
     references: Sequence[str] = (),
     open_loop: bool = False,
 ) -> IOData:
-    """Take inputs and outputs out of a record.
-
-    `inputs`, `outputs`: channel names; no inputs for a time series; `references`: channels of the loop's outer
-    excitation; `open_loop`: whether the record is open loop.
+    """Take channels `inputs` (none for a time series), `outputs` and `references` (the loop's outer excitation) out of
+    a record; `open_loop`: whether it is declared so.
     """
     if not outputs:
         raise EstimationError(f"no output was named; a model needs at least one. Give {setting('output', 'COLUMN')}")
@@ -197,10 +193,7 @@ AUTO = "auto"
 
 
 def check_order_names(who: str, orders: Orders, allowed: Sequence[str], needed: Sequence[str] = ()) -> None:
-    """Refuse unknown and missing orders.
-
-    `who`: method.
-    """
+    """Refuse unknown and missing orders of the method `who`."""
     takes = ", ".join(allowed)
     for name in orders:
         if name not in allowed:
@@ -219,10 +212,7 @@ def left_open(orders: Orders, name: str) -> bool:
 
 
 def single_order(who: str, orders: Orders, name: str, least: int, *, remedy: str = "Correct it") -> int:
-    """Return an order that is one number.
-
-    `least`: smallest allowed; `remedy`: what to do about a number that is not.
-    """
+    """Return an order that is one number, at least `least`; `remedy`: what to do about one that is not."""
     value = orders[name]
     values = set(value) if isinstance(value, tuple | list) else {value}
     if len(values) != 1:
@@ -233,10 +223,8 @@ def single_order(who: str, orders: Orders, name: str, least: int, *, remedy: str
 def order_per_input(
     who: str, orders: Orders, name: str, least: int, n: int, *, each: str = "input", remedy: str = "Correct it"
 ) -> tuple[int, ...]:
-    """Return an order for every input.
-
-    `least`: smallest allowed; `n`: number of inputs; `each`: what has an order, if not inputs; `remedy`: what to do
-    about a number that is not.
+    """Return an order, at least `least`, for each of `n` inputs, or of what `each` names; `remedy`: what to do if it is
+    none.
     """
     value = orders[name]
     values = tuple(value) if isinstance(value, tuple | list) else (value,) * n
@@ -254,9 +242,8 @@ def compact_order(values: tuple[int, ...]) -> int | tuple[int, ...]:
 
 
 def check_length(who: str, data: IOData, rows: int, unknowns: int) -> None:
-    """Refuse records that are too short, without inputs, or with a channel that stands still.
-
-    `rows`: samples that are left after lags; `unknowns`: numbers to be estimated for one output.
+    """Refuse records without inputs, with a channel that stands still, or with too few `rows` (after lags) for the
+    `unknowns` of one output.
     """
     if not data.n_inputs:
         raise EstimationError(

@@ -1,6 +1,5 @@
-"""The register of black-box structures; the result of every one, how it is built, and its file.
-
-A file is JSON, schema ``ambid.fit/1`` (contracts.md).
+"""The register of black-box structures; their results, how they are built, and their files: JSON, schema
+``ambid.fit/1``.
 """
 
 from __future__ import annotations
@@ -204,7 +203,7 @@ class BlackBoxFit(FittedModel, Linear):
     orders : Mapping[str, int or tuple of int]
         ``na``, ``nb`` ..., or ``n``; a tuple where inputs differ.
     model : BlackBoxModel
-        PolynomialModel, StateSpaceModel or TransferModel, for deviations from `offsets`.
+        For deviations from `offsets`.
     covariance : ndarray, shape (n_theta, n_theta) or None
         Of ``model.theta``; zeros where a coefficient was not estimated. None where the method has none to give.
     n_estimated : int
@@ -213,25 +212,23 @@ class BlackBoxFit(FittedModel, Linear):
         Operating point, SI.
     noise_covariance : ndarray, shape (n_outputs, n_outputs), SI
         Of the innovations.
-    inputs, outputs : tuple of str
+    inputs, outputs, warnings : tuple of str
     units : Mapping[str, str]
     dt : float, s
     record : Mapping[str, object]
     status : {"converged", "stalled"}
     fit : Mapping[str, OutputFit]
         By output.
-    criteria : Mapping[str, float]
-        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
+    criteria, timing_s : Mapping[str, float]
+        Criteria are ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
     checks : Mapping[str, Check]
     validation : Mapping[str, object] or None
         By output, on a second record.
-    warnings : tuple of str
-    timing_s : Mapping[str, float]
     details : Mapping[str, object]
         Further results of the method as JSON-able values (singular values, condition numbers, chosen horizons).
     derived : Mapping[str, object]
-        What was worked out from it, by name: ``physical`` parameters of a rig, ``sensitivity`` of the coefficients.
-        Written, but not read back.
+        What was worked out from it, ``physical`` parameters of a rig, ``sensitivity`` of the coefficients; written, but
+        not read back.
     """
 
     orders: UsedOrders
@@ -262,11 +259,8 @@ def build_fit(
     warnings: Sequence[str] = (),
     details: Mapping[str, object] | None = None,
 ) -> BlackBoxFit:
-    """Put the result of an estimator together.
-
-    `name`: structure, as in the register; `data`: what it was estimated from; `orders`: as used, delays included;
-    `noise_covariance`: (n_outputs, n_outputs), SI. Returns with a warning where the structure is biased under feedback
-    and the data are not declared open loop.
+    """Put the result of the structure `name` together, with a warning where it is biased under feedback and `data` are
+    not declared open loop. `orders`: as used, delays included; `noise_covariance`: (n_outputs, n_outputs), SI.
     """
     if not np.all(np.isfinite(model.theta)) or not np.all(np.isfinite(noise_covariance)):
         raise EstimationError(f"{name}: no finite coefficients fit this record. Lower the orders, or check the columns")
@@ -313,12 +307,10 @@ def fit_text(fit: BlackBoxFit) -> str:
 
 
 def fit_to_json(fit: BlackBoxFit) -> dict[str, Any]:
-    """Return a fit in the form of schema ``ambid.fit/1``.
-
-    With one input, B and F are lists of coefficients, with several a list of such lists; with several outputs
-    ``polynomials`` and ``sd`` have one entry for each output. ``fit`` and ``validation`` have an entry for each output,
-    and with one output ``one_step`` and ``simulation`` beside it. A fit to a frequency response has no innovations:
-    ``noise_variance`` and ``noise_covariance`` are null, and ``noise`` says why.
+    """Return a fit in the form of schema ``ambid.fit/1``. With several inputs B and F are lists of lists of
+    coefficients, with several outputs ``polynomials`` and ``sd`` have an entry for each; with one, ``one_step`` and
+    ``simulation`` stand beside it. Of a response's fit ``noise_variance`` and ``noise_covariance`` are null, and
+    ``noise`` says why.
     """
     kind, values = _model_json(fit.model, fit.model.theta, fit.outputs)
     of_response = fit.structure in RESPONSE_STRUCTURES

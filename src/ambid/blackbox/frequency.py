@@ -1,14 +1,11 @@
 """Frequency responses as every fit sees them, and transfer functions from them by maximum likelihood, in s or in z.
 
-The likelihood of circular complex errors is the sum of e^H C^-1 e over the lines (Pintelon and Schoukens 2012, ch. 9).
-Where C is itself estimated with few degrees of freedom, its inverse is too large on average and scatters; `Lines` knows
-by how much, so that cost and standard deviations stay honest (complex Wishart moments; their ch. 12 for one output).
-
-`frf_ml` minimises it with e = G - N/D exp(-j omega tau) by Levenberg-Marquardt with the exact Jacobian, from iterated
-linear fits (Sanathanan and Koerner 1963; Pintelon and Schoukens 2012, ch. 9) that begin with D = 1 and with poles
-spread over the band, as vector fitting does (Gustavsen and Semlyen 1999). N and D are searched in polynomials that are
-orthogonal on the lines (Forsythe 1957; Rolain et al. 1995; Brubeck, Nakatsukasa and Trefethen 2021), with one common
-factor left free, so that the search is well-conditioned at any order.
+The likelihood of circular complex errors is the sum of e^H C^-1 e over the lines (Pintelon and Schoukens 2012, ch. 9);
+`Lines` corrects cost and standard deviations for a C estimated with few degrees of freedom (complex Wishart moments;
+their ch. 12 for one output). `frf_ml` minimises it with e = G - N/D exp(-j omega tau) by Levenberg-Marquardt, exact
+Jacobian, from iterated linear fits (Sanathanan and Koerner 1963) that begin with D = 1 and with poles over the band
+(Gustavsen and Semlyen 1999). N and D are searched in polynomials orthogonal on the lines (Forsythe 1957; Rolain et al.
+1995; Brubeck, Nakatsukasa and Trefethen 2021), one common factor left free: well-conditioned at any order.
 """
 
 from __future__ import annotations
@@ -75,10 +72,8 @@ class Lines:
         return int(self.root.shape[1])
 
     def whitened(self, error: Complex) -> Array:
-        """Return errors as independent real numbers of unit variance.
-
-        `error`: (n_frequencies, n_outputs, n_inputs, ...), complex, the last axes are taken along (columns of a
-        Jacobian). Returns (2 * n_frequencies * m, ...).
+        """Return complex errors (n_frequencies, n_outputs, n_inputs, ...) as independent real numbers of unit variance,
+        (2 * n_frequencies * m, ...); last axes are taken along, such as columns of a Jacobian.
         """
         flat = error.reshape(self.n_lines, self.entries, -1)
         white = (self.root @ flat).reshape(self.n_lines * self.entries, -1) * np.sqrt(2.0)
@@ -93,9 +88,8 @@ class Lines:
         return self.alike * (1.0 if np.isinf(v) else v**2 / (q**2 - 1.0))
 
     def covariance(self, J: Array, n_seen: int) -> tuple[Array, float]:
-        """Return the covariance of what a Jacobian of `whitened` rows shows, and the condition of the scaled Jacobian.
-
-        `J`: (n_rows, n_vector); `n_seen`: directions that carry information, the strongest ones: zero along others.
+        """Return the covariance by a Jacobian of `whitened` rows, zero but along the `n_seen` strongest directions, and
+        the condition of the scaled Jacobian.
         """
         norm = np.maximum(np.linalg.norm(J, axis=0), 1e-300)
         _, s, vt = np.linalg.svd(J / norm, full_matrices=False)
@@ -103,14 +97,10 @@ class Lines:
         return half @ half.T * self.widening, float(s[0] / s[n_seen - 1])
 
     def verdict(self, cost: float, n_estimated: int, n_extra: int = 0) -> Check:
-        """Compare a cost with what noise alone would leave.
-
-        Periods that are short beside the memory of the noise make its scatter, and so the standard deviations, a
-        little too large: the cost then comes out under its expectation.
-
-        `cost`: sum of e^H C^-1 e: half the sum of squares of `whitened`; `n_estimated`: real numbers that were
-        estimated; `n_extra`: real data beside the lines (priors). Returns with ``cost``, ``expected_cost`` and
-        ``cost_sd``; `p` is the probability of so large a cost.
+        """Compare `cost`, the sum of e^H C^-1 e, with what noise alone would leave; `p` is the probability of so large
+        a cost. Periods short beside the noise's memory make its scatter, and so the standard deviations, a little too
+        large: the cost then comes out low. `n_estimated`, `n_extra`: real numbers estimated, and real data beside the
+        lines (priors).
         """
         from scipy.stats import gamma
 
@@ -134,10 +124,7 @@ class Lines:
 
 
 def check_lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
-    """Check a frequency response and take its covariance apart.
-
-    `n_estimated`: real numbers that are to be estimated from it.
-    """
+    """Check a frequency response for `n_estimated` real numbers, and take its covariance apart."""
     f, G = np.asarray(frf.frequency_hz, dtype=np.float64), np.asarray(frf.G, dtype=np.complex128)
     n, m = f.size, int(np.prod(G.shape[1:]))
     C = np.asarray(frf.covariance, dtype=np.complex128)
@@ -197,9 +184,8 @@ def check_lines(frf: FrequencyResponse, n_estimated: int) -> Lines:
 def search_lines(
     residual: Callable[[Array], Array], slope: Callable[[Array], Array], start: Array
 ) -> tuple[float, Array, bool]:
-    """Search the likelihood: half the least sum of squares, where it is, and whether the search converged.
-
-    `residual`, `slope`: whitened rows and their derivative at a vector, (n_rows,) and (n_rows, n_vector).
+    """Return half the least sum of squares, where it is, and whether the search converged; `residual`, `slope`:
+    whitened rows (n_rows,) and their derivative (n_rows, n_vector) at a vector.
     """
     end = search(Rows(residual, slope), start, most=200, tolerance=1e-13, settled=1e-12)
     return end.cost / 2, end.theta, end.converged
@@ -219,13 +205,9 @@ def build_response_fit(
     details: Mapping[str, object] | None = None,
     warnings: Sequence[str] = (),
 ) -> BlackBoxFit:
-    """Put the result of a fit to a frequency response together.
-
-    Such a fit has no innovations: `noise_covariance` is zero, and nothing is said of a predictor. What the noise does
-    stands in the covariance of the response, and from there in that of the coefficients.
-
-    `name`: structure; `covariance`: (n_theta, n_theta); `cost`: sum of e^H C^-1 e at the model. Returns with the check
-    ``cost``; a warning where it fails.
+    """Put a fit to a frequency response together, with the check ``cost`` and a warning where it fails. It has no
+    innovations: `noise_covariance` is zero, and noise stands in the `covariance` (n_theta, n_theta) that comes from the
+    response's.
     """
     if not np.all(np.isfinite(model.theta)) or not np.all(np.isfinite(covariance)):
         raise EstimationError(
@@ -258,13 +240,9 @@ def build_response_fit(
 
 
 def orthogonal_polynomials(points: Complex, weight: Array, degree: int) -> tuple[Complex, Array]:
-    """Return orthogonal polynomials on points and their coefficients.
-
-    Orthonormal for Re sum_f weight_f^2 conj(a_f) b_f, which is the sum over the lines and their conjugates.
-
-    `points`: (n_frequencies,), complex, of order one (s over a frequency of the band, or z); `weight`:
-    (n_frequencies,), positive. Returns `values`: (n_frequencies, degree + 1), complex; `powers`: (degree + 1, degree +
-    1), column k holds the coefficients of polynomial k, lowest power first.
+    """Return polynomials orthonormal for Re sum_f weight_f^2 conj(a_f) b_f, the sum over lines and their conjugates:
+    complex `values` (n_frequencies, degree + 1) at `points` of order one, and `powers`, lowest first, of polynomial k
+    in column k.
     """
     n = points.size
     q = np.empty((n, degree + 1), dtype=np.complex128)
@@ -326,12 +304,10 @@ def frf_ml(
     domain: Literal["s", "z"] | None = None,
     delay: float | Literal["auto"] = 0.0,
 ) -> BlackBoxFit:
-    """Fit transfer functions to a frequency response by maximum likelihood.
-
-    `orders`: ``nf``, degree of the common denominator, ``nb``, number of numerator coefficients (a tuple, row by row,
-    where entries differ), at most nf + 1; `domain`: z by default where the input is held, where such a model is exact,
-    else s; with s and a held input the hold's own response is taken out, what it folds down stays, and the check sees
-    it; `delay`: of all inputs in s, "auto" estimates it (in whole samples for z).
+    """Fit transfer functions to a frequency response by maximum likelihood. `orders`: ``nf`` of the common denominator,
+    ``nb`` numerator coefficients (a tuple, row by row, where entries differ), at most nf + 1; `domain`: z by default
+    for held inputs, where it is exact, else s, where a hold's own response is taken out, what it folds down stays, and
+    the check sees it; `delay`: of all inputs in s, "auto" estimates it (in whole samples for z).
     """
     domain = domain or ("z" if frf.hold == "zoh" else "s")
     if domain not in ("s", "z"):

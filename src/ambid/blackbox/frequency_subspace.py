@@ -1,13 +1,10 @@
 """State space from a frequency response by subspace, with the Laguerre operator w = (s - p)/(s + p) (thesis 1.7-1.8).
 
-On s = j omega, |w| = 1: its powers are as good as those of a discrete-time system's z, where powers of j omega grow
-with omega^k and are nearly parallel. Inputs are projected out of the block rows w^k G, rows are weighted by the noise
-they carry, the column space gives A and C, a linear fit B and D (McKelvey, Akcay and Ljung 1996; Van Overschee and De
-Moor 1996). A held input is exact too: sampled lines are lines of a rational function of (2/T)(z - 1)/(z + 1).
-
-At the end the likelihood is searched from there. All matrices are free, also the choice of the state; the directions in
-which only the state changes carry no information and are left out by their known number (McKelvey, Helmersson and
-Ribarits 2004).
+On s = j omega, |w| = 1: powers as good as a discrete z's, where those of j omega are nearly parallel. Inputs are
+projected out of block rows w^k G, weighted by the noise they carry; the column space gives A and C, a linear fit B and
+D (McKelvey, Akcay and Ljung 1996; Van Overschee and De Moor 1996). A held input is exact too, as a rational function of
+(2/T)(z - 1)/(z + 1). From there the likelihood is searched over all matrices, but for the known number of directions in
+which only the state changes (McKelvey, Helmersson and Ribarits 2004).
 """
 
 from __future__ import annotations
@@ -32,10 +29,8 @@ Complex = NDArray[np.complex128]
 
 
 def laguerre_operator(omega: Array, p: float) -> Complex:
-    """Return w = (j omega - p)/(j omega + p).
-
-    `omega`: (n_frequencies,), rad/s; `p`: positive. Returns (n_frequencies,), complex, on the unit circle: -1 at 0, j
-    at p, towards 1 far above it.
+    """Return w = (j omega - p)/(j omega + p) on the unit circle: -1 at 0, j at p > 0, towards 1 far above; omega in
+    rad/s.
     """
     if not (np.isfinite(p) and p > 0):
         raise EstimationError(f"the Laguerre operator's p is {p} rad/s; it must be positive. Give one inside the band")
@@ -43,10 +38,8 @@ def laguerre_operator(omega: Array, p: float) -> Complex:
 
 
 def block_rows_condition(omega: Array, order: int, p: float | None = None) -> float:
-    """Return the condition number of the rows 1, v, v^2 ... v^order that a subspace method works on.
-
-    `omega`: (n_frequencies,), rad/s; `p`: rad/s, of the Laguerre operator v; without, v = j omega over the median of
-    omega, so that it is not the unit of time that makes the number large.
+    """Return the condition number of a subspace method's rows 1, v, v^2 ... v^order: v the Laguerre operator of `p` in
+    rad/s, or without `p` j omega over its median, so that the unit of time does not make the number large.
     """
     if not 1 <= order < 2 * omega.size:
         raise EstimationError(f"powers up to {order} on {omega.size} lines; give an order from 1 to twice the lines")
@@ -74,10 +67,7 @@ def best_conditioned(omega: Array, order: int) -> float:
 
 
 def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[float, StateSpaceModel, bool]:
-    """Search the likelihood from a model by Levenberg-Marquardt.
-
-    `feedthrough`: whether D is free.
-    """
+    """Search the likelihood from a model by Levenberg-Marquardt, D free with `feedthrough`."""
     # states of which inputs and outputs speak alike: rows of B and columns of C of equal size, A balanced.
     from scipy.linalg import matrix_balance
 
@@ -103,9 +93,8 @@ def refine_matrices(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tup
 
 
 def information(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[Array, float]:
-    """Return the covariance of all matrices from the information matrix, and the condition of the scaled Jacobian.
-
-    Returns `covariance`: (n_theta, n_theta), minimal in the directions of the state's choice: zero there.
+    """Return the covariance (n_theta, n_theta) of all matrices, zero in the directions of the state's choice, and the
+    condition of the scaled Jacobian.
     """
     free = _free(model, feedthrough)
     J = ln.whitened(model.frequency_response_derivative(ln.omega)[..., free])
@@ -116,9 +105,8 @@ def information(ln: Lines, model: StateSpaceModel, feedthrough: bool) -> tuple[A
 
 
 def to_continuous(model: StateSpaceModel, covariance: Array) -> tuple[StateSpaceModel, Array] | None:
-    """Return the continuous model that gives the discrete one under a hold, and its covariance.
-
-    `model`: discrete; `covariance`: (n_theta, n_theta). Returns none where no real continuous model exists.
+    """Return the continuous model that under a hold gives the discrete one, and its covariance; None where none is
+    real.
     """
     from scipy.linalg import logm
 
@@ -182,11 +170,10 @@ def frf_subspace(
     feedthrough: bool = False,
     domain: Literal["s", "z"] = "s",
 ) -> BlackBoxFit:
-    """Identify a state space from a frequency response.
-
-    `orders`: ``n``; "auto", or left out: the lowest order whose refined cost noise explains, the one of least BIC where
-    none does; `p`: rad/s, of the Laguerre operator, default the one of least mean square error on a grid over the band;
-    `delay`: of all inputs in s, known; `feedthrough`: whether D is estimated; `domain`: z is for held inputs only.
+    """Identify a state space from a frequency response. `orders`: ``n``; "auto", or left out: the lowest whose refined
+    cost noise explains, else that of least BIC; `p`: rad/s, of the Laguerre operator, default of least mean square
+    error on a grid over the band; `delay`: of all inputs in s, known; `feedthrough`: whether D is estimated; `domain`:
+    z for held inputs only.
     """
     if domain not in ("s", "z") or (domain == "z" and frf.hold != "zoh"):
         raise EstimationError(f"domain {domain!r} with hold {frf.hold!r}; it must be 's', or 'z' for a held input")

@@ -1,9 +1,8 @@
-"""Impulse responses: many taps by regularised least squares (`rfir`), and by correlation.
+"""Impulse responses: many taps by regularised least squares (`rfir`), and by correlation (Ljung 1999, sec. 6.1).
 
-A prior of fading, smooth responses (the stable spline of order one, "TC") takes the place of an order; its sizes come
-from the marginal likelihood (Pillonetto and De Nicolao 2010; Chen, Ohlsson and Ljung 2012). All that the data say
-stands in the triangle of [1 Phi y], taken once, by pieces; every evaluation is then a QR of that size (Chen and Ljung
-2013). The noise variance is profiled out; the gradient is exact. Correlation analysis is that of Ljung 1999, sec. 6.1.
+A prior of fading, smooth responses (stable spline of order one, "TC") replaces an order; its sizes come from the
+marginal likelihood (Pillonetto and De Nicolao 2010; Chen, Ohlsson and Ljung 2012), noise variance profiled out. The
+triangle of [1 Phi y] is taken once; every evaluation is a QR of its size (Chen and Ljung 2013).
 """
 
 from __future__ import annotations
@@ -63,10 +62,8 @@ class Posterior:
 
 
 def triangle(regressors: Sequence[tuple[Array, int]], outputs: Array, first: int) -> Triangle:
-    """Reduce a regression on lagged signals and a constant to a triangle.
-
-    `regressors`: (n_samples,), and int), signal and lag of every column of Phi; `outputs`: (n_samples, n_outputs);
-    `first`: first row, at least the largest lag.
+    """Reduce a regression of `outputs` (n_samples, n_outputs) on a constant and lagged signals to a triangle, from row
+    `first` on; `regressors`: signal (n_samples,) and lag of every column of Phi.
     """
     rows, p = outputs.shape[0], len(regressors)
     R = lagged_triangle([(np.ones(rows), 0), *regressors, *((y, 0) for y in outputs.T)], first)
@@ -163,10 +160,8 @@ _SEEN = 1e-3  # chance of a false alarm
 
 
 def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate a long FIR model with a fading prior; every output by itself.
-
-    `data`: without feedback. Returns a PolynomialModel whose covariance is that of the posterior; `n_estimated` is the
-    effective number of coefficients.
+    """Estimate a long FIR model with a fading prior; every output by itself, without feedback. The covariance is that
+    of the posterior; `n_estimated` is the effective number of coefficients.
     """
     check_order_names("rfir", orders, ("nb", "nk"), ("nb",))
     nb = order_per_input("rfir", orders, "nb", 1, data.n_inputs)
@@ -207,10 +202,8 @@ def rfir(data: IOData, orders: Orders) -> BlackBoxFit:
 def _whiten(
     rough: Posterior, u: Array, y: Array, nb: tuple[int, ...], lags: Sequence[tuple[int, int]], first: int
 ) -> Posterior:
-    """Fit once more with all signals filtered so that the noise is white; as it is where it was white already.
-
-    Noise of another colour would be averaged too well and too badly: the band of the step response would be too narrow
-    by a factor of the noise's memory.
+    """Fit once more with signals filtered so that the noise is white, unless it was: noise of another colour would make
+    the band of the step response too narrow by a factor of its memory.
     """
     from scipy.signal import lfilter
 
@@ -258,11 +251,9 @@ def _left(taps: Array, constant: float, u: Array, y: Array, lags: Sequence[tuple
 
 
 def correlation(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate a FIR model by correlation (Ljung 1999, sec. 6.1): g(k) = R_yu(k) / R_uu(0), both channels filtered so
-    that the input is white. One input at a time, so inputs must not be correlated.
-
-    `data`: without feedback. Returns a PolynomialModel whose standard deviations are those of taps where there is no
-    response. Warns where inputs are correlated, or taps of negative lag are significant (feedback).
+    """Estimate a FIR model without feedback by g(k) = R_yu(k) / R_uu(0), both channels filtered so that the input is
+    white (Ljung 1999, sec. 6.1); one input at a time. Standard deviations are those of taps where there is no response;
+    warns of correlated inputs, and of significant taps of negative lag (feedback).
     """
     from scipy.fft import irfft, next_fast_len, rfft
     from scipy.signal import lfilter

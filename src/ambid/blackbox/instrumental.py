@@ -1,13 +1,9 @@
 """Instrumental variables in discrete time: iv4 without feedback; cliv with the reference of a loop.
 
-A y = B u + noise of any colour: least squares is biased where the equation's noise is not white. Instruments that the
-noise did not make (what the inputs, or in a loop the reference, explain) take the bias off, and filtering with a model
-of the noise makes the estimate as sharp as a method without a noise model of G can be (Ljung 1999, sec. 15.3; Gilson
-and Van den Hof 2005). Noise model and estimate are repeated in turn until they settle.
-
-Neither Z' Z nor Z' Phi is formed from raw columns: Z = Q R, and Q' Phi theta = Q' target is solved by singular values;
-with more instruments than unknowns this is two-stage least squares. Noise is modelled as an autoregression by Burg's
-recursion (Burg 1967): stable by construction, all orders at once, no normal equations.
+Instruments that the noise did not make take the bias of least squares off A y = B u + noise of any colour; filtering
+with a noise model, repeated until both settle, makes the estimate as sharp as one without a noise model of G can be
+(Ljung 1999, sec. 15.3; Gilson and Van den Hof 2005). Z = Q R, and Q' Phi theta = Q' target by singular values:
+two-stage least squares where instruments are to spare. Noise is an autoregression by Burg's recursion (Burg 1967).
 """
 
 from __future__ import annotations
@@ -45,10 +41,7 @@ class Autoregression:
 
 
 def autoregression(residual: Array, highest: int) -> Autoregression:
-    """Model a residual as an autoregression, its order by Akaike's criterion with the small-sample term.
-
-    `residual`: (n_samples,).
-    """
+    """Model a residual (n_samples,) as an autoregression, order by Akaike's criterion with the small-sample term."""
     n = residual.size
     forward = backward = residual
     most, power = min(highest, n // 4), float(residual @ residual) / n
@@ -70,10 +63,8 @@ def autoregression(residual: Array, highest: int) -> Autoregression:
 
 
 def score_covariance(instruments: Array, noise: Autoregression) -> Array:
-    """Return Cov(Z' e) = variance * (H* Z)' (H* Z), H* running backwards in time (Ljung 1999, eq. 9.83).
-
-    `instruments`: (n_samples, n_instruments), Z, independent of the noise; `noise`: H = 1/D of e. Returns
-    (n_instruments, n_instruments).
+    """Return Cov(Z' e) = variance * (H* Z)' (H* Z), H* the filter H = 1/D of e backwards in time (Ljung 1999, eq.
+    9.83); instruments Z (n_samples, n_instruments) independent of the noise.
     """
     from scipy.signal import lfilter
 
@@ -82,10 +73,7 @@ def score_covariance(instruments: Array, noise: Autoregression) -> Array:
 
 
 def noise_covariance(noise: Autoregression, n_samples: int) -> Array:
-    """Return the covariance of the coefficients of D, leading one included (Ljung 1999, eq. 9.62).
-
-    Returns (order + 1, order + 1).
-    """
+    """Return the (order + 1, order + 1) covariance of D's coefficients, leading one included (Ljung 1999, eq. 9.62)."""
     p = noise.order
     out = np.zeros((p + 1, p + 1))
     if not p:
@@ -117,21 +105,14 @@ class Solution:
     regressors: Array  # (n_samples, n_theta), phi, columns of unit length
 
     def covariance(self, noise: Autoregression) -> Array:
-        """Return (Q' Phi)^-1 Cov(Q' e) (Q' Phi)^-T (Soderstrom and Stoica 1989, sec. 8.2).
-
-        `noise`: of the residual. Returns (n_theta, n_theta).
-        """
+        """Return (Q' Phi)^-1 Cov(Q' e) (Q' Phi)^-T, `noise` that of e (Soderstrom and Stoica 1989, sec. 8.2)."""
         return np.asarray(self.inverse @ score_covariance(self.Q, noise) @ self.inverse.T)
 
     def strength(self) -> float:
-        """Return the first-stage F of the direction of the regressors that the instruments see least.
-
-        It is that of the least canonical correlation (Cragg and Donald 1993). What the instruments leave of it is no
-        white noise: the variance of its product with them is that of its colour (Kleibergen and Paap 2006). Regressors
-        that are instruments themselves have the correlation 1. Wald tests of 5 % have a size of at most 10 % from about
-        16 on (Stock and Yogo 2005).
-
-        Returns at most 1e12.
+        """Return the first-stage F, at most 1e12, of the regressors' direction that instruments see least, that of the
+        least canonical correlation (Cragg and Donald 1993), for what they leave coloured (Kleibergen and Paap 2006).
+        Regressors that are instruments have correlation 1; from about 16 on Wald tests of 5 % have a size of at most 10
+        % (Stock and Yogo 2005).
         """
         basis = np.linalg.qr(self.regressors)[0]
         left, correlations, right = np.linalg.svd(self.Q.T @ basis, full_matrices=False)
@@ -144,10 +125,8 @@ class Solution:
 
 
 def solve(instruments: Array, regressors: Array, target: Array, *, who: str) -> Solution:
-    """Solve one instrumental variable step.
-
-    `instruments`: (n_samples, n_instruments), at least as many as regressors; `regressors`: (n_samples, n_theta);
-    `target`: (n_samples,); `who`: method, for the error.
+    """Solve one instrumental variable step of `target` (n_samples,) by at least as many instruments as regressors, both
+    (n_samples, n); `who`: method, for the error.
     """
     z_size, size = _norms(instruments), _norms(regressors)
     Q = np.linalg.qr(instruments / z_size)[0]
@@ -170,10 +149,7 @@ def solve(instruments: Array, regressors: Array, target: Array, *, who: str) -> 
 
 
 def weak_instruments(solutions: Sequence[Solution], outputs: Sequence[str]) -> list[str]:
-    """Warn of outputs whose instruments are weak: errors are then not normal, and their spread is not the one given.
-
-    `solutions`: last step of each output.
-    """
+    """Warn of outputs whose instruments are weak: errors are then not normal, and their spread is not the one given."""
     strengths = [(x.strength(), name) for x, name in zip(solutions, outputs, strict=True)]
     return [
         f"the instruments of {name!r} are weak: the reference or input excites one combination of the terms hardly "
@@ -185,20 +161,13 @@ def weak_instruments(solutions: Sequence[Solution], outputs: Sequence[str]) -> l
 
 
 def project_out(nuisance: Array, columns: Array) -> Array:
-    """Take off what offsets and initial states explain: the part of `columns` in the span of `nuisance`.
-
-    `nuisance`: (n_samples, n_nuisance), may be rank deficient; `columns`: (n_samples, n_columns). Returns (n_samples,
-    n_columns).
-    """
+    """Return what offsets and initial states, `nuisance` (perhaps rank deficient), leave of (n_samples, n) columns."""
     basis = span(nuisance)
     return np.asarray(columns - basis @ (basis.T @ columns))
 
 
 def span(columns: Array) -> Array:
-    """Return an orthonormal basis of the columns, dependent ones left out.
-
-    `columns`: (n_samples, n_columns). Returns (n_samples, rank).
-    """
+    """Return an orthonormal basis (n_samples, rank) of the columns, dependent ones left out."""
     from scipy.linalg import qr
 
     Q, R, _ = qr(columns / _norms(columns), mode="economic", pivoting=True)
@@ -227,10 +196,7 @@ def require_reference(who: str, data: IOData) -> None:
 
 
 def reference_part(who: str, data: IOData) -> tuple[Array, Array]:
-    """Return inputs and outputs of the loop without noise, simulated from its reference.
-
-    `who`: method, for errors; `data`: means taken off.
-    """
+    """Return inputs and outputs of the loop without noise, simulated from its reference; means are off the data."""
     require_reference(who, data)
     w = np.hstack([data.y, data.u])
     scale = (w.std(axis=0), data.reference.std(axis=0))
@@ -343,10 +309,7 @@ def instrumental_step(
     noise: Autoregression = _NO_NOISE_MODEL,
     C: Array = _NO_AVERAGE,
 ) -> Solution:
-    """Make one instrumental variable step; all columns are filtered by D/C.
-
-    `who`: method, for errors; `C`: (n + 1,).
-    """
+    """Make one instrumental variable step for the method `who`; all columns are filtered by D/C, C (n + 1,)."""
     p = noise.order
     rows, Z, target = regressors(data, layout), regressors(instruments, layout), data.y[layout.first_row :]
     if p or C.size > 1:
@@ -358,23 +321,17 @@ def instrumental_step(
 
 
 def least_squares(who: str, data: Signals, layout: Layout) -> Array:
-    """Return the least-squares coefficients: instruments equal to regressors; biased by coloured noise.
-
-    Returns (n_coefficients + 1,).
-    """
+    """Return least-squares coefficients (n_coefficients + 1,): regressors as instruments; biased by coloured noise."""
     return instrumental_step(who, data, data, layout).theta
 
 
 def optimal_step(
     who: str, data: Signals, instruments: Signals, layout: Layout, theta: Array, highest: int
 ) -> ArxEstimate:
-    """Model the noise of the equation at `theta` and make the filtered, optimal step (Ljung 1999, eq. 15.25-15.29).
-
-    The noise is modelled twice, as 1/D and as C/D with C the stable counterpart of A, and the sharper model is taken.
-    The second is that of noise on the output: sampled fast, it has zeros next to the unit circle, which no
-    autoregression of moderate order holds. For an unstable plant C mirrors its poles: noise spectra do not tell them.
-
-    `theta`: (n_coefficients + 1,), consistent estimate from a step before; `highest`: highest order of the noise model.
+    """Model the noise of the equation at the consistent `theta` (n_coefficients + 1,) and make the filtered, optimal
+    step (Ljung 1999, eq. 15.25-15.29). The sharper noise model is taken of 1/D and C/D, C the stable counterpart of A
+    (unstable poles mirrored): noise on a fast-sampled output has zeros next to the unit circle, which no moderate
+    autoregression holds.
     """
     error = data.y[layout.first_row :] - regressors(data, layout) @ theta
     noise, C = autoregression(error, highest), _NO_AVERAGE
@@ -396,10 +353,7 @@ def iterate_optimal(
     theta: Array,
     rounds: int,
 ) -> ArxEstimate:
-    """Repeat `optimal_step` until noise model and estimate agree.
-
-    `instruments`: of an estimate; `theta`: (n_coefficients + 1,); `rounds`: at most.
-    """
+    """Repeat `optimal_step`, at most `rounds` times, until noise model and estimate `theta` agree."""
     for _ in range(rounds):
         estimate = optimal_step(who, data, instruments(theta), layout, theta, layout.free.size + NOISE_ORDER)
         before, theta = theta, estimate.solution.theta
@@ -426,10 +380,9 @@ def _cost(noise: Autoregression, n: int) -> float:
 
 
 def covariance(estimate: ArxEstimate) -> Array:
-    """Return the covariance of all coefficients, leading ones and zeros included.
-
-    C follows from A and has zeros. The noise of the filtered equation is modelled once more, so that a noise model of
-    too low an order costs efficiency but does not make the standard deviations too small.
+    """Return the covariance of all coefficients, leading ones and zeros included; C follows from A and has zeros. The
+    filtered equation's noise is modelled once more: too low an order costs efficiency, but makes no deviations too
+    small.
     """
     rows, layout, p = estimate.innovations.size, estimate.layout, estimate.polynomials
     left = autoregression(estimate.innovations, 10)
@@ -443,12 +396,9 @@ def covariance(estimate: ArxEstimate) -> Array:
 
 
 def operating_point(estimates: list[ArxEstimate], u_mean: Array, y_mean: Array, u_sd: Array, y_sd: Array) -> Offsets:
-    """Share the constants of the equations out over input and output offsets, each moved as little as possible.
-
-    A(1) y0 - B(1) u0 = constant; where A(1) is near zero (an integrating plant) the input takes it.
-
-    `estimates`: one for each output, for signals with the means taken off; `u_mean`, `u_sd`: (n_inputs,), SI; `y_mean`,
-    `y_sd`: (n_outputs,), SI.
+    """Share the equations' constants, A(1) y0 - B(1) u0, out over offsets of input and output in SI, each moved as
+    little as possible; where A(1) is near zero (an integrating plant) the input takes it. `estimates`, one for each
+    output, are of signals with the means off.
     """
     n_y = y_mean.size
     rows = np.zeros((n_y, n_y + u_mean.size))
@@ -467,10 +417,7 @@ _NOISE_ROUNDS = 30  # noise model and estimate in turn, at most
 
 
 def estimate_output(who: str, signals: Signals, clean: Signals, layout: Layout) -> ArxEstimate:
-    """Estimate one output with given instruments.
-
-    `who`: method, for the error; `signals`, `clean`: as measured, and without what the noise does.
-    """
+    """Estimate one output by given instruments; `signals`, `clean`: as measured, and without what the noise does."""
     best, failed = list[ArxEstimate](), list[EstimationError]()
     for corner in _CORNERS if layout.na else _CORNERS[:1]:
         C = np.asarray(np.poly(np.full(layout.na, np.exp(-corner)))) if np.isfinite(corner) else _NO_AVERAGE
@@ -497,10 +444,9 @@ _INSTRUMENT_RADIUS = 0.999  # radius to which the poles of an unstable instrumen
 
 
 def iv4(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate G = B/A by the four-step instrumental variable method, without feedback; every output by itself.
-
-    `orders`: ``na``; ``nb`` and ``nk`` (default 1), one or one for each input. Past inputs are instruments. Returns a
-    PolynomialModel with A, B and the noise model C/D; C is 1, or the stable counterpart of A.
+    """Estimate G = B/A by the four-step instrumental variable method, without feedback, every output by itself; past
+    inputs are instruments. `orders`: ``na``; ``nb`` and ``nk`` (default 1), one or one for each input. The noise model
+    is C/D with C 1, or the stable counterpart of A.
     """
     layout = arx_orders("iv4", data, orders)
     deviations, means, sds = centre(data)
@@ -532,10 +478,7 @@ def arx_orders(who: str, data: IOData, orders: Orders) -> Layout:
 
 
 def centre(data: IOData) -> tuple[IOData, tuple[Array, Array], tuple[Array, Array]]:
-    """Return the data with means off (for the numbers' sake; constants are estimated), the means and the spreads.
-
-    Returns means; standard deviations.
-    """
+    """Return data with means off (for the numbers' sake; constants are estimated), means and standard deviations."""
     means = (data.u.mean(axis=0), data.y.mean(axis=0))
     sds = (data.u.std(axis=0), data.y.std(axis=0))
     reference = data.reference - data.reference.mean(axis=0)
@@ -549,10 +492,7 @@ def arx_fit(
     means: tuple[Array, Array],
     sds: tuple[Array, Array],
 ) -> BlackBoxFit:
-    """Put the estimates of all outputs together.
-
-    `estimates`: for each output, of the data with the means off.
-    """
+    """Put the estimates of all outputs together, those of the data with the means off."""
     layout = estimates[0].layout
     rows = min(f.innovations.size for f in estimates)
     e = np.stack([f.innovations[-rows:] for f in estimates], axis=1)
@@ -591,10 +531,7 @@ def _one_output(signals: Signals, layout: Layout, explained: Array | None) -> Ar
 
 
 def cliv(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate G = B/A of a plant in a loop, with instruments from the reference; every output by itself.
-
-    `data`: with a reference that the noise does not reach; `orders`: as `iv4`. Returns what `iv4` does.
-    """
+    """Estimate as `iv4` does, of a plant in a loop, with instruments from a reference that the noise does not reach."""
     require_reference("cliv", data)
     layout = arx_orders("cliv", data, orders)
     deviations, means, sds = centre(data)

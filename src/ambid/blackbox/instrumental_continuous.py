@@ -1,16 +1,12 @@
 """Continuous-time transfer functions by refined instrumental variables: srivc without feedback, clsrivc in a loop.
 
-srivc finds F, B_i in y = sum of B_i(s)/F(s) exp(-s delay_i) u_i + constant + free responses + noise from sampled data
-directly. Each step solves Z' (e - Phi step) = 0 with all signals filtered by 1/F: Z from the simulated output, Phi from
-the measured one (Young and Jakeman 1980; Young 2011, ch. 8). Where it settles, Z' e = 0: the output error is as small
-as it can be. A step that makes the error larger is shortened, or replaced by one with Z for Phi (Gauss-Newton).
-
-Filtering by 1/F fails for an unstable plant: clsrivc estimates the sampled equation with instruments from the reference
-(cliv), and takes the continuous coefficients whose exact zero-order-hold equivalent is nearest in the metric of its
-information (the problem of Gilson, Garnier, Young and Van den Hof 2008).
-
-Time is measured in units of 1/w0 inside (p = s/w0), which keeps the coefficients of stiff plants near one. The filter
-p^k/F(p) is state k of the companion form of F, exact for inputs held over a sample or straight between samples.
+srivc finds F, B_i in y = sum of B_i(s)/F(s) exp(-s delay_i) u_i + constant + free responses + noise from sampled data.
+Each step solves Z' (e - Phi step) = 0, signals filtered by 1/F, Z from the simulated and Phi from the measured output
+(Young and Jakeman 1980; Young 2011, ch. 8); where it settles, the output error is least. A step that enlarges the error
+is shortened, or made with Z for Phi (Gauss-Newton). Filtering by 1/F fails for an unstable plant: clsrivc runs cliv,
+and takes the continuous coefficients whose exact zero-order-hold equivalent is nearest in the metric of its information
+(the problem of Gilson, Garnier, Young and Van den Hof 2008). Time inside is in units of 1/w0 (p = s/w0), and p^k/F(p)
+is state k of F's companion form, exact for inputs held over a sample or straight between samples.
 """
 
 from __future__ import annotations
@@ -143,10 +139,7 @@ def linearise(setting: Setting, theta: Array) -> Linearised:
 
 
 def refine(setting: Setting, theta: Array, steps: int) -> Found:
-    """Step until settled.
-
-    `theta`: start, stable; `steps`: at most.
-    """
+    """Step from a stable `theta` until settled, at most `steps` times."""
     at = linearise(setting, theta)
     floor = (_EXACT * float(np.linalg.norm(setting.y))) ** 2
     for k in range(steps):
@@ -171,9 +164,8 @@ def refine(setting: Setting, theta: Array, steps: int) -> Found:
 
 
 def search(y: Array, u: Array, dt: float, orders: TransferOrders) -> tuple[Found, float]:
-    """Start from several time scales and refine the best.
-
-    `y`: (n_samples,); `u`: (n_samples, n_inputs), delays taken off. Returns w0 in rad/s.
+    """Start from several time scales, refine the best, and return it with w0 in rad/s; `y`: (n_samples,); `u`:
+    (n_samples, n_inputs), delays taken off.
     """
     rough = list[tuple[Found, float]]()
     # corner frequencies of the start filters, from the record's length to half the sampling rate, middle first
@@ -236,11 +228,9 @@ _DELAYS = tuple(range(6))  # scanned where nk is not given
 
 
 def srivc(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate continuous-time transfer functions by refined instrumental variables; every output by itself.
-
-    `data`: without feedback, inputs held over a sample; `orders`: ``nb`` numerator coefficients (1: a constant) and
-    ``nk`` samples of delay, one or one for each input, ``nf`` degree of the denominator, which all inputs share.
-    Without ``nk`` the delay up to 5, common to all inputs, that fits best is taken.
+    """Estimate continuous-time transfer functions without feedback, inputs held over a sample, every output by itself.
+    `orders`: ``nb`` numerator coefficients (1: a constant) and ``nk`` samples of delay, one or one for each input,
+    ``nf`` degree of the common denominator; without ``nk`` the common delay up to 5 that fits best is taken.
     """
     degrees = transfer_orders("srivc", data, orders)
     deviations, means, _ = centre(data)
@@ -373,10 +363,8 @@ class _Continuous:
 
 
 def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate continuous-time transfer functions of a plant in a loop; every output by itself.
-
-    `data`: with a reference that the noise does not reach, inputs held over a sample; `orders`: as `srivc`, ``nk`` 0
-    where it is left out.
+    """Estimate continuous-time transfer functions of a plant in a loop, inputs held over a sample, every output by
+    itself, from a reference that the noise does not reach; `orders`: as `srivc`, ``nk`` 0 where it is left out.
     """
     who = "clsrivc"
     require_reference(who, data)
@@ -399,10 +387,9 @@ def clsrivc(data: IOData, orders: Orders) -> BlackBoxFit:
 
 
 def sampled_coefficients(theta: Numbers, n: int, nb: tuple[int, ...], step: float) -> Numbers:
-    """Return the zero-order-hold equivalent of B_i(p)/F(p): a_1 ... a_n, then the numerator of every input.
-
-    `theta`: (n + sum(nb), ), real or complex, f_0 ... f_(n-1), then b_0 ... of each input; `n`: degree of F; `step`:
-    sampling interval in units of 1/w0. Returns (n + n of each input (one more with feedthrough), ).
+    """Return the zero-order-hold equivalent of B_i(p)/F(p), F of degree `n`: a_1 ... a_n, then the numerator of every
+    input (n, or n + 1 with feedthrough). `theta`, real or complex: f_0 ... f_(n-1), b_0 ... of each input; `step` in
+    1/w0.
     """
     den = np.concatenate([[1.0], theta[:n][::-1]])
     E, first_state = zero_order_hold(companion(den), np.eye(n)[:, -1:], step)

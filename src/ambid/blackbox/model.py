@@ -1,8 +1,7 @@
-"""What a black-box model is: coefficients, frequency response, poles and zeros, each with its derivatives.
+"""What a black-box model is: coefficients, frequency response, poles and zeros, with derivatives by *all* coefficients.
 
-Derivatives are by *all* coefficients, fixed ones included: a coefficient that was not estimated has a row and a column
-of zeros in the covariance. So every standard deviation follows by the delta method. The state-space model in
-innovations form (thesis eq. 1.1-1.3), x+ = A x + B u + K e, y = C x + D u + e, is what every other one can become.
+One that was not estimated has a zero row and column in the covariance. Every model can become the innovations form
+(thesis eq. 1.1-1.3), x+ = A x + B u + K e, y = C x + D u + e.
 """
 
 from __future__ import annotations
@@ -56,42 +55,15 @@ class BlackBoxModel(ABC):
 
     @abstractmethod
     def frequency_response(self, omega: Array) -> Complex:
-        """Return G.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
-        """
+        """Return complex G at `omega` (rad/s), shape (n_frequencies, n_outputs, n_inputs)."""
 
     @abstractmethod
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return dG/dtheta.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
-        """
+        """Return complex dG/dtheta at `omega` (rad/s), shape (n_frequencies, n_outputs, n_inputs, n_theta)."""
 
     @abstractmethod
     def noise_response(self, omega: Array) -> Complex:
-        """Return H.
-
-        Parameters
-        ----------
-        omega : ndarray, shape (n_frequencies,), rad/s
-
-        Returns
-        -------
-        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
-        """
+        """Return complex H at `omega` (rad/s), shape (n_frequencies, n_outputs, n_outputs)."""
 
     @abstractmethod
     def state_space(self) -> StateSpaceModel:
@@ -136,10 +108,7 @@ class StateSpaceModel(BlackBoxModel):
 
     Attributes
     ----------
-    A : ndarray, shape (n, n)
-    B : ndarray, shape (n, n_inputs)
-    C : ndarray, shape (n_outputs, n)
-    D : ndarray, shape (n_outputs, n_inputs)
+    A, B, C, D : ndarray, shapes (n, n), (n, n_inputs), (n_outputs, n), (n_outputs, n_inputs)
     K : ndarray, shape (n, n_outputs)
         Gain of the innovations; zero for an output-error model.
     dt : float or None
@@ -188,16 +157,7 @@ class StateSpaceModel(BlackBoxModel):
         return np.concatenate([getattr(self, m).ravel() for m in "ABCDK"])
 
     def with_theta(self, theta: Array) -> StateSpaceModel:
-        """Return the same structure with other coefficients.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (n_theta,)
-
-        Returns
-        -------
-        StateSpaceModel
-        """
+        """Return the same structure with coefficients `theta`, (n_theta,)."""
         parts, first = {}, 0
         for m in "ABCDK":
             rows, columns = getattr(self, m).shape
@@ -206,16 +166,7 @@ class StateSpaceModel(BlackBoxModel):
         return StateSpaceModel(dt=self.dt, **parts)
 
     def in_states(self, T: Array) -> StateSpaceModel:
-        """Return the same model in the state T^-1 x.
-
-        Parameters
-        ----------
-        T : ndarray, shape (n, n)
-
-        Returns
-        -------
-        StateSpaceModel
-        """
+        """Return the same model in the state T^-1 x, `T` of shape (n, n)."""
         back = np.linalg.inv(T)
         return StateSpaceModel(
             A=back @ self.A @ T, B=back @ self.B, C=self.C @ T, D=self.D, K=back @ self.K, dt=self.dt
@@ -312,10 +263,8 @@ class StateSpaceModel(BlackBoxModel):
 
 
 def complex_covariance(derivative: Complex, covariance: Array) -> Array:
-    """Propagate a covariance of coefficients to complex numbers.
-
-    `derivative`: (..., n_theta), complex; `covariance`: (n_theta, n_theta). Returns (..., 2, 2), of real and imaginary
-    part.
+    """Propagate `covariance` (n_theta, n_theta) by a complex `derivative` (..., n_theta) to (..., 2, 2), real and
+    imaginary.
     """
     parts = np.stack([derivative.real, derivative.imag], axis=-2)
     with np.errstate(over="ignore", invalid="ignore"):  # not finite at multiple roots
@@ -323,27 +272,20 @@ def complex_covariance(derivative: Complex, covariance: Array) -> Array:
 
 
 def pole_covariance(model: BlackBoxModel, covariance: Array) -> Array:
-    """Return the covariance of real and imaginary part of every pole, shape (n_poles, 2, 2).
-
-    `covariance`: (n_theta, n_theta). Returns (n_poles, 2, 2), in the order of ``model.poles()``. Not finite at multiple
-    poles, where no first-order spread exists.
+    """Return the covariance (n_poles, 2, 2) of real and imaginary part in the order of ``model.poles()``; not finite at
+    multiple poles, where no first-order spread exists.
     """
     return complex_covariance(model.pole_derivative(), covariance)
 
 
 def zero_covariance(model: BlackBoxModel, covariance: Array) -> Array:
-    """Return the covariance of real and imaginary part of every zero, shape (n_zeros, 2, 2).
-
-    `covariance`: (n_theta, n_theta). Returns (n_zeros, 2, 2), in the order of ``model.zeros()``.
-    """
+    """Return the covariance (n_zeros, 2, 2) of real and imaginary part in the order of ``model.zeros()``."""
     return complex_covariance(model.zero_derivative(), covariance)
 
 
 def response_covariance(model: BlackBoxModel, covariance: Array, omega: Array) -> Array:
-    """Return the covariance of real and imaginary part of the frequency response.
-
-    `covariance`: (n_theta, n_theta); `omega`: (n_frequencies,), rad/s. Returns (n_frequencies, n_outputs, n_inputs, 2,
-    2).
+    """Return the covariance of real and imaginary part of the frequency response at `omega` in rad/s, shape
+    (n_frequencies, n_outputs, n_inputs, 2, 2).
     """
     return complex_covariance(model.frequency_response_derivative(omega), covariance)
 
@@ -352,10 +294,7 @@ _ROUNDING = 1e-13
 
 
 def stable(p: Array) -> bool:
-    """Return whether all roots in z are inside the unit circle, by more than rounding may move them out again.
-
-    `p`: (n + 1,), coefficients of q^0, q^-1, ..., the first is 1.
-    """
+    """Return whether all roots in z of `p`, 1 + p_1 q^-1 + ..., are inside the unit circle by more than rounding."""
     c = [float(x) for x in p]
     while len(c) > 1:
         k = c[-1]
@@ -367,10 +306,7 @@ def stable(p: Array) -> bool:
 
 
 def reflect(p: Array, radius: float = 0.98) -> Array:
-    """Return the polynomial with roots outside the unit circle reflected, for a start alone.
-
-    `p`: (n + 1,); `radius`: roots are drawn in to at most this. Returns (n + 1,).
-    """
+    """Return `p` with roots outside the unit circle reflected, and drawn in to at most `radius`; for a start alone."""
     if p.size < 2 or not np.all(np.isfinite(p)):
         return np.asarray(np.eye(1, p.size)[0])
     if stable(p / radius ** np.arange(p.size)):
@@ -386,10 +322,7 @@ def reflect(p: Array, radius: float = 0.98) -> Array:
 
 
 def roots_of(p: Array) -> Complex:
-    """Return the roots in z; the formula serves for up to two, which are most.
-
-    `p`: (n + 1,), the first is not 0; none at all have no roots. Returns (n,), complex.
-    """
+    """Return the complex roots in z of `p` (first not 0), by the formula for up to two, which are most."""
     if p.size < 2:
         return np.empty(0, dtype=np.complex128)
     if p.size == 2:
@@ -405,10 +338,8 @@ def roots_of(p: Array) -> Complex:
 
 
 def root_derivative(coefficients: Array, roots: Complex) -> Complex:
-    """Return the derivative of polynomial roots by its coefficients.
-
-    `coefficients`: (n + 1,), of z^n ... z^0; `roots`: (n_roots,). Returns (n_roots, n + 1), complex, from P(r) = 0:
-    dr/dp_k = -r^(n-k) / P'(r). Infinite at a multiple root.
+    """Return the derivative (n_roots, n + 1) of roots by coefficients of z^n ... z^0, from P(r) = 0: dr/dp_k = -r^(n-k)
+    / P'(r); infinite at a multiple root.
     """
     n = coefficients.size - 1
     if n < 1:
@@ -424,19 +355,14 @@ def root_derivative(coefficients: Array, roots: Complex) -> Complex:
 
 
 def used_part(theta: Array, place: slice) -> slice:
-    """Return where a polynomial begins behind leading zeros: a delay has no roots.
-
-    `theta`: (n_theta,); `place`: of the polynomial.
-    """
+    """Return where the polynomial at `place` in `theta` begins behind leading zeros: a delay has no roots."""
     nonzero = np.nonzero(theta[place])[0]
     return slice(place.start + int(nonzero[0]) if nonzero.size else place.stop, place.stop)
 
 
 def roots_at(theta: Array, *places: slice) -> tuple[Complex, Complex]:
-    """Return the roots of some of a model's polynomials, and their derivatives by all its coefficients.
-
-    `theta`: (n_theta,); `places`: of the polynomials; leading zeros are a delay. Returns `roots`: (n_roots,), complex;
-    `derivatives`: (n_roots, n_theta), complex.
+    """Return complex `roots` (n_roots,) of the polynomials at `places` in `theta`, leading zeros being a delay, and
+    their `derivatives` (n_roots, n_theta).
     """
     roots, rows = [np.empty(0, dtype=np.complex128)], [np.zeros((0, theta.size), dtype=np.complex128)]
     for place in places:
@@ -507,16 +433,7 @@ class Polynomials:
         return np.concatenate([c for _, _, c in self.parts()])
 
     def with_theta(self, theta: Array) -> Polynomials:
-        """Return polynomials of the same degrees with other coefficients.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (n_theta,)
-
-        Returns
-        -------
-        Polynomials
-        """
+        """Return polynomials of the same degrees with coefficients `theta`, (n_theta,)."""
         parts, n = np.split(theta, np.cumsum([c.size for _, _, c in self.parts()])[:-1]), len(self.B)
         return Polynomials(
             A=parts[0], B=tuple(parts[1 : n + 1]), C=parts[n + 1], D=parts[n + 2], F=tuple(parts[n + 3 :])
@@ -581,16 +498,7 @@ class PolynomialModel(RationalModel):
                 first += c.size
 
     def with_theta(self, theta: Array) -> PolynomialModel:
-        """Return the same structure with other coefficients.
-
-        Parameters
-        ----------
-        theta : ndarray, shape (n_theta,)
-
-        Returns
-        -------
-        PolynomialModel
-        """
+        """Return the same structure with coefficients `theta`, (n_theta,)."""
         ends = np.cumsum([p.theta.size for p in self.outputs])
         split = zip(self.outputs, np.split(theta, ends[:-1]), strict=True)
         return PolynomialModel(outputs=tuple(p.with_theta(part) for p, part in split), dt=self.dt)
@@ -653,10 +561,8 @@ def _at(p: Array, z: Complex) -> Complex:
 
 
 def _observer_form(p: Polynomials) -> tuple[Array, Array, Array, Array, Array]:
-    """Return A, B, C, D, K of one output.
-
-    A chain of order n carries -a_k y, b_k u of the inputs without F and, without D, c_k e. Every B/F, and C/D, is a
-    chain of its own whose output w adds to y: y = first state + sum of w + b0 u + e.
+    """Return A, B, C, D, K of one output. A chain of order n carries -a_k y, b_k u of inputs without F and, without D,
+    c_k e; every B/F, and C/D, is a chain whose output w adds to y: y = first state + sum of w + b0 u + e.
     """
     n_u, fir = len(p.B), [f.size == 1 for f in p.F]
     main = max(p.A.size, p.C.size if p.D.size == 1 else 1, *(b.size for b, x in zip(p.B, fir, strict=True) if x), 1) - 1

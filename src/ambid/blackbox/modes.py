@@ -1,16 +1,12 @@
-"""Modes from a record: common poles of all outputs by maximum likelihood on its discrete Fourier transform, leakage
-included.
+"""Modes from a record: common poles of all outputs by maximum likelihood on its Fourier transform, leakage included.
 
 About a mode each output's spectrum is Y = (sum_r a_r/(jw - p_r) + P(w)) U + sum_r b_r/(jw - p_r) + Q(w) + V: poles p
-are common, the residues a, the transients b (first and last state of the record) and the polynomials P, Q, which stand
-for everything farther away, are linear (Pintelon and Schoukens 2012, sec. 6.3.2; McKelvey and Guerin 2012). A hold, a
-delay or a sensor multiply this by what is smooth about the mode: they change a, P and Q, not p. So each mode is fitted
-in a window of its own, with its neighbours, by variable projection (Golub and Pereyra 1973); no smoothed response is
-formed. The noise V is what the fit leaves about each line, model errors included.
-
-Where the search begins: a common denominator of all outputs in powers of z, with numerators for inputs and for leakage,
-is fitted to overlapping bands by linear least squares for all orders (least-squares complex frequency: Guillaume et al.
-2003). Its lowest coefficient is 1, so that poles of noise come out unstable (Cauberghe 2004).
+are common; residues a, transients b (first and last state) and polynomials P, Q for all that is farther away are linear
+(Pintelon and Schoukens 2012, sec. 6.3.2; McKelvey and Guerin 2012). A hold, a delay or a sensor changes a, P and Q, not
+p. Each mode is fitted in a window of its own, with its neighbours, by variable projection (Golub and Pereyra 1973); the
+noise V is what the fit leaves about each line, model errors included. The search begins with a common denominator in
+powers of z, numerators for inputs and leakage, by linear least squares in overlapping bands for all orders (Guillaume
+et al. 2003); its lowest coefficient is 1, so that poles of noise come out unstable (Cauberghe 2004).
 """
 
 from __future__ import annotations
@@ -88,9 +84,8 @@ def spectra(data: IOData, band: tuple[float, float] | None) -> Spectra:
 def lines_in_band(
     data: IOData, signals: Sequence[Array], band: tuple[float, float] | None, least: int, what: str
 ) -> tuple[Array, tuple[float, float], list[Complex]]:
-    """Return the frequencies of the lines in a band in Hz, the band, and the spectra of signals there, (n_lines, n).
-
-    `band`: Hz, by default that of the first signals; `least`: lines that there must be; `what`: needs them.
+    """Return the frequencies of the lines in a band in Hz (by default the first signals'), the band, and spectra
+    (n_lines, n) there; refuse fewer than `least` lines, which `what` needs.
     """
     n = data.y.shape[0]
     spectra = [np.fft.rfft(x - x.mean(axis=0), axis=0)[1 : (n + 1) // 2] / np.sqrt(n) for x in signals]
@@ -112,10 +107,9 @@ def light_poles(order: int, p: Complex, shapes: Complex, low: float, high: float
 
 
 def excited_band(U: Complex, frequency_hz: Array) -> tuple[float, float]:
-    """Return the band in which inputs have power: the upper of two classes of their level over the logarithm of the
-    frequency (Otsu 1979); all lines where there is no floor beside it.
-
-    `U`: (n_lines, n_inputs), spectra. Returns lowest and highest frequency, Hz.
+    """Return lowest and highest frequency in Hz of where inputs, spectra `U` (n_lines, n_inputs), have power: the upper
+    of two classes of level over the logarithm of the frequency (Otsu 1979); all lines where there is no floor beside
+    it.
     """
     width = max(frequency_hz.size // 2000, 16)
     n = frequency_hz.size // width
@@ -207,10 +201,9 @@ def _followed_poles(lines: Spectra) -> tuple[list[TrialPole], list[complex]]:
 
 
 def _common_denominators(lines: Spectra, models: Sequence[int]) -> list[tuple[int, Complex, Complex]]:
-    """Order, poles (n,) and shapes (n, n_outputs) of common denominators by linear least squares.
-
-    All products of powers of x = exp(s T) depend on their difference alone: the normal equations of all orders are
-    parts of a few sums over the lines.
+    """Order, poles (n,) and shapes (n, n_outputs) of common denominators by linear least squares: products of powers of
+    x = exp(s T) depend on their difference alone, so that a few sums over the lines hold the normal equations of all
+    orders.
     """
     n, (n_lines, m), n_y = max(models), lines.U.shape, lines.Y.shape[1]
     angle = 0.9 * 2 * np.pi / n_lines
@@ -371,9 +364,8 @@ class _Window:
         return self.search(poles)
 
     def covariance(self, poles: Complex) -> tuple[Array, Array]:
-        """Covariance of real and imaginary parts from the likelihood, outputs whose errors go together counted so
-        (sandwich), and by the jackknife over outputs (of one step), both (2n, 2n) in (rad/s)²; the second is zero
-        with one output.
+        """Covariances (2n, 2n) of real and imaginary parts in (rad/s)²: of the likelihood, outputs whose errors go
+        together counted so (sandwich), and of the (one-step) jackknife over outputs, zero with one output.
         """
         at, J = self.project(poles), self.slopes(poles)
         apart = np.real(np.einsum("ajk,bjk->jab", J.conj(), J))
@@ -569,10 +561,8 @@ def find_modes(
     band: tuple[float, float] | None = None,
     tick: Callable[[str, float], object] | None = None,
 ) -> Modal:
-    """Estimate the modes that inputs excite and outputs show.
-
-    `count`: "auto", or how many, of which the most significant are taken; `band`: Hz, default where the inputs have
-    power. EstimationError where the band has too few lines.
+    """Estimate `count` modes ("auto", or the most significant) that inputs excite and outputs show, in a `band` in Hz,
+    default where inputs have power; EstimationError where it has too few lines.
     """
 
     def say(stage: str, share: float) -> None:

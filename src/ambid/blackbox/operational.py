@@ -1,13 +1,10 @@
 """Modes from outputs alone by covariance-driven stochastic subspace (SSI-COV; Peeters and De Roeck 1999).
 
-White excitation that nobody measured makes covariances R(l) = C A^(l-1) G of the outputs. The block Toeplitz matrix of
-R(1) ... R(2i-1) is O_i times a controllability matrix; its singular vectors give O_i, its shift A, and A the poles.
-Each band of the record is shifted to zero and taken alone, as a complex signal at the band's own rate: a mode is one
-pole there, and few lags reach far. Orders are followed as everywhere; standard deviations are from the jackknife over
-stretches of the record (Efron and Tibshirani 1993, ch. 11).
-
-A harmonic (mains, unbalance) looks like a mode without damping. Its envelope is steady, where that of a mode that noise
-drives has the distribution of a Gaussian's: E|z|^4 = 2 (E|z|^2)^2 (Jacobsen, Andersen and Brincker 2007).
+White excitation makes covariances R(l) = C A^(l-1) G; the singular vectors of the block Toeplitz matrix of R(1) ...
+R(2i-1) give O_i, its shift A, and A the poles. Each band is shifted to zero and taken as a complex signal at its own
+rate: a mode is one pole there, and few lags reach far. Standard deviations are from the jackknife over stretches (Efron
+and Tibshirani 1993, ch. 11). A harmonic looks like a mode without damping, but its envelope is steady, where that of a
+mode driven by noise has E|z|^4 = 2 (E|z|^2)^2 (Jacobsen, Andersen and Brincker 2007).
 """
 
 from __future__ import annotations
@@ -92,10 +89,8 @@ def operational_modes(
     band: tuple[float, float] | None = None,
     tick: Callable[[str, float], object] | None = None,
 ) -> Modal:
-    """Estimate modes that unmeasured broadband noise excites.
-
-    `count`: "auto", or how many, the best known; `band`: Hz, default where the outputs have power. EstimationError
-    where the band has too few lines.
+    """Estimate `count` modes ("auto", or the best known) that unmeasured broadband noise excites, in a `band` in Hz,
+    default where outputs have power; EstimationError where it has too few lines.
     """
     n, rate = data.y.shape[0], 1.0 / data.dt
     f, _, (Y,) = lines_in_band(data, (data.y,), band, _LEAST_LINES, "operational modes")

@@ -54,10 +54,7 @@ def polynomial_fit(
     *,
     estimated_delay: bool,
 ) -> BlackBoxFit:
-    """Put the outputs' searches together.
-
-    `layouts`: one for each output, fixed coefficients marked.
-    """
+    """Put the outputs' searches together; each output's layout marks its fixed coefficients."""
     units = [coefficient_units(x, scaled, o) for o, x in enumerate(layouts)]
     model = PolynomialModel(
         outputs=tuple(x.polynomials(f.theta * w) for x, f, w in zip(layouts, fits, units, strict=True)), dt=data.dt
@@ -152,10 +149,8 @@ def _shared(
 
 
 def _offsets(scaled: ScaledData, layouts: Sequence[Layout], fits: Sequence[Minimum]) -> Offsets:
-    """Turn the constant of A y - (B/F) u = constant into an operating point.
-
-    It is the output's, unless A sums to (nearly) zero: an integrating plant has any level, and the constant stands for
-    an offset of its input.
+    """Turn the constant of A y - (B/F) u = constant into the output's operating point, or the input's where A sums to
+    (nearly) zero: an integrating plant has any level.
     """
     n_u = scaled.u.shape[0]
     y, levels, gains, rows, right = np.zeros(len(fits)), [], [], [], []
@@ -184,10 +179,7 @@ _OUTER = 0.9  # roots inside are not at the border, however vague
 
 
 def cautions(model: PolynomialModel, covariance: Array, fits: Sequence[Minimum]) -> list[str]:
-    """Return warnings of directions that the data do not see, and of roots of C and F not surely inside the circle.
-
-    `covariance`: (n_theta, n_theta); `fits`: one for each output.
-    """
+    """Return warnings of directions that the data do not see, and of roots of C and F not surely inside the circle."""
     warnings = list[str]()
     for o, fit in enumerate(fits):
         where, s, weights = f"output {o}: " if len(fits) > 1 else "", fit.directions.s, np.abs(fit.directions.Vt[-1:])
@@ -251,10 +243,7 @@ _ROUNDING = 1e-22  # squared residual over squared output that is nothing but ro
 
 
 def not_at_rest(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: ScaledData) -> list[str]:
-    """Return a warning for each output whose record does not begin at rest at zero.
-
-    `layouts`: at rest; `fits`: one for each output.
-    """
+    """Return a warning for each output, its layout at rest, whose record does not begin at rest at zero."""
     warnings = []
     for o, (layout, fit) in enumerate(zip(layouts, fits, strict=True)):
         p = rest_probability(layout, fit, scaled.y[o], scaled.u)
@@ -268,10 +257,8 @@ def not_at_rest(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: Scal
 
 
 def rest_probability(layout: Layout, fit: Minimum, y: Array, u: Array) -> float:
-    """Return how probable it is that a record at rest asks so much for an initial state and a constant.
-
-    `layout`: at rest; `fit`: its fit; `y`: (n_samples,), scaled; `u`: (n_inputs, n_samples). Returns 1 where the fit
-    leaves nothing but rounding.
+    """Return how probable it is that a record at rest, scaled `y` (n_samples,) and `u` (n_inputs, n_samples), asks so
+    much for an initial state and a constant; 1 where the fit leaves nothing but rounding.
     """
     free = replace(layout, at_rest=False)
     p = predictor(free)
@@ -286,12 +273,9 @@ def rest_probability(layout: Layout, fit: Minimum, y: Array, u: Array) -> float:
 
 
 def missed_minimum(layouts: Sequence[Layout], fits: Sequence[Minimum], scaled: ScaledData) -> list[str]:
-    """Return a warning for each output whose search went a long way and left what a longer model explains.
-
-    A and B get more coefficients; by how much the next Gauss-Newton step lowers the squared residual is F distributed
-    where the search ended in the minimum of the right model (score test; Söderström & Stoica 1989, sec. 11.5).
-
-    `fits`: one for each output.
+    """Return a warning for each output whose search went a long way and left what a longer model explains: with more of
+    A and B, what the next Gauss-Newton step takes off the squared residual is F distributed in the minimum of the right
+    model (score test; Söderström & Stoica 1989, sec. 11.5).
     """
     warnings = []
     for o, (layout, fit) in enumerate(zip(layouts, fits, strict=True)):
@@ -346,9 +330,8 @@ def estimate(
     tick: Callable[[], None] | None = None,
 ) -> BlackBoxFit:
     """Fit one of the eight structures, each output by itself (Ljung 1999, sec. 4.2); an nk left out is estimated.
-
-    `fixed`: known coefficients, by the names of `PolynomialModel.names`, in SI; `tick`: called before each look at the
-    data; `at_rest`: the record begins at rest at zero.
+    `fixed`: known coefficients, by the names of `PolynomialModel.names`, in SI; `at_rest`: the record begins at rest at
+    zero.
     """
     layout, free_delay = read_orders(name, data, orders, at_rest=at_rest)
     scaled = scale_data(name, data, at_rest=at_rest)
@@ -406,10 +389,7 @@ def fit_output(
     fixed: Mapping[int, float],
     tick: Callable[[], None] | None,
 ) -> Minimum:
-    """Fit one output from the best of its starts.
-
-    `fixed`: fixed coefficients by place, SI.
-    """
+    """Fit one output from the best of its starts; `fixed`: fixed coefficients by place, SI."""
     p, y = predictor(layout), scaled.y[o]
     need = layout.first_row + 2 * (p.n_nuisance + layout.free.size) + 1
     if y.size < need:

@@ -1,9 +1,7 @@
 """Compiled recursions of the polynomial predictor, and the triangle of its residual and gradients.
 
-All signals of a predictor are rows of one buffer, each made from earlier rows by one filter. What is filtered by what
-is a table of whole numbers, made once for a structure; only the coefficients change from one call to the next. The
-buffer holds one block of samples behind `pad` samples of history, so a long record needs no more memory than a short
-one. Its rows are turned into the triangle of a QR decomposition block by block, by Householder reflections.
+Signals are rows of one buffer, each made from earlier rows by one filter, by a table of whole numbers made once for a
+structure. The buffer holds a block of samples behind `pad` of history, so that a long record needs no more memory.
 """
 
 from __future__ import annotations
@@ -134,10 +132,8 @@ def _still_ringing(filters: Table, s: Array, pad: int, m: int) -> int:
 
 @compiled(fastmath={"contract", "reassoc", "nsz"})
 def add_rows(R: Array, w: Array, n: int, first: int) -> None:
-    """Take the first `n` samples of rows `w` (n_columns, block) into the triangle R by Householder reflections.
-
-    The reflection of column j mixes R[j] with the new samples alone. Columns before `first` are zero in `w`. Each
-    column passes all reflections before it at once: one sweep takes one off and sums the product with the next.
+    """Take the first `n` samples of rows `w` (n_columns, block), zero before column `first`, into the triangle R by
+    Householder reflections, column j's mixing R[j] with new samples alone: one sweep takes one off and sums the next.
     """
     p = R.shape[0]
     tau, size = np.zeros(p), np.zeros(p)
@@ -184,7 +180,6 @@ def block_rows(
     ringing: int,
 ) -> tuple[int, int]:
     """Put the rows of samples `first`, ... into w (n_columns, block); return how many, and whether impulses still ring.
-
     Blocks follow each other; `s` (n_signals, pad + block) begins with zeros and carries the history, `ringing` with 1.
     """
     n, p, m = y.size, columns.shape[0], w.shape[1]

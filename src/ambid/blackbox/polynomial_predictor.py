@@ -1,11 +1,9 @@
 """Orders, data and predictor of A y = (B/F) u + (C/D) e for one output, with its exact gradients (thesis eq. 3.12).
 
-Residual: e = (D/C) (A y - sum_i (B_i/F_i) u_i - kappa), kappa the constant that offsets leave.
-Gradients: all lags of one polynomial are one filtered signal, shifted: de/da_k = (D/C) y(t-k),
-de/db_k = -D/(C F) u(t-k), de/dc_k = -(1/C) e(t-k), de/dd_k = (1/C) v(t-k) with v = A y - (B/F) u - kappa,
-de/df_k = (D B)/(C F^2) u(t-k). Filters start at rest at sample 0; residuals count from `first_row` on, and what came
-before is replaced by impulses at that row whose sizes are estimated (as many as there are initial states). From rest
-nothing came before: all residuals count, and there are neither impulses nor a constant.
+Residual: e = (D/C) (A y - sum_i (B_i/F_i) u_i - kappa), kappa the constant that offsets leave. Gradients are filtered
+signals, shifted: de/da_k = (D/C) y(t-k), de/db_k = -D/(C F) u(t-k), de/dc_k = -(1/C) e(t-k), de/dd_k = (1/C) v(t-k)
+with v = A y - (B/F) u - kappa, de/df_k = (D B)/(C F^2) u(t-k). Filters start at rest at sample 0, residuals count from
+`first_row` on, and impulses there of estimated size stand for what was before; from rest, no impulses and no constant.
 """
 
 from __future__ import annotations
@@ -83,10 +81,7 @@ class Layout:
         return max([self.na, *(b + k - 1 for b, k in zip(self.nb, self.nk, strict=True))])
 
     def free_lags(self, key: Key) -> tuple[int, ...]:
-        """Return the lags of the coefficients of polynomial `key` that are estimated.
-
-        `key`: letter and input.
-        """
+        """Return the lags of the estimated coefficients of polynomial `key`, letter and input."""
         place = self.places[key]
         first = self.nk[key[1]] if key[0] == "B" and key[1] is not None else 1
         return tuple(k for k in range(first, place.stop - place.start) if place.start + k not in self.fixed)
@@ -117,10 +112,7 @@ class Layout:
         return theta
 
     def polynomials(self, theta: Array) -> Polynomials:
-        """Return the polynomials that `theta` holds.
-
-        `theta`: (n_theta,).
-        """
+        """Return the polynomials that `theta` (n_theta,) holds."""
         p = self.places
         per_input = range(self.n_inputs)
         return Polynomials(
@@ -145,9 +137,8 @@ def _free(layout: Layout) -> NDArray[np.int64]:
 
 
 def read_orders(name: str, data: IOData, orders: Orders, *, at_rest: bool = False) -> tuple[Layout, bool]:
-    """Check orders against structure and data; return the layout, and whether the delay is left open (nk is then 0).
-
-    `name`: structure.
+    """Check a structure's orders against the data; return the layout, and whether the delay is left open (nk is then
+    0).
     """
     letters, n_u = structure(name).orders, data.n_inputs
     wants = structure(name).inputs
@@ -191,11 +182,7 @@ def compact_orders(name: str, layout: Layout) -> UsedOrders:
 
 
 def fixed_places(name: str, layouts: tuple[Layout, ...], fixed: Mapping[str, float]) -> list[dict[int, float]]:
-    """Find where the coefficients that the user fixed stand.
-
-    `name`: structure; `layouts`: one for each output; `fixed`: by the names of `PolynomialModel.names`. Returns place
-    and value, for each output.
-    """
+    """Return place and value, for each output, of the coefficients `fixed` by the names of `PolynomialModel.names`."""
     if not fixed:
         return [{} for _ in layouts]
     outputs = tuple(layout.polynomials(layout.start()) for layout in layouts)
@@ -251,10 +238,7 @@ def scale_data(name: str, data: IOData, *, at_rest: bool = False) -> ScaledData:
 
 
 def coefficient_units(layout: Layout, scaled: ScaledData, o: int) -> Array:
-    """Return what one scaled coefficient is worth in SI, shape (n_theta,).
-
-    `o`: output. Returns (n_theta,).
-    """
+    """Return what one scaled coefficient of output `o` is worth in SI, shape (n_theta,)."""
     out = np.ones(layout.n_theta)
     for i in range(layout.n_inputs):
         out[layout.places["B", i]] = scaled.y_scale[o] / scaled.u_scale[i]
@@ -262,9 +246,8 @@ def coefficient_units(layout: Layout, scaled: ScaledData, o: int) -> Array:
 
 
 def liveliest_part(u: Array, size: int = 8192) -> slice:
-    """Return the piece of a long record in which the inputs move most, for a start or a first choice.
-
-    `u`: (n_inputs, n_samples); `size`: of the piece; records up to twice as long are taken whole.
+    """Return the piece of `size` samples in which the inputs (n_inputs, n_samples) move most, for a start or a first
+    choice; records up to twice as long are taken whole.
     """
     n = u.shape[1]
     if n <= 2 * size:
@@ -296,20 +279,12 @@ class Predictor:
     n_nuisance: int  # initial states and constant
 
     def coefficients(self, theta: Array, nuisance: Array) -> Array:
-        """Return what the filters take.
-
-        `theta`: (n_theta,), all coefficients of the output; `nuisance`: (n_nuisance,), initial states, then the
-        constant. Returns (3 + n_theta + n_initial,).
-        """
+        """Return what the filters take, (3 + n_theta + n_initial,); `nuisance`: initial states, then the constant."""
         constant = nuisance[self.n_initial :] if self.n_nuisance > self.n_initial else np.zeros(1)
         return np.concatenate([[1.0, -1.0], -constant, theta, nuisance[: self.n_initial]])
 
     def triangle(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Array:
-        """Return R of the QR decomposition of [initial states, constant, free coefficients, residual].
-
-        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,). Returns
-        (n_columns, n_columns).
-        """
+        """Return R of the QR of [initial states, constant, free coefficients, residual]; `u`: (n_inputs, n_samples)."""
         from ambid.blackbox.polynomial_kernels import add_rows
 
         R = np.zeros((self.columns.shape[0],) * 2)
@@ -319,9 +294,8 @@ class Predictor:
         return R
 
     def blocks(self, y: Array, u: Array, theta: Array, nuisance: Array) -> Iterator[tuple[int, Array]]:
-        """Yield first sample and rows [gradients, residual] block by block; rows are good until the next is asked for.
-
-        `y`: (n_samples,); `u`: (n_inputs, n_samples); `theta`: (n_theta,); `nuisance`: (n_nuisance,).
+        """Yield first sample and rows [gradients, residual] block by block, good until the next; `u`: (n_inputs,
+        n_samples).
         """
         m = max(_BLOCK, self.pad + 1)
         for k, (w, n, _) in enumerate(self._blocks(y, u, self.coefficients(theta, nuisance), m)):
@@ -374,10 +348,7 @@ class _Plan:
 
 @lru_cache(maxsize=256)
 def predictor(layout: Layout) -> Predictor:
-    """Write down the predictor of one output.
-
-    `layout`: at rest: without initial states and without the constant that offsets leave.
-    """
+    """Write down the predictor of one output; at rest it has no initial states and no constant."""
     n_u, free = layout.n_inputs, not layout.at_rest
     place = {key: slice(p.start + _THETA, p.stop + _THETA) for key, p in layout.places.items()}
     A, C, D = (place[x, None] for x in "ACD")

@@ -1,16 +1,11 @@
 """Search for the coefficients of one output, and where it starts.
 
-The search minimises the squared residual over the coefficients, initial states and constant taken out exactly (they
-enter linearly; Golub & Pereyra 1973). Each step works on the triangle of the rows, so its cost does not grow with the
-record: scipy's optimisers would hold and factorise all rows again. Steps that leave the region where the predictor is
-stable are shortened, so the result is stable by construction.
-
-Starts need no help: a long ARX model gives innovations; with them as one more input, A, B and C follow by least squares
-(Hannan & Rissanen 1982), and so do C and D of the noise of any plant model. B and F follow from iterated prefiltering
-(Steiglitz & McBride 1965) or from the null space of the long model (Galrinho, Rojas & Hjalmarsson 2019). For hard cases
-C and D come from a grid: with both known, e = A (D/C) y - B (D/C) u is linear in A and B, and one triangle gives the
-best loss of a candidate. Fast sampling puts the roots of C near 1, where an ARX model of moderate length cannot see
-them; repeated roots span such long memories with few numbers (Laguerre models; Wahlberg 1991).
+The squared residual is minimised with initial states and constant taken out exactly (linear; Golub & Pereyra 1973), by
+steps on the triangle of the rows, shortened where the predictor would be unstable. Starts: a long ARX model gives
+innovations, which as an input give A, B, C (Hannan & Rissanen 1982), and C and D of the noise of any plant; B and F
+come from iterated prefiltering (Steiglitz & McBride 1965) or the long model's null space (Galrinho, Rojas & Hjalmarsson
+2019). For hard cases C and D come from a grid, e = A (D/C) y - B (D/C) u being linear in A and B, with repeated roots
+near 1, which fast sampling asks for and no moderate ARX model sees (Laguerre models; Wahlberg 1991).
 """
 
 from __future__ import annotations
@@ -81,10 +76,8 @@ def search(
     most: int = _MOST,
     tick: Callable[[], None] | None = None,
 ) -> Minimum:
-    """Minimise the squared residual from `start`.
-
-    `y`: (n_samples,), scaled, mean taken off; `u`: (n_inputs, n_samples); `start`: (n_theta,), its C and F must be
-    stable; `most`: evaluations; `tick`: called before each evaluation.
+    """Minimise the squared residual from `start` (n_theta,), its C and F stable; `y`: (n_samples,), scaled, mean taken
+    off; `u`: (n_inputs, n_samples); `most`: evaluations, before each of which `tick` is called.
     """
     n, free = predictor.n_nuisance, predictor.layout.free
 
@@ -176,19 +169,13 @@ def _kept_stable(predictor: Predictor, theta: Array, free: NDArray[np.int64], st
 
 
 def stable_predictor(layout: Layout, theta: Array) -> bool:
-    """Return whether C and every F are stable.
-
-    `theta`: (n_theta,).
-    """
+    """Return whether C and every F of `theta` (n_theta,) are stable."""
     places = layout.places
     return all(stable(theta[p]) for (letter, _), p in places.items() if letter in "CF")
 
 
 def solve_triangle(R: Array, right: Array) -> Array:
-    """Solve R x = right for a triangle R; the shortest x where R leaves some of it open.
-
-    `R`: (n, n), upper triangular.
-    """
+    """Solve R x = right for an upper triangle R (n, n); the shortest x where R leaves some of it open."""
     if not R.size:
         return np.zeros(right.shape)
     scale = np.sqrt(np.einsum("ij,ij->j", R, R))
@@ -216,10 +203,7 @@ class LongModel:
 
 
 def arx_coefficients(layout: Layout, y: Array, u: Array) -> Array:
-    """Return the least-squares coefficients of an ARX layout with a constant.
-
-    `layout`: nc, nd and nf zero; `y`: (n_samples,); `u`: (n_inputs, n_samples). Returns (n_theta,).
-    """
+    """Return the least-squares coefficients (n_theta,) of an ARX layout (nc, nd, nf zero) with a constant."""
     return _regression(layout, y, u, None)[0]
 
 
@@ -237,10 +221,7 @@ def _regression(layout: Layout, y: Array, u: Array, most_rows: int | None) -> tu
 
 
 def starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """Yield first values, the most promising first.
-
-    `y`: (n_samples,), scaled, mean taken off; `u`: (n_inputs, n_samples). Returns (n_theta,).
-    """
+    """Yield first values (n_theta,), the most promising first; `y`: (n_samples,), scaled, mean taken off."""
     if not (layout.nc or layout.nd or any(layout.nf)):
         yield layout.start()  # one step from anywhere
         return
@@ -281,12 +262,9 @@ def _long_model(layout: Layout, y: Array, u: Array) -> LongModel:
 
 
 def reduce_long_model(long: LongModel, inputs: Sequence[int], nb: Sequence[int], nf: int) -> tuple[list[Array], Array]:
-    """Find B_i and the common F with P B_i = Q_i F, weighted by the spread of the long model.
-
-    The null space of the long model is fitted (Galrinho, Rojas & Hjalmarsson 2019): linear, and consistent under
-    feedback and for any noise.
-
-    `nb`: for each of `inputs`. Returns B for each of `inputs`, and F, stable or not.
+    """Find B_i (`nb` coefficients for each of `inputs`) and the common F, stable or not, with P B_i = Q_i F weighted by
+    the long model's spread: its null space (Galrinho, Rojas & Hjalmarsson 2019), linear, and consistent under feedback
+    and for any noise.
     """
     n = long.P.size - 1
     count = [min(b, n) for b in nb]
@@ -391,9 +369,8 @@ def _output_error(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
 
 
 def weighted_starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """Yield starts for hard cases of OE and BJ: the plant from the data with other frequencies stressed.
-
-    `y`: (n_samples,), scaled, mean taken off; `u`: (n_inputs, n_samples). Returns (n_theta,).
+    """Yield starts (n_theta,) for hard cases of OE and BJ: the plant from the data with other frequencies stressed;
+    `y`: (n_samples,), scaled, mean taken off.
     """
     if layout.n_inputs > 1:
         return
@@ -417,10 +394,7 @@ def _from_long_model(layout: Layout, y: Array, u: Array) -> Array:
 
 
 def steiglitz_mcbride(y: Array, u: Array, nb: int, nf: int, nk: int, *, at_rest: bool = False) -> tuple[Array, Array]:
-    """Fit B/F by least squares on data filtered by the last 1/F (Steiglitz & McBride 1965).
-
-    `y`, `u`: (n_samples,). Returns B and a stable F.
-    """
+    """Fit B and a stable F by least squares on data filtered by the last 1/F (Steiglitz & McBride 1965)."""
     part, F = liveliest_part(u[None, :]), np.ones(1)
     arx = arx_layout(nf, (nb,), (nk,), at_rest=at_rest and not part.start)
     y, u = y[part], u[part]
@@ -440,10 +414,7 @@ _CANDIDATES = 3  # candidates to search from
 
 
 def separable_starts(layout: Layout, y: Array, u: Array) -> Iterator[Array]:
-    """Yield starts with C and D from a grid, those first that leave least; none for structures with F.
-
-    `y`: (n_samples,), scaled; `u`: (n_inputs, n_samples). Returns (n_theta,).
-    """
+    """Yield starts (n_theta,) with C and D from a grid, those first that leave least; none for structures with F."""
     if any(layout.nf) or not (layout.nc or layout.nd):
         return
     part = liveliest_part(u)
@@ -488,9 +459,8 @@ _HISTORY = 10  # past outputs, and inputs after the delay, of the long model
 
 
 def long_delays(name: str, y: Array, u: Array, least: int, *, at_rest: bool = False) -> tuple[int, ...]:
-    """Return the delay of every input with the smallest BIC of a long ARX model.
-
-    `name`: structure, for messages; `y`: (n_samples,), scaled, mean taken off; `u`: (n_inputs, n_samples).
+    """Return the delay of every input with the smallest BIC of a long ARX model; `y`: (n_samples,), scaled, mean taken
+    off; `name`: structure, for messages.
     """
     n_u, n = u.shape[0], y.size
     history = min(_HISTORY, n // (10 * (1 + n_u)))

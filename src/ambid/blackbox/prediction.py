@@ -1,16 +1,11 @@
 """Any black-box fit as a discrete predictor at its sampling interval: its errors on a record, and their derivatives.
 
-A continuous model is discretised under a zero-order hold; a delay that is not a whole number of samples lets the plant
-see first the previous input, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
-
-Residual tests project the derivatives along everything that was estimated out: to first order, that takes the error of
-the estimate out of the residuals, whatever the estimator was. Polynomial models have the five exact filters of thesis
-ch. 3 (theory.md, 2.5; Ljung 1999, eq. 10.54). A transfer function is an output-error polynomial model once it is
-discretised. A full state space moves along every entry of A, B, D and K; C moves nothing more where it has full row
-rank, because states can be exchanged.
-
-Models become objects of python-control too. What has no place there is refused or named, never dropped silently: its
-objects know neither noise models nor operating points, and its transfer functions no delay in continuous time.
+Continuous models are discretised under a zero-order hold; with a delay of part of a sample the plant sees the previous
+input first (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2). Residual tests project derivatives along all
+that was estimated out, which takes the estimate's error out of residuals to first order. Polynomial models have the
+five filters of thesis ch. 3 (theory.md, 2.5; Ljung 1999, eq. 10.54); a discretised transfer function is an output-error
+one; a state space moves along A, B, D and K (C adds nothing where it has full row rank). For python-control, noise
+models and operating points have no place, nor has a continuous transfer function's delay: refused or named, never lost.
 """
 
 from __future__ import annotations
@@ -36,10 +31,8 @@ _RUNAWAY = 30.0  # log of the growth of an unstable predictor over the record fr
 
 
 def one_step(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array:
-    """Predict every output from all samples before it (thesis eq. 3.12), the initial state by least squares.
-
-    `model`: discrete; `u`: (n_samples, n_inputs), SI; `y`: (n_samples, n_outputs), SI. Returns (n_samples, n_outputs),
-    SI, not a number throughout where an unstable predictor (A - K C) runs away over the record.
+    """Predict outputs (n_samples, n_outputs) in SI from all samples before (thesis eq. 3.12), the initial state by
+    least squares; NaN throughout where an unstable predictor (A - K C) runs away over the record.
     """
     F = model.A - model.K @ model.C
     growth = np.max(np.abs(np.linalg.eigvals(F)), initial=0.0) if F.size else 0.0
@@ -50,10 +43,8 @@ def one_step(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Ar
 
 
 def simulation(model: StateSpaceModel, u: Array, y: Array, offsets: Offsets) -> Array | None:
-    """Simulate the outputs from the inputs alone; the initial state that fits `y` best is the only use of `y`.
-
-    `model`: discrete; `u`: (n_samples, n_inputs), SI; `y`: (n_samples, n_outputs), SI. Returns (n_samples, n_outputs),
-    SI, or None, none for an unstable model: its simulation runs away and says nothing. None without inputs.
+    """Simulate outputs (n_samples, n_outputs) in SI from the inputs alone; the initial state that fits `y` best is the
+    only use of `y`. None without inputs, and for an unstable model: its simulation runs away and says nothing.
     """
     if not model.n_inputs or not stable(model):
         return None
@@ -104,10 +95,8 @@ def _free_responses(F: Array, C: Array, n_samples: int) -> Array:
 
 
 class Sensitivities:
-    """Sensitivities that move along a record block by block.
-
-    `model`: discrete; `directions`: (n_theta, n_directions), changes of ``model.theta``, one a column; `initial`:
-    whether the states at the first sample follow as n further directions.
+    """Sensitivities that move along a record block by block, along `directions` (n_theta, n_directions) of
+    ``model.theta`` and, if `initial`, of the n states at the first sample.
     """
 
     def __init__(self, model: StateSpaceModel, directions: Array, *, initial: bool = False) -> None:
@@ -129,11 +118,9 @@ class Sensitivities:
         self._state[:, d : d + extra] = np.eye(n, extra)
 
     def block(self, signals: Array) -> Array:
-        """Return the derivatives of the predictions over the next samples.
-
-        `signals`: (block, n + n_inputs + n_outputs), states before each sample, inputs, and one-step errors without a
-        constant taken off. Returns (n_outputs, block, n_directions), n more directions where the states at the first
-        sample are among them.
+        """Return the derivatives (n_outputs, block, n_directions; n more with first states) of the predictions of the
+        next samples by `signals` (block, n + n_inputs + n_outputs): states before, inputs, one-step errors without a
+        constant taken off.
         """
         from ambid.estimation.kernels import sensitivity_scan
 
@@ -149,9 +136,8 @@ class Sensitivities:
 
 
 def companion(den: Numbers) -> Numbers:
-    """Return the companion matrix whose state k is p^k/F(p) times the input, shape (n, n).
-
-    `den`: (n + 1,), F, highest power first, monic; complex for a complex step. Returns (n, n).
+    """Return the companion matrix (n, n) whose state k is p^k/F(p) times the input; `den`: F, highest power first,
+    monic; complex for a complex step.
     """
     n = den.size - 1
     out = np.eye(n, k=1, dtype=den.dtype)
@@ -160,10 +146,7 @@ def companion(den: Numbers) -> Numbers:
 
 
 def filter_states(den: Array, step: float, x: Array) -> Array:
-    """Return p^k/F(p) x for k = 0 ... n - 1, x straight between samples, from rest.
-
-    `den`: (n + 1,); `step`: sampling interval in units of 1/w0; `x`: (n_samples,). Returns (n_samples, n).
-    """
+    """Return p^k/F(p) x, (n_samples, n), x straight between samples, from rest; `step`: sampling interval in 1/w0."""
     from scipy.linalg import expm
 
     n = den.size - 1
@@ -177,10 +160,7 @@ def filter_states(den: Array, step: float, x: Array) -> Array:
 
 
 def free_response(den: Array, step: float, n_samples: int) -> Array:
-    """Return n responses of 1/F(p) without input that span all of them, shape (n_samples, n).
-
-    `den`: (n + 1,); `step`: sampling interval in units of 1/w0. Returns (n_samples, n).
-    """
+    """Return n responses (n_samples, n) of 1/F(p) without input that span all; `step`: sampling interval in 1/w0."""
     from scipy.linalg import expm
 
     n = den.size - 1
@@ -200,10 +180,8 @@ class Responses:
 
 
 def responses(den: Array, num: Array, step: float, u: Array) -> Responses:
-    """Simulate B_i/F u_i and its derivatives by the coefficients, inputs held over a sample, from rest.
-
-    `den`: (n + 1,); `num`: (n_inputs, n + 1), highest power first; `step`: sampling interval in units of 1/w0; `u`:
-    (n_samples, n_inputs).
+    """Simulate B_i/F u_i and its derivatives by the coefficients, inputs held over a sample, from rest; `num`:
+    (n_inputs, n + 1), highest power first; `step`: sampling interval in units of 1/w0.
     """
     from ambid.physics.linear_model import zero_order_hold
 
@@ -245,10 +223,7 @@ class Errors:
 
 
 def errors(fit: BlackBoxFit, data: IOData) -> Errors:
-    """Run a record through a fit.
-
-    `data`: same inputs and outputs, same rate.
-    """
+    """Run a record with a fit's inputs, outputs and rate through it."""
     if abs(data.dt / fit.dt - 1) > 1e-6:
         raise EstimationError(
             f"the record is sampled at {1 / data.dt:g} Hz, the fit at {1 / fit.dt:g} Hz; they must agree. "
@@ -270,9 +245,8 @@ def errors(fit: BlackBoxFit, data: IOData) -> Errors:
 
 
 def errors_ahead(run: Errors, steps: int) -> Array:
-    """Return y minus its prediction `steps` samples ahead, (n_samples - steps + 1, n_outputs), SI.
-
-    Row k is the error at sample k + steps - 1, predicted from outputs before sample k.
+    """Return y minus its prediction `steps` samples ahead, (n_samples - steps + 1, n_outputs), SI: row k is at sample k
+    + steps - 1, from outputs before sample k.
     """
     e, power = run.one_step[steps - 1 :].copy(), run.model.K
     for j in range(1, steps):
@@ -282,9 +256,8 @@ def errors_ahead(run: Errors, steps: int) -> Array:
 
 
 def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
-    """Run a record with an operating point of its own through a fit: a constant in every output is fitted.
-
-    Returns their means are zero.
+    """Run a record with an operating point of its own through a fit: a constant in every output is fitted, errors have
+    no mean.
     """
     first = errors(fit, data)
     m = first.model
@@ -313,10 +286,9 @@ def errors_elsewhere(fit: BlackBoxFit, data: IOData) -> Errors:
 
 
 def _mirrored(model: StateSpaceModel, noise: Array) -> StateSpaceModel:
-    """Return an unstable output-error model with the gain of its best predictor under white output noise.
-
-    It mirrors the unstable poles at the unit circle: the stabilising Riccati solution without process noise (Anderson
-    and Moore 1979, sec. 4.4). Without one, the model comes back as it was.
+    """Return an unstable output-error model with the gain of its best predictor under white output noise, which mirrors
+    the unstable poles at the unit circle: the stabilising Riccati solution without process noise (Anderson and Moore
+    1979, sec. 4.4), or the model as it was where there is none.
     """
     from scipy.linalg import LinAlgError, solve_discrete_are
 
@@ -331,10 +303,7 @@ def _mirrored(model: StateSpaceModel, noise: Array) -> StateSpaceModel:
 
 
 def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
-    """Return the model of a fit as a discrete innovations form.
-
-    Returns at the sampling interval of the fit.
-    """
+    """Return the model of a fit as a discrete innovations form at its sampling interval."""
     model = fit.model
     if model.dt is not None:
         return model.state_space()
@@ -344,28 +313,19 @@ def innovations_form(fit: BlackBoxFit) -> StateSpaceModel:
 
 
 def plant_form(fit: BlackBoxFit) -> StateSpaceModel:
-    """Return the way from inputs to outputs as a discrete state space, without the states of the noise.
-
-    Returns with K = 0.
-    """
+    """Return the way from inputs to outputs as a discrete state space with K = 0, without the states of the noise."""
     return innovations_form(fit).plant() if fit.model.dt is None else fit.model.plant()
 
 
 def held(model: StateSpaceModel, dt: float) -> StateSpaceModel:
-    """Discretise a continuous state space, inputs and innovations held over a sample.
-
-    `model`: continuous.
-    """
+    """Discretise a continuous state space, inputs and innovations held over a sample."""
     A, B = zero_order_hold(model.A, np.hstack([model.B, model.K]), dt)
     n_u = model.n_inputs
     return StateSpaceModel(A=A, B=B[:, :n_u], C=model.C, D=model.D, K=B[:, n_u:], dt=dt)
 
 
 def held_transfer(model: TransferModel, dt: float) -> StateSpaceModel:
-    """Discretise a continuous transfer model under a zero-order hold.
-
-    `model`: continuous; may have delays. Returns the delay of each input is a chain of states in front of it.
-    """
+    """Discretise a continuous transfer model under a zero-order hold, delays as a chain of states before each input."""
     plain = TransferModel(num=model.num, den=model.den, dt=None).state_space()
     n, n_u = plain.order, model.n_inputs
     lags = np.asarray(model.delay) / dt
@@ -408,10 +368,7 @@ class Gradient:
 
 
 def gradient(fit: BlackBoxFit, data: IOData, run: Errors) -> Gradient:
-    """Differentiate the one-step predictions.
-
-    `run`: the data run through the fit. Returns started from rest: the first samples are not exact.
-    """
+    """Differentiate the one-step predictions of `run`, started from rest: the first samples are not exact."""
     u, y = data.u - fit.offsets.u, data.y - fit.offsets.y
     model = fit.model
     if isinstance(model, PolynomialModel):
@@ -432,11 +389,8 @@ def gradient(fit: BlackBoxFit, data: IOData, run: Errors) -> Gradient:
 
 
 def polynomial_gradient(p: Polynomials, u: Array, y: Array, e: Array) -> Array:
-    """Differentiate the predictions of one output by all of its coefficients, from rest.
-
-    `u`: (n_samples, n_inputs), without offsets; `y`: (n_samples,), without offset; `e`: (n_samples,), one-step errors.
-    Returns (n_samples, n_coefficients), in the order of ``Polynomials.parts``; leading ones included, as if they could
-    move.
+    """Differentiate one output's predictions from rest, (n_samples, n_coefficients) in the order of
+    ``Polynomials.parts``, leading ones as if they could move; `u` and `y` without offsets, `e` the one-step errors.
     """
     from scipy.signal import lfilter
 
@@ -495,9 +449,8 @@ def _transfer_gradient(model: TransferModel, dt: float, o: int, u: Array, y: Arr
 
 
 def _state_space_tangent(fit: BlackBoxFit, run: Errors, u: Array, y: Array) -> tuple[Array, ...]:
-    """Move along every entry of A and B, of K where there is noise, and of D where there is any.
-
-    Entries that were not estimated stand still: moving them would take what they miss out of the residuals.
+    """Move along every entry of A and B, of K where there is noise, and of D where there is any, but not along those
+    not estimated: that would take what they miss out of the residuals.
     """
     m = run.model
     x = run_states(m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K]), np.hstack([u, y]))

@@ -1,11 +1,10 @@
 """State-space models by prediction error: the maximum of the likelihood, started from a subspace estimate.
 
-Solves: min log det (1/N) sum e e' with x+ = A x + B u + K e, y = C x + D u + e over A, B, C, [D,] K, first states and a
-constant for every output, for stable and unstable plants, with and without feedback. Levenberg-Marquardt on QR-reduced
-rows whitened by the errors' covariance (Ljung 1999, sec. 7.4 and 10.2), in local coordinates theta = theta_0 + P beta:
-the columns of P are orthonormal, and orthogonal to all that a change of states does, (T A - A T, T B, -C T, 0, T K) for
-every T (McKelvey, Helmersson and Ribarits 2004, Automatica 40, 1629). Efficient where the innovations are white (Ljung
-1999, sec. 9.3): its covariance is the inverse of the information matrix.
+Solves min log det (1/N) sum e e' with x+ = A x + B u + K e, y = C x + D u + e over A, B, C, [D,] K, first states and a
+constant for every output, for stable and unstable plants, with and without feedback: Levenberg-Marquardt on QR-reduced
+whitened rows (Ljung 1999, sec. 7.4, 10.2), in theta = theta_0 + P beta, P orthonormal and orthogonal to a change of
+states, (T A - A T, T B, -C T, 0, T K) for every T (McKelvey, Helmersson and Ribarits 2004, Automatica 40, 1629).
+Efficient where innovations are white (Ljung 1999, sec. 9.3): the covariance is the inverse of the information matrix.
 """
 
 from __future__ import annotations
@@ -41,9 +40,8 @@ _FAINT = 1e-10  # Hankel singular value beside the largest below which a state i
 
 
 def tangent(model: StateSpaceModel, *, feedthrough: bool) -> Array:
-    """Return directions along which the model moves, those of a mere change of states left out.
-
-    `feedthrough`: whether D moves. Returns orthonormal columns.
+    """Return orthonormal directions (columns) that change the model, not its states alone; `feedthrough`: whether D
+    moves.
     """
     m, n, n_u, n_y = model, model.order, model.n_inputs, model.n_outputs
     eye = np.eye(n)
@@ -66,11 +64,8 @@ def tangent(model: StateSpaceModel, *, feedthrough: bool) -> Array:
 
 
 def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
-    """Return directions along which the predictions are linear: inputs and outputs enter a predictor that stays.
-
-    With F = A - K C and C held, they are linear in K and in B - K D; in D beside K up to the product of their changes.
-
-    `feedthrough`: whether D moves.
+    """Return directions along which predictions are linear: with F = A - K C and C held, in K and in B - K D; in D (if
+    `feedthrough`) beside K up to the product of their changes.
     """
     m, n, n_u, n_y = model, model.order, model.n_inputs, model.n_outputs
     ends = np.cumsum([0, n * n, n * n_u, n_y * n, n_y * n_u, n * n_y])
@@ -87,11 +82,9 @@ def linear(model: StateSpaceModel, *, feedthrough: bool) -> Array:
 
 
 def balance(model: StateSpaceModel, x0: Array, noise: Array) -> tuple[StateSpaceModel, Array]:
-    """Return the model in states that white inputs and outputs drive, and the predictions show, by equal amounts.
-
-    `model`: with a stable predictor; `x0`: (n,), first states; `noise`: (n_outputs, n_outputs), of the innovations:
-    errors are counted in it. Returns `model`: as it was where its predictor is too near the edge of stability to be
-    balanced; `x0`: (n,).
+    """Return a stable predictor's model, and x0 (n,), in states that white inputs and outputs drive, and predictions
+    show, by equal amounts, errors counted in `noise` (n_outputs, n_outputs); as it was where too near the edge of
+    stability.
     """
     m = model
     F, G = m.A - m.K @ m.C, np.hstack([m.B - m.K @ m.D, m.K])
@@ -156,10 +149,8 @@ class Point:
 
 
 def start_point(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Point | None:
-    """Give a model the first states and constants that suit it best.
-
-    `model`: scaled; `noise`: (n_outputs, n_outputs), of the innovations, roughly; `u`: (n_samples, n_inputs); `y`:
-    (n_samples, n_outputs). Returns none where the predictor is not stable, or leaves no errors.
+    """Give a scaled model the first states and constants that suit it best, with `noise` (n_outputs, n_outputs) of the
+    innovations, roughly; None where the predictor is not stable, or leaves no errors.
     """
     if radius(model.A - model.K @ model.C) >= 1.0:
         return None
@@ -169,9 +160,8 @@ def start_point(model: StateSpaceModel, noise: Array, u: Array, y: Array) -> Poi
 
 
 class Likelihood:
-    """The problem that is searched: its vector holds first states, constants and coefficients.
-
-    The coordinates change at every triangle: the model is balanced there, and steps run along the tangent.
+    """The problem that is searched, over first states, constants and coefficients; at every triangle the model is
+    balanced, and steps run along its tangent.
     """
 
     def __init__(self, start: Point, u: Array, y: Array, *, feedthrough: bool) -> None:
@@ -288,10 +278,9 @@ _LOOSE = 1e6  # condition of the scaled information's root from which states are
 
 
 def sspem(data: IOData, orders: Orders, *, tick: Tick = None) -> BlackBoxFit:
-    """Identify a state-space model by prediction error (local coordinates: McKelvey et al. 2004, Automatica 40, 1629).
-
-    `orders`: ``n`` states, ``"auto"`` or missing to choose it; a delay of the input counts as states. Consistent under
-    feedback as long as n states hold plant and noise.
+    """Identify a state-space model by prediction error (local coordinates: McKelvey et al. 2004, Automatica 40, 1629),
+    of ``n`` states, ``"auto"`` or missing to choose it; input delays count as states. Consistent under feedback as long
+    as n states hold plant and noise.
     """
     with one_thread():
         first = first_model("pbsid", data, orders, None, None, tick)

@@ -1,9 +1,8 @@
 """N4SID, PO-MOESP, CVA and PBSID-opt: state-space models in innovations form without a search (thesis eq. 1.1-1.3).
 
-Solves: x+ = A x + B u + w, y = C x + D u + v, cov [w; v] = [Q S; S' R], and its Kalman gain, for stable and unstable
-plants, any number of inputs (none: a time series) and outputs. N4SID, MOESP and CVA are biased under feedback; PBSID
-is not. The record is compressed once to triangular factors; everything else is done on those, once more without each
-group of time for the covariance (delete-a-group jackknife; Shao and Tu 1995, ch. 2).
+Solves x+ = A x + B u + w, y = C x + D u + v, cov [w; v] = [Q S; S' R], and its Kalman gain, for stable and unstable
+plants, any inputs (none: a time series) and outputs; all but PBSID are biased under feedback. The record is compressed
+once to triangular factors, without each group of time for the covariance (jackknife; Shao and Tu 1995, ch. 2).
 """
 
 from __future__ import annotations
@@ -79,10 +78,8 @@ def plan_estimate(
     method: Method, data: IOData, orders: Orders, horizon: int | None, feedthrough: bool | None, tick: Tick,
     n_max: int | None = None,
 ) -> Plan:  # fmt: skip
-    """Check orders and options, compress the record and choose what was left open.
-
-    `horizon`: samples of future and of past; `feedthrough`: whether to estimate D; `tick`: called between steps;
-    `n_max`: largest order to try.
+    """Check orders and options, compress the record, choose what was left open; `horizon`: samples of future and of
+    past; `feedthrough`: whether to estimate D; `n_max`: largest order to try.
     """
     check_order_names(method, orders, ("n",))
     n = None if left_open(orders, "n") else single_order(method, orders, "n", 1, remedy="Correct it, or give 'auto'")
@@ -172,10 +169,8 @@ def build_subspace_fit(
     criterion: Array | None,
     **more: Any,
 ) -> BlackBoxFit:
-    """Give the numbers their units and put the result together.
-
-    `covariance`: (n_theta, n_theta), of the scaled coefficients; `criterion`: by which the order was chosen; `more`:
-    as `build_fit` takes it.
+    """Give the numbers their units and put the result together; `covariance` (n_theta, n_theta) is of the scaled
+    coefficients, `criterion` that of the order, `more` as `build_fit` takes it.
     """
     model, scale = to_units(scaled, plan.channels, data.dt)
     if covariance is not None:
@@ -208,10 +203,9 @@ def to_units(scaled: Realisation, channels: Channels, dt: float) -> tuple[StateS
 
 
 def offsets(scaled: Realisation, plan: Plan) -> Offsets:
-    """Return the operating point at which the innovations have no mean.
-
-    A shift of y by dy and of u by du moves their mean by Py dy - Pu du, the predictor's answers at frequency zero:
-    finite and solvable for unstable plants and integrators too. The shortest shift of means is taken.
+    """Return the operating point at which the innovations have no mean, by the shortest shift of the means: shifts dy
+    and du move it by Py dy - Pu du, the predictor's answers at frequency zero, finite for unstable plants and
+    integrators too.
     """
     f, s = plan.factors, scaled.model
     mean = plan.total[0] / plan.total[0, 0]
@@ -226,9 +220,8 @@ def offsets(scaled: Realisation, plan: Plan) -> Offsets:
 
 
 def operating_point(scaled: Realisation, channels: Channels, error: Array) -> Offsets:
-    """Return the shortest shift of the channels' means that takes a mean off the innovations.
-
-    `error`: (n_outputs,), mean of the innovations of the centred, scaled channels.
+    """Return the shortest shift of the channels' means that takes `error` (n_outputs,), scaled, off the innovations'
+    mean.
     """
     s = scaled.model
     n, n_u = s.A.shape[0], s.B.shape[1]
@@ -260,11 +253,9 @@ def estimate(
     method: Method, data: IOData, orders: Orders, *, horizon: int | None = None, feedthrough: bool | None = None,
     tick: Tick = None,
 ) -> BlackBoxFit:  # fmt: skip
-    """Compress, decompose, choose the order, regress; then again without each group of time for the covariance.
-
-    `orders`: ``n`` states, ``"auto"`` or missing to choose it; a delay of the input counts as states; `feedthrough`:
-    where left open, only where the record is declared open loop and shows one, because a controller that acts within
-    the sample cannot be told from a feedthrough.
+    """Compress, decompose, choose the order, regress; again without each group of time for the covariance. ``n``
+    states, ``"auto"`` or missing to choose it, input delays counted; `feedthrough` left open: only where the record is
+    declared open loop and shows one, as a controller that acts within the sample cannot be told from a feedthrough.
     """
     with one_thread():
         first = first_model(method, data, orders, horizon, feedthrough, tick)
@@ -292,9 +283,8 @@ def first_model(
 
 
 def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
-    """Decompose what all data say.
-
-    Returns `prior`: of the autoregression, where there is one; `found`: states of all orders.
+    """Decompose what all data say into the autoregression's `prior`, where there is one, and `found`, states of all
+    orders.
     """
     total = triangular_factor(plan.total[:, [0, *_columns(plan)]])
     prior = None  # the prior of the autoregression, from all data: it stays when groups are left out
@@ -304,9 +294,8 @@ def decomposition(plan: Plan) -> tuple[Prior | None, Projection | Prediction]:
 
 
 def _choose_horizons(plan: Plan, n: int) -> Plan:
-    """Return the plan with the horizon whose model leaves the least innovations, freedom taken into account.
-
-    A long horizon averages noise out of slow states and brings it into fast ones; no rule knows which a plant has.
+    """Return the plan with the horizon that leaves the least innovations, freedom taken into account: a long one
+    averages noise out of slow states and brings it into fast ones; no rule knows which a plant has.
     """
     f, n_y = plan.factors, plan.factors.n_outputs
     best, best_cost = plan, np.inf
@@ -357,11 +346,8 @@ def model_of(plan: Plan, decomposed: Projection | Prediction, n: int) -> Realisa
 
 
 def order_criterion(plan: Plan) -> Array:
-    """Return Bayes' criterion for 0, 1, 2 ... states, for every method from the autoregression's states.
-
-    Their order is that of their use for prediction, under feedback too, which oblique projections do not give.
-
-    Returns (n_states + 1,).
+    """Return Bayes' criterion for 0, 1, 2 ... states, (n_states + 1,), for every method from the autoregression's
+    states, whose order is that of their use for prediction, under feedback too, which oblique projections do not give.
     """
     past = plan.past if plan.method == "pbsid" else min(max(plan.autoregression, plan.past), plan.factors.length - 1)
     future = max(min(past, plan.future), -(-plan.n_max // plan.factors.n_outputs))
@@ -426,9 +412,8 @@ def subspace_models(
     *,
     tick: Tick = None,
 ) -> tuple[OrderModel, ...]:
-    """Identify the models of all orders up to `n_max` from one factorisation, as a stabilisation diagram needs them.
-
-    Returns orders 1, 2 ... n_max, fewer where horizons or data show fewer states; without covariance.
+    """Identify models of orders 1 ... `n_max` (fewer where horizons or data show fewer states) from one factorisation,
+    without covariance, for a stabilisation diagram.
     """
     if n_max < 1:
         raise EstimationError(f"{method}: largest order {n_max}; it must be at least 1. Raise it")

@@ -1,17 +1,12 @@
 """What every subspace method starts from: a record compressed to triangular factors, projections, realisations.
 
-H is the window matrix, whose row t is [1, z(t), ..., z(t+L-1)] with z = [u, y]. It is never held: blocks of rows are
-folded into a running triangular factor, one for each group of time. R'R = H'H holds to rounding.
-
-N4SID, MOESP and CVA solve Y_f = Gamma x + H U_f + noise with x in the span of the past: one singular value
-decomposition, whose weights are the whole difference between them (Van Overschee and De Moor 1996, ch. 4, table 4.1);
-then A, C from a regression of states on states and B, D from its input part (their robust algorithm, fig. 4.8).
-
-PBSID-opt takes the state from y(t) = sum_k Phi_k z(t-k) + d + e(t), whose regressors are all older than e(t), whatever
-made the inputs: the shifted blocks of Phi times the past are the observability matrix times the state (Chiuso and Picci
-2005; Chiuso 2007, Automatica 43, 1034). Phi has a prior that fades with the lag, Phi_k ~ N(0, size decay^k), its two
-numbers by the marginal likelihood (Pillonetto, Chen, Chiuso, De Nicolao and Ljung 2022, ch. 4): band-limited inputs
-leave directions of Phi unseen, and shifting brings them into view.
+Row t of the window matrix H is [1, z(t), ..., z(t+L-1)] with z = [u, y]; blocks of rows are folded into one running
+triangular factor for each group of time, R'R = H'H. N4SID, MOESP and CVA solve Y_f = Gamma x + H U_f + noise, x in the
+span of the past, by one SVD, whose weights are their whole difference (Van Overschee and De Moor 1996, ch. 4, table
+4.1); A, C, then B, D by regression (robust algorithm, fig. 4.8). PBSID-opt takes the state from y(t) = sum_k Phi_k
+z(t-k) + d + e(t), regressors older than e(t), whatever made the inputs (Chiuso and Picci 2005; Chiuso 2007, Automatica
+43, 1034). The prior Phi_k ~ N(0, size decay^k), its two numbers by the marginal likelihood (Pillonetto, Chen, Chiuso,
+De Nicolao and Ljung 2022, ch. 4), holds directions that band-limited inputs leave unseen and shifting brings into view.
 """
 
 from __future__ import annotations
@@ -61,19 +56,13 @@ class Factors:
     n_outputs: int
 
     def columns(self, what: str, first: int, last: int) -> list[int]:
-        """Return the columns of samples `first` to `last` (not included) of the window.
-
-        Returns sample by sample, oldest first.
-        """
+        """Return the columns of samples `first` to `last` (not included) of the window, by sample, oldest first."""
         n_z = self.n_inputs + self.n_outputs
         inside = {"u": range(self.n_inputs), "y": range(self.n_inputs, n_z), "z": range(n_z)}[what]
         return [1 + k * n_z + j for k in range(first, last) for j in inside]
 
     def arranged(self, columns: Sequence[int]) -> Array:
-        """Return the groups' factors for the constant followed by `columns`, in that order.
-
-        Returns (n_groups, n_chosen, n_chosen).
-        """
+        """Return the groups' factors (n_groups, n_chosen, n_chosen) for the constant, then `columns` in order."""
         chosen = self.groups[:, :, [0, *columns]]
         return np.stack([triangular_factor(g) for g in chosen])
 
@@ -89,10 +78,7 @@ def channels(data: IOData) -> Channels:
 
 
 def compress(channels: Channels, length: int, n_groups: int) -> Factors:
-    """Fold all windows of a record into triangular factors.
-
-    `length`: samples in a window; `n_groups`: groups of time.
-    """
+    """Fold all windows of `length` samples of a record into triangular factors of `n_groups` groups of time."""
     n_rows = channels.n_samples - length + 1
     edges = np.linspace(0, n_rows, n_groups + 1).astype(int)
     groups = []
@@ -112,21 +98,14 @@ def compress(channels: Channels, length: int, n_groups: int) -> Factors:
 
 
 def triangular_factor(rows: Array) -> Array:
-    """Return the square upper triangular factor of a matrix.
-
-    `rows`: (n_rows, n_columns). Returns (n_columns, n_columns), padded with rows of zeros where there are fewer rows
-    than columns.
-    """
+    """Return the square upper triangular factor of `rows`, padded with zero rows where there are fewer than columns."""
     factor = np.asarray(np.linalg.qr(rows, mode="r"))
     missing = rows.shape[1] - factor.shape[0]
     return np.vstack([factor, np.zeros((missing, rows.shape[1]))]) if missing > 0 else factor
 
 
 def merge_factors(groups: Array) -> Array:
-    """Return the triangular factor of all groups together.
-
-    `groups`: (n_groups, n_columns, n_columns). Returns (n_columns, n_columns).
-    """
+    """Return the triangular factor of all groups (n_groups, n_columns, n_columns) together."""
     total = np.array(groups[0])
     for g in groups[1:]:
         total = triangular_factor(np.vstack([total, g]))
@@ -134,10 +113,7 @@ def merge_factors(groups: Array) -> Array:
 
 
 def leave_each_out(groups: Array) -> list[Array]:
-    """Return, for each group, the triangular factor of all others.
-
-    `groups`: (n_groups, n_columns, n_columns). Returns (n_columns, n_columns).
-    """
+    """Return, for each of the groups (n_groups, n_columns, n_columns), the triangular factor of all others."""
     n = groups.shape[0]
     after: list[Array | None] = [None] * n
     for g in range(n - 1, 0, -1):
@@ -157,10 +133,8 @@ _TAKES_PART = 1e-3  # coefficient beside the largest from which an input is name
 
 
 def check_inputs_differ(factors: Factors, total: Array, names: Sequence[str], window: int) -> None:
-    """Refuse inputs of which one follows from the others, at the same sample or over a window.
-
-    `total`: (n_columns, n_columns), all groups together; `names`: of the inputs; `window`: samples; as many as a
-    numerator of the model has coefficients.
+    """Refuse inputs `names` of which one follows from the others, at the same sample or over a `window` of samples, as
+    many as a numerator of the model has coefficients; `total`: factor of all groups.
     """
     for length in sorted({1, window}):
         relation = input_relation(factors, total, names, length)
@@ -169,10 +143,8 @@ def check_inputs_differ(factors: Factors, total: Array, names: Sequence[str], wi
 
 
 def input_relation(factors: Factors, total: Array, names: Sequence[str], window: int) -> str | None:
-    """Say which inputs move together within a window.
-
-    `total`: (n_columns, n_columns), all groups together; `names`: of the inputs; `window`: samples; at most those of
-    the factors count. Returns none where every input has something of its own.
+    """Say which inputs move together within a `window` of samples (at most those of the factors); none where every
+    input has something of its own. `total`: factor of all groups.
     """
     n_u, now = factors.n_inputs, factors.length - 1
     length = min(window, now + 1)
@@ -201,10 +173,8 @@ _NOISE_FREE = 1e-18  # variance beside outputs of unit variance that counts as r
 
 
 def autoregression_criterion(factors: Factors, factor: Array) -> Array:
-    """Return Akaike's criterion of autoregressions with inputs of 0, 1, 2 ... lags.
-
-    `factor`: (n_columns, n_columns), of all groups. Returns (window,), N log det(residual covariance) + 2 (numbers
-    estimated).
+    """Return Akaike's criterion, N log det(residual covariance) + 2 (numbers estimated), of autoregressions with inputs
+    of 0, 1, 2 ... lags, (window,), from the factor of all groups.
     """
     now, n_y, n_z = factors.length - 1, factors.n_outputs, factors.n_inputs + factors.n_outputs
     newest_first = [c for k in range(now - 1, -1, -1) for c in factors.columns("z", k, k + 1)]
@@ -216,10 +186,8 @@ def autoregression_criterion(factors: Factors, factor: Array) -> Array:
 
 
 def state_criterion(states: Array, y: Array, n_inputs: int, n_rows: int) -> Array:
-    """Return Bayes' criterion of 0, 1, 2 ... leading states as predictors of y(t).
-
-    `states`: (n_states, n_coordinates), leading first; `y`: (n_outputs, n_coordinates or more), the first coordinates
-    are those of the states. Returns (n_states + 1,).
+    """Return Bayes' criterion (n_states + 1,) of 0, 1, 2 ... leading states (rows, leading first) as predictors of
+    y(t), the first coordinates of `y` being those of the states.
     """
     basis = np.linalg.qr(states.T)[0]
     by_state = y[:, : basis.shape[0]] @ basis
@@ -262,11 +230,8 @@ class Realisation:
 
 
 def kalman_gain(A: Array, C: Array, Q: Array, S: Array, R: Array) -> tuple[Array, Array, bool]:
-    """Return the gain K = (A P C' + S)(C P C' + R)^-1 of the stationary predictor, P from its Riccati equation.
-
-    `A`: (n, n); `C`: (n_outputs, n); `Q`: (n, n); `S`: (n, n_outputs); `R`: (n_outputs, n_outputs). Returns `K`: (n,
-    n_outputs); `innovation`: (n_outputs, n_outputs), C P C' + R; `found`: whether A - K C is stable; if not, K is the
-    least-squares gain S R^-1.
+    """Return K = (A P C' + S)(C P C' + R)^-1 of the stationary predictor, P from its Riccati equation, the innovations'
+    covariance C P C' + R, and whether A - K C is stable; if not, K is the least-squares gain S R^-1.
     """
     eye = np.eye(C.shape[0])
     for floor in _FLOORS:
@@ -284,18 +249,12 @@ def kalman_gain(A: Array, C: Array, Q: Array, S: Array, R: Array) -> tuple[Array
 
 
 def radius(A: Array) -> float:
-    """Return the largest magnitude of the eigenvalues.
-
-    `A`: (n, n).
-    """
+    """Return the largest magnitude of the eigenvalues of `A`."""
     return float(np.max(np.abs(np.linalg.eigvals(A)), initial=0.0))
 
 
 def least_squares(rows: Array, right: Array) -> Array:
-    """Solve min |rows x - right| through an orthogonal factor; deficient columns get the shortest solution.
-
-    `rows`: (n_rows, n_unknowns); `right`: (n_rows, n_right). Returns (n_unknowns, n_right).
-    """
+    """Solve min |rows x - right| through an orthogonal factor; deficient columns get the shortest solution."""
     n = rows.shape[1]
     if rows.shape[0] >= n > 0:
         factor = np.asarray(np.linalg.qr(np.hstack([rows, right]), mode="r"))
@@ -306,10 +265,7 @@ def least_squares(rows: Array, right: Array) -> Array:
 
 
 def observability(A: Array, C: Array, length: int) -> Array:
-    """Return [C; C A; ...; C A^(length-1)].
-
-    `A`: (n, n); `C`: (n_outputs, n). Returns (length * n_outputs, n).
-    """
+    """Return [C; C A; ...; C A^(length-1)], (length * n_outputs, n)."""
     blocks = [C]
     for _ in range(length - 1):
         blocks.append(blocks[-1] @ A)
@@ -337,20 +293,15 @@ class Projection:
 
 
 def classical_columns(factors: Factors, past: int, future: int) -> list[int]:
-    """Return the columns of a projection: future inputs, past, future outputs.
-
-    `past`, `future`: samples; together at most the window.
-    """
+    """Return the columns of a projection, future inputs, past, future outputs, of samples that fit into the window."""
     now = factors.length - future
     ahead = (now, factors.length)
     return factors.columns("u", *ahead) + factors.columns("z", now - past, now) + factors.columns("y", *ahead)
 
 
 def project(factor: Array, weighting: Weighting, *, past: int, future: int, like: Factors) -> Projection:
-    """Project the future on the past along the future inputs and decompose it.
-
-    `factor`: (n_columns, n_columns), of the constant and `classical_columns`; `past`, `future`: samples; `like`: for
-    the sizes.
+    """Project the future on the past along the future inputs and decompose it; `factor`: of the constant and
+    `classical_columns`; `past`, `future`: samples; `like`: for the sizes.
     """
     n_u, n_y = like.n_inputs, like.n_outputs
     r = factor[1:, 1:]  # without the row of the constant everything is centred, as a constant in each regression does
@@ -381,10 +332,7 @@ def project(factor: Array, weighting: Weighting, *, past: int, future: int, like
 
 
 def realise(projection: Projection, n: int, *, feedthrough: bool) -> Realisation:
-    """Return the model of order `n`.
-
-    `feedthrough`: whether to estimate D; else it is zero.
-    """
+    """Return the model of order `n`, with D zero without `feedthrough`."""
     p, n_y, n_u = projection, projection.n_outputs, projection.n_inputs
     k1 = p.inputs.shape[0]
     k2, k3 = k1 + p.past, k1 + p.past + n_y
@@ -477,10 +425,7 @@ class Prediction:
 
 
 def predictor_columns(factors: Factors, past: int) -> list[int]:
-    """Return the columns of the regression: past, u(t), y(t).
-
-    `past`: samples; less than the window.
-    """
+    """Return the columns of the regression: `past` samples, fewer than the window, u(t), y(t)."""
     now = factors.length - 1
     return (
         factors.columns("z", now - past, now) + factors.columns("u", now, now + 1) + factors.columns("y", now, now + 1)
@@ -488,9 +433,8 @@ def predictor_columns(factors: Factors, past: int) -> list[int]:
 
 
 def fit_prior(factor: Array, *, past: int, feedthrough: bool, like: Factors) -> Prior:
-    """Return the prior of the autoregression that makes the data most likely.
-
-    `factor`: (n_columns, n_columns), of the constant and `predictor_columns`; `past`: samples; `like`: for the sizes.
+    """Return the autoregression's prior that makes the data most likely; `factor`: of the constant and
+    `predictor_columns`; `past`: samples; `like`: for the sizes.
     """
     rows, y, lags = _regression(factor, past, feedthrough, like)
     k = rows.shape[1]
@@ -516,10 +460,8 @@ def fit_prior(factor: Array, *, past: int, feedthrough: bool, like: Factors) -> 
 def predict_states(
     factor: Array, *, past: int, future: int, feedthrough: bool, like: Factors, prior: Prior
 ) -> Prediction:
-    """Fit the autoregression and decompose what it says of the future.
-
-    `factor`: (n_columns, n_columns), of the constant and `predictor_columns`; `past`, `future`: samples, future <=
-    past; `feedthrough`: whether u(t) acts on y(t); `like`: for the sizes; `prior`: of the autoregression.
+    """Fit the autoregression with its `prior` and decompose what it says of `future` <= `past` samples; `factor`: of
+    the constant and `predictor_columns`; `feedthrough`: whether u(t) acts on y(t); `like`: for the sizes.
     """
     n_u, n_y = like.n_inputs, like.n_outputs
     n_z, width = n_u + n_y, (n_u + n_y) * past
@@ -547,10 +489,7 @@ def predict_states(
 
 
 def regress_states(prediction: Prediction, n: int, *, feedthrough: bool) -> Realisation:
-    """Return the model of order `n`.
-
-    `feedthrough`: whether to estimate D; else it is zero.
-    """
+    """Return the model of order `n`, with D zero without `feedthrough`."""
     p = prediction
     x, ahead, n_u = p.state[:n], p.ahead[:n], p.u.shape[0]
     regressors = np.vstack([x, p.u]) if feedthrough else x
@@ -593,11 +532,8 @@ def _with_prior(rows: Array, right: Array, lags: Array, prior: Prior) -> Array:
 
 
 def jackknife(full: Realisation, others: Sequence[Realisation], length: int, *, with_bias: bool) -> Array | None:
-    """Return the covariance of vec(A, B, C, D, K), each row by row.
-
-    `full`: from all groups; `others`: each without one group; `length`: block rows of the observability matrices that
-    are compared; `with_bias`: whether to add the square of the bias that leaving out data shows. Returns (n_theta,
-    n_theta), or None, none where a basis cannot be matched.
+    """Return the covariance of vec(A, B, C, D, K), each row by row, from models without one group each, compared by
+    `length` block rows of observability; `with_bias` adds the square of the bias. None where a basis cannot be matched.
     """
     wanted, rows = observability(full.model.A, full.model.C, length), []
     for one in others:

@@ -1,13 +1,11 @@
 """Transfer functions in continuous time in weak form (thesis eq. 3.8): y^(n) + ... + a_0 y = b_m u^(m) + ... + b_0 u.
 
-Integrated against test functions phi(t) = (1 - (t/h)^2)^p, whose derivatives vanish at both ends, no signal is
-differentiated: int phi y^(k) dt = (-1)^k int phi^(k) y dt (Messenger and Bortz 2021). What the trapezoidal rule leaves
-is the spectrum of phi^(k) at the sampling rate, which falls as (2 / (w h))^(p - k): short supports want a high degree.
-
-Rows r(theta) = V(theta) (signals) are what the equation leaves over. White noise of the output enters through the same
-V: cov r = V Sigma V^T. Minimising r^T (V Sigma V^T)^-1 r is least squares on the signals themselves under the equation
-as a constraint: no errors-in-variables bias, no initial state, no simulation, so unstable plants are no harder (Bortz,
-Messenger and Dukic 2023). Noise of another colour, or a disturbance inside a loop, leaves a bias.
+Test functions phi(t) = (1 - (t/h)^2)^p, whose derivatives vanish at both ends, spare signals differentiation: int phi
+y^(k) dt = (-1)^k int phi^(k) y dt (Messenger and Bortz 2021); the trapezoidal rule leaves the spectrum of phi^(k) at
+the sampling rate, ~ (2 / (w h))^(p - k): short supports want a high degree. White output noise enters the rows r(theta)
+= V(theta) (signals) as cov r = V Sigma V^T; minimising r^T (V Sigma V^T)^-1 r has no errors-in-variables bias, initial
+state or simulation: unstable plants are no harder (Bortz, Messenger and Dukic 2023). Noise of another colour, or a
+disturbance inside a loop, leaves a bias.
 """
 
 from __future__ import annotations
@@ -43,10 +41,9 @@ _SHORTEST, _LONGEST = 10, 2560  # half supports tried, samples
 
 
 def weakform(data: IOData, orders: Orders) -> BlackBoxFit:
-    """Estimate a transfer function in continuous time for every output; its inputs share a denominator.
-
-    `data`: inputs held over a sample; `orders`: ``nf``, degree of the denominator, ``nb`` numerator coefficients, at
-    most nf, and ``nk`` (default 0) samples of delay, one or one for each input. `details` tells the supports tried.
+    """Estimate a continuous-time transfer function for every output, inputs held over a sample and sharing a
+    denominator. `orders`: ``nf`` its degree, ``nb`` numerator coefficients, at most nf, and ``nk`` (default 0) samples
+    of delay, one or one for each input. `details` tells the supports tried.
     """
     degrees = transfer_orders("weakform", data, {"nk": 0, **orders}, more=0)
     n, nb, nk = degrees.n, degrees.nb, degrees.nk or ()
@@ -155,10 +152,9 @@ def _bump(degree: int) -> Polynomial:
 
 
 def kink(u: Array, delay: int, dt: float) -> Array:
-    """Return what to add to samples of a signal whose slope jumps by `u`'s steps, so that sums are integrals.
-
-    The trapezoidal rule is wrong at a kink: as sampling folds its spectrum 1/w^2, dt^2 (1/s - 1/x^2) = dt^2 (1/12 +
-    s/240 + 31 s^2/60480 + ...) with x = w dt and s = 4 sin^2(x/2), which is minus a second difference.
+    """Return what to add to samples of a signal whose slope jumps by `u`'s steps, so that trapezoidal sums are
+    integrals: dt^2 (1/s - 1/x^2) = dt^2 (1/12 + s/240 + 31 s^2/60480 + ...), as sampling folds the spectrum 1/w^2, x =
+    w dt and s = 4 sin^2(x/2), minus a second difference.
     """
     out = np.zeros_like(u)
     out[delay:] = np.diff(u, prepend=u[:1])[: u.size - delay]
@@ -278,9 +274,8 @@ class Solution:
 
 
 def solve(equation: Equation, bump: Bump, start: Array | None = None) -> Solution:
-    """Estimate the parameters with one test function, from ordinary least squares or from `start` where that is better.
-
-    The regressors of a step are moments of the output freed from its estimated noise.
+    """Estimate the parameters with one test function, from least squares or from `start` where that is better;
+    regressors of a step are moments of the output freed from its estimated noise.
     """
     work = Rows(equation, bump)
     first = [work.ordinary(), *([] if start is None else [start])]
@@ -305,11 +300,9 @@ def supports(n_samples: int) -> list[int]:
 
 
 def best_support(equation: Equation, halves: Sequence[int]) -> tuple[Solution, list[dict[str, float]]]:
-    """Solve from long supports to short, from the one before or again; keep the one that predicts least variance.
-
-    Long supports average most but see low frequencies alone, where a wrong plant may fit as well; short ones see all.
-    So every solution is also held against the shortest support, and those that it contradicts do not count. Returns
-    the best, and half support, noise, log determinant of the covariance and contradiction of each.
+    """Solve from long supports to short and keep the one that predicts least variance, not contradicted by the
+    shortest: long ones average most but see low frequencies alone, where a wrong plant may fit as well. Returns the
+    best, and each one's half support, noise, log determinant of the covariance and contradiction.
     """
     solution: Solution | None = None
     results, tried, why = list[tuple[float, Solution]](), list[dict[str, float]](), "the record is too short"
