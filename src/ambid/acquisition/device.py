@@ -1,8 +1,5 @@
-"""What stands at the other end: the contract of all devices, and the values that pass between them and the host.
-
-The host requests, the controller decides: a device may refuse what it is asked, and goes to its safe state by itself.
-Four implementations keep to this contract: serial hardware, the emulated controller, a simulated bench, a replayed
-record; ``tests/acquisition/test_conformance.py`` holds each to it.
+"""What stands at the other end: the contract of all devices (`tests/acquisition/test_conformance.py` holds each to it),
+and the values that pass. The host requests, the device decides: it may refuse, and goes to its safe state by itself.
 """
 
 from __future__ import annotations
@@ -114,9 +111,9 @@ class SelfTest:
 class Device(Protocol):
     """A bench that can be asked for samples. Made ready by its constructor's arguments; a context opens and closes it.
 
-    Closing always leaves the bench in its safe state, whatever happened before. All methods raise `DeviceError` where
-    the device refuses or the line is lost, with what, where, rule and remedy. A replay has mode ``sample`` alone, and
-    refuses every excitation. Every other device has all modes.
+    Closing always leaves the bench in its safe state. All methods raise `DeviceError` where the device refuses or the
+    line is lost, with what, where, rule and remedy. A replay has mode ``sample`` alone and no excitation; all others
+    have all.
     """
 
     @property

@@ -1,8 +1,5 @@
-"""A state-space law as the 16-bit words that the controller runs (``firmware/amb_daq/law.h``), and back.
-
-The controller holds A as blocks of two states at most, less one, so that a slow pole costs no digits and 32 products a
-tick do for six states; a power of two stands before each row. Here a law is brought to such blocks, its states are
-scaled to the places that they have, and rounded.
+"""A state-space law as the controller's 16-bit words (``firmware/amb_daq/law.h``) and back: A less one in blocks of two
+states at most, so that a slow pole costs no digits, a power of two before each row; states scaled, then rounded.
 """
 
 from __future__ import annotations
@@ -108,7 +105,7 @@ def law_words(law: StateLaw) -> LawWords:
     """Bring a law of one axis, from counts (position, current) to counts of pulse width, to the controller's words.
 
     Where G tracks the states back, so that they are stable with the command given, they have room for any course of
-    inputs within 512 counts and any pulse width. Else for such inputs alone; an integrator for 4096 counts of pulse
+    inputs within 512 counts and any pulse width; else for such inputs alone, an integrator for 4096 counts of pulse
     width.
     """
     if law.D.shape != (1, 2):
@@ -219,9 +216,8 @@ def _scaled(law: StateLaw, factors: Array) -> StateLaw:
 
 
 def _peaks(law: StateLaw) -> Array:
-    """Return the largest value of each state: with the command v given, z+ = (A - G C) z + (B - G D) y + G v.
-
-    Where that is not stable, that for inputs alone, and of an integrator what pulse width asks of it.
+    """Return the largest value of each state: with the command v given, z+ = (A - G C) z + (B - G D) y + G v; where
+    that is not stable, for inputs alone, and of an integrator what pulse width asks of it.
     """
     G = law.windup
     peaks = l1_norms(law.A - G @ law.C, np.hstack([law.B - G @ law.D, G])) @ [_INPUT, _INPUT, PWM_TOP]

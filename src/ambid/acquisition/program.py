@@ -1,7 +1,5 @@
-"""Excitations by name as a controller can play them: a square wave, a shift register, or a table over and over.
-
-How each is played, tick by tick, is defined in the comments of ``protocol/messages.toml``; the firmware and this file
-keep to that.
+"""Excitations by name as a controller plays them: a square wave, a shift register, or a table over and over. The
+comments of ``protocol/messages.toml`` define it tick by tick; the firmware and this file keep to that.
 """
 
 from __future__ import annotations
@@ -45,11 +43,8 @@ def program(
     seconds: float,
     seed: int = 0,
 ) -> Program:
-    """Make an excitation for a controller.
-
-    `name`: ``steps``, ``prbs``, ``multisine`` or ``schroeder``, as `ambid.signals.excitation` knows them;
-    `amplitude_v`: peak at the coil, V; `rate_hz`: ticks in one second; `seed`: phases of a multisine, where the
-    register of a PRBS starts. Returns played until it is ended.
+    """Make an excitation that a controller plays until it is ended: ``steps``, ``prbs``, ``multisine`` or
+    ``schroeder``, as `ambid.signals.excitation`, peak in V at the coil; `seed`: phases of a multisine, start of a PRBS.
     """
     _check(name, amplitude_v, band, rate_hz, seconds)
     ticks = round(seconds * rate_hz)
@@ -160,11 +155,7 @@ def _lowest(high: float, rate_hz: float) -> float:
 
 
 def counts_of(program: Program, rig: Rig, settings: ControllerSettings) -> dict[str, int]:
-    """Return the fields of the message ``excitation``.
-
-    `program`: amplitude in V; `rig`: with the calibration of its voltage; `settings`: of the device. Returns without
-    ``id``.
-    """
+    """Return the fields of the message ``excitation`` without ``id``, by the calibration of the rig's voltage."""
     amplitude = 0
     if program.kind != "none":
         amplitude = amplitude_counts(program, rig, settings.duty_bias, (settings.duty_low, settings.duty_high))
@@ -208,11 +199,7 @@ def expected(program: Program, n_ticks: int, *, counts: int | None = None) -> Ar
 
 
 def elements_of(program: Program) -> Array:
-    """Return the elements of one cycle.
-
-    `program`: the excitation. Returns (n_elements,), 1 and -1 for steps and PRBS, -127 to 127 for a table, one 0 for
-    none.
-    """
+    """Return the elements of one cycle: 1 and -1 for steps and PRBS, -127 to 127 for a table, one 0 for none."""
     if program.kind == "step":
         return np.array([1.0, -1.0])
     if program.kind == "table":
@@ -234,12 +221,10 @@ def elements_of(program: Program) -> Array:
 
 
 def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int, int]) -> int:
-    """Return the amplitude of an excitation in counts of pulse width.
+    """Return the amplitude in counts of pulse width, at least 1, between the least and the largest `duty` about its
+    bias.
 
     Where the voltage falls as the pulse gets wider, the excitation at the coil has the other sign.
-
-    `program`: the excitation; `rig`: with a calibration of the voltage; `duty_bias`: pulse width at rest, counts;
-    `duty`: least and largest pulse width, counts. Returns at least 1.
     """
     step = abs(scale_of(rig, "voltage").slope(duty_bias))
     exact = program.amplitude / step
@@ -254,9 +239,6 @@ def amplitude_counts(program: Program, rig: Rig, duty_bias: int, duty: tuple[int
 
 
 def period_ticks(program: Program) -> int:
-    """Return the period of an excitation.
-
-    `program`: the excitation. Returns ticks; 0 where it has none.
-    """
+    """Return the period of an excitation in ticks; 0 where it has none."""
     n = {"none": 0, "step": 2, "prbs": 2**program.length - 1, "table": program.length}[program.kind]
     return int(n) * program.hold

@@ -1,7 +1,5 @@
-"""How good is what comes in: judged block by block while it comes, in constant memory.
-
-Noise is told from signal by the periods of the excitation where one plays: what repeats is signal, the rest is noise.
-Else by third differences, which let fast noise through and slow motion hardly: the noise is then at most that.
+"""How good is what comes in, judged by block in constant memory. Where an excitation plays, what repeats with its
+period is signal, the rest noise; else noise is at most what third differences let through, slow motion hardly.
 """
 
 from __future__ import annotations
@@ -218,10 +216,7 @@ class QualityReport:
 
 
 class Quality:
-    """Judges a stream as it comes.
-
-    `info`: of the opened device; `program`: the excitation that begins with the stream; None: none.
-    """
+    """Judges a stream as it comes, of an opened device and the excitation that begins with it, if any."""
 
     def __init__(self, info: DeviceInfo, program: Program | None = None) -> None:
         self._info, width = info, len(info.columns)
@@ -237,10 +232,7 @@ class Quality:
         self._waiting: list[Array] = []  # consecutive samples, judged together: a block is short, and each costs calls
 
     def add(self, frame: Frame) -> None:
-        """Take the next block.
-
-        `frame`: values of shape (n_samples, n_columns), in the device's units.
-        """
+        """Take the next block, (n_samples, n_columns) in the device's units."""
         first, x = frame.block.first, frame.block.values
         if self._first is None:
             self._first = self._next = first
@@ -357,11 +349,7 @@ def _decibels(signal: float, noise: float) -> float | None:
 
 
 def faults(report: QualityReport, info: DeviceInfo) -> tuple[Reason, ...]:
-    """Say what is not good enough.
-
-    `report`: all but its verdict; `info`: of the device. Returns empty where all is well, or where there are too few
-    samples to tell.
-    """
+    """Say what is not good enough; empty where all is well, or there are too few samples to tell."""
     reasons = list(_stream(report, info))
     if report.samples >= _FEWEST:
         for column in report.columns:

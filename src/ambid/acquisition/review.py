@@ -32,10 +32,8 @@ _NOBODY: Mapping[str, float] = MappingProxyType({})
 
 
 def review(rig: Rig, settings: ControllerSettings, *, parameters: Mapping[str, float] = _NOBODY) -> tuple[str, ...]:
-    """Say what a rig's controller will do only roughly, or what speaks against closing its loop.
-
-    `rig`: the rig; `settings`: made from it by `ambid.acquisition.settings.controller_settings`; `parameters`: as
-    `predicted`. Returns one line each, with its remedy; empty where nothing is to be said.
+    """Say what a rig's controller does only roughly, or what speaks against closing its loop: one line each with its
+    remedy. `settings`: made by `ambid.acquisition.settings.controller_settings`; `parameters`: as `predicted`.
     """
     lines = [*_voltage(rig, settings), *_trips(rig, settings), *_tables(rig)]
     if not settings.drives:
@@ -150,10 +148,8 @@ def _stability(rig: Rig, settings: ControllerSettings, parameters: Mapping[str, 
 def predicted(
     rig: Rig, settings: ControllerSettings, parameters: Mapping[str, float] = _NOBODY
 ) -> tuple[LoopMargins | None, str]:
-    """Predict the loop that a controller will close.
-
-    `rig`: with a loop; `settings`: made from it; `parameters`: of the bench, SI, where the rig has no value of its own.
-    Returns the margins and whose plant it is; None and why where a value is missing.
+    """Return the margins of the loop that a controller will close, and whose plant it is; None and why where a value
+    lacks. `parameters`: of the bench, SI, where the rig has no value of its own.
     """
     values = {p.name: p.value for p in rig.parameters if p.value is not None}
     lent = [p.name for p in rig.parameters if p.name not in values and p.name in parameters]
@@ -172,10 +168,7 @@ def predicted(
 
 
 def loop_on(rig: Rig, info: DeviceInfo, parameters: Mapping[str, float] = _NOBODY) -> tuple[LoopMargins | None, str]:
-    """Predict the loop that a device will close, on a plant of these parameters, or on the one that the rig expects.
-
-    `rig`: with a loop; `info`: of the device; `parameters`: all of the model's, SI. Returns as `predicted`.
-    """
+    """Predict, as `predicted`, the loop that a device closes on a plant of all these parameters (SI) or the rig's."""
     full = with_default_daq(rig) if info.kind in ("emulated", "simulated") else rig
     settings = controller_settings(full)
     if parameters:
@@ -184,10 +177,7 @@ def loop_on(rig: Rig, info: DeviceInfo, parameters: Mapping[str, float] = _NOBOD
 
 
 def refuse_unstable(rig: Rig, info: DeviceInfo) -> None:
-    """Refuse to let a device close a loop that is predicted unstable.
-
-    `rig`: with a loop; `info`: of the device.
-    """
+    """Refuse to let a device close a loop that is predicted unstable."""
     margins, whose = loop_on(rig, info)
     if margins is not None:
         _refuse(margins, whose, info.rate_hz)

@@ -1,7 +1,5 @@
-"""What the controller (ATmega328P at 16 MHz, an Arduino Uno) can do, and its counts in SI by a channel's calibration.
-
-A tick is a whole number of periods of the pulse width modulation, so that the inputs are always held at the same point
-of a pulse.
+"""What the controller (ATmega328P at 16 MHz, an Arduino Uno) can do, and its counts in SI by a channel's calibration. A
+tick is a whole number of periods of the pulse width, so that inputs are held at the same point of a pulse.
 """
 
 from __future__ import annotations
@@ -61,25 +59,16 @@ class Scale:
     ends: tuple[float, float] | None = None
 
     def to_si(self, counts: ArrayLike) -> Array:
-        """Return what counts mean.
-
-        `counts`: what the controller gives. Returns continued in a straight line outside the corners.
-        """
+        """Return what counts mean, in a straight line outside the corners."""
         return _line(np.asarray(counts, dtype=np.float64), self.raw, self.si)
 
     def to_counts(self, si: ArrayLike) -> Array:
-        """Return the counts that mean a value, not rounded.
-
-        `si`: values of the role. Returns continued in a straight line outside the corners; may lie outside 0 to `top`.
-        """
+        """Return the counts of values, not rounded, straight on outside the corners; may be outside 0 to `top`."""
         order = slice(None) if self.si[-1] > self.si[0] else slice(None, None, -1)
         return _line(np.asarray(si, dtype=np.float64), self.si[order], self.raw[order])
 
     def slope(self, counts: float) -> float:
-        """Return SI per count at a point of the line; at a corner the mean of both sides.
-
-        `counts`: where. Returns positive or negative, never 0.
-        """
+        """Return SI per count (signed, never 0) at a point; at a corner the mean of both sides."""
         slopes = np.diff(self.si) / np.diff(self.raw)
         last = slopes.size - 1
         after = int(np.clip(np.searchsorted(self.raw, counts, side="right") - 1, 0, last))
@@ -87,10 +76,7 @@ class Scale:
         return float((slopes[before] + slopes[after]) / 2.0)
 
     def slopes(self, low: float, high: float) -> tuple[float, float]:
-        """Return the least and the largest slope by magnitude between two counts.
-
-        `low`, `high`: the stretch, counts. Returns SI per count, without sign.
-        """
+        """Return the least and the largest slope between two counts, SI per count without sign."""
         slopes = np.abs(np.diff(self.si) / np.diff(self.raw))
         touched = (self.raw[:-1] < high) & (self.raw[1:] > low)
         inside = slopes[touched] if touched.any() else np.abs([self.slope(low)])
@@ -98,10 +84,8 @@ class Scale:
 
 
 def scale_of(rig: Rig, role: str) -> Scale:
-    """Return the scale of a role.
-
-    `rig`: with a calibration from counts for that role; `role`: ``voltage`` (counts of pulse width), or an analog
-    input: ``position``, ``current``, ``speed``, ``angle``. Returns from counts to the role's SI unit.
+    """Return the calibration from counts to SI of a role: ``voltage`` (counts of pulse width), or an analog input
+    (``position``, ``current``, ``speed``, ``angle``).
     """
     c = rig.channel(role)
     top = PWM_TOP if role == "voltage" else ADC_TOP
@@ -129,10 +113,7 @@ def scale_of(rig: Rig, role: str) -> Scale:
 
 
 def who(rig: Rig) -> str:
-    """Return how messages call a rig.
-
-    `rig`: any. Returns by its file, else by its name.
-    """
+    """Return how messages call a rig: its file, else its name."""
     return f"rig {rig.source}" if rig.source is not None else f"rig {rig.name!r}"
 
 
@@ -273,10 +254,7 @@ def count_inside(rig: Rig, scale: Scale, value: float, low: int, high: int, what
 
 
 def period_of(rate_hz: float) -> int:
-    """Return the tick of a rate.
-
-    `rate_hz`: ticks in one second. Returns in periods of the pulse width modulation.
-    """
+    """Return the tick of a rate in periods of the pulse width modulation."""
     exact = PWM_HZ / rate_hz
     period = round(exact)
     if SHORTEST_PERIOD <= period <= LONGEST_PERIOD and math.isclose(exact, period, rel_tol=1e-9):
@@ -290,10 +268,7 @@ def period_of(rate_hz: float) -> int:
 
 
 def nearest_rate(rate_hz: float, *, output: bool = False) -> float:
-    """Return the rate that the controller can do and that is nearest by ratio.
-
-    `rate_hz`: wanted rate, Hz; `output`: only rates with which the output may be on. Returns hz.
-    """
+    """Return the rate in Hz that the controller can do nearest by ratio; `output`: with which the output may be on."""
     ends = (FASTEST_OUTPUT, SLOWEST_OUTPUT) if output else (SHORTEST_PERIOD, LONGEST_PERIOD)
     exact = PWM_HZ / rate_hz
     rates = [PWM_HZ / _possible(n, ends) for n in (math.floor(exact), math.ceil(exact))]
@@ -301,18 +276,12 @@ def nearest_rate(rate_hz: float, *, output: bool = False) -> float:
 
 
 def drives(period: int) -> bool:
-    """Return whether the output may be on with ticks of that length.
-
-    `period`: in periods of the pulse width modulation.
-    """
+    """Return whether the output may be on with ticks of `period` periods of the pulse width modulation."""
     return FASTEST_OUTPUT <= period <= SLOWEST_OUTPUT
 
 
 def output_rates() -> str:
-    """Return the rates with which the output may be on, for messages.
-
-    Returns such as ``1000 to 2500 Hz``.
-    """
+    """Return the rates with which the output may be on, such as ``1000 to 2500 Hz``."""
     return f"{PWM_HZ / SLOWEST_OUTPUT:g} to {PWM_HZ / FASTEST_OUTPUT:g} Hz"
 
 

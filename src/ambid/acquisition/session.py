@@ -1,8 +1,5 @@
-"""One run of a device: started, settled, excited, listened to for a time, stopped, and recorded.
-
-Blocks go to taps (recorder, quality, ring to a tracker) in the order in which they came; nothing is lost uncounted. A
-fault of the device ends the run: what was sampled before it has been passed on. What an earlier run left unread is not
-of this one.
+"""One run of a device: started, settled, excited, listened to, stopped, recorded. Taps get blocks in order, none lost
+uncounted nor left from an earlier run; a fault ends the run, and what came before has been passed on.
 """
 
 from __future__ import annotations
@@ -36,10 +33,7 @@ class Tap(Protocol):
     """Whoever listens to a run."""
 
     def take(self, frame: Frame) -> None:
-        """Take a block; must not keep the run waiting.
-
-        `frame`: a block with its time of arrival.
-        """
+        """Take a block with its time of arrival; must not keep the run waiting."""
         ...
 
 
@@ -86,10 +80,8 @@ def run(
     on_event: Callable[[DeviceEvent], object] | None = None,
     stopped: Callable[[], bool] = lambda: False,
 ) -> RunReport:
-    """Let a device do a course, and pass on what it samples.
-
-    `device`: opened, idle; `taps`: each is given every block, cut to the wanted part; `on_event`: told of each event of
-    the device as it comes; `stopped`: asked between blocks; True ends the run in an orderly way.
+    """Let an opened, idle device do a course; each tap gets every block, cut to the wanted part, `on_event` each event.
+    `stopped` is asked between blocks; True ends the run in an orderly way.
     """
     state = _Run(device, course, taps, on_event)
     try:
@@ -377,11 +369,9 @@ def acquire(
     path : str or Path
         The record: .h5, .hdf5, .csv or .csv.gz.
     course : Course
-        What the device is to do.
     force : bool, optional
         Whether a record that exists may be written over.
     taps : sequence of Tap, optional
-        Others who listen.
     stopped : callable, optional
         Asked now and then; True ends the run.
     **listeners
@@ -408,10 +398,7 @@ def acquire(
 def recording(
     device: Device, rig: Rig, path: str | Path, course: Course, *, force: bool = False, **listeners: Unpack[Listeners]
 ) -> Iterator[Recording]:
-    """Record what a run passes on, whoever runs it: yield a tap of the run; on leaving, the journal becomes the record.
-
-    Arguments as those of `acquire`.
-    """
+    """Yield a tap that records, as `acquire`, what anybody's run passes on; on leaving, the record is made."""
     troubles: list[DeviceError] = []
 
     def trouble(what: DeviceError) -> None:

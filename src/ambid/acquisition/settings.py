@@ -1,8 +1,5 @@
-"""From a rig in SI to the whole numbers that its controller is given, and back.
-
-Gains, set point, limits and trips go through the calibrations of the channels; a bent calibration is taken by its slope
-at rest. What a controller cannot hold, or could not protect, is refused; what it holds only roughly is told by
-`ambid.acquisition.review`.
+"""From a rig in SI to the whole numbers that its controller is given, by the calibrations (slope at rest), and back.
+What it cannot hold or protect is refused; what it holds only roughly is told by `ambid.acquisition.review`.
 """
 
 from __future__ import annotations
@@ -103,10 +100,8 @@ class ControllerSettings:
 
 
 def controller_settings(rig: Rig) -> ControllerSettings:
-    """Turn a rig into what its controller is told.
-
-    `rig`: with ``[daq]`` and calibrations from counts; `ambid.acquisition.settings.with_default_daq` makes them up.
-    Returns each within what the controller takes. Trips are rounded inwards, all else to the nearest.
+    """Turn a rig with ``[daq]`` and calibrations from counts (`with_default_daq`) into what its controller is told:
+    trips rounded inwards, all else to the nearest.
     """
     daq = _daq(rig)
     voltage, current = scale_of(rig, "voltage"), scale_of(rig, "current")
@@ -144,10 +139,8 @@ def controller_settings(rig: Rig) -> ControllerSettings:
 
 
 def law_trial(rig: Rig, new: Rig) -> LawTrial:
-    """Return another rig's loop as a law to be tried by the controller of a rig that levitates.
-
-    `rig`: with ``[daq]`` and calibrations; `new`: whose ``[loop]`` is tried, gains as a law of two states. The
-    bounds are half way from the set point to the trips.
+    """Return the ``[loop]`` of `new`, gains as a law of two states, to be tried by the controller of a rig that
+    levitates. The bounds are half way from the set point to the trips.
     """
     if new.loop is None or not new.loop.closed:
         raise RigError(f"{who(new)} has no [loop] with a gain; there is nothing to arm. Give it one")
@@ -165,10 +158,8 @@ def law_trial(rig: Rig, new: Rig) -> LawTrial:
 
 
 def realised(settings: ControllerSettings, rig: Rig) -> Loop:
-    """Return the loop that the controller really closes, after rounding, in SI.
-
-    `settings`: what it is told; `rig`: the rig that they were made from, for its calibrations. Returns in SI, by the
-    slopes of the calibrations at rest; its delay is that of the controller itself.
+    """Return the loop that the controller really closes after rounding, in SI, by the slopes of the rig's calibrations
+    at rest; its delay is that of the controller itself.
     """
     voltage = scale_of(rig, "voltage").slope(settings.duty_bias)
     current = scale_of(rig, "current").slope(settings.current_rest)
@@ -190,9 +181,8 @@ def realised(settings: ControllerSettings, rig: Rig) -> Loop:
 
 
 def held_by(rig: Rig, loop: Loop) -> Loop:
-    """Return a loop, gains or law, as the rig's controller holds it in fixed point; RigError where it does not fit.
-
-    As it is where there is no ``[daq]``, and of a rotor: the controller drives one axis.
+    """Return a loop, gains or law, as the rig's controller holds it in fixed point; RigError where it does not fit. As
+    it is without ``[daq]``, and of a rotor: the controller drives one axis.
     """
     if rig.daq is None or rig.rotor is not None:
         return loop
@@ -203,10 +193,7 @@ def held_by(rig: Rig, loop: Loop) -> Loop:
 
 
 def rest_of(rig: Rig) -> dict[str, float]:
-    """Return the point about which the controller works.
-
-    Returns ``position`` (m), ``current`` (A), ``voltage`` (V).
-    """
+    """Return the point about which the controller works: ``position`` (m), ``current`` (A), ``voltage`` (V)."""
     point = rig.operating_point
     current = point.get("current", 0.0)
     resistance = next((p.value for p in rig.parameters if p.name == "R"), None) or 0.0
@@ -240,10 +227,8 @@ def _daq(rig: Rig) -> Daq:
 
 
 def exact_gains(rig: Rig, rest: tuple[int, int, int]) -> dict[str, float]:
-    """Return the loop's gains in steps of the controller, not rounded, by the slopes of the calibrations at rest.
-
-    `rig`: with a loop, ``[daq]`` and calibrations; `rest`: counts at rest: pulse width, current, position. Returns
-    ``kp``, ``ki``, ``kd``, ``kc`` in the units of the message ``gains``.
+    """Return ``kp``, ``ki``, ``kd``, ``kc`` in the steps of message ``gains``, not rounded, by the slopes of the
+    calibrations at `rest`: counts of pulse width, current, position.
     """
     assert rig.loop is not None
     assert rig.daq is not None
@@ -328,11 +313,8 @@ def _check_line(rig: Rig, daq: Daq, settings: ControllerSettings) -> None:
 
 
 def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tuple[Column, ...]:
-    """Return what a sample carries, column by column.
-
-    `rig`: names the columns; `settings`: which there are; `si`: as `in_si` gives them instead of in counts. Returns in
-    the order of the stream mask; spans are what the converter can give, for the voltage what the controller orders at
-    most.
+    """Return what a sample carries, in the order of the stream mask, in counts or SI. Spans are what the converter can
+    give, for the voltage what the controller orders at most.
     """
     names = {c.column for c in rig.channels}
     result = []
@@ -350,11 +332,7 @@ def columns(rig: Rig, settings: ControllerSettings, *, si: bool = False) -> tupl
 
 
 def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
-    """Turn samples in counts into SI.
-
-    `rig`: with calibrations; `settings`: what a sample carries; `values`: (n_samples, n_columns), counts, as the
-    controller sends them. Returns (n_samples, n_columns), SI, columns without a calibration stay as they are.
-    """
+    """Return counts (n_samples, n_columns) in SI; columns without a calibration stay as they are."""
     out = np.array(values, dtype=np.float64)
     for k, role in enumerate(carried(settings)):
         scale = _si_scale(rig, settings, role)
@@ -364,10 +342,7 @@ def in_si(rig: Rig, settings: ControllerSettings, values: ArrayLike) -> Array:
 
 
 def stream_of(rig: Rig, daq: Daq) -> int:
-    """Return the stream mask: current, pulse width and excitation always, the rest where the rig has it.
-
-    `rig`: with channel ``reference`` or not; `daq`: with a third input or not. Returns one bit for each of `STREAM`.
-    """
+    """Return the mask over `STREAM`: current, pulse width and excitation always, the rest where the rig has it."""
     wanted = {"current", "voltage", "excitation"} | ({"position"} if has_position(rig) else set())
     wanted |= {"third"} if daq.third is not None else set()
     wanted |= {"reference"} & {c.role for c in rig.channels}
@@ -375,18 +350,12 @@ def stream_of(rig: Rig, daq: Daq) -> int:
 
 
 def carried(settings: ControllerSettings) -> list[str]:
-    """Return the roles of what a sample carries.
-
-    `settings`: with the stream mask. Returns of `STREAM`, in its order.
-    """
+    """Return the roles of `STREAM` that a sample carries, in its order."""
     return [role for bit, role in enumerate(STREAM) if settings.stream >> bit & 1]
 
 
 def has_position(rig: Rig) -> bool:
-    """Return whether the rig's model has a position.
-
-    `rig`: any. Returns false for a coil alone.
-    """
+    """Return whether the rig's model has a position: false for a coil alone."""
     return "position" in model(rig.model).outputs
 
 
@@ -434,10 +403,9 @@ _UNITS = {"position": "m", "current": "A", "voltage": "V"}
 
 
 def with_default_daq(rig: Rig) -> Rig:
-    """Return a rig with ``[daq]`` and calibrations from counts; what it has already stays.
-
-    `rig`: with limits of voltage, current and position where it has no calibrations. Returns for `controller_settings`,
-    as an emulated or simulated bench uses it; `default_daq_notes` says what was made up.
+    """Return a rig with ``[daq]`` and calibrations from counts for an emulated or simulated bench; what it has already
+    stays. Needs limits of voltage, current and position where calibrations lack; `default_daq_notes` says what was made
+    up.
     """
     return _filled(rig)[0]
 
@@ -448,10 +416,7 @@ def is_made_up(rig: Rig, full: Rig) -> bool:
 
 
 def default_daq_notes(rig: Rig) -> tuple[str, ...]:
-    """Return what `with_default_daq` makes up for a rig, one line each.
-
-    `rig`: as for `with_default_daq`. Returns empty where the rig is complete.
-    """
+    """Return what `with_default_daq` makes up for a rig, one line each."""
     return _filled(rig)[1]
 
 
@@ -517,10 +482,7 @@ _AT_ONCE_MS = 10  # after the time to lift
 
 
 def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int = 0) -> str:
-    """Write a fault for people: cause, what it means, where, and what to do.
-
-    `fault`: of kind ``fault``. Returns one sentence with its remedy, without a full stop.
-    """
+    """Write a fault for people, one sentence without full stop: cause, what it means, where, and the remedy."""
     about = {entry.name: entry.about for entry in table().enums["cause"]}.get(fault.what)
     at = "" if fault.sample is None else f" at sample {fault.sample}"
     meaning = "" if about is None else f", {about}"
@@ -532,22 +494,15 @@ def fault_words(fault: DeviceEvent, *, rate_hz: float = math.nan, lift_ms: int =
 
 
 def as_record(values: Array, columns: Sequence[Column], rate_hz: float, *, start_s: float = 0.0) -> Record:
-    """Return samples of a device as a record.
-
-    `values`: (n_samples, n_columns), in the columns' units, as blocks hold them; `columns`: of the device; `rate_hz`:
-    sampling rate in Hz; `start_s`: time of the first sample, s. Returns one channel per column, named like it.
+    """Return samples (n_samples, n_columns), in the columns' units as blocks hold them, as a record, one channel per
+    column; `start_s`: time of the first, s.
     """
     channels = tuple(Channel(name=c.name, unit=c.unit, values=values[:, k]) for k, c in enumerate(columns))
     return Record(channels=channels, rate_hz=rate_hz, start_s=start_s, provenance=MappingProxyType({}), history=())
 
 
 class BenchView:
-    """Turns raw blocks of a device into blocks of roles, SI.
-
-    `info`: of the opened device; `rig`: its columns and calibrations; `roles`: which, in which order.
-
-    `units`: SI unit of each role, in the order given; `rate_hz`: sampling rate in Hz.
-    """
+    """Turns raw blocks of an opened device into blocks of the named `roles`, SI (`units`), in their order."""
 
     def __init__(self, info: DeviceInfo, rig: Rig, roles: Sequence[str]) -> None:
         self.rate_hz = info.rate_hz
@@ -564,9 +519,8 @@ class BenchView:
         self._lines = self._linear()
 
     def block(self, raw: Block) -> Block:
-        """Return a block in the order of the roles.
-
-        `raw`: shape (n_samples, n_columns), in the device's units. Returns shape (n_samples, n_roles), SI.
+        """Return a block (n_samples, n_roles) in SI, in the order of the roles, of (n_samples, n_columns) in the
+        device's units.
         """
         if self._lines is None:
             record = self.record(raw.values)
@@ -577,9 +531,8 @@ class BenchView:
         return Block(first=raw.first, time_s=raw.time_s, values=values)
 
     def _linear(self) -> tuple[NDArray[np.int64], Array, Array] | None:
-        """Return columns, gains and offsets of the roles; applying them takes a tenth of the time of making a record.
-
-        None where a table or a declared unit asks for more.
+        """Return columns, gains and offsets of the roles, ten times faster than a record; None where a table or a
+        declared unit asks for more.
         """
         columns = {c.name: k for k, c in enumerate(self._columns)}
         channels = {c.role: c for c in self._rig.channels}
@@ -593,9 +546,7 @@ class BenchView:
         return k.astype(int), gain, offset
 
     def record(self, values: Array, *, start_s: float = 0.0) -> Record:
-        """Return samples as a record whose channels are named by role.
-
-        `values`: (n_samples, n_columns), in the device's units, as blocks hold them; `start_s`: time of the first
-        sample, s. Returns all of the rig's channels, SI.
+        """Return samples (n_samples, n_columns), in the device's units, as a record of the rig's channels named by
+        role, in SI; `start_s`: time of the first, s.
         """
         return bench_record(as_record(values, self._columns, self.rate_hz, start_s=start_s), self._rig)

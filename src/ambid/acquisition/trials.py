@@ -1,12 +1,5 @@
-"""Short looks at a bench, kept in memory and seen through the rig: which way it answers, and the size of an excitation.
-
-Which way it answers is found before its loop is closed, by pulses of voltage, small ones first. The rotor lies on a
-stop, or is drawn to one: it may only move away from it. So pulses of both signs are played without feedback, each a
-little larger than the last, until the position moves or a part of the way to the current's trip is used. Each lasts
-some milliseconds, and ends before the controller's time to lift is over.
-
-An excitation may use a part of the way from rest to the trips of position and current, and most of the voltage. The
-first trial is so small that a bench which is hard to hold stands it; one that was too large is followed by a smaller.
+"""Short looks at a bench, seen through the rig. Pulses of both signs, without feedback, grow until the rotor leaves its
+stop or part of the way to the current's trip is used; a few ms, within the time to lift. Then the excitation's size.
 """
 
 from __future__ import annotations
@@ -50,10 +43,7 @@ class Room:
 
     @classmethod
     def of(cls, rig: Rig) -> Room:
-        """Take it from a rig.
-
-        `rig`: with ``[daq]``. Returns infinite where the rig knows no limit.
-        """
+        """Take it from a rig with ``[daq]``; infinite where the rig knows no limit."""
         unlimited = (-math.inf, math.inf)
         roles = [role for role in ("position", "current") if role in rig.plant.outputs]
         trips: dict[str, tuple[float, float]] = {role: rig.trip(role) or unlimited for role in roles}
@@ -62,10 +52,8 @@ class Room:
         )
 
     def used(self, role: str, values: Array, rest: float) -> float:
-        """Return which part of the way from rest to the nearer trip is used, 0 to 1 and beyond.
-
-        `role`: ``position`` or ``current``; `values`: (n_samples,), SI, measured; `rest`: where the bench rests, SI.
-        Returns 0 where there is no limit.
+        """Return which part of the way from rest to the nearer trip `values` (n_samples,), SI, use: 0 to 1 and beyond;
+        0 where there is no limit.
         """
         low, high = self.trips[role]
         up, down = float(values.max()) - rest, rest - float(values.min())
@@ -86,10 +74,7 @@ Look = Callable[[Course], tuple[RunReport, dict[str, Array]]]
 
 
 def make_look(device: Device, rig: Rig, stopped: Callable[[], bool]) -> Look:
-    """Return a way of running a course: it gives the report, and by role what came, SI, seen through the rig.
-
-    `device`: opened, idle; `stopped`: as `session.run`.
-    """
+    """Return a way of running a course on an opened, idle device: it gives the report, and what came, by role in SI."""
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
 
@@ -121,10 +106,7 @@ class Kept:
 
 
 def why_incomplete(report: RunReport, what: str) -> tuple[str, ...]:
-    """Say why a run is not whole.
-
-    `report`: of the run; `what`: what it was for. Returns empty where it is whole.
-    """
+    """Say why a run for `what` is not whole; empty where it is."""
     if report.fault is not None:
         return (f"the controller went to its safe state during {what}: {fault_words(report.fault)}",)
     if report.interrupted:
@@ -168,10 +150,7 @@ class Size:
 
 
 def moving_band(rate_hz: float, seconds: float = math.inf) -> tuple[float, float]:
-    """Return the band in which a levitated rotor moves: an excitation above it tells of the coil alone.
-
-    `rate_hz`: of the device, Hz. Returns from a thousandth of the rate to a thirtieth, Hz.
-    """
+    """Return the band, rate/1000 to rate/30 in Hz, in which a levitated rotor moves; above it only the coil is seen."""
     return max(rate_hz / 1000.0, _FEWEST_PERIODS / seconds), rate_hz / 30.0
 
 
@@ -193,11 +172,11 @@ def find_amplitude(
     use: float,
     amplitude_v: float | None = None,
 ) -> Size:
-    """Find the excitation that uses its part of the room: three quarters of it at least, a fifth more at most.
+    """Find the excitation that uses its part `use` of the room: three quarters of it at least, a fifth more at most.
+    The first trial is small enough for a bench that is hard to hold; one too large is followed by a smaller.
 
-    `look`: see `make_look`; `room`: limits; `trial`: what is played; `resting`: position in m and current
-    in A without excitation; `rate_hz`: of the device, Hz; `use`: part of the room. Returns that of the last trial; with
-    reasons where it tripped, or used too much. It may use less than its part where trials have run out.
+    `resting`: position in m and current in A without excitation. Returns the last trial's, with reasons where it
+    tripped or used too much; it may use less where trials have run out.
     """
     low, high = room.voltage
     if amplitude_v is None and not math.isfinite(high - low):
@@ -228,11 +207,7 @@ def find_amplitude(
 
 
 def fitting_amplitude(device: Device, rig: Rig, trial: Trial, *, stopped: Callable[[], bool] = lambda: False) -> float:
-    """Find an amplitude for a device that has not run yet.
-
-    `device`: opened, idle; `rig`: of the device; `trial`: what is played; `stopped`: as
-    `session.run`. Returns peak in V.
-    """
+    """Find the amplitude, peak in V, for a device that is opened, idle and has not run yet."""
     look, room = make_look(device, rig, stopped), Room.of(rig)
     report, signals = look(Course(mode=trial.mode, seconds=trial.seconds, settle_s=trial.settle_s))
     reasons = why_incomplete(report, "the look before the excitation")
@@ -347,11 +322,7 @@ class Polarity:
 def find_polarity(
     look: Look, room: Room, rig: Rig, rate_hz: float, *, clear: Callable[[], object] = lambda: None
 ) -> Polarity:
-    """Find the signs from voltage to current and from current to motion.
-
-    `look`: see `make_look`; `room`: limits; `rig`: of the device; `rate_hz`: of the device, Hz; `clear`: makes the
-    device leave its safe state.
-    """
+    """Find the signs from voltage to current and from current to motion; `clear`: out of the safe state."""
     return _Pulses(look, room, rig, rate_hz, clear).found()
 
 
@@ -434,9 +405,8 @@ class _Pulses:
         return 0
 
     def _size_for(self, share: float, side: float) -> tuple[float, float]:
-        """Return voltage and time of a pulse to one side that uses a part of the way to the current's trip.
-
-        By the pair that showed the current: it grows with the voltage, and at most with the time.
+        """Return voltage and time of a pulse to one side that uses a part of the way to the current's trip, by the pair
+        that showed the current: it grows with the voltage, and at most with the time.
         """
         most, wanted = _MOST * self._voltage, share * self._current_room(side) / abs(self._per_volt)
         longer = min(max(1.0, wanted / most), self._longest_s / self._hold_s)  # where the voltage does not reach it

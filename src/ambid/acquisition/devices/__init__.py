@@ -21,10 +21,9 @@ def open_device(
     pace: Pace = "fastest",
     seed: int = 0,
 ) -> Device:
-    """Return the device that a port's name stands for, not yet opened: it is a context.
-
-    `port`: ``emulated``, ``simulated``, ``replay:FILE``, else the name of a serial port; `rig`: of the bench; `pace`:
-    of what is no hardware, which has its own; `seed`: of the noise of what is emulated or simulated.
+    """Return the device, a context not yet opened, of a port's name: ``emulated``, ``simulated``, ``replay:FILE``, else
+    of a serial port; `pace` is of what is no hardware, which has its own, `seed` of the noise of what is emulated or
+    simulated.
     """
     if rig.rotor is not None:
         making = command("simulate", "RIG", excitation="zippered", excitation_only=True, out="FILE.csv")

@@ -35,9 +35,8 @@ def limited(value: int, largest: int) -> int:
 
 @compiled
 def law_tick(words: Integers, z: Integers, position: int, current: int, offset: int, low: int, high: int) -> int:
-    """Return the pulse width of a tick, and move the states `z` (n,) on.
-
-    `position`, `current`: from set point and rest, counts; `offset`: bias and excitation.
+    """Return the pulse width of a tick from position (from set point) and current (from rest), in counts, and move the
+    states `z` (n,) on; `offset`: bias and excitation.
     """
     n, y0, y1 = words[HEAD] & 0xFF, position << Y_BITS, current << Y_BITS
     total = words[D0] * y0 + words[D1] * y1
@@ -200,15 +199,12 @@ def tick_on(
     stops: tuple[float, float],
     room: Array,
 ) -> int:
-    """Carry controller and plant over some ticks.
+    """Carry controller and plant over some ticks into counts (n, 6): position, current, pulse width, excitation, set
+    point, state; return the first tick whose state is not finite, -1 for none.
 
-    `noise` (n, 2 + n_disturbances) are standard normal numbers, `noise_size` what they are multiplied with: position,
-    current, disturbances. `maps` are x and y of position to counts, current to counts, pulse width to volts. `roles`
-    are the states of position and current (-1: none). `words` and `z` are a law and its states, empty for gains.
-    `line` (whole delay + 2,) are the newest voltages.
-
-    Filled: counts (n, 6): position, current, pulse width, excitation, set point, state. Returns the first tick whose
-    state is not finite, -1 for none.
+    `noise` (n, 2 + n_disturbances) is standard normal, times `noise_size`: position, current, disturbances. `maps`: x
+    and y of position to counts, current to counts, pulse width to volts; `roles`: states of position and current (-1:
+    none); `words`, `z`: a law and its states, empty for gains; `line` (whole delay + 2,): the newest voltages.
     """
     disturbance = np.empty(noise_size.size - 2)
     whole = line.size - 2

@@ -28,10 +28,9 @@ _THIRD = {"third_position_gain": 0.0, "third_current_gain": 0.0, "third_offset":
 
 
 def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
-    """Return the bench that stands behind a rig, nonlinear where a preset is; its loop and rate have no meaning.
-
-    Where it is the rig's own, its force grows with the current as the rig's controller assumes, whatever the sign of
-    its k_i: a bench does not follow what is believed of it.
+    """Return the bench behind a rig, nonlinear where a preset is; its loop and rate have no meaning. The rig's own
+    bench has a force that grows with the current as the controller assumes, whatever the sign of its k_i: it follows no
+    belief.
     """
     truth = _named(rig) if bench is None else bench
     if isinstance(truth, Preset) and truth.rotor is None and model(truth.model).inputs != ("voltage",):
@@ -45,11 +44,8 @@ def bench_of(rig: Rig, bench: Preset | Rig | None) -> Bench:
 
 
 def instruments(rig: Rig, bench: Preset | Rig | None) -> dict[str, Scale]:
-    """Return what really stands between a bench and its controller, by role: the rig only claims it.
-
-    Those of the bench's own rig file, where it is calibrated; else the rig's, wired so that each rises with its counts.
-
-    `rig`: with calibrations; `bench`: as `bench_of`.
+    """Return by role what really stands between a bench and its controller (the rig only claims it): from the bench's
+    own rig file where it is calibrated, else the rig's, wired so that each rises with its counts.
     """
     truth = _named(rig) if bench is None else bench
     scales = {}
@@ -88,12 +84,10 @@ def _named(rig: Rig) -> Preset | Rig:
 
 
 def plant_text(rig: Rig, *, bench: Preset | Rig | None = None) -> str:
-    """Return the bench behind a rig as a plant file of ``firmware/bench`` has it: what is at the controller's pins.
+    """Return the bench behind a rig as a plant file of ``firmware/bench``: what is at the controller's pins.
 
-    A converter's count c stands for the volts in the middle of its step, (c + 1/2) 5 V / 1024, so that a calibrated
-    reading is right in the mean. The rotor begins where it comes to lie without current; nothing is at the third input.
-
-    `bench`: as `bench_of`.
+    A count c stands for the volts in the middle of its step, (c + 1/2) 5 V / 1024: a calibrated reading is right in the
+    mean. The rotor begins where it comes to lie without current; nothing is at the third input.
     """
     truth = bench_of(rig, bench)
     body = tuple(_plant(truth))  # first: a bench that is not known is refused by its name

@@ -1,7 +1,4 @@
-"""The port: a serial line that is ours alone, opened with a remedy in each refusal.
-
-Whoever can read and write bytes is a port; the rest of the link does not know what is behind it.
-"""
+"""The port: a serial line that is ours alone, opened with a remedy in each refusal; the link knows no more of it."""
 
 from __future__ import annotations
 
@@ -56,10 +53,7 @@ class Port(Protocol):
 
 
 class SerialPort:
-    """A serial port or pseudo-terminal through pyserial.
-
-    `line`: open; `name`: where it is.
-    """
+    """A serial port or pseudo-terminal through pyserial; `line` is open."""
 
     def __init__(self, line: serial.Serial, name: str) -> None:
         self._line, self._name = line, name
@@ -70,10 +64,7 @@ class SerialPort:
         return self._name
 
     def read(self) -> bytes:
-        """Return the bytes that have come.
-
-        Returns empty if none came within some milliseconds.
-        """
+        """Return the bytes that have come, none after some milliseconds."""
         try:
             return bytes(self._line.read(_LARGEST))
         except (TypeError, ValueError) as failure:  # pyserial's answer to a descriptor that was closed meanwhile
@@ -93,11 +84,7 @@ class SerialPort:
 
 
 def open_port(name: str, *, baud: int, boot_s: float | None = None) -> SerialPort:
-    """Open a serial port for this program alone.
-
-    `name`: such as ``/dev/ttyACM0`` or ``COM3``; `baud`: bits per second. Returns ready; bytes from before are
-    discarded.
-    """
+    """Open a serial port (``/dev/ttyACM0``, ``COM3``) for this program alone, ready; earlier bytes are discarded."""
     try:
         import serial
     except ImportError:
@@ -127,10 +114,7 @@ def open_port(name: str, *, baud: int, boot_s: float | None = None) -> SerialPor
 
 
 def candidate_ports() -> Sequence[str]:
-    """Return the serial ports of this machine that have a device behind them, those of USB first.
-
-    Returns name and description of each; empty without pyserial.
-    """
+    """Return names and descriptions of serial ports with a device behind them, USB first; empty without pyserial."""
     try:
         from serial.tools import list_ports
     except ImportError:
@@ -213,11 +197,9 @@ class Chunk:
 
 
 class Reader:
-    """Reads a port until it is closed or lost.
+    """Alone reads a port until it is closed or lost (`failure` says why), with `room` bytes that wait at most.
 
-    `port`: nobody else may read from it; `room`: bytes that wait at most.
-
-    `overruns`: reads dropped for want of room; `overrun_bytes`: bytes in them; `failure`: why the line is lost.
+    `overruns`: reads dropped for want of room; `overrun_bytes`: bytes in them.
     """
 
     def __init__(self, port: Port, *, room: int = _ROOM) -> None:
@@ -233,10 +215,7 @@ class Reader:
         self._thread.start()
 
     def take(self, timeout_s: float) -> list[Chunk]:
-        """Take all that has come.
-
-        `timeout_s`: how long to wait for something, s. Returns empty if nothing came.
-        """
+        """Take all that has come, waiting at most `timeout_s`; empty if nothing came."""
         with self._news:
             self._news.wait_for(lambda: self._chunks or self._over, timeout_s)
             chunks = list(self._chunks)
@@ -295,14 +274,9 @@ class _Waiting:
 class Controller:
     """Commands, answers and the sign of life. Its methods may be called from any thread, except from `heard`.
 
-    `port`: open; nobody else may use it. It is closed with the controller; `samples`: given frames of samples and their
-    time of arrival, from the listener's thread; `told`: given messages that nobody asked for, and statuses, from the
-    listener's thread; `lost`: given the error, once, when the line is lost, from whichever thread sees it; `paused`:
-    tells whether the controller's time stands still: then it is not pinged; `answer_s`: how long to wait for an answer
-    before a command is sent again, s.
-
-    `resent`: commands sent again; `odd`: sound frames that are no message; `counters`, `reader`: what came over the
-    line; `failure`: why it is lost, once it is.
+    It owns an open `port` and closes it. The listener's thread gives `samples` frames and their time of arrival, and
+    `told` statuses and what nobody asked for; `lost` gets the error once, from the thread that sees it. No ping while
+    `paused`; a command is sent again after `answer_s`, counted in `resent`. `odd`: sound frames that are no message.
     """
 
     def __init__(
@@ -343,10 +317,7 @@ class Controller:
         return bool(self._waiting)
 
     def identify(self) -> Message:
-        """Ask who is there.
-
-        Returns ``identity``.
-        """
+        """Ask who is there; return ``identity``."""
         try:
             return self.ask("identify")
         except DeviceError:
@@ -357,10 +328,8 @@ class Controller:
             raise DeviceError(self._nobody()) from None
 
     def ask(self, name: str, fields: Mapping[str, int] = _NONE, *, values: tuple[int, ...] = ()) -> Message:
-        """Send a command and wait for its answer.
-
-        `name`: of the message; `fields`: its fields but ``id``; `values`: elements of its last field, where that is an
-        array. Returns the answer: ``ack``, or the command's own.
+        """Send a command, its fields but ``id``, and return its answer: ``ack``, or the command's own. `values`:
+        elements of a last field that is an array.
         """
         with self._asking:
             number = self._next_id()
@@ -383,10 +352,7 @@ class Controller:
         return answer
 
     def pace(self, rate_hz: float) -> None:
-        """Begin with pings, and count samples as the time between them.
-
-        `rate_hz`: samples in a second.
-        """
+        """Begin with pings, and count samples of `rate_hz` as the time between them."""
         with self._due:
             self._per_ping = max(1, int(_PING_SAMPLES_S * rate_hz))
             self._due.notify_all()
@@ -546,10 +512,7 @@ _REMEDY = {
 
 
 def refusal(command: Message, answer: Message) -> str:
-    """Return what was refused, why, and what to do.
-
-    `command`: the command; `answer`: its ``ack`` with a code that is not 0. Returns one line.
-    """
+    """Return in one line what was refused, why, and what to do; `answer`: an ``ack`` with a code that is not 0."""
     protocol = table()
     code = protocol.name("code", answer["code"])
     about = next((e.about for e in protocol.enums["code"] if e.value == answer["code"]), "an unknown code")

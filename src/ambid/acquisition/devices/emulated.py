@@ -1,8 +1,5 @@
-"""The very firmware, run by an emulator before a simulated bearing, behind an ordinary serial port.
-
-The emulator is a process: found, built where that is possible, started, and always ended. Its program is
-``firmware/build/amb_bench`` of a checkout (libsimavr runs the firmware's own binary against a simulated bearing, behind
-a pseudo-terminal); it is no part of the installed package.
+"""The very firmware, its binary run by ``firmware/build/amb_bench`` (libsimavr) of a checkout, no part of the installed
+package, before a simulated bearing, behind a pseudo-terminal: a process found, built, started and always ended.
 """
 
 from __future__ import annotations
@@ -44,29 +41,22 @@ _AVR = b"\x53\x00"  # machine of an ELF file, little-endian
 
 
 def find_program() -> Path:
-    """Return the emulated bench's program, built first where its sources are newer.
-
-    Returns what ``AMBID_BENCH`` names, else ``firmware/build/amb_bench`` of the checkout.
-    """
+    """Return what ``AMBID_BENCH`` names, else ``firmware/build/amb_bench``, built first where its sources are newer."""
     return _find("AMBID_BENCH", "amb_bench", "bench", ("bench",))
 
 
 def find_firmware() -> Path:
-    """Return the firmware's ELF file, built first where its sources are newer.
-
-    Returns what ``AMBID_FIRMWARE`` names, else ``firmware/build/amb_daq.elf`` of the checkout.
+    """Return the ELF file in ``AMBID_FIRMWARE``, else ``firmware/build/amb_daq.elf``, built first where sources are
+    newer.
     """
     return _find("AMBID_FIRMWARE", "amb_daq.elf", "firmware", ("amb_daq",))
 
 
 class Emulator:
-    """The firmware in an emulated controller before a simulated bench. A context: ended when it is left.
+    """The firmware in an emulated controller before a simulated bench: a context, ended when it is left.
 
-    `plant`: plant file, or its text, see `plant_text`; `firmware`, `program`: see `find_firmware`, `find_program`, the
-    defaults; `script`: what happens while it runs: the lines themselves, or a file; `pace`:
-    emulated time as fast as it goes, or as the wall clock; `seed`: of all noise.
-
-    `port`: the pseudo-terminal; after the start; `pid`: of the process; after the start.
+    `plant`: a file or its text, see `plant_text`; `script`: what happens meanwhile, lines or a file; `pace`: as fast as
+    possible, or the wall clock. After the start, `port` is the pseudo-terminal and `pid` the process.
     """
 
     def __init__(
@@ -149,10 +139,7 @@ class Emulator:
             raise
 
     def close(self, *, keep: bool = False) -> None:
-        """End the process, wait for it, and remove the temporary folder.
-
-        `keep`: leave the folder.
-        """
+        """End the process, wait for it, and remove the temporary folder unless told to keep it."""
         atexit.unregister(self.close)
         process, self._process = self._process, None
         if process is not None:
@@ -164,10 +151,7 @@ class Emulator:
             self._folder = None
 
     def ended(self, timeout_s: float) -> str | None:
-        """Return how the process ended by itself.
-
-        `timeout_s`: how long to wait for its end, s. Returns words; None where it still runs, or was never started.
-        """
+        """Return how the process ended by itself within `timeout_s`; None where it runs, or was never started."""
         if self._process is None:
             return None
         try:
@@ -177,10 +161,8 @@ class Emulator:
         return f"{_way(code)}: {errors}" if (errors := self.said()) else _way(code)
 
     def events(self, name: str | None = None) -> list[dict[str, Any]]:
-        """Return what the log says so far.
-
-        `name`: only events of that name: ``start``, ``host``, ``enable``, ``script``, ``stop``, ``reset``, ``end``.
-        Returns each with ``t`` in s of emulated time and ``event``.
+        """Return what the log says so far, each with ``t`` in s of emulated time and ``event``, one of ``start``,
+        ``host``, ``enable``, ``script``, ``stop``, ``reset``, ``end``: all, or those of a name.
         """
         if self._folder is None or not self.log_path.exists():
             return []
@@ -189,10 +171,7 @@ class Emulator:
         return [e for e in events if name is None or e["event"] == name]
 
     def said(self) -> str:
-        """Return what the program wrote on its standard error.
-
-        Returns empty if nothing.
-        """
+        """Return what the program wrote on its standard error."""
         path = self._said_path()
         return path.read_text(encoding="utf-8", errors="replace").strip() if path.exists() else ""
 
@@ -350,13 +329,9 @@ class _EmulatedPort:
 class EmulatedDevice(LineDevice):
     """The firmware in an emulated controller. Everything but the copper is real: binary, converter, line, protocol.
 
-    As fast as possible, its time is not the host's: it waits for a host that says nothing, and for a reader who left a
-    quarter of a second unread, and no drift is told.
-
-    `bench`: the truth; default what daq.bench names, else the rig's own numbers; `seed`: of the noise; `script`: what
-    happens to bench and line meanwhile, see `Emulator`.
-
-    `emulator`: the process, while the device is open: its log says what happened at the bench.
+    As fast as possible, its time is not the host's: it waits for a silent host and for a reader a quarter of a second
+    behind, and tells no drift. `bench`: the truth, by default daq.bench, else the rig's own numbers; `script`: see
+    `Emulator`; `emulator`: the process while the device is open, whose log says what happened.
     """
 
     def __init__(

@@ -62,10 +62,7 @@ class Drift:
 
 
 class ClockDrift:
-    """Learns from arrivals in constant memory.
-
-    `rate_hz`: samples in a second by the controller's clock.
-    """
+    """Learns from arrivals in constant memory; `rate_hz` is by the controller's clock."""
 
     def __init__(self, rate_hz: float) -> None:
         self._period = 1.0 / rate_hz
@@ -74,10 +71,7 @@ class ClockDrift:
         self._origin: float | None = None
 
     def learn(self, number: int, arrived_s: float) -> None:
-        """Take in one arrival.
-
-        `number`: sample number; `arrived_s`: when it was there by the host's clock, s.
-        """
+        """Take in a sample number and when it arrived by the host's clock, s."""
         if self._origin is None:
             self._origin = arrived_s - number * self._period
         t = number * self._period
@@ -132,10 +126,8 @@ class ClockDrift:
 class SampleStream:
     """Turns frames of samples into blocks and events. `heard` and `told` are called from the listener's thread.
 
-    `mask`: stream mask; `real`: whether the controller's time runs with the host's; else no drift is estimated;
-    `convert`: from counts, shape (n_samples, n_columns), to what blocks hold.
-
-    `frames`: what is read; `live`: whether what the controller tells is of this session; `ending`: whether it was asked
+    `real`: whether the controller's time runs with the host's, else no drift is estimated; `convert`: counts
+    (n_samples, n_columns) to what blocks hold; `live`: whether what is told is of this session; `ending`: it was asked
     to stop.
     """
 
@@ -196,10 +188,7 @@ class SampleStream:
             self.frames.begin()
 
     def finish(self, ticks: int | None) -> None:
-        """Give out what was held back: the controller has stopped.
-
-        `ticks`: since start, as its status says.
-        """
+        """Give out what was held back: the controller has stopped, after `ticks` since start by its status."""
         with self._lock:
             if self._running:
                 # A stop may break off the tick under way: it has a number, but never became a sample.
@@ -218,10 +207,7 @@ class SampleStream:
             self.frames.end(failure)
 
     def enter(self, state: State, *, unless_fault: bool = False) -> None:
-        """Note a state that a command brought about.
-
-        `unless_fault`: only `clear` leaves a fault.
-        """
+        """Note a state that a command brought about; only `clear` leaves a fault."""
         with self._lock:
             if unless_fault and self._state == "fault":
                 return
@@ -232,10 +218,7 @@ class SampleStream:
                 self._latched = False
 
     def heard(self, payloads: list[bytes], arrived_s: float) -> None:
-        """Take frames of samples.
-
-        `arrived_s`: by `time.perf_counter`, s.
-        """
+        """Take frames of samples that arrived at `arrived_s` by `time.perf_counter`, s."""
         with self._lock:
             if not self._running:
                 return  # of an earlier session
@@ -301,9 +284,9 @@ def _state_of(number: int) -> State | None:
 class LineDevice(ABC):
     """A device behind a port. See `ambid.acquisition.device.Device` for what its methods promise.
 
-    `rig`: with ``[daq]`` and calibrations from counts; `where`: the port's name, for whoever asks before it is open;
-    `si`: columns in SI instead of in counts; `real`: whether the controller's time runs with the host's; `answer_s`:
-    how long to wait for an answer before a command is sent again, s.
+    `rig`: with ``[daq]`` and calibrations from counts; `where`: the port's name; `si`: columns in SI, not counts;
+    `real`: the controller's time runs with the host's; `answer_s`: wait for an answer before a command is sent again,
+    s.
     """
 
     def __init__(
@@ -575,13 +558,10 @@ class LineDevice(ABC):
 
 
 class SerialDevice(LineDevice):
-    """The controller behind a serial port, or a pseudo-terminal that acts as one.
+    """The controller behind a serial port or a pseudo-terminal, its `rig` with ``[daq]`` and calibrations from counts.
 
-    Blocks hold counts. ``Block.time_s`` is sample number over rate, by the controller's clock; its drift against the
-    host's is in the counters.
-
-    `port`: such as ``/dev/ttyACM0`` or ``COM3``; `rig`: with ``[daq]`` and calibrations from counts; `answer_s`: how
-    long to wait for an answer before a command is sent again, s.
+    Blocks hold counts. ``Block.time_s`` is sample number over rate by the controller's clock, whose drift against the
+    host's is in the counters; a command is sent again after `answer_s`.
     """
 
     def __init__(self, port: str, rig: Rig, *, answer_s: float = 0.3) -> None:

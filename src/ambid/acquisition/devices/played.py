@@ -1,8 +1,5 @@
-"""Devices without a line: what a simulated bench and a replayed record share, and the replay.
-
-As fast as possible, a block is made whenever one is read. In real time, every call first makes the blocks that are due
-by now, and a command also the part of one, so that it acts between two samples as it would on a bench; what nobody
-reads waits, and without room is counted.
+"""Devices without a line, simulated or replayed. As fast as possible, a block is made when one is read. In real time
+every call makes what is due, a command also part of a block, so that it acts between two samples as on a bench.
 """
 
 from __future__ import annotations
@@ -43,9 +40,9 @@ ROOM = 4_000_000
 
 
 class FrameQueue:
-    """A queue of frames with an end, and perhaps a reason for it.
+    """A queue of frames with an end, and perhaps a reason for it; `room` samples wait at most.
 
-    `room`: samples that wait at most; `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
+    `overruns`: blocks dropped for want of room; `overrun_samples`: samples in them.
     """
 
     def __init__(self) -> None:
@@ -62,10 +59,7 @@ class FrameQueue:
             self._ended = False
 
     def put(self, frame: Frame) -> bool:
-        """Append a frame, or count it as lost.
-
-        Returns false if there was no room.
-        """
+        """Append a frame, or count it as lost and return False."""
         n = len(frame.block.values)
         with self._changed:
             if self._held + n > self.room:
@@ -78,20 +72,14 @@ class FrameQueue:
             return True
 
     def end(self, failure: DeviceError | None = None) -> None:
-        """Say that nothing more will come until the next beginning.
-
-        `failure`: why; raised to whoever reads, once all frames are read.
-        """
+        """Say that nothing more will come until the next beginning; `failure` is raised once all frames are read."""
         with self._changed:
             self._ended = True
             self._failure = self._failure or failure
             self._changed.notify_all()
 
     def take(self, timeout_s: float) -> Frame | None:
-        """Take the next frame.
-
-        `timeout_s`: how long to wait for it, s. Returns none if none came in time, or at the end.
-        """
+        """Return the next frame; None if none came within `timeout_s`, or at the end."""
         with self._changed:
             self._changed.wait_for(lambda: self._frames or self._ended, timeout_s)
             if self._frames:
@@ -126,9 +114,8 @@ def check_pace(pace: str) -> None:
 
 
 class PlayedDevice(ABC):
-    """A device without a line. See `ambid.acquisition.device.Device` for what its methods promise.
-
-    `rate_hz`: samples in one second; `block_samples`: samples of a block at most; default those of 10 ms.
+    """A device without a line. See `ambid.acquisition.device.Device` for what its methods promise. Blocks have
+    `block_samples` at most, by default those of 10 ms.
     """
 
     def __init__(self, rate_hz: float, pace: Pace, block_samples: int | None = None) -> None:
@@ -355,12 +342,8 @@ class PlayedDevice(ABC):
 
 
 class ReplayDevice(PlayedDevice):
-    """A record file as a device.
-
-    Each start out of idle plays it from its first row on; numbers count on. ``Block.time_s`` is what the record says,
-    counted from the first row.
-
-    `path`: ``.csv``, ``.csv.gz``, ``.h5``; `rig`: its columns are played first, then all others of the record.
+    """A record file as a device: the rig's columns first, then all others. Each start out of idle plays it from its
+    first row, numbers counting on; ``Block.time_s`` is the record's, from the first row.
     """
 
     def __init__(self, path: str | Path, rig: Rig, *, pace: Pace = "real") -> None:

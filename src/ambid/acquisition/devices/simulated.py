@@ -1,6 +1,5 @@
-"""A simulated bench that behaves like the controller: its modes, its law in whole numbers, its limits and trips.
-
-Nothing of the line is simulated: no frame is ever lost, and the host is never silent. For that, emulate.
+"""A simulated bench that behaves like the controller: its modes, its law in whole numbers, its limits and trips. Of the
+line nothing is simulated: no frame is lost, and the host is never silent. For that, emulate.
 """
 
 from __future__ import annotations
@@ -60,11 +59,9 @@ class _Plant:
 
 
 class SimulatedDevice(PlayedDevice):
-    """A bench in this process.
+    """A bench in this process: equal seeds and equal commands between equal samples give equal samples.
 
-    `bench`: the truth; default what daq.bench names, else the rig's own numbers; `seed`: of the noise; equal seeds and
-    equal commands between equal samples give equal samples; `block_samples`: samples of a block at most; default those
-    of 10 ms.
+    `bench`: the truth, by default daq.bench, else the rig's own numbers; `block_samples`: at most, by default of 10 ms.
     """
 
     def __init__(

@@ -1,7 +1,4 @@
-"""The table of the wire protocol: ``messages.toml``.
-
-Codec, C header and reference page are made from this table, the latter two by ``tools/protocol_header.py``.
-"""
+"""The table of the wire protocol, ``messages.toml``: codec, and by ``tools/protocol_header.py`` C header and page."""
 
 from __future__ import annotations
 
@@ -126,10 +123,7 @@ def table() -> Table:
 
 
 def read_table(text: str) -> Table:
-    """Read a protocol from its text; ``tools/protocol_header.py`` checks it when header and page are made.
-
-    `text`: as in ``messages.toml``.
-    """
+    """Read a protocol from text as in ``messages.toml``, which ``tools/protocol_header.py`` checks."""
     raw = tomllib.loads(text)
     return Table(
         version=raw["version"],

@@ -1,9 +1,5 @@
-"""Messages to bytes and back: code and fields, little endian, as the table says; and frames on a line of bytes.
-
-A frame is COBS( code | fields | CRC-16/XMODEM ) 0x00. COBS (consistent overhead byte stuffing; Cheshire and Baker 1999)
-takes the zeros out of it, so that 0x00 ends a frame and nothing else: after any damage the next 0x00 is the place to
-begin again. Frames here have fewer than 254 bytes, so each block of COBS ends in a zero, and the code is undone in
-place.
+"""Messages to bytes (code and fields, little endian) and frames: COBS( code | fields | CRC-16/XMODEM ) 0x00. COBS
+(Cheshire and Baker 1999) leaves 0x00 to end a frame, to begin again after damage; under 254 bytes: undone in place.
 """
 
 from __future__ import annotations
@@ -34,11 +30,7 @@ class Message:
 
 
 def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
-    """Make a message, checked against the table.
-
-    `name`: as in the table; `values`: elements of the last field, for a message that ends in an array; `**fields`:
-    every other field.
-    """
+    """Make a message of the table and check it; `values`: elements of a last field that is an array."""
     kind = _kind(name)
     wanted = [f.name for f in kind.fixed]
     for field_name in fields:
@@ -59,10 +51,7 @@ def message(name: str, *, values: Iterable[int] = (), **fields: int) -> Message:
 
 
 def pack(what: Message) -> bytes:
-    """Return code and fields of a message as bytes, without CRC.
-
-    `what`: made by `message`, or with fields as the table has them.
-    """
+    """Return code and fields of a message as bytes, without CRC."""
     kind = _kind(what.name)
     tail = kind.tail
     layout = _head(kind).format + (f"{len(what.values)}{tail.format}" if tail else "")
@@ -74,10 +63,7 @@ def pack(what: Message) -> bytes:
 
 
 def unpack(payload: bytes, to: str = "host") -> Message:
-    """Read a message from the code and fields of a sound frame.
-
-    `payload`: as `FrameDecoder.feed` returns them; `to`: who receives it.
-    """
+    """Read a message to a receiver from the code and fields of a sound frame, as `FrameDecoder.feed` gives them."""
     kind = _codes(to).get(payload[0]) if payload else None
     if kind is None:
         raise DeviceError(f"a frame to the {to} has no known code: {payload[:8].hex(' ') or 'it is empty'}. Drop it")
@@ -95,20 +81,14 @@ def unpack(payload: bytes, to: str = "host") -> Message:
 
 
 def fits(kind: MessageType, length: int) -> bool:
-    """Tell whether code and fields of a message may have this many bytes.
-
-    `kind`: the message; `length`: bytes of code and fields.
-    """
+    """Tell whether code and fields of a message may have this many bytes."""
     if kind.tail is None:
         return length == kind.length
     return length >= kind.length and (length - kind.length) % kind.tail.width == 0
 
 
 def refuse_other_version(version: int) -> None:
-    """Refuse a controller that speaks another version of the protocol.
-
-    `version`: what the controller says (field ``protocol`` of ``identity``).
-    """
+    """Refuse a controller whose ``identity`` has another version of the protocol."""
     ours = table().version
     if version != ours:
         older = "firmware of this ambid" if version < ours else "newer ambid, or the firmware of this one"
@@ -173,10 +153,7 @@ class FrameCounters:
 
 
 def frame(payload: bytes) -> bytes:
-    """Return the bytes on the line for code and fields, with CRC, COBS and the 0x00 at the end.
-
-    `payload`: code and fields.
-    """
+    """Return the bytes on the line for code and fields, with CRC, COBS and the 0x00 at the end."""
     if not 0 < len(payload) <= table().largest - CRC_BYTES:
         raise ValueError(f"{len(payload)} bytes of code and fields; a frame holds 1 to {table().largest - CRC_BYTES}")
     body = payload + crc_hqx(payload, 0).to_bytes(CRC_BYTES, "little")
@@ -189,11 +166,8 @@ def encode(what: Message) -> bytes:
 
 
 class FrameDecoder:
-    """Finds the sound frames in what a line delivers, in pieces of any size, and counts all the rest.
-
-    It never raises, whatever it is fed, and keeps at most one frame's bytes between calls.
-
-    `to`: which side's messages are known.
+    """Finds the sound frames, for the side `to`, in what a line delivers in pieces of any size, and counts all the
+    rest. Never raises, whatever it is fed, and keeps at most one frame's bytes between calls.
     """
 
     def __init__(self, to: str = "host") -> None:
@@ -211,10 +185,8 @@ class FrameDecoder:
         return len(self._tail)
 
     def feed(self, data: bytes | bytearray | memoryview) -> list[bytes]:
-        """Take the next bytes of the line.
-
-        `data`: any number of bytes. Returns code and fields of each sound frame that ended in them, in their order;
-        code known, length that of the message.
+        """Take the next bytes of the line; return code and fields of each sound frame that ended in them, in order,
+        code known and length that of the message.
         """
         runs = (self._tail + data).split(b"\0")
         tail = runs.pop()

@@ -1,7 +1,5 @@
-"""Many frames of samples to arrays at once, with the 16-bit numbers of their ticks unwrapped and every gap counted.
-
-A number that jumps is believed once the next sample goes on from it: a damaged frame whose CRC is right by chance
-(one in 65536) would else look like a gap, and the return from it like one of 65 thousand samples.
+"""Many frames of samples to arrays at once, 16-bit tick numbers unwrapped, every gap counted. A jump is believed once
+the next sample goes on from it: a damaged frame with a CRC right by chance (1 in 65536) would else look like a gap.
 """
 
 from __future__ import annotations
@@ -57,10 +55,7 @@ class SampleCounters:
 
 
 def columns_of(mask: int) -> tuple[StreamColumn, ...]:
-    """Return what a sample carries for a stream mask.
-
-    `mask`: field ``stream`` of ``configure``. Returns in the order of a sample's values.
-    """
+    """Return what a sample carries for a stream mask (``stream`` of ``configure``), in the order of its values."""
     stream = table().stream
     if mask < 0 or mask >> len(stream):
         raise DeviceError(f"stream mask {mask:#x} has unknown bits. Give bits 0 to {len(stream) - 1} only")
@@ -68,10 +63,7 @@ def columns_of(mask: int) -> tuple[StreamColumn, ...]:
 
 
 class SampleDecoder:
-    """Turns frames of samples into arrays.
-
-    `mask`: stream mask that was configured.
-    """
+    """Turns frames of samples, by the configured stream mask, into arrays."""
 
     def __init__(self, mask: int, *, rate_hz: float | None = None) -> None:
         self._columns = columns_of(mask)
@@ -96,9 +88,8 @@ class SampleDecoder:
         return None if self._last is None else self._last + 1
 
     def restart(self, first: int | None = 0) -> None:
-        """Expect a new stream; what was counted stays. A sample that is still held counts as misnumbered.
-
-        `first`: number of its first sample; None: any, of a stream joined on its way.
+        """Expect a new stream from number `first` on (None: any, joined on its way); counts stay, a held sample is
+        misnumbered.
         """
         self._last = None if first is None else first - 1
         self.counters.misnumbered += bool(self._held)
@@ -107,18 +98,13 @@ class SampleDecoder:
         self._zero_at = 0.0
 
     def decode(self, payloads: Iterable[bytes], arrived_s: float | None = None) -> Samples:
-        """Take the next frames of samples.
-
-        `payloads`: code and fields of sound frames of message ``sample``, in their order. Returns may be empty. A last
-        sample whose number jumped comes with the next call, or with `finish`.
+        """Take the next sound frames of samples, in order; the result may be empty. A last sample whose number jumped
+        comes with the next call, or with `finish`.
         """
         return self._take(payloads, arrived_s, final=False)
 
     def finish(self, ticks: int | None = None) -> Samples:
-        """Give out what was held back, at the end of a stream.
-
-        Returns one or none.
-        """
+        """Give out what was held back at the end of a stream: one sample or none."""
         rest = self._take((), self._held_s, final=True)
         if ticks is None or self._last is None:
             return rest
@@ -199,10 +185,9 @@ class SampleDecoder:
         return numbers, gaps
 
     def _wraps(self, at_least: int, arrived_s: float | None) -> int:
-        """Return how often 65536 ticks went by unseen, if the time says so.
-
-        A sample can arrive late by any time but never early; so time counts from the earliest start that all samples so
-        far allow, and a host that slept and finds its buffer full does not take the buffer for a gap.
+        """Return how often 65536 ticks went by unseen, if the time says so. A sample can be late but never early: time
+        counts from the earliest start that all so far allow, so that a host that slept does not take a full buffer for
+        a gap.
         """
         if arrived_s is None or not math.isfinite(self._zero_s + self._rate):
             return 0

@@ -1,12 +1,5 @@
-"""From a journal, sound or not, to a record: every frame that is whole comes back, everything else is counted.
-
-Nothing is believed without its check value. After damage the next sync word is looked for, so one bad byte costs one
-frame; numbers of frames and blocks tell how many are missing.
-
-A journal becomes a record in two passes, first to see what is there, then to write it, piece by piece. Time stays
-uniform: samples that are missing become rows of NaN, counted in the record's history, so that whoever reads the record
-says how to treat them. Rows whose numbers were there before are not written a second time; they are counted, and the
-journal is kept for their sake. The record is put in its place only when it was read back.
+"""From a journal, sound or not, to a record: each whole frame comes back, missing samples are rows of NaN, repeated
+rows left out; all is counted. After damage the next sync word is sought. The record is put in place once read back.
 """
 
 from __future__ import annotations
@@ -69,11 +62,8 @@ class Damage:
 
 
 class JournalReader:
-    """A journal to be read, from its beginning, as often as wanted.
-
-    `read`: takes a place and a number of bytes, and gives them; `size`: bytes of the file; `path`: for messages.
-
-    `damage`: of the last reading that came to its end.
+    """A journal read from its beginning as often as wanted: `read` gives bytes by place and number, `size` is the
+    file's. `damage` is of the last reading that came to its end.
     """
 
     def __init__(self, read: Callable[[int, int], bytes], size: int, path: Path) -> None:
@@ -115,10 +105,7 @@ class JournalReader:
             self._fd = -1
 
     def items(self) -> Iterator[Block | DeviceEvent]:
-        """Read from the beginning; `damage` is complete once the last item was taken.
-
-        Returns in the order in which they were written.
-        """
+        """Read in the order of writing; `damage` is complete once the last item was taken."""
         damage, number, block = Damage(), 0, 0
         end = PREAMBLE_SIZE  # of what is accounted for
         for at, head, data in self._frames(self._journal):
@@ -342,10 +329,7 @@ class Recorded(Result):
 
 
 def check_target(path: Path, header: JournalHeader, *, force: bool) -> None:
-    """Refuse a record that could not be written, before anything is recorded.
-
-    `path`: the record to be; `force`: whether it may exist.
-    """
+    """Refuse a record that could not be written (or exists, without `force`), before anything is recorded."""
     if not path.name.lower().endswith(FORMATS):
         raise DeviceError(f"{path}: a recording is written as {', '.join(FORMATS)}. Name it so")
     if path.is_dir():
@@ -368,11 +352,8 @@ def recorded_from(
     force: bool = False,
     extra: Mapping[str, object] = MappingProxyType({}),
 ) -> Recorded | None:
-    """Make the record of a journal, read it back, and put it in its place.
-
-    `path`: ``.h5``, ``.hdf5``, ``.csv`` or ``.csv.gz``; `force`: whether a file that is there may be replaced; `extra`:
-    what else its history is to say. Returns none if there is no sample
-    in the journal.
+    """Make a journal's record (.h5, .hdf5, .csv, .csv.gz), read it back, put it in place, over another with `force`;
+    None if there is no sample. `extra`: what else its history is to say.
     """
     content = survey(reader)
     if not content.samples:
@@ -398,11 +379,8 @@ def recorded_from(
 
 
 def recorded_already(reader: JournalReader, path: Path) -> Recorded | None:
-    """Hold a record that is there against a journal: the power may have gone after the one and before the other's
-    end.
-
-    `path`: of the record. Returns none unless the record reads back as every value, column and event that the journal
-    gives.
+    """Hold an existing record against a journal, which a power cut may have left: None unless it reads back as every
+    value, column and event that the journal gives.
     """
     content = survey(reader)
     if not content.samples or not path.is_file() or not path.name.lower().endswith(FORMATS):

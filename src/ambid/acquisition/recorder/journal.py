@@ -1,7 +1,5 @@
-"""A journal on the disk: framed blocks with a check value, header and events as JSON; a file that is only appended to.
-
-The file is made once, locked, appended to and brought to the disk. A program that dies loses nothing of what was
-written; a power cut loses what was not brought to the disk by `sync`.
+"""A journal on the disk: framed blocks with a check value, header and events as JSON; made once, locked, appended to. A
+program that dies loses nothing written; a power cut loses what `sync` did not bring to the disk.
 """
 
 from __future__ import annotations
@@ -57,10 +55,7 @@ class JournalHeader:
 
     @classmethod
     def of(cls, info: DeviceInfo, rig: str = "") -> Self:
-        """Describe a recording that begins now.
-
-        `info`: of the device that gives the samples; `rig`: text of the rig file.
-        """
+        """Describe a recording that begins now, of a device and the text of a rig file."""
         from importlib.metadata import version
 
         return cls(
@@ -78,18 +73,12 @@ class JournalHeader:
         return hashlib.sha256(self.rig.encode()).hexdigest() if self.rig else ""
 
     def as_json(self) -> dict[str, object]:
-        """Return it as a JSON object.
-
-        Returns what `from_json` takes.
-        """
+        """Return it as a JSON object for `from_json`."""
         return {"schema": SCHEMA, **fields_json(self), "rig_sha256": self.rig_sha256}
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Self:
-        """Read it back.
-
-        `document`: that `as_json` made.
-        """
+        """Read back what `as_json` made."""
         if document.get("schema") != SCHEMA:
             raise DeviceError(f"the journal's schema is {document.get('schema')!r}; this program reads {SCHEMA!r}."
                               " Recover it with the version that recorded it")  # fmt: skip
@@ -113,26 +102,17 @@ def _check_unit(column: Column) -> None:
 
 
 def json_bytes(value: object) -> bytes:
-    """Write a header or an event.
-
-    `value`: JSON-able. Returns UTF-8.
-    """
+    """Write a header or an event as UTF-8."""
     return json.dumps(value, ensure_ascii=False, separators=(",", ":")).encode()
 
 
 def journal_path(path: Path) -> Path:
-    """Return where the journal of a record lies.
-
-    `path`: the record to be. Returns beside it.
-    """
+    """Return where the journal of a record lies: beside it."""
     return path.with_name(path.name + SUFFIX)
 
 
 def record_path(journal: Path) -> Path:
-    """Return the record that a journal was to become.
-
-    Returns beside it.
-    """
+    """Return the record, beside it, that a journal was to become."""
     name = journal.name.removesuffix(SUFFIX)
     return journal.with_name(name if name != journal.name else name + ".h5")
 
@@ -191,27 +171,18 @@ def event_frame(event: DeviceEvent) -> tuple[Head, bytes]:
 
 
 def event_of(text: bytes) -> DeviceEvent:
-    """Read an event.
-
-    `text`: payload of `event_frame`.
-    """
+    """Read an event from the payload of `event_frame`."""
     return DeviceEvent(**json.loads(text))
 
 
 def preamble() -> bytes:
-    """Return the first bytes of a journal.
-
-    Returns `PREAMBLE_SIZE` of them.
-    """
+    """Return the first `PREAMBLE_SIZE` bytes of a journal."""
     text = _PREAMBLE.pack(_MAGIC, VERSION)
     return text + _CRC.pack(crc32(text))
 
 
 def version_of(data: bytes) -> int | None:
-    """Return the version that the first bytes of a file tell.
-
-    `data`: at least `PREAMBLE_SIZE`, or all there are. Returns none if they are not those of a journal, or damaged.
-    """
+    """Return the version in the first `PREAMBLE_SIZE` bytes; None if they are not those of a journal, or damaged."""
     if len(data) < PREAMBLE_SIZE or crc32(data[: _PREAMBLE.size]) != _CRC.unpack_from(data, _PREAMBLE.size)[0]:
         return None
     magic, version = _PREAMBLE.unpack_from(data)
@@ -219,10 +190,7 @@ def version_of(data: bytes) -> int | None:
 
 
 def frame_bytes(head: Head, payload: bytes) -> bytes:
-    """Put a frame together.
-
-    `head`: its ``length`` is that of the payload; `payload`: at most `LARGEST`. Returns ``head.size`` of them.
-    """
+    """Put a frame of ``head.size`` bytes together from its head and a payload of at most `LARGEST`."""
     packed = _HEAD.pack(
         SYNC, head.journal, head.frame, head.block, head.first, head.time_s, head.length,
         head.n_samples, head.n_columns, head.kind, head.dtype,
@@ -232,10 +200,7 @@ def frame_bytes(head: Head, payload: bytes) -> bytes:
 
 
 def head_of(data: bytes) -> Head | None:
-    """Read the head of a frame.
-
-    `data`: from the sync word on. Returns none if it is damaged, or does not agree with itself.
-    """
+    """Read the head of a frame from the sync word on; None if it is damaged, or does not agree with itself."""
     if len(data) < HEAD_SIZE or data[:8] != SYNC or crc32(data[:60]) != _CRC.unpack_from(data, _HEAD.size)[0]:
         return None
     _, journal, frame, block, first, time_s, length, n_samples, n_columns, kind, dtype = _HEAD.unpack_from(data)
@@ -253,11 +218,7 @@ def _agrees(head: Head) -> bool:
 
 
 def is_whole(data: bytes, head: Head) -> bool:
-    """Tell whether a frame's payload is what was written.
-
-    `data`: the frame, ``head.size`` bytes or fewer; `head`: that it begins with. Returns false if a byte of it is wrong
-    or missing.
-    """
+    """Tell whether a frame's payload is what was written: false if a byte of it is wrong or missing."""
     if len(data) < head.size:
         return False
     end = HEAD_SIZE + head.length
@@ -265,10 +226,8 @@ def is_whole(data: bytes, head: Head) -> bool:
 
 
 def packed_values(values: NDArray[np.float64]) -> tuple[int, bytes]:
-    """Write values in the narrowest type that gives every bit of them back.
-
-    `values`: (n_samples, n_columns), float64, anything, NaN and signed zeros included. Returns code of the type, and
-    the payload row by row.
+    """Return code and row-major bytes of values (n_samples, n_columns) in the narrowest type that gives every bit back,
+    NaN and signed zeros included.
     """
     plain = np.ascontiguousarray(values, dtype="<f8")
     bits = plain.tobytes()
@@ -289,11 +248,7 @@ def _candidates(first: float) -> list[str]:
 
 
 def unpacked_values(data: bytes, head: Head) -> NDArray[np.float64]:
-    """Return the values of a block's payload.
-
-    `data`: the payload, or a frame cut to it; `head`: of the frame. Returns (n_samples, n_columns), float64, bit for
-    bit what was packed.
-    """
+    """Return the values (n_samples, n_columns) of a block's payload, bit for bit what was packed."""
     flat = np.frombuffer(data, dtype=_DTYPES[head.dtype])
     return flat.reshape(head.n_samples, head.n_columns).astype(np.float64)
 
@@ -314,21 +269,13 @@ _WHY = {
 
 
 def disk_error(what: str, failure: OSError, remedy: str = "") -> DeviceError:
-    """Put what the system says of a file into words.
-
-    `what`: which file, and what was done with it; `remedy`: what else to do, a sentence.
-    """
+    """Put into words what the system says of a file, with what was done to it and a sentence of remedy."""
     why, first = _WHY.get(failure.errno or 0, (failure.strerror or str(failure), "Check folder and disk"))
     return DeviceError(f"{what}: {why}. {first}{'. ' + remedy if remedy else ''}")
 
 
 class JournalFile:
-    """A file that is only appended to, and that no second recorder writes.
-
-    `path`: must not exist.
-
-    `size`: bytes written so far.
-    """
+    """A new file that is only appended to (`size` bytes so far), and that no second recorder writes."""
 
     def __init__(self, path: Path) -> None:
         self.path, self.size = path, 0
@@ -356,9 +303,8 @@ class JournalFile:
         _DATA_SYNC(self._fd)
 
     def fault(self) -> str:
-        """Say what makes the file useless although it can still be written.
-
-        Returns empty if it lies where it was made, in a folder that will take the record too.
+        """Say what makes a writable file useless; empty if it lies where it was made, in a folder that takes the record
+        too.
         """
         if os.fstat(self._fd).st_nlink == 0:
             return REMOVED
@@ -377,10 +323,7 @@ class JournalFile:
             return False
 
     def read(self, at: int, n: int) -> bytes:
-        """Return the bytes from a place on, also where the file was removed.
-
-        `at`, `n`: first byte, and how many; fewer at the end.
-        """
+        """Return `n` bytes from a place on, fewer at the end, also where the file was removed."""
         return os.pread(self._fd, n, at)
 
     def remove(self) -> None:
@@ -408,10 +351,7 @@ if hasattr(os, "register_at_fork"):
 
 
 def lock(fd: int, path: Path) -> None:
-    """Lock a journal against every other recorder and recovery, until the file is closed.
-
-    `fd`: closed if it cannot be locked; `path`: for the message.
-    """
+    """Lock a journal against every other recorder and recovery; `fd` is closed if that fails."""
     try:
         import fcntl
     except ImportError:  # not a POSIX system: that it is made only once has to do
@@ -428,10 +368,7 @@ def lock(fd: int, path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Bring the name of a file to the disk, as far as the system can.
-
-    `path`: of the file.
-    """
+    """Bring the name of a file to the disk, as far as the system can."""
     if os.name != "posix":
         return
     with contextlib.suppress(OSError):  # not every file system has it
@@ -443,10 +380,7 @@ def sync_folder(path: Path) -> None:
 
 
 def free_bytes(folder: Path) -> int:
-    """Return how much more a folder takes.
-
-    Returns bytes.
-    """
+    """Return how many more bytes a folder takes."""
     import shutil
 
     return shutil.disk_usage(folder).free

@@ -1,8 +1,6 @@
-"""The recorder: blocks go to an append-only journal beside the wanted file, and at the end become a record.
-
-The caller never waits: `Recorder.append` puts a block into a bounded queue, and a thread of the recorder's own writes
-and brings it to the disk. A block is acknowledged once it is there; from then on neither a kill nor a power cut takes
-it away. What finds no room in the queue is counted, told at once, and marked in the journal.
+"""The recorder: blocks go through a bounded queue to a journal beside the wanted file, at the end a record; nobody
+waits. A block is acknowledged once on the disk, safe from kill and power cut; one without room is counted, told and
+marked.
 """
 
 from __future__ import annotations
@@ -357,13 +355,9 @@ class JournalWriter:
 class Recorder:
     """A recording: a context that makes the journal, and at its end the record. One thread may append.
 
-    `header`: what is recorded; `write_s`: how often it is written, s: a kill costs no more; `queue_s`: how long the
-    disk may stall before blocks find no room, s; `force`: whether a record that exists may be written over;
-    `on_trouble`: takes a `DeviceError` as soon as something is wrong, in whichever thread sees it; `open_file`: makes
-    the file from its path.
-
-    `path`, `journal`: the record to be, and its journal; `result`: what became of
-    it, once closed; None before, and where nothing was recorded.
+    It writes every `write_s` s, all that a kill costs; the disk may stall for `queue_s` s before blocks find no room.
+    `on_trouble` gets a `DeviceError` at once, in the thread that sees it; `result` is None until closed, or if nothing
+    came.
     """
 
     def __init__(
@@ -423,9 +417,8 @@ class Recorder:
         return self._writer.failed
 
     def append(self, block: Block) -> bool:
-        """Take a block, without waiting for the disk.
-
-        Returns false if it will not be stored: there was no room, or the disk has failed. It is then counted.
+        """Take a block without waiting for the disk; return False, and count it, if there is no room or the disk has
+        failed.
         """
         values = self._checked(block)
         n = len(values)
@@ -457,19 +450,15 @@ class Recorder:
         self._queue.put(event_frame(event))
 
     def flush(self, timeout_s: float = 60.0) -> bool:
-        """Wait until everything that was taken is on the disk.
-
-        `timeout_s`: longest wait. Returns whether it is.
-        """
+        """Wait at most `timeout_s` until everything taken is on the disk; return whether it is."""
         return self._writer.flush(self._queue.blocks, timeout_s)
 
     def close(self) -> Recorded | None:
-        """End the recording: journal to record, read back, and only then the journal removed.
+        """End the recording: journal to record, read back, and only then the journal removed; None, and no file, if
+        nothing came.
 
-        Whatever goes wrong, Ctrl-C included, leaves the journal, from which ``ambid recover`` makes the record. So does
-        a disk that had failed, from which reading back proves little, and a journal that holds more than the record.
-
-        Returns none if nothing was recorded; there is then neither record nor journal.
+        Whatever goes wrong, Ctrl-C included, leaves the journal for ``ambid recover``. So do a disk that had failed,
+        from which reading back proves little, and a journal that holds more than the record.
         """
         if self._closed or not self._writer.started:
             return self.result
