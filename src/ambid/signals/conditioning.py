@@ -64,20 +64,15 @@ def scale(record: Record, name: str, gain: float, *, offset: float = 0.0, unit: 
     Parameters
     ----------
     record : Record
-        The record to condition.
-    name : str
-        Channel.
-    gain : float
-        Factor, in new unit per old unit; not zero.
-    offset : float
-        Added after the factor, in the new unit.
+    name : str, a channel
+    gain : float, not zero, in new unit per old unit
+    offset : float, in the new unit
     unit : str, optional
         SI unit of the result; unchanged by default.
 
     Returns
     -------
-    Record
-        A new record with the step in its history.
+    Record, a new one with the step in its history
 
     Raises
     ------
@@ -105,17 +100,14 @@ def replace_samples(record: Record, name: str, indices: Sequence[int] | NDArray[
     Parameters
     ----------
     record : Record
-        The record to condition.
-    name : str
-        Channel.
+    name : str, a channel
     indices : sequence of int
-        Samples to replace, 0 to n_samples - 1, e.g. ``find_outliers(record, name).indices``. None of them leaves the
-        record as it is.
+        Samples to replace, e.g. ``find_outliers(record, name).indices``; none leaves the record as it is.
 
     Returns
     -------
-    Record
-        A new record; its history names the channel, the number of samples and the first one.
+    Record, a new one
+        Its history names the channel, the number of samples and the first one.
 
     Raises
     ------
@@ -160,14 +152,13 @@ def remove_offset(record: Record, names: str | Sequence[str] | None = None) -> R
     Parameters
     ----------
     record : Record
-        The record to condition.
     names : str or sequence of str, optional
         Channels; all of them by default.
 
     Returns
     -------
-    Record
-        A new record; its history holds the removed means, in each channel's unit.
+    Record, a new one
+        Its history holds the removed means, in each channel's unit.
 
     Raises
     ------
@@ -185,16 +176,14 @@ def remove_trend(record: Record, names: str | Sequence[str] | None = None, *, de
     Parameters
     ----------
     record : Record
-        The record to condition.
     names : str or sequence of str, optional
         Channels; all of them by default.
     degree : int
-        Degree of the least-squares polynomial; 1: a straight line, with the offset.
+        Of the least-squares polynomial; 1: a straight line, with the offset.
 
     Returns
     -------
-    Record
-        A new record with the step in its history.
+    Record, a new one with the step in its history
 
     Raises
     ------
@@ -212,11 +201,7 @@ def remove_trend(record: Record, names: str | Sequence[str] | None = None, *, de
 
 
 def polynomial_trend(x: Array, degree: int) -> Array:
-    """Return the least-squares polynomial through equally spaced samples.
-
-    `x`: (n_samples,), any unit, samples; `degree`: degree of the polynomial. Returns (n_samples,), unit of `x`, the
-    polynomial at the sampling instants.
-    """
+    """Return the least-squares polynomial through equally spaced samples (n_samples,), at their instants."""
     # Legendre polynomials on [-1, 1]: nearly orthogonal, so that the problem stays well conditioned at any length.
     basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, x.size), degree)
     coefficients = np.linalg.lstsq(basis, x, rcond=None)[0]
@@ -227,26 +212,23 @@ def polynomial_trend(x: Array, degree: int) -> Array:
 def lowpass(record: Record, cutoff_hz: float, names: str | Sequence[str] | None = None, *, order: int = 4) -> Record:
     """Low-pass channels forwards and backwards, so that nothing is delayed.
 
-    The same filter goes over all channels unless some are named. Filtering the input and the output of an
-    identification differently puts the ratio of the filters into the identified plant; filtering both alike leaves the
-    plant as it is and only weights the frequencies (Ljung 1999, sec. 14.4). A zero-phase filter looks ahead: it is for
-    records, not for control, and an estimator that models its noise (grey-box, ARMAX) is better fed the raw record.
+    Filtering input and output of an identification differently puts the ratio of the filters into the plant; alike, it
+    only weights the frequencies (Ljung 1999, sec. 14.4). A zero-phase filter looks ahead: it is for records, not for
+    control, and an estimator that models its noise (grey-box, ARMAX) is better fed the raw record.
 
     Parameters
     ----------
     record : Record
-        The record to condition.
     cutoff_hz : float
         Frequency in Hz where the two passes together give -6 dB.
     names : str or sequence of str, optional
         Channels; all of them by default.
     order : int
-        Order of the Butterworth filter of one pass, 1 to 12.
+        Of the Butterworth filter of one pass, 1 to 12.
 
     Returns
     -------
-    Record
-        A new record with the step in its history.
+    Record, a new one with the step in its history
 
     Raises
     ------
@@ -259,11 +241,8 @@ def lowpass(record: Record, cutoff_hz: float, names: str | Sequence[str] | None 
 
 
 def zero_phase(x: Array, rate_hz: float, corner_hz: float, *, order: int) -> Array:
-    """Filter forwards and backwards with a Butterworth low-pass in second-order sections.
-
-    `x`: (n_samples,), any unit, samples; `rate_hz`: sampling rate in Hz; `corner_hz`: frequency in Hz where the two
-    passes together give -6 dB; `order`: order of one pass, 1 to 12. Returns (n_samples,), unit of `x`, filtered
-    samples, not delayed.
+    """Filter samples (n_samples,) forwards and backwards with a Butterworth low-pass in second-order sections, of
+    `order` 1 to 12 in one pass; both together give -6 dB at the corner and no delay.
     """
     from scipy.signal import butter, sosfiltfilt
 
@@ -296,14 +275,12 @@ def resample(record: Record, rate_hz: float) -> Record:
     Parameters
     ----------
     record : Record
-        The record to condition.
     rate_hz : float
         New rate in Hz; its ratio to the present one must be a fraction with terms up to 1000.
 
     Returns
     -------
-    Record
-        A new record with the step in its history.
+    Record, a new one with the step in its history
 
     Raises
     ------
@@ -330,10 +307,8 @@ def resample(record: Record, rate_hz: float) -> Record:
 
 
 def resampled(x: Array, ratio: Fraction) -> Array:
-    """Change the rate of samples by a rational factor with a polyphase anti-alias filter.
-
-    `x`: (n_samples,), any unit, samples; `ratio`: new rate over old rate. Returns (ceil(n_samples * ratio), ), unit of
-    `x`, samples at the new rate, the first one at the same instant.
+    """Return samples (ceil(n_samples * ratio),) at a new rate, `ratio` times the old one, by a polyphase anti-alias
+    filter; the first is at the same instant.
     """
     from scipy.signal import resample_poly
 

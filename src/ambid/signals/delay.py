@@ -1,7 +1,5 @@
-"""Pure delay between an input and an output, from the first significant lag of a high-order ARX model.
-
-Solved by one QR factorisation. A high-order ARX model needs no noise model and stays consistent under feedback as long
-as the loop holds a delay (Ljung 1999, sec. 13.4), where correlation of input and output does not.
+"""Pure delay between input and output: the first significant lag of a high-order ARX model by one QR factorisation. It
+needs no noise model and is consistent under feedback whose loop holds a delay (Ljung 1999, sec. 13.4).
 """
 
 from __future__ import annotations
@@ -21,11 +19,8 @@ _PANEL = 32  # columns that LAPACK eliminates together
 
 
 def lagged_triangle(columns: Sequence[tuple[Array, int]], first: int) -> Array:
-    """Return R of the QR factorisation of [x(t - lag) of every column] for t >= first.
-
-    `columns`: (n_samples,), and int), signal x and its lag; a constant is a signal of ones without lag; `first`: first
-    row, at least the largest lag. Returns (n_columns, n_columns), rows of zeros at the end where there are fewer rows
-    than columns.
+    """Return R (n_columns, n_columns) of the QR factorisation of [x(t - lag) of every column] for t >= first, at least
+    the largest lag; zero rows at the end where rows are fewer. A column is a signal (n_samples,) and its lag.
     """
     n, width = columns[0][0].size, len(columns)
     R = np.zeros((width, width), order="F")
@@ -58,10 +53,7 @@ class Regression:
 
 
 def fit_arx(y: Array, inputs: Sequence[Array], na: int, lags: Sequence[int]) -> Regression:
-    """Fit y(t) = -a·y(t-1…t-na) + b·u(t-lags) + constant by QR.
-
-    Columns: `na` of the output, then len(lags) of each input, then the constant. Coefficients hold +y weights (-a).
-    """
+    """Fit y(t) = -a·y(t-1…t-na) + b·u(t-lags) + constant by QR; columns in this order, coefficients of +y (-a)."""
     reach = max([na, *lags])
     n_columns, n_rows = na + len(lags) * len(inputs) + 1, y.size - reach
     if n_rows <= 2 * n_columns:
@@ -113,9 +105,9 @@ class Delay:
 def find_delay(u: Array, y: Array, *, max_delay: int = 10, order: int = 20, feedthrough: bool = False) -> Delay:
     """Find the pure delay of `y` behind `u` in whole samples.
 
-    Fits y(t) = Σ a_k y(t-k) + Σ b_k u(t-k) + constant and takes the first lag whose b_k is both significant (4
-    standard deviations) and at least a fifth of the largest. A sampled plant that the input drives through a hold
-    answers one sample later by itself, so a delay of d samples shows first at lag d + 1.
+    Fits y(t) = Σ a_k y(t-k) + Σ b_k u(t-k) + constant and takes the first lag whose b_k is both significant (4 standard
+    deviations) and at least a fifth of the largest. A sampled plant that the input drives through a hold answers one
+    sample later by itself, so a delay of d samples shows first at lag d + 1.
 
     Limits: the output has to answer within a few samples of the delay, as the coil current answers the voltage; a
     position behind a mass answers with the second or third power of time and shows no clear first lag. A fraction of a
@@ -124,28 +116,24 @@ def find_delay(u: Array, y: Array, *, max_delay: int = 10, order: int = 20, feed
 
     Parameters
     ----------
-    u : ndarray, shape (n_samples,)
-        Input, e.g. voltage in V.
-    y : ndarray, shape (n_samples,)
-        Output, e.g. current in A.
+    u, y : ndarray, shape (n_samples,)
+        Input and output, e.g. voltage in V and current in A.
     max_delay : int
         Largest candidate in samples.
     order : int
         Lags of the output, and lags of the input beyond `max_delay`.
     feedthrough : bool
-        The output may answer in the same sample (an input that is measured rather than held): lag 0 then is a delay of
-        0.
+        The output may answer in the same sample (an input measured rather than held): lag 0 then is a delay of 0.
 
     Returns
     -------
     Delay
-        The delay with the statistic of each lag.
+        With the statistic of each lag.
 
     Raises
     ------
     EstimationError
-        If lengths differ, a signal is constant or not finite, the settings are out of range, or the record is too
-        short.
+        If lengths differ, a signal is constant or not finite, a setting is out of range, or the record is too short.
     """
     u, y = np.asarray(u, dtype=np.float64), np.asarray(y, dtype=np.float64)
     if u.ndim != 1 or u.shape != y.shape:
@@ -224,14 +212,13 @@ class PersistentExcitation:
 def persistent_excitation(u: Array, order: int, *, tolerance: float = 1e-9) -> PersistentExcitation:
     """Measure the order of persistent excitation of a signal.
 
-    A signal is persistently exciting of order n if the Hankel matrix of its samples with n columns has full column rank
-    (Ljung 1999, def. 13.2). The mean is removed, because an identification that estimates an offset has no use of it:
-    a sum of k sines has order 2k.
+    It is of order n if the Hankel matrix of its samples with n columns has full column rank (Ljung 1999, def. 13.2).
+    The mean is removed, because an identification that estimates an offset has no use of it: a sum of k sines has order
+    2k.
 
     Parameters
     ----------
     u : ndarray, shape (n_samples,), any unit
-        Signal.
     order : int
         Largest order to look at, at least 1; the record needs twice as many samples.
     tolerance : float

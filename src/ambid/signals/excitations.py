@@ -19,10 +19,8 @@ AmplitudeIs = Literal["peak", "rms"]
 
 
 def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
-    """Scale samples so that their largest absolute value, or their rms, is `amplitude`.
-
-    `x`: (n_samples,), samples, not all zero; `amplitude`: wanted peak or rms, in the unit of the result; over 0;
-    `amplitude_is`: what `amplitude` means. Returns (n_samples,), unit of `amplitude`, scaled samples.
+    """Return samples (n_samples,), not all zero, scaled so that their largest absolute value, or their rms, is
+    `amplitude`.
     """
     if not (np.isfinite(amplitude) and amplitude > 0):
         raise AmbidError(f"excitation amplitude {amplitude}; it must be a positive number. Give another")
@@ -33,10 +31,7 @@ def scaled(x: Array, amplitude: float, amplitude_is: AmplitudeIs) -> Array:
 
 
 def checked(n_samples: int, rate_hz: float) -> None:
-    """Refuse a length under two samples or a rate that is not positive.
-
-    `n_samples`: samples; `rate_hz`: sampling rate in Hz.
-    """
+    """Refuse a length under two samples or a rate that is not positive."""
     if n_samples < 2 or not (np.isfinite(rate_hz) and rate_hz > 0):
         raise AmbidError(
             f"excitation of {n_samples} samples at {rate_hz} Hz; it needs at least 2 samples and a positive rate. "
@@ -45,10 +40,7 @@ def checked(n_samples: int, rate_hz: float) -> None:
 
 
 def checked_band(band: tuple[float, float], rate_hz: float) -> tuple[float, float]:
-    """Return a band (low, high) in Hz after checking 0 <= low < high <= rate/2.
-
-    `band`: ends in Hz; `rate_hz`: sampling rate in Hz. Returns the same band in Hz.
-    """
+    """Return a band (low, high) in Hz after checking 0 <= low < high <= rate/2."""
     low, high = float(band[0]), float(band[1])
     if not 0.0 <= low < high <= rate_hz / 2:
         raise AmbidError(
@@ -121,11 +113,9 @@ def prbs(
     seed: int | np.random.Generator = 0,
     amplitude_is: AmplitudeIs = "peak",
 ) -> Array:
-    """Return a maximum-length pseudo-random binary sequence of ±amplitude.
-
-    A shift register of `bits` bits gives a period of 2^bits - 1 clock ticks; its mean is amplitude/(2^bits - 1) and
-    its periodic autocorrelation has two values only (Ljung 1999, sec. 13.3). The spectrum falls to half at 0.44/tick
-    and to nothing at 1/tick.
+    """Return a maximum-length pseudo-random binary sequence of ±amplitude: `bits` bits give a period of 2^bits - 1
+    ticks, mean amplitude/(2^bits - 1) and a two-valued periodic autocorrelation (Ljung 1999, sec. 13.3). The spectrum
+    falls to half at 0.44/tick and to nothing at 1/tick.
     """
     from scipy.signal import max_len_seq
 
@@ -189,38 +179,33 @@ def multisine(
     It has a line at each multiple of rate/(n_samples/periods) in the band (0 and half the rate left out). Schroeder
     phases φ_k = -2π Σ_{j<k} (k - j) p_j, with p_j the share of line j in the power, give a crest factor of about 1.7
     for a flat spectrum of many lines (Schroeder 1970). `crest_iterations` lowers it by clipping the peaks and putting
-    the amplitudes back, from the given phases (van der Ouderaa, Schoukens and Renneboog 1988); the best iteration is
-    kept.
+    the amplitudes back (van der Ouderaa, Schoukens and Renneboog 1988); the best iteration is kept.
 
     Parameters
     ----------
     n_samples : int
-        Samples, a multiple of `periods`.
+        A multiple of `periods`.
     rate_hz : float
         Sampling rate in Hz.
     amplitude : float
         Largest absolute value, or rms, in the unit of the result.
-    band : (float, float)
-        Band in Hz.
+    band : (float, float), Hz
     periods : int
         Whole periods in the signal, at least 1.
     phases : {"random", "schroeder"}
-        Phases of the lines.
     shape : {"flat", "pink"}
         Amplitude of the lines: all equal, or falling with 1/√f (equal power per octave).
     lines : {"all", "odd"}
         All multiples, or the odd ones only, whose even neighbours then show nonlinearity.
     crest_iterations : int
-        Iterations that lower the crest factor; some 100 go far.
+        Some 100 go far.
     seed : int or numpy.random.Generator
         Source of random phases.
     amplitude_is : {"peak", "rms"}
-        What `amplitude` means.
 
     Returns
     -------
     ndarray, shape (n_samples,), unit of `amplitude`
-        The multisine.
 
     Raises
     ------
@@ -263,7 +248,7 @@ def crest_factor(x: Array) -> float:
     Parameters
     ----------
     x : ndarray, shape (n_samples,), any unit
-        Samples, not all zero.
+        Not all zero.
 
     Returns
     -------
@@ -359,28 +344,27 @@ def excitation_of_axes(
 ) -> Array:
     """Make an excitation of several axes at once.
 
-    ``zippered``: the lines of a multisine are dealt out, line k to axis k mod n, so that each line excites one axis and
-    one experiment shows the whole response matrix, at every n-th line. ``orthogonal``: every axis has all lines, in n
-    experiments one after the other; from one to the next the phases turn by 2 pi b j/n on axis j, so that those of all
-    experiments, a discrete Fourier matrix at each line, are orthogonal over the axes (Dobrowiecki and Schoukens 2007).
-    Every other name: an excitation of its own on each axis.
+    ``zippered``: line k of a multisine goes to axis k mod n, so that each line excites one axis and one experiment
+    shows the whole response matrix, at every n-th line. ``orthogonal``: every axis has all lines, in n experiments one
+    after the other; from one to the next the phases turn by 2 pi b j/n on axis j, so that those of all experiments, a
+    discrete Fourier matrix at each line, are orthogonal over the axes (Dobrowiecki and Schoukens 2007). Every other
+    name: an excitation of its own on each axis.
 
     Parameters
     ----------
     name : str
         One of `AXES_EXCITATIONS`, or of `EXCITATIONS` with random numbers in it.
     n_samples : int
-        Samples; a multiple of `periods`, for ``orthogonal`` of `periods` times the excited axes.
+        A multiple of `periods`, for ``orthogonal`` of `periods` times the excited axes.
     rate_hz : float
         Sampling rate in Hz.
     axes : int
-        Axes there are.
     excited : sequence of int, optional
-        Those that are excited, counted from 0; default all.
+        Axes that are excited, counted from 0; default all.
     amplitude : float
         Peak of each excited axis (rms for ``gaussian``), in the unit of the result.
-    band : (float, float), optional
-        Band in Hz; default: from one line on to a fifth of the rate.
+    band : (float, float), Hz, optional
+        Default: from one line on to a fifth of the rate.
     periods : int
         Whole periods; of ``orthogonal`` in each experiment.
     seed : int
@@ -474,25 +458,22 @@ def excitation(
     name : str
         ``steps``, ``chirp``, ``prbs``, ``gaussian``, ``multisine`` or ``schroeder``.
     n_samples : int
-        Samples.
     rate_hz : float
         Sampling rate in Hz.
     amplitude : float
         Peak (rms for ``gaussian``) in the unit of the result, unless the option ``amplitude_is`` says otherwise.
-    band : (float, float), optional
-        Band in Hz. Default: one period over the record to a fifth of the rate for chirp and multisines, all for prbs
-        and gaussian. Steps have none: their option is ``hold_s``, an eighth of the duration by default.
+    band : (float, float), Hz, optional
+        Default: one period over the record to a fifth of the rate for chirp and multisines, all for prbs and gaussian.
+        Steps have none: their option is ``hold_s``, an eighth of the duration by default.
     seed : int or numpy.random.Generator
-        Source of randomness; the same seed gives the same samples. Steps and chirp have none.
+        The same seed gives the same samples. Steps and chirp have none.
     **options : object
-        Further settings of that excitation. All: ``amplitude_is`` ("peak" or "rms"). Steps: ``hold_s``, ``levels``.
-        Chirp: ``sweep`` ("linear" or "log"). Prbs: ``bits`` of the register, 2 to 31, and ``hold``, samples of a tick.
-        Multisines: those of `multisine`.
+        All: ``amplitude_is`` ("peak" or "rms"). Steps: ``hold_s``, ``levels``. Chirp: ``sweep`` ("linear" or "log").
+        Prbs: ``bits`` of the register, 2 to 31, and ``hold``, samples of a tick. Multisines: those of `multisine`.
 
     Returns
     -------
     ndarray, shape (n_samples,), unit of `amplitude`
-        The excitation.
 
     Raises
     ------

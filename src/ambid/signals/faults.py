@@ -68,17 +68,15 @@ def find_dropouts(record: Record, name: str, *, saturation: Saturation | None = 
     Parameters
     ----------
     record : Record
-        The record to look at.
-    name : str
-        Channel.
+    name : str, a channel
     saturation : Saturation, optional
         What `find_saturation` found in this channel, where that is known already: it sorts the whole channel.
 
     Returns
     -------
     Dropouts
-        The stretches, without those at a limit that `find_saturation` reports; all samples in one for a channel that
-        never changes. In a channel that moves without any noise (a simulated one) equal samples are taken as rest.
+        Without those at a limit that `find_saturation` reports; all samples in one for a channel that never changes. In
+        a channel that moves without any noise (a simulated one) equal samples are taken as rest.
 
     Raises
     ------
@@ -98,13 +96,11 @@ def find_dropouts(record: Record, name: str, *, saturation: Saturation | None = 
 
 
 def longest_chance_run(x: Array) -> int:
-    """Return the longest run of equal samples that chance explains.
+    """Return the longest run of equal samples that chance explains, at least 3 and at most n_samples - 1, so that a
+    channel that never changes is one run too long.
 
-    With p the probability that a sample repeats the one before it, a run of r samples begins at a given place with
-    probability p^(r-1); over n places it stays under 1e-4 for r > 1 + log(1e-4/n)/log(p).
-
-    `x`: (n_samples,), any unit, samples. Returns samples, at least 3;
-    n_samples - 1 at most, so that a channel that never changes is always one run too long.
+    With p the probability that a sample repeats the one before it, a run of r begins at a given place with probability
+    p^(r-1); over n places it stays under 1e-4 for r > 1 + log(1e-4/n)/log(p).
     """
     p = 1.0 - equal_runs(x)[0].size / x.size
     if p == 0.0 or x.size < 5:
@@ -186,9 +182,7 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0) -> Outli
     Parameters
     ----------
     record : Record
-        The record to look at.
-    name : str
-        Channel.
+    name : str, a channel
     threshold : float
         Prediction error that makes an outlier, in local robust standard deviations of the innovations (Hampel
         identifier: median absolute value times 1.4826). At 6, Gaussian noise gives less than one in 1e8 samples.
@@ -196,7 +190,7 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0) -> Outli
     Returns
     -------
     Outliers
-        Their indices, in order. The first and last few samples, which have no past or future, are not judged.
+        In order. The first and last few samples, which have no past or future, are not judged.
 
     Raises
     ------
@@ -217,10 +211,8 @@ def find_outliers(record: Record, name: str, *, threshold: float = 6.0) -> Outli
 
 
 def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
-    """Return the prediction error of each outlier in robust standard deviations, 0 for samples that are none.
-
-    `x`: (n_samples,), any unit, samples, finite; `threshold`: error that makes an outlier, in local robust standard
-    deviations. Returns (n_samples,), dimensionless, sizes; 0 where there is no outlier.
+    """Return for samples (n_samples,) the prediction error of each outlier in local robust standard deviations, 0 for
+    samples that are none.
     """
     spread = float(np.std(x))
     if spread == 0.0:
@@ -247,9 +239,8 @@ def outlier_sizes(x: Array, threshold: float = 6.0) -> Array:
 
 
 def _predictors(clean: Array) -> tuple[Array, Array]:
-    """Weights of the samples before and of those after, nearest first, then the constant, that predict a sample best.
-
-    Both come from the same windows of neighbouring samples, and so from one triangle.
+    """Weights of samples before and after, nearest first, then the constant, that predict a sample best; both from the
+    triangle of the same windows.
     """
     size, one = float(np.linalg.norm(clean)) or 1.0, 1.0 / np.sqrt(clean.size - _ORDER)
     scaled = clean / size
@@ -354,18 +345,16 @@ class Saturation:
 def find_saturation(record: Record, name: str) -> Saturation:
     """Find samples held at a limit of the channel's range.
 
-    An extreme value is a limit where it holds at least 5 samples and over 3 times as many as any of
-    the 10 levels next to it. A quantised sine holds at most 2.4 times as many (its peaks dwell); steps and PRBS hold
-    all their levels. Not reported, because the samples alone do not tell it from design or rest: an input of two
-    levels, and an extreme value held only from the very start of the record (see `find_dropouts`). A sensor whose curve
-    flattens without an exact limit is not found either.
+    An extreme value is a limit where it holds at least 5 samples and over 3 times as many as any of the 10 levels next
+    to it. A quantised sine holds at most 2.4 times as many (its peaks dwell); steps and PRBS hold all their levels. Not
+    reported, because the samples alone do not tell it from design or rest: an input of two levels, and an extreme value
+    held only from the start of the record (see `find_dropouts`); nor a sensor whose curve flattens without an exact
+    limit.
 
     Parameters
     ----------
     record : Record
-        The record to look at.
-    name : str
-        Channel.
+    name : str, a channel
 
     Returns
     -------
@@ -465,9 +454,7 @@ def resolution(record: Record, name: str) -> Resolution:
     Parameters
     ----------
     record : Record
-        The record to look at.
-    name : str
-        Channel.
+    name : str, a channel
 
     Returns
     -------
@@ -495,12 +482,9 @@ def resolution(record: Record, name: str) -> Resolution:
 
 
 def level_spacing(x: Array) -> float:
-    """Return the typical smallest spacing between neighbouring levels.
-
-    The median of the spacings up to 1.5 times their 10 % quantile, which neither a few odd pairs of levels
-    (calibration, clipping) nor missing levels move.
-
-    `x`: (n_samples,), any unit, samples. Returns spacing in the unit of `x`; 0 if all samples are equal.
+    """Return the typical smallest spacing between neighbouring levels, 0 if all samples are equal: the median of the
+    spacings up to 1.5 times their 10 % quantile, which neither odd pairs of levels (calibration, clipping) nor missing
+    ones move.
     """
     spacings = _spacings(x)
     if not spacings.size:

@@ -1,13 +1,5 @@
-"""Frequency responses from records: the choice of the method, and the methods for arbitrary excitation.
-
-Local polynomials: in a window of lines around each line, Z = G(q) X + T(q) + V with polynomials G and T of the distance
-q, where T is the leakage: a smooth spectrum too (Pintelon and Schoukens 2012, sec. 7.2; Schoukens et al. 2009). Least
-squares by QR; what it leaves gives the noise and the covariance of G. X are the inputs, or with feedback the
-references.
-
-Averaged spectra: G = S_yu S_uu⁻¹ (H1: noise at the output), S_yy S_uy⁻¹ (H2: at the input), total least squares (Hv: at
-both), or S_yr S_ur⁻¹ with a reference, which feedback does not bias. Leakage of short segments is not in the variance:
-it is looked for by halving them.
+"""Frequency responses from records: the choice of the method, and those for arbitrary excitation: local polynomials of
+response and leakage (Pintelon and Schoukens 2012, sec. 7.2; Schoukens et al. 2009) and averaged spectra.
 """
 
 from __future__ import annotations
@@ -89,10 +81,9 @@ def frf_local(
     outputs: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> FrequencyResponse:
-    """Estimate the frequency response by local polynomials of response and leakage in sliding windows.
-
-    The resolution is that of the record, rate/n_samples; a resonance should be wider than the window. Errors of
-    neighbouring lines are correlated over the window (`lines_per_independent`).
+    """Estimate the frequency response by local polynomials: around each line Z = G(q) X + T(q) + V with polynomials G
+    and leakage T of the distance q; X: inputs or, with feedback, references. A resonance should be wider than a window;
+    errors of neighbours are correlated over it (`lines_per_independent`); the resolution is rate/n_samples.
     """
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     n, n_y, n_u = u.shape[0], y.shape[1], u.shape[1]
@@ -206,10 +197,8 @@ def _fitted(X: Complex, Z: Complex, wanted: np.ndarray, plan: _Plan) -> _Fitted:
 
 
 def _windows(X: Complex, Z: Complex, q: np.ndarray, plan: _Plan) -> tuple[Complex, Complex, Complex, Array]:
-    """Fit all windows of a chunk: X (c, w, n_x), Z (c, w, n_z), q (c, w) distances in lines.
-
-    Returns the responses (c, n_z, n_x), the rows L (c, n_x, w) that make them from Z, the noise (c, n_z, n_z)
-    and the condition of the columns (c,).
+    """Fit windows X (c, w, n_x), Z (c, w, n_z), distances q (c, w) in lines. Returns responses (c, n_z, n_x), the rows
+    L (c, n_x, w) that make them from Z, the noise (c, n_z, n_z) and the condition of the columns (c,).
     """
     powers = (q / plan.half)[:, :, None] ** np.arange(_DEGREE + 1)
     of_x = (X[:, :, None, :] * powers[:, :, :, None]).reshape(*X.shape[:2], -1)
@@ -263,10 +252,11 @@ def frf_random(
     outputs: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> FrequencyResponse:
-    """Estimate the frequency response from arbitrary excitation by Welch's averages.
+    """Estimate the frequency response by Welch's averages: G = S_yu S_uu⁻¹ (H1: noise at the output), S_yy S_uy⁻¹ (H2:
+    at the input), total least squares (Hv: both), or S_yr S_ur⁻¹ with a reference, which feedback does not bias.
 
-    Its variance is (1 - γ²)/γ² |G|²/n with one input and n independent averages (Bendat and Piersol 2010, sec. 9.2),
-    with n reduced for overlap (Welch 1967), and its several-input form S_vv ⊗ S_uu⁻ᵀ/n.
+    Variance (1 - γ²)/γ² |G|²/n of n independent averages (Bendat and Piersol 2010, sec. 9.2), n reduced for overlap
+    (Welch 1967); of several inputs S_vv ⊗ S_uu⁻ᵀ/n. Leakage is not in it, but looked for by halving segments.
     """
     u, y, r = checked(u, y, r, rate_hz, inputs, outputs)
     if kind not in ("h1", "h2", "hv"):
@@ -336,10 +326,9 @@ def _found(
 
 
 def _leakage(full: _Found, half: _Found, nu: float) -> tuple[str, ...]:
-    """Return a warning where segments half as long, whose leakage is twice or more, give another response.
-
-    Both share their data, so that without leakage the difference is well under what the sum of variances allows
-    (a quarter of it on average for a Hann window).
+    """Return a warning where segments half as long, with twice the leakage or more, give another response. Without
+    leakage the difference is well under what the sum of variances allows (a quarter on average for a Hann window): data
+    are shared.
     """
     k = 2 * np.arange(half[0].shape[0]) + _EDGE  # line i + 2 of half the length is line 2(i + 2) of the full one
     apart = np.abs(full[0][k] - half[0]) ** 2
@@ -467,19 +456,18 @@ def frequency_response(
         References of a closed loop.
     method : {"auto", "periodic", "random", "local"}
         "auto" takes `frf_periodic` for several experiments, a given period, or an excitation (r, or u without it) of
-        one input that repeats at least twice; else `frf_local`. What was taken is in the result's `method`.
+        one input that repeats at least twice; else `frf_local`.
     **options
-        Passed on to the method. All know `open_loop` (the record is known to be open loop), `hold` ("zoh" or
-        "band-limited", what the input does between samples), and `inputs`, `outputs`, `units` (names, and SI unit by
-        name). Local: `free` (least lines of a window beyond its unknowns), `band` in Hz, `leave_out` (lines at which
-        the excitation does not tell G from leakage are left out instead of refused). Random: `kind` ("h1", "h2", "hv":
-        where the noise is), `segment` in samples, `noise_ratio` (for "hv", of input over output noise). Periodic:
-        `period` in samples, `lines` that are excited, `drop_periods` (a number, or "auto") that hold a transient.
+        All methods: `open_loop` (the record is known to be open loop), `hold` ("zoh" or "band-limited", what the input
+        does between samples), and `inputs`, `outputs`, `units` (names, and SI unit by name). Local: `free` (least lines
+        of a window beyond its unknowns), `band` in Hz, `leave_out` (lines at which the excitation does not tell G from
+        leakage are left out instead of refused). Random: `kind` ("h1", "h2", "hv": where the noise is), `segment` in
+        samples, `noise_ratio` (for "hv", of input over output noise). Periodic: `period` in samples, `lines` that are
+        excited, `drop_periods` (a number, or "auto") that hold a transient.
 
     Returns
     -------
     FrequencyResponse
-        The estimate.
 
     Raises
     ------
@@ -503,10 +491,7 @@ def frequency_response(
 
 
 def repeats(x: object) -> bool:
-    """Tell whether one excitation repeats at least twice.
-
-    `x`: more than one column never does, nor does a constant.
-    """
+    """Tell whether one excitation repeats at least twice; a constant or more than one column never does."""
     excitation = np.asarray(x, dtype=np.float64)
     if (excitation.ndim == 2 and excitation.shape[1] > 1) or np.ptp(excitation) == 0.0:
         return False

@@ -1,8 +1,5 @@
-"""Frequency response from periodic excitation, with the noise and the nonlinear distortion separated.
-
-Noise differs between periods; stochastic nonlinear distortion is the same in every period and differs between
-realisations of the random phases (Pintelon and Schoukens 2012, ch. 2 to 4). With one realisation, lines that the
-excitation leaves out show it (`Distortions`). Inputs are as noisy as outputs here, and may be fed back.
+"""Frequency response from periodic excitation, the inputs as noisy as the outputs, feedback allowed. Noise differs
+between periods, nonlinear distortion between realisations of the phases (Pintelon and Schoukens 2012, ch. 2 to 4).
 """
 
 from __future__ import annotations
@@ -38,14 +35,14 @@ _LARGEST_GAP_FROM = 1e-3  # of the largest line: no line under it counts as exci
 def find_period(x: Array) -> int:
     """Find the period of an excitation: the smallest shift under which it comes back.
 
-    The mean square difference d(τ) between the signal and itself τ later, over that of unrelated stretches, is 0 at
-    the period (noise over total power with noise). The first local minimum that is nearly as deep as the deepest,
-    after d has once risen over a half, is taken.
+    The mean square difference d(τ) between the signal and itself τ later, over that of unrelated stretches, is 0 at the
+    period (noise over total power with noise). The first local minimum that is nearly as deep as the deepest, after d
+    has once risen over a half, is taken.
 
     Parameters
     ----------
     x : ndarray, shape (n_samples,) or (n_samples, n_channels), any unit
-        Excitation, at least a period and a thirty-second of one.
+        At least a period and a thirty-second of one.
 
     Returns
     -------
@@ -73,10 +70,9 @@ def find_period(x: Array) -> int:
 
 
 def excited_lines(mean: Complex, noise: Array | None, *, least: int = 1) -> tuple[Lines, bool]:
-    """Return the excited lines of spectra `mean` (n_experiments, n_lines, n_channels), and whether a gap shows them.
-
-    The lines are those over the largest gap in the sorted amplitudes, of 12 dB at least, below the `least` largest;
-    without such a gap all that are within 60 dB of the largest and 10 dB over their own noise power `noise` (n_lines,).
+    """Return the excited lines of spectra `mean` (n_experiments, n_lines, n_channels), and whether a gap shows them:
+    those over the largest gap in the sorted amplitudes, of 12 dB at least, below the `least` largest. Without one, all
+    within 60 dB of the largest and 10 dB over their own noise power `noise` (n_lines,).
     """
     power = np.sum(np.abs(mean) ** 2, axis=(0, 2))
     if not np.any(power > 0):
@@ -105,10 +101,9 @@ def without_strays(lines: Lines) -> tuple[Lines, Lines]:
 
 
 def transient_ratio(periods: Array) -> float:
-    """Return how many standard deviations the first of P >= 3 periods (P, n, n_z) differs more than noise allows.
-
-    Its mean square distance from the mean of the others is compared with theirs; the number of independent samples is
-    that of the noise spectrum, (Σ S)²/Σ S². The worst channel counts.
+    """Return how many standard deviations the first of P >= 3 periods (P, n, n_z) differs more than noise allows, in
+    the worst channel: its mean square distance from the mean of the others against theirs, with (Σ S)²/Σ S² independent
+    samples.
     """
     count = periods.shape[0]
     rest = periods[1:]
@@ -126,9 +121,8 @@ def transient_ratio(periods: Array) -> float:
 
 
 def _differences(x: Array) -> Array:
-    """Return d(τ), 0 for equal and 1 for unrelated stretches, 1 where too little is left to compare.
-
-    Enough is a whole τ, or a thirty-second of it that holds 16 independent samples, (Σ S)²/Σ S² in the whole record.
+    """Return d(τ), 0 for equal and 1 for unrelated stretches, 1 where less is left to compare than a whole τ, or a
+    thirty-second of it that holds 16 independent samples, (Σ S)²/Σ S² in the whole record.
     """
     x = x - x.mean()
     n = x.size
@@ -151,9 +145,8 @@ _POOLED = 6  # detection lines averaged around each excited line
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Distortions:
-    """Output levels at detection lines, each the rms of the sine at that line (mean over experiments).
-
-    Levels hold noise too; compare them with the noise beside them.
+    """Output levels at detection lines, rms of the sine there (mean over experiments); they hold noise: compare with
+    it.
     """
 
     even_hz: Array  # (n_even,), Hz: Even lines without excitation, between the lowest and the highest excited line
@@ -182,10 +175,9 @@ class Detection:
 
 
 def detected(Z: Complex, noise: Complex | None, G: Complex, excited: Lines) -> Detection:
-    """Return what the output does at lines without excitation, less the response to the input there.
-
-    `Z` (n_experiments, n_lines, n_y + 1) mean spectra, `noise` (n_experiments, n_lines, n_y + 1, n_y + 1) of them,
-    `G` (n_f, n_y, 1) at the lines `excited`.
+    """Return what the output does at lines without excitation, less the response to the input there: of mean spectra
+    `Z` (n_experiments, n_lines, n_y + 1), their `noise` (..., n_y + 1, n_y + 1) and `G` (n_f, n_y, 1) at the lines
+    `excited`.
     """
     n_y = G.shape[1]
     inside = np.arange(excited[0], excited[-1] + 1)
@@ -213,10 +205,9 @@ def distortions(detection: Detection, spacing_hz: float, signal: Complex) -> Dis
 
 
 def at_excited(detection: Detection, excited: Lines) -> tuple[Complex, float] | None:
-    """Return the distortion's covariance of the output at the excited lines and its degrees of freedom.
-
-    The mean over the nearest detection lines that share the parity of the excitation, less the noise there, with
-    negative parts (noise that scatters) at 0. None where there are no such lines.
+    """Return the distortion's covariance of the output at the excited lines and its degrees of freedom, None without
+    lines: the mean over the nearest detection lines of the excitation's parity, less the noise there, negative parts at
+    0.
     """
     odd_only = bool(np.all((excited + 1) % 2 == 1))
     lines = detection.of_parity(True) if odd_only else detection
@@ -331,11 +322,10 @@ def frf_periodic(
     outputs: Sequence[str] | None = None,
     units: Mapping[str, str] | None = None,
 ) -> FrequencyResponse:
-    """Estimate the frequency response from one or more experiments with periodic excitation.
-
-    With n_u inputs, n_u successive experiments (with inputs that are linearly independent at every line, e.g.
-    orthogonal multisines) make a realisation, in which G = Y U⁻¹. Realisations are averaged; with a reference r, the
-    responses of [Y; U] to it are averaged first, so that noise and distortion at the input do not bias G.
+    """Estimate the frequency response from one or more experiments with periodic excitation. n_u successive ones,
+    inputs linearly independent at every line, e.g. orthogonal multisines, make a realisation, G = Y U⁻¹; these are
+    averaged. With a reference r the responses of [Y; U] to it are averaged first, so that noise and distortion at the
+    input do not bias G.
     """
     experiments = _experiments(u, y, r, rate_hz, inputs, outputs)
     n_u, n_y = experiments[0][0].shape[1], experiments[0][1].shape[1]

@@ -25,9 +25,9 @@ class FrequencyResponse:
     Attributes
     ----------
     frequency_hz : ndarray, shape (n_f,), Hz
-        Frequencies, rising, over 0 and under half the rate.
+        Rising, over 0 and under half the rate.
     G : complex ndarray, shape (n_f, n_y, n_u), output unit per input unit
-        The response, best linear approximation where the system is not linear.
+        Best linear approximation where the system is not linear.
     covariance : complex ndarray, shape (n_f, n_y*n_u, n_y*n_u)
         Total: E[vec(dG) vec(dG)ᴴ], vec row by row (all inputs of the first output, then of the second).
     noise_covariance : complex ndarray, shape (n_f, n_y*n_u, n_y*n_u), or None
@@ -35,9 +35,7 @@ class FrequencyResponse:
     coherence : ndarray, shape (n_f, n_y), or None
         Multiple coherence, 0 to 1: share of each output's power that the inputs (or references) explain linearly.
     method : str
-        How it was measured.
     inputs, outputs : tuple of str
-        Names.
     units : Mapping[str, str]
         SI unit by name.
     rate_hz : float
@@ -47,10 +45,9 @@ class FrequencyResponse:
     degrees_of_freedom : ndarray, shape (n_f,), or float
         Real degrees of freedom ν of the variance: ν·(estimate/truth) is χ² with ν; inf where it is known.
     lines_per_independent : float
-        Neighbouring errors are correlated after windows and local fits: a quantity fitted to many lines as if they
-        were independent has this many times the variance that the fit believes. 1 for periodic excitation.
+        Neighbouring errors are correlated after windows and local fits: a quantity fitted to many lines as if they were
+        independent has this many times the variance that the fit believes. 1 for periodic excitation.
     warnings : tuple of str
-        What should be known before it is used.
     details : Mapping[str, object]
         Numbers of the method: periods, segments, lines, levels.
     """
@@ -140,7 +137,6 @@ class FrequencyResponse:
         Returns
         -------
         ndarray, shape (n_f, n_y, n_u), unit of G
-            Radii.
 
         Raises
         ------
@@ -167,7 +163,6 @@ class FrequencyResponse:
         Returns
         -------
         FrequencyResponse
-            The same estimate at fewer frequencies.
 
         Raises
         ------
@@ -263,12 +258,10 @@ def ratio(Z: Complex, covariance: Complex, n_y: int, weight: Complex | None = No
 
 
 def ratio_map(Z: Complex, n_y: int, weight: Complex | None = None) -> tuple[Complex, Complex]:
-    """Return G = Y U⁻¹ and T, the derivative of vec(G) by vec(Z), both row by row.
+    """Return G = Y U⁻¹ and T, the derivative of vec(G) by vec(Z), both row by row, from `Z` (n_f, n_z, m).
 
-    dG = [I, -G] dZ U⁻¹ to first order, so T = [I, -G] ⊗ U⁻ᵀ; T C Tᴴ is Pintelon and Schoukens 2012, eq. 2-32 f., for
-    any number of inputs. With more columns than inputs, U⁻¹ is the right inverse W Uᴴ (U W Uᴴ)⁻¹.
-
-    `Z` (n_f, n_z, m), `weight` W (n_f, m, m).
+    dG = [I, -G] dZ U⁻¹ to first order, so T = [I, -G] ⊗ U⁻ᵀ; T C Tᴴ is Pintelon and Schoukens 2012, eq. 2-32 f. With
+    more columns than inputs, U⁻¹ is the right inverse W Uᴴ (U W Uᴴ)⁻¹, `weight` W (n_f, m, m).
     """
     Y, U = Z[:, :n_y], Z[:, n_y:]
     inverse = right_inverse(U, weight)
@@ -280,10 +273,9 @@ def ratio_map(Z: Complex, n_y: int, weight: Complex | None = None) -> tuple[Comp
 
 
 def weak_inputs(Z: Complex, covariance: Complex, n_y: int) -> tuple[str, ...]:
-    """Return a warning where the inputs' responses barely stand above their own noise.
-
-    A ratio is biased by about exp(-|U|²/σ_U²) (Pintelon and Schoukens 2012, sec. 2.4.2) and its first-order covariance
-    no longer holds; under a ratio of 10, the bias is over 5e-5 and the tails are heavy.
+    """Return a warning where the inputs' responses barely stand above their own noise. A ratio is biased by about
+    exp(-|U|²/σ_U²) (Pintelon and Schoukens 2012, sec. 2.4.2), its first-order covariance void; under a ratio of 10 the
+    bias is over 5e-5 and tails are heavy.
     """
     U = Z[:, n_y:]
     n, n_u, m = U.shape

@@ -1,7 +1,5 @@
-"""Frequency responses from files: CSV, and universal files (UFF, UNV), dataset 58, ASCII and binary.
-
-Its records by columns: SDRC, Universal File Datasets Summary. Units are those of the axis labels; without a label, of
-the quantity where dataset 164 says SI.
+"""Frequency responses from CSV and universal files (UFF, UNV), dataset 58, ASCII and binary (SDRC, Universal File
+Datasets Summary). Units are those of the axis labels; without one, of the quantity where dataset 164 says SI.
 """
 
 from __future__ import annotations
@@ -55,12 +53,10 @@ def read_response(
     path: Path, *, inputs: Sequence[str] = (), outputs: Sequence[str] = (), references: Sequence[str] = (),
     layout: Mapping[str, str] | None = None, hold: Hold = "band-limited", rate_hz: float | None = None,
 ) -> tuple[FrequencyResponse, dict[str, object]]:  # fmt: skip
-    """Read a frequency response.
+    """Read a frequency response, by default of all `inputs` and `outputs`; also file, SHA-256 and what was done.
 
-    `inputs`, `outputs`: names in the file, by default all; `references`: the inputs of its functions where the wanted
-    ones are among its outputs (a closed loop): the responses to them are divided, which feedback does not bias;
-    `rate_hz`: of the plant's converters, for delays in samples and a held input. Returns also file, SHA-256 and what
-    was done.
+    `references`: the inputs of its functions where the wanted ones are among its outputs (a closed loop): the responses
+    to them are divided, which feedback does not bias. `rate_hz`: of the converters, for delays and a held input.
     """
     words = dict(layout or {})
     for word in words:

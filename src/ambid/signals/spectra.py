@@ -65,7 +65,6 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
     Parameters
     ----------
     x : ndarray, shape (n_samples,), any unit
-        Samples.
     rate_hz : float
         Sampling rate in Hz.
     segment : int, optional
@@ -74,7 +73,7 @@ def power_spectrum(x: Array, rate_hz: float, *, segment: int | None = None) -> P
     Returns
     -------
     PowerSpectrum
-        The density in the unit of `x` squared per Hz.
+        In the unit of `x` squared per Hz.
 
     Raises
     ------
@@ -96,11 +95,10 @@ def cross_spectra(z: Array, rate_hz: float, *, segment: int | None = None) -> Cr
     Parameters
     ----------
     z : ndarray, shape (n_samples, n_signals), any units
-        Signals.
     rate_hz : float
         Sampling rate in Hz.
     segment : int, optional
-        Samples of a segment, as in `power_spectrum`.
+        As in `power_spectrum`.
 
     Returns
     -------
@@ -183,9 +181,7 @@ def snr(
     Parameters
     ----------
     record : Record
-        The record.
-    name : str
-        Channel.
+    name : str, a channel
     inputs : str or sequence of str
         Channels that drive it, for the prediction; without them an unpredictable excitation counts as noise and the
         ratio is a lower bound.
@@ -195,7 +191,7 @@ def snr(
     Returns
     -------
     Snr
-        The ratio in dB with the method stated.
+        In dB, with the method stated.
 
     Raises
     ------
