@@ -22,7 +22,8 @@ from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import Bearing, RotorModel
 from ambid.record import Record, read_record
 from ambid.rig import Rig
-from ambid.rig.rig import RecordSettings, RigChannel, RigModes
+from ambid.rig.rig import RecordSettings, RigChannel
+from ambid.rig.rotor import RigModes
 from tests.measured import RECORDS
 
 DATUM = 0.2

@@ -176,7 +176,7 @@ def test_a_record_is_identified_from_the_page(bench, tmp_path):
 
 def test_a_ledger_is_shown_over_time_without_numbers_that_are_not_known(tmp_path):
     pytest.importorskip("sqlalchemy", reason="the extra [fleet] is not installed")
-    from ambid.console.history import drawn
+    from ambid.console.worker import drawn
     from ambid.ledger import open_ledger
     from tests.ledger.entries import entry, parameter
 

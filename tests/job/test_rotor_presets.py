@@ -11,7 +11,7 @@ from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.physics.whirl import drawn_numbers
 from ambid.rig import rig_of_preset
-from ambid.rig.rig import RigModes
+from ambid.rig.rotor import RigModes
 
 _FAR = 3.8  # standard deviations
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ambid.errors import AmbidError
-from ambid.ledger import open_ledger, schema, store
+from ambid.ledger import open_ledger, store
 from ambid.ledger.entry import Note, key_of, moment, settings_text
 from ambid.ledger.store import Failure
 from tests.ledger.entries import entry, parameter
@@ -157,8 +157,8 @@ def test_a_batch_that_fails_in_the_middle_leaves_nothing(place, monkeypatch):
 def test_a_newer_ledger_is_refused_and_an_older_one_brought_up(place, monkeypatch):
     with open_ledger(place) as ledger:
         ledger.add([entry(0)])
-    monkeypatch.setattr(schema, "VERSION", 2)
-    monkeypatch.setattr(schema, "STEPS", {1: ("ALTER TABLE event ADD COLUMN more TEXT",)})
+    monkeypatch.setattr("ambid.ledger.entry.VERSION", 2)
+    monkeypatch.setattr("ambid.ledger.entry.STEPS", {1: ("ALTER TABLE event ADD COLUMN more TEXT",)})
     with pytest.raises(AmbidError, match="is of version 1, and is read as 2"):
         open_ledger(place, write=False)
     open_ledger(place).close()

@@ -12,7 +12,7 @@ import ambid
 from ambid.physics.linear_model import Parameter
 from ambid.record import Record
 from ambid.rig import Rig
-from ambid.rig.rig import RigModes
+from ambid.rig.rotor import RigModes
 from ambid.rotor import RotorEstimate
 from ambid.rotor.likelihood import Experiment, Point, rough_weight
 from ambid.rotor.modes import scan

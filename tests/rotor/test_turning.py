@@ -11,7 +11,8 @@ from ambid.physics.linear_model import Parameter
 from ambid.report.document import sections_text
 from ambid.report.drawing import WIDE, stacked
 from ambid.report.rotor_drawing import balance_block, orbit_blocks, synchronous_sections
-from ambid.rig.rig import RigChannel, RigModes
+from ambid.rig.rig import RigChannel
+from ambid.rig.rotor import RigModes
 from tests.rotor.test_synchronous import planes_of, spinning, without
 from tests.rotor_benches import needs_simulator, rig_of
 

@@ -1,4 +1,4 @@
-"""The command ``ambid``: one file per verb, each of which parses, calls and prints."""
+"""The command ``ambid``: one file per verb or two, each of which parses, calls and prints."""
 
 from __future__ import annotations
 

@@ -39,6 +39,7 @@ VERBS = {
     "models": "list models, parameters, units, excitations, presets",
 }
 """What each verb does, in the order of the help."""
+_BESIDE = {"compare": "fit", "models": "info", "validate": "identify"}  # verbs in the file of another
 
 
 def _global(
@@ -74,12 +75,11 @@ def parser(verb: str = "") -> Any:
     )
     app.callback(invoke_without_command=True)(_global)
     for name in [verb] if verb else VERBS:
-        module = import_module(f"ambid.cli.{'info' if name == 'models' else name}")
+        module = import_module(f"ambid.cli.{_BESIDE.get(name, name)}")
         if hasattr(module, "group"):
             app.add_typer(module.group, name=name, short_help=VERBS[name])
         else:
-            function = module.command if hasattr(module, "command") else getattr(module, name)
-            app.command(name, short_help=VERBS[name])(function)
+            app.command(name, short_help=VERBS[name])(getattr(module, name, None) or module.command)
     return typer.main.get_command(app)
 
 

@@ -1,4 +1,4 @@
-"""``ambid fit``: a black-box model from one record, or a nonlinear one from several."""
+"""``ambid fit``: a black-box model of one record or several; ``ambid compare``: several structures on one record."""
 
 from __future__ import annotations
 
@@ -85,3 +85,21 @@ def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:
 
     method = found.structure if found.structure in ("n4sid", "moesp", "cva") else "pbsid"
     return stabilisation_figure(stabilisation(data, method, tick=lambda: tick("stabilisation")))
+
+
+@verb("compare")
+def compare(v: Values) -> None:
+    """Fit several structures to a record and compare them on data that none of them has seen.
+
+    Without --validate, the last part of the record is held back. Best first.
+    """
+    from ambid.job import compare
+
+    with (
+        Outputs(v.record, v.validate, **v.outputs) as outputs,
+        progress("compare") as tick,
+    ):
+        how = v.only("input output reference open_loop from_s to_s rate_hz gaps layout validate holdout")
+        found = compare(v.record, v.candidates, **how, tick=tick)
+        outputs.give(found, tick)
+    outputs.show(found, strict=v.strict)

@@ -1,4 +1,7 @@
-"""``ambid identify``: physical parameters with uncertainty from one record, or a nonlinear magnet from several."""
+"""``ambid identify``: physical parameters with uncertainty from one record, or a nonlinear magnet from several.
+
+``ambid validate``: the checks of an estimate on other data.
+"""
 
 from __future__ import annotations
 
@@ -70,3 +73,20 @@ def command(v: Values) -> None:
     if refused is not None:
         raise refused
     end(failed=v.strict and not estimate.passed)
+
+
+@verb("validate")
+def validate(v: Values) -> None:
+    """Judge an estimate on another record of the same bench: nothing is fitted but offsets and initial state.
+
+    Without --rig, the record is read through the rig that the estimate was made with.
+    """
+    from ambid.job.results import validate
+
+    with (
+        Outputs(v.estimate, v.record, v.rig, **v.outputs) as outputs,
+        progress("validate") as show,
+    ):
+        found = validate(v.estimate, v.record, v.rig, **v.only("from_s to_s rate_hz gaps layout"))
+        outputs.give(found, show)
+    outputs.show(found, strict=v.strict)

@@ -11,15 +11,19 @@ import typer
 
 from ambid.cli.options import Values
 from ambid.cli.terminal import painter
+from ambid.errors import AmbidError
 from ambid.estimation.progress import silent
 from ambid.job.files import FIGURE_ENDINGS, PAGE_ENDINGS, Files
-from ambid.settings.caller import refuse_given
+from ambid.settings.caller import refuse_given, setting
 
 if TYPE_CHECKING:
     from ambid.estimation.progress import Tick
     from ambid.estimation.result import Result
+    from ambid.ledger import Ledger
+    from ambid.rig import Rig
 
 FAILED_CHECK = 3
+_FILE = "file"  # the word for the time of the record's file
 
 
 def json_path(json: str | None) -> Path | None:
@@ -102,13 +106,12 @@ def keeping(
         yield lambda _: None
         return
     from ambid.job.data import known_rig
-    from ambid.job.keeping import bearing_of, keep, time_of
     from ambid.ledger import open_ledger
     from ambid.ledger.entry import settings_text, sha_of
 
     bench = known_rig(v.rig)
-    name = bearing_of(None if v.rig is None else bench, v.bearing)
-    at = None if taken_now else time_of(taken_at, records[0])
+    name = _bearing_of(None if v.rig is None else bench, v.bearing)
+    at = None if taken_now else _time_of(taken_at, records[0])
     given = {key: sha_of(x) if isinstance(x, Path) else x for key, x in settings.items()}
     new = "://" not in ledger and not Path(ledger).exists()
     used = False
@@ -116,7 +119,7 @@ def keeping(
     def store(result: Any) -> None:
         nonlocal used
         words = settings_text(job, **given)
-        said = keep(place, result, records, bench, bearing=name, taken_at=at, job=job, settings=words)
+        said = _keep(place, result, records, bench, bearing=name, taken_at=at, job=job, settings=words)
         used = True
         typer.echo(said, err=True)
 
@@ -126,3 +129,48 @@ def keeping(
     finally:
         if new and not used:  # a job that failed leaves no empty ledger
             Path(ledger).unlink(missing_ok=True)
+
+
+def _bearing_of(rig: Rig | None, given: str | None) -> str:
+    """Return the name of the bearing: what is given, else the rig's name."""
+    name = given if given is not None else "" if rig is None else rig.name
+    if not name.strip():
+        raise AmbidError(
+            f"the ledger has to know which bearing this is. Give {setting('bearing', 'NAME')}, or a rig that has a name"
+        )
+    return name
+
+
+def _time_of(given: str | None, record: Path) -> float | None:
+    """Return when a record was taken as its setting says; None: as the record says itself, which CSV cannot."""
+    from ambid.ledger.entry import moment
+
+    if given == _FILE:
+        return record.stat().st_mtime
+    if given is not None:
+        return moment(given)
+    if record.name.lower().endswith((".csv", ".csv.gz")):
+        raise AmbidError(
+            f"{record} does not say when it was taken, and the ledger has to know. Give "
+            f"{setting('taken_at', 'TIME')}, or "
+            f"{setting('taken_at', 'file')} for the time of its file"
+        )
+    return None
+
+
+def _keep(
+    ledger: Ledger, result: Any, records: Sequence[Path], rig: Rig, *, bearing: str, taken_at: float | None, job: str,
+    settings: str,
+) -> str:  # fmt: skip
+    """Put a result into a ledger, and say so; nothing is added where the same one is there."""
+    from ambid.job.presentation import document
+    from ambid.ledger.entry import entry_of, sha_of
+    from ambid.report.history import day
+
+    made = entry_of(
+        result, bearing=bearing, sha=sha_of(*records), rig=rig, settings=settings, job=job, taken_at=taken_at,
+        document=document(result),
+    )  # fmt: skip
+    if ledger.add([made]):
+        return f"stored in {ledger.shown}: {made.bearing}, record of {day(made.taken_at)} UTC"
+    return f"{ledger.shown} has this already (same record, rig, settings and version); nothing was added"

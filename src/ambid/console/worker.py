@@ -25,9 +25,11 @@ from ambid.console.feed import FeedWriter
 from ambid.console.folder import plain
 from ambid.console.runs import Heard, Run
 from ambid.errors import AmbidError
+from ambid.estimation.result import NORMAL_95
 from ambid.record.calibration import INSIDE
 
 if TYPE_CHECKING:
+    from ambid.ledger import History, Series
     from ambid.recursive.lines import Event
     from ambid.tracking.lines_file import LiveState
 
@@ -37,6 +39,7 @@ _LINE_S = 0.1  # between two lines of parameters that are shown
 _FLAGS = ("track", "hold", "accept", "revert")
 _PREVIEW = 800  # envelopes of a channel in a preview
 _LONGEST_S = 86_400.0
+_MOST_ESTIMATES = 2000  # of a history, the latest, that are drawn
 
 
 class Worker:
@@ -461,7 +464,6 @@ def _commission(worker: Worker) -> None:
 
 def _history(worker: Worker) -> None:
     """Tell which bearings a ledger has, and one of them over time: that which is asked for, else the first."""
-    from ambid.console.history import drawn
     from ambid.ledger import open_ledger
 
     path = worker.path("ledger")
@@ -474,6 +476,34 @@ def _history(worker: Worker) -> None:
         worker.tick("history")
         if names:
             worker.feed.tell("history", drawn(ledger.history(worker.spec.get("bearing", names[0]))))
+
+
+def drawn(found: History) -> Mapping[str, Any]:
+    """Return verdict, series, estimates and events of a history; of a long one the latest."""
+    from ambid.job.presentation import text
+
+    first = max(0, len(found.estimates) - _MOST_ESTIMATES)
+    asked = ("taken_at", "record", "job", "status", "verdict", "failed", "version")
+    verdict = found.verdict
+    return {
+        "bearing": found.bearing, "plant": found.plant, "verdict": verdict.word,
+        "reasons": [r.text for r in verdict.reasons], "text": text(found, width=110), "left_out": first,
+        "estimates": [{k: getattr(e, k) for k in asked} for e in found.estimates[first:]],
+        "series": {name: _series(found, s, first) for name, s in found.measured.items()},
+        "events": [{k: getattr(e, k) for k in ("at", "kind", "text", "parameter")} for e in found.events],
+    }  # fmt: skip
+
+
+def _series(found: History, s: Series, first: int) -> Mapping[str, Any]:
+    """Return one series; `verdict`: of each estimate, or that its record did not show this number."""
+    of = s.estimate >= first
+    said = zip(s.estimate[of], s.identifiable[of], strict=True)
+    return {
+        "unit": s.unit, "t": s.taken_at[of].tolist(), "value": rounded(s.value[of], 9),
+        "sd": rounded(s.sd[of]), "half": rounded(NORMAL_95 * s.sd[of]),
+        "verdict": [found.estimates[k].verdict if seen else "hidden" for k, seen in said],
+        "known": int(np.count_nonzero(np.isfinite(s.value))),
+    }  # fmt: skip
 
 
 JOBS: Mapping[str, Callable[[Worker], None]] = {

@@ -23,9 +23,9 @@ if TYPE_CHECKING:
     from ambid.job.fits import physics as physics
     from ambid.job.identification import identify as identify
     from ambid.job.identification import identify_nonlinear as identify_nonlinear
-    from ambid.job.keeping import history as history
     from ambid.job.loop_margins import margins as margins
     from ambid.job.response import frf as frf
+    from ambid.job.results import history as history
     from ambid.job.results import load as load
     from ambid.job.results import validate as validate
     from ambid.job.simulation import simulate as simulate

@@ -1,4 +1,4 @@
-"""Results as they come from files, and how they do on another record."""
+"""Results as they come from files, how they do on another record, and what a ledger has of them."""
 
 from __future__ import annotations
 
@@ -29,6 +29,7 @@ from ambid.validation.second_record import Validation, validation
 
 if TYPE_CHECKING:
     from ambid.control.experiment import Experiment
+    from ambid.ledger import History
 
 AnyFit = BlackBoxFit | NonlinearFit
 AnyEstimate = Estimate | NonlinearBearingEstimate | RotorEstimate
@@ -278,3 +279,28 @@ def rig_of(estimate: AnyEstimate | RotorEstimate, where: str) -> Rig:
         return rig_from_text(text, Path(folder) / "rig.toml")
     except AmbidError as error:
         raise EstimationError(f"{where}: its rig cannot be used: {error}. Give {setting('rig')}") from None
+
+
+def history(bearing: str, *, ledger: str | Path) -> History:
+    """Return what is known of a bearing over time.
+
+    Parameters
+    ----------
+    bearing : str
+        Its name; of a rotor the machine's.
+    ledger : str or Path
+        File of SQLite, or URL of PostgreSQL.
+
+    Returns
+    -------
+    History
+
+    Raises
+    ------
+    AmbidError
+        If there is no such ledger, or no such bearing in it.
+    """
+    from ambid.ledger import open_ledger
+
+    with open_ledger(ledger, write=False) as found:
+        return found.history(bearing)

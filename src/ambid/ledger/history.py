@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from ambid.arrays import Array
 from ambid.errors import AmbidError, EstimationError, counted, nearest
 from ambid.estimation.result import Reason, Result
-from ambid.ledger import schema
-from ambid.ledger.entry import Note
+from ambid.ledger.entry import Note, tables
 from ambid.settings.caller import command
 
 if TYPE_CHECKING:
@@ -220,7 +219,7 @@ def _rig_changes(c: Connection, estimates: tuple[KnownEstimate, ...]) -> list[No
     at = [k for k, (old, new) in enumerate(pairwise(estimates), 1) if old.rig_sha != new.rig_sha]
     if not at:
         return []
-    t = schema.tables().tables["rig"].c
+    t = tables().tables["rig"].c
     digests = {estimates[k - j].rig_sha for k in at for j in (0, 1)}
     lines = {
         row.sha: zlib.decompress(row.text).decode().splitlines()

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from ambid.errors import AmbidError, counted
 from ambid.estimation.result import Reason, Result
-from ambid.ledger import schema
+from ambid.ledger import entry
 from ambid.settings.caller import setting
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Ledger:
             return frozenset()
         from sqlalchemy import delete
 
-        t = schema.tables().tables
+        t = entry.tables().tables
         with self._writing() as c:
             bearings, now = self._bearings(c, batch.values()), time.time()
             rigs = {e.rig_sha: {"sha": e.rig_sha, "name": e.rig_name, "text": _packed(e.rig)} for e in batch.values()}
@@ -165,7 +165,7 @@ class Ledger:
         }
         from sqlalchemy import delete
 
-        t = schema.tables().tables["failure"]
+        t = entry.tables().tables["failure"]
         with self._writing() as c:
             for keys in _chunks(list(rows)):
                 c.execute(delete(t).where(t.c.key.in_(keys)))
@@ -185,7 +185,7 @@ class Ledger:
         """
         from sqlalchemy import select
 
-        t = schema.tables().tables
+        t = entry.tables().tables
         e, d = t["estimate"].c, t["document"].c
         query = select(e.key, e.status, e.verdict, e.failed, d.json).join_from(
             t["estimate"], t["document"], isouter=True
@@ -206,7 +206,7 @@ class Ledger:
         """
         from sqlalchemy import select
 
-        t = schema.tables().tables["failure"]
+        t = entry.tables().tables["failure"]
         with self._reading() as c:
             return {row.key: Failure(**{x: row[x] for x in row if x != "key"}) for row in _mappings(c, select(t))}
 
@@ -219,7 +219,7 @@ class Ledger:
         """
         from sqlalchemy import func, select
 
-        t = schema.tables().tables
+        t = entry.tables().tables
         b, e = t["bearing"].c, t["estimate"].c
         query = (
             select(
@@ -331,7 +331,7 @@ class Ledger:
         """Return the numbers of bearings by name; one that is new is entered."""
         from sqlalchemy import select
 
-        t = schema.tables().tables["bearing"]
+        t = entry.tables().tables["bearing"]
         plants = {e.bearing: e.rig_name for e in entries}
         self._insert(c, t, [{"name": name, "plant": plants[name]} for name in sorted(plants)])
         return {
@@ -344,7 +344,7 @@ class Ledger:
         """Return the numbers of estimates that are there, by key."""
         from sqlalchemy import select
 
-        t = schema.tables().tables["estimate"]
+        t = entry.tables().tables["estimate"]
         return {
             row.key: row.id
             for some in _chunks(list(keys))
@@ -507,7 +507,7 @@ def _check_file(path: Path) -> None:
             connection.close()
     except sqlite3.DatabaseError:
         row = None
-    if row != (schema.SCHEMA,):
+    if row != (entry.SCHEMA,):
         raise AmbidError(refusal)
 
 
@@ -544,7 +544,7 @@ def _make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
     """Make the tables where there are none; bring them to this version; refuse what is of another kind or newer."""
     from sqlalchemy import insert, inspect, select, update
 
-    whole = schema.tables()
+    whole = entry.tables()
     meta = whole.tables["meta"]
     connection = engine.begin() if write else engine.connect().execution_options(reads=True)
     with connection as c:
@@ -555,27 +555,27 @@ def _make_ready(engine: Engine, ledger: str, *, write: bool) -> None:
             raise AmbidError(f"ledger {ledger} holds no ledger yet. Check the URL")
         if not there:
             whole.create_all(c)
-            c.execute(insert(meta), [{"name": n, "value": v} for n, v in (("schema", schema.SCHEMA), ("version", "1"))])
-            c.execute(update(meta).where(meta.c.name == "version").values(value=str(schema.VERSION)))
+            c.execute(insert(meta), [{"name": n, "value": v} for n, v in (("schema", entry.SCHEMA), ("version", "1"))])
+            c.execute(update(meta).where(meta.c.name == "version").values(value=str(entry.VERSION)))
             return
         if "meta" not in there:
             raise AmbidError(f"{ledger} is not a ledger of ambid: it has other tables of the same names. Give another")
         facts = {row.name: row.value for row in c.execute(select(meta.c.name, meta.c.value))}
         version = int(facts.get("version", "0"))
-        if version > schema.VERSION:
+        if version > entry.VERSION:
             raise AmbidError(
-                f"ledger {ledger} is of version {version}; this ambid reads {schema.VERSION}. Install a newer one"
+                f"ledger {ledger} is of version {version}; this ambid reads {entry.VERSION}. Install a newer one"
             )
-        if version < schema.VERSION and not write:
+        if version < entry.VERSION and not write:
             raise AmbidError(
-                f"ledger {ledger} is of version {version}, and is read as {schema.VERSION}. Write to it once, which "
+                f"ledger {ledger} is of version {version}, and is read as {entry.VERSION}. Write to it once, which "
                 "brings it to that version"
             )
-        for step in range(version, schema.VERSION):
-            for statement in schema.STEPS[step]:
+        for step in range(version, entry.VERSION):
+            for statement in entry.STEPS[step]:
                 c.exec_driver_sql(statement)
-        if version < schema.VERSION:
-            c.execute(update(meta).where(meta.c.name == "version").values(value=str(schema.VERSION)))
+        if version < entry.VERSION:
+            c.execute(update(meta).where(meta.c.name == "version").values(value=str(entry.VERSION)))
 
 
 @contextmanager
@@ -629,9 +629,9 @@ def _write(c: Connection, name: str, path: Path) -> None:
     import pyarrow.parquet as parquet
     from sqlalchemy import select
 
-    table = schema.tables().tables[name]
+    table = entry.tables().tables[name]
     kinds = [pa.field(x.name, _kind(pa, name, x)) for x in table.columns]
-    whole = pa.schema(kinds, metadata={_MADE: schema.SCHEMA.encode()})
+    whole = pa.schema(kinds, metadata={_MADE: entry.SCHEMA.encode()})
     partial = path.with_name(f".{path.name}")
     try:
         with parquet.ParquetWriter(partial, whole) as writer:

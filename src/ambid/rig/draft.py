@@ -20,13 +20,13 @@ from ambid.rig.rig import (
     Rig,
     RigChannel,
     RigMagnet,
-    RigModes,
     layout_line,
     rig_text,
     role_units,
     toml_text,
 )
 from ambid.rig.roles import NAMES, SET_POINT, Candidate, at_rest, rank_roles
+from ambid.rig.rotor import RigModes
 from ambid.settings.caller import command, setting
 from ambid.units import UNKNOWN, parse_unit
 

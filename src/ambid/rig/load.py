@@ -31,8 +31,7 @@ from ambid.rig.rig import (
     optional_roles,
     role_units,
 )
-from ambid.rig.rotor import modes_of, planes_of, rotor_of, speed_of, turning_of
-from ambid.rig.shaft import shaft_of, si_of, unit_of
+from ambid.rig.rotor import modes_of, planes_of, rotor_of, shaft_of, si_of, speed_of, turning_of, unit_of
 from ambid.settings.caller import path_of
 from ambid.units import UNKNOWN, parse_unit
 

@@ -20,7 +20,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.physics.shaft import Shaft
 from ambid.record.calibration import Calibration
 from ambid.record.sampling import GapPolicy
-from ambid.rig.shaft import shaft_lines
+from ambid.rig.rotor import RigModes, shaft_lines
 from ambid.settings.caller import setting
 
 TRIP_SHARE = 0.9
@@ -207,17 +207,6 @@ class RigMagnet:
         Parameter or None
         """
         return next((p for p in self.parameters if p.name == name), None)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RigModes:
-    """What is known of the bending modes of a rotor."""
-
-    count: int | None = None  # how many are in the excited band; None: the record decides
-    frequency_hz: tuple[float, ...] = ()  # where they may be found; searched everywhere without
-    # for simulation, under the names of the rotor's model: ``mode1.omega``, ``mode1.zeta``, ``mode1.A.z`` …,
-    # ``mode1.unbalance.<name>``, ``gyro.01`` …; SI
-    numbers: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

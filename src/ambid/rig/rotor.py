@@ -1,26 +1,54 @@
-"""From the tables of a rig file to a rotor on many axes: its bearings, planes and speed, and what drives it."""
+"""From the tables of a rig file to a rotor on many axes: its bearings, planes and speed, what drives it, its drawing.
+
+Numbers with a unit are read in SI; ``[shaft]`` is written too.
+"""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from ambid.errors import RigError, nearest
+from ambid.errors import ModelError, RigError, UnitError, nearest
+from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import Turning
 from ambid.physics.rotor_model import Bearing, Drive, RotorModel
-from ambid.rig.rig import RigModes
-from ambid.rig.shaft import si_of, unit_of
+from ambid.physics.shaft import Disc, Material, Shaft, Step
+from ambid.units import Unit, parse_unit
 
 if TYPE_CHECKING:
     from ambid.physics.linear_model import LinearModel
-    from ambid.rig.schema import BearingEntry, ParameterEntry, PlaneEntry, QuantityEntry, RigFile
+    from ambid.rig.schema import (
+        BearingEntry,
+        DiscEntry,
+        MaterialEntry,
+        ParameterEntry,
+        PlaneEntry,
+        QuantityEntry,
+        RigFile,
+        ShaftEntry,
+        StepEntry,
+        TurningEntry,
+    )
 
 _DRIVES: tuple[Drive, ...] = ("voltage", "current", "command")
 TURN = 2.0 * math.pi
 _SPEEDS = {"rad/s": 1.0, "Hz": TURN}
 """SI units in which a speed may be given, and what makes rad/s of them."""
+_DISC = {"m": "kg", "Id": "kg m^2", "Ip": "kg m^2", "outer": "m", "inner": "m", "width": "m", "rho": "kg/m^3"}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RigModes:
+    """What is known of the bending modes of a rotor."""
+
+    count: int | None = None  # how many are in the excited band; None: the record decides
+    frequency_hz: tuple[float, ...] = ()  # where they may be found; searched everywhere without
+    # for simulation, under the names of the rotor's model: ``mode1.omega``, ``mode1.zeta``, ``mode1.A.z`` …,
+    # ``mode1.unbalance.<name>``, ``gyro.01`` …; SI
+    numbers: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
 
 
 def rotor_of(file: RigFile, where: str) -> RotorModel:
@@ -185,3 +213,100 @@ def speed_of(entry: QuantityEntry | None, where: str) -> float:
     if unit.si not in _SPEEDS:
         raise RigError(f"{where}: speed is in [{entry.unit}]; it is measured in [rpm], [rad/s] or [Hz]. Correct unit")
     return unit.to_si(entry.value) * _SPEEDS[unit.si]
+
+
+def shaft_of(entry: ShaftEntry, parameters: Sequence[Parameter], where: str) -> Shaft:
+    """Return the shaft of a rig file, on which the planes among `parameters` lie; `where`: the file, for messages."""
+    place = f"{where}: shaft"
+    try:
+        material = _material(entry.material, f"{place}.material")
+        shaft = Shaft(
+            steps=tuple(_step(x, f"{place}.steps.{k}") for k, x in enumerate(entry.steps, 1)),
+            discs=tuple(_disc(x, material, f"{place}.discs.{k}") for k, x in enumerate(entry.discs, 1)),
+            material=material,
+            z=si_of(entry.z, "m", f"{place}.z"),
+            zeta=tuple(entry.damping) if isinstance(entry.damping, list) else (entry.damping,),
+        )
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+    for p in parameters:
+        if p.unit == "m" and p.value is not None and not shaft.z <= p.value <= shaft.z + shaft.length:
+            raise RigError(
+                f"{place} goes from {shaft.z:g} to {shaft.z + shaft.length:g} m, but {p.name} is at {p.value:g} m. "
+                "Correct shaft.z, which is its left end from the datum of the planes, or that plane"
+            )
+    return shaft
+
+
+def shaft_lines(shaft: Shaft) -> list[str]:
+    """Return a shaft as lines of TOML, in SI units."""
+    lines = ["[shaft]", f"z = {_quantity(shaft.z, 'm')}", f"material = {_material_text(shaft.material)}"]
+    lines += [f"damping = {list(shaft.zeta)}"] if shaft.zeta else []
+    for step in shaft.steps:
+        sizes = {"length": step.length, "diameter": step.diameter} | ({"bore": step.bore} if step.bore else {})
+        lines += ["[[shaft.steps]]", *(f"{name} = {_quantity(size, 'm')}" for name, size in sizes.items())]
+        lines += [f"material = {_material_text(step.material)}"] if step.material else []
+    for disc in shaft.discs:
+        lines += ["[[shaft.discs]]", f"z = {_quantity(disc.z, 'm')}"]
+        lines += [f"{name} = {_quantity(getattr(disc, name), _DISC[name])}" for name in ("m", "Id", "Ip")]
+    return lines
+
+
+def _material(entry: MaterialEntry, place: str) -> Material:
+    return Material(E=si_of(entry.E, "Pa", f"{place}.E"), rho=si_of(entry.rho, "kg/m^3", f"{place}.rho"), nu=entry.nu)
+
+
+def _step(entry: StepEntry, place: str) -> Step:
+    try:
+        return Step(
+            length=si_of(entry.length, "m", f"{place}.length"),
+            diameter=si_of(entry.diameter, "m", f"{place}.diameter"),
+            bore=si_of(entry.bore, "m", f"{place}.bore"),
+            material=None if entry.material is None else _material(entry.material, f"{place}.material"),
+        )
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+
+
+def _disc(entry: DiscEntry, material: Material, place: str) -> Disc:
+    z = si_of(entry.z, "m", f"{place}.z")
+    values = {name: getattr(entry, name) for name in _DISC if getattr(entry, name) is not None}
+    sizes = {name: si_of(x, _DISC[name], f"{place}.{name}") for name, x in values.items()}
+    try:
+        if set(sizes) in ({"m"}, {"m", "Id", "Ip"}):
+            return Disc(z=z, **sizes)
+        if {"outer", "width"} <= set(sizes) <= {"outer", "inner", "width", "rho"}:
+            return Disc.of_geometry(z=z, **{"inner": 0.0, "rho": material.rho, **sizes})
+    except ModelError as error:
+        raise RigError(f"{place}: {error}") from None
+    raise RigError(
+        f"{place} has {', '.join(sizes) or 'a plane alone'}; a disc has m, or m, Id and Ip, or outer and width (and "
+        "inner, rho). Give one of these sets"
+    )
+
+
+def _quantity(value: float, unit: str) -> str:
+    return f'{{ value = {value!r}, unit = "{unit}" }}'
+
+
+def _material_text(material: Material) -> str:
+    E, rho = _quantity(material.E, "Pa"), _quantity(material.rho, "kg/m^3")
+    return f"{{ E = {E}, rho = {rho}, nu = {material.nu!r} }}"
+
+
+def unit_of(text: str, place: str) -> Unit:
+    """Read a unit of a rig file; `place` is where it stands, for messages."""
+    try:
+        return parse_unit(text)
+    except UnitError as error:
+        raise RigError(f"{place}.unit: {error}") from None
+
+
+def si_of(entry: QuantityEntry | PlaneEntry | TurningEntry | None, si: str, place: str) -> float:
+    """Return a quantity in its SI unit, 0 where none is given."""
+    if entry is None or entry.value is None:
+        return 0.0
+    unit = unit_of(entry.unit, place)
+    if unit.si != parse_unit(si).si:
+        raise RigError(f"{place} is in [{entry.unit}]; it is measured in [{si}]. Correct unit")
+    return unit.to_si(entry.value)

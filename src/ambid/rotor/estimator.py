@@ -21,7 +21,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.estimation.search import Status
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
-from ambid.rig.rig import RigModes
+from ambid.rig.rotor import RigModes
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, minimise, noise_weight, rough_weight
 from ambid.rotor.modes import Candidate, scan
 from ambid.rotor.scores import sensor_gain

@@ -22,7 +22,7 @@ from ambid.estimation.progress import Tick, silent
 from ambid.physics.linear_model import Parameter, ParameterSpec, StateSpace, discretise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
-from ambid.rig.rig import RigModes
+from ambid.rig.rotor import RigModes
 from ambid.rotor.estimator import Ending, Starter, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra

@@ -18,8 +18,7 @@ from ambid.estimation.estimate import Check
 from ambid.physics.rotor_model import RotorModel
 from ambid.rotor.conclusion import line_checks
 from ambid.rotor.estimate import RotorEstimate
-from ambid.rotor.likelihood import Experiment, Point, sampled
-from ambid.rotor.noise import fit_noise
+from ambid.rotor.likelihood import Experiment, Point, fit_noise, sampled
 from ambid.rotor.response import Sampled
 
 
