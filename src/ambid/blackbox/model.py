@@ -55,15 +55,42 @@ class BlackBoxModel(ABC):
 
     @abstractmethod
     def frequency_response(self, omega: Array) -> Complex:
-        """Return complex G at `omega` (rad/s), shape (n_frequencies, n_outputs, n_inputs)."""
+        """Return G.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs), complex
+        """
 
     @abstractmethod
     def frequency_response_derivative(self, omega: Array) -> Complex:
-        """Return complex dG/dtheta at `omega` (rad/s), shape (n_frequencies, n_outputs, n_inputs, n_theta)."""
+        """Return dG/dtheta.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_inputs, n_theta), complex
+        """
 
     @abstractmethod
     def noise_response(self, omega: Array) -> Complex:
-        """Return complex H at `omega` (rad/s), shape (n_frequencies, n_outputs, n_outputs)."""
+        """Return H.
+
+        Parameters
+        ----------
+        omega : ndarray, shape (n_frequencies,), rad/s
+
+        Returns
+        -------
+        ndarray, shape (n_frequencies, n_outputs, n_outputs), complex
+        """
 
     @abstractmethod
     def state_space(self) -> StateSpaceModel:
@@ -157,7 +184,16 @@ class StateSpaceModel(BlackBoxModel):
         return np.concatenate([getattr(self, m).ravel() for m in "ABCDK"])
 
     def with_theta(self, theta: Array) -> StateSpaceModel:
-        """Return the same structure with coefficients `theta`, (n_theta,)."""
+        """Return the same structure with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        StateSpaceModel
+        """
         parts, first = {}, 0
         for m in "ABCDK":
             rows, columns = getattr(self, m).shape
@@ -166,7 +202,16 @@ class StateSpaceModel(BlackBoxModel):
         return StateSpaceModel(dt=self.dt, **parts)
 
     def in_states(self, T: Array) -> StateSpaceModel:
-        """Return the same model in the state T^-1 x, `T` of shape (n, n)."""
+        """Return the same model in the state T^-1 x.
+
+        Parameters
+        ----------
+        T : ndarray, shape (n, n)
+
+        Returns
+        -------
+        StateSpaceModel
+        """
         back = np.linalg.inv(T)
         return StateSpaceModel(
             A=back @ self.A @ T, B=back @ self.B, C=self.C @ T, D=self.D, K=back @ self.K, dt=self.dt
@@ -433,7 +478,16 @@ class Polynomials:
         return np.concatenate([c for _, _, c in self.parts()])
 
     def with_theta(self, theta: Array) -> Polynomials:
-        """Return polynomials of the same degrees with coefficients `theta`, (n_theta,)."""
+        """Return polynomials of the same degrees with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        Polynomials
+        """
         parts, n = np.split(theta, np.cumsum([c.size for _, _, c in self.parts()])[:-1]), len(self.B)
         return Polynomials(
             A=parts[0], B=tuple(parts[1 : n + 1]), C=parts[n + 1], D=parts[n + 2], F=tuple(parts[n + 3 :])
@@ -498,7 +552,16 @@ class PolynomialModel(RationalModel):
                 first += c.size
 
     def with_theta(self, theta: Array) -> PolynomialModel:
-        """Return the same structure with coefficients `theta`, (n_theta,)."""
+        """Return the same structure with other coefficients.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_theta,)
+
+        Returns
+        -------
+        PolynomialModel
+        """
         ends = np.cumsum([p.theta.size for p in self.outputs])
         split = zip(self.outputs, np.split(theta, ends[:-1]), strict=True)
         return PolynomialModel(outputs=tuple(p.with_theta(part) for p, part in split), dt=self.dt)
