@@ -1,7 +1,6 @@
 """Coil from voltage and current, rotor at rest, as the thesis does it: V = R i + L i' (thesis eq. 4.1 to 4.3).
 
-Least squares on the first-order difference equation is biased by noise on the measured current, because the regressor
-is that same current. The 'coil' model of `ambid identify` is not.
+Least squares is biased by noise on the current, its own regressor; the 'coil' model of `ambid identify` is not.
 """
 
 from __future__ import annotations

@@ -1,12 +1,9 @@
-"""Columns that are not what the rig says: one without a signal, reversed, swapped, or late.
+"""Columns that are not what the rig says: one without a signal, reversed, swapped, or late; refused by name.
 
-No bearing explains such a record, and the search for one is long: it is refused, with the column's name. A column
-without a signal is one of which the others explain nothing. A sign or an order is wrong where the start values fit
-badly, and those of the record with that sign or order changed lead to a fit that fits fully.
-
-A channel that lags behind the other is no plant: the rotor's equation x'' = -(k_x/m) x + (k_i/m) i + constant is
-regressed over frequencies (`take_moments`: nothing measured is differentiated) with the current taken some samples
-later or earlier, and where it explains most is the lag. A delay of the voltage, or of both channels, is the model's.
+No bearing explains such a record, and the search for one is long. Without a signal: the others explain nothing of it;
+wrong sign or order: the start values fit badly, and lead to a full fit with it changed. For a lag between channels the
+rotor's x'' = -(k_x/m) x + (k_i/m) i + constant is regressed over frequencies (`take_moments`), the current shifted to
+where it explains most. A delay of the voltage, or of both channels, is the model's.
 """
 
 from __future__ import annotations
@@ -138,10 +135,9 @@ def refuse_mistaken(
     *,
     searched: bool = False,
 ) -> None:
-    """Raise where the record fits badly, and fits well with one sign reversed or with two columns swapped.
-
-    `as_is`: criterion per sample of the best start, infinite where there is none, or (`searched`) of a fit that failed;
-    `follow`: searches from start values.
+    """Raise where the record fits badly, and well with one sign reversed or two columns swapped. `as_is`: criterion per
+    sample of the best start, infinite where there is none, or (`searched`) of a failed fit; `follow`: searches from
+    start values.
     """
     coil = _coil(model, signals)
     turned = coil is not None and coil.reversed and coil.share > _CLEAR
@@ -186,10 +182,7 @@ def _coil(model: LinearModel, signals: Signals) -> Coil | None:
 
 
 def _likely(model: LinearModel, changes: Iterable[Change], share: float) -> tuple[list[Change], list[Change]]:
-    """Changes after which there is a clear coil between voltage and current, the clearest first; and the others.
-
-    `share`: of the coil as it is; what makes it less clear is left out.
-    """
+    """Changes that leave a coil no less clear than its `share` as it is, the clearest first; and the others."""
     coils, others = [], []
     for change in changes:
         coil = _coil(model, change[2])
@@ -227,8 +220,7 @@ def _refuse_units(
     follow: Callable[[Sequence[Candidate]], Fit],
     below: float,
 ) -> None:
-    """Raise where only what the rig says of a parameter stands in the way, and a mistaken unit would explain that.
-
+    """Raise where only what the rig says of a parameter stands in the way, and a mistaken unit would explain that;
     `below`: criterion per sample that the start values without it have to reach.
     """
     if all(p.role == "free" for p in parameters if p.value):
@@ -407,10 +399,8 @@ def _rows(
 
 
 def _coarse(target: Spectrum, stiffness: Spectrum, current: Spectrum, turn: Array) -> tuple[float, int]:
-    """The whole lag at which most is explained, and how much; of several that explain as much the smallest.
-
-    Where one resonance has most of the motion, half of its period later the current explains as much with the other
-    sign.
+    """The whole lag at which most is explained, the smallest of equals, and how much: with one resonance dominant, half
+    its period later the current explains as much with the other sign.
     """
     if not (np.any(target) and np.any(stiffness) and np.any(current)):
         return 0.0, 0
@@ -431,11 +421,9 @@ def _coarse(target: Spectrum, stiffness: Spectrum, current: Spectrum, turn: Arra
 
 
 def _sd(terms: Array, left: Array) -> float:
-    """Standard deviation of the last coefficient, whatever the spectrum of what is `left` is.
-
-    The window makes neighbouring lines alike, and a few high ones count most. So the products of lines that the window
-    joins are summed (Newey and West 1987), and each is judged as if it and its neighbours had been left out (MacKinnon
-    and White 1985): over sound records the lag found over this has a root mean square of 1, without it of 2 to 3.
+    """Standard deviation of the last coefficient, whatever the spectrum of what is `left`. Products of lines that the
+    window joins are summed (Newey and West 1987), each judged as if its neighbours were left out (MacKinnon and White
+    1985): over sound records the lag over this has a root mean square of 1, without it of 2 to 3.
     """
     inverse, n = np.linalg.pinv(terms.T @ terms), left.size // 2  # real parts of the lines, then imaginary ones
     leverage = np.einsum("ij,jk,ik->i", terms, inverse, terms)

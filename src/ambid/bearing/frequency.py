@@ -1,8 +1,7 @@
 """Physical parameters of a linear model from a frequency response, by maximum likelihood.
 
-Minimises the sum of e^H C^-1 e between the measured response and that of the model, exactly sampled where the input is
-held, with exact derivatives; starts come from the response itself. Consistent under feedback as far as the response is:
-take it with the reference (`ambid.signals.response`).
+Minimises the sum of e^H C^-1 e against the model, exactly sampled where the input is held. Consistent under feedback as
+far as the response is: take it with the reference (`ambid.signals.response`).
 """
 
 from __future__ import annotations
@@ -51,10 +50,8 @@ def response(
     *,
     moving: bool = False,
 ) -> tuple[Complex, Complex]:
-    """Return the model's response in the measured channels and its derivative by parameters, and by the delay.
-
-    `theta`: SI; `names`: parameters to differentiate by; `delay`: in samples; `moving`: whether the derivative by it
-    comes last. Returns (n_frequencies, n_outputs, n_inputs), and the same with one more axis.
+    """Return the model's response (n_frequencies, n_outputs, n_inputs) at `theta` (SI), and its derivative by
+    parameters `names`, on one more axis, where `moving` with that by the delay (samples) last.
     """
     physical = physical_response(
         model, theta, ln.omega, dt=ln.dt if ln.held else None, delay_s=delay * ln.dt, along=names, with_delay=moving
@@ -68,12 +65,9 @@ def response(
 def start_values(
     model: LinearModel, ln: Lines, channels: Channels, delay: float, known: Mapping[str, float]
 ) -> Iterator[dict[str, float]]:
-    """Yield start values: the equations of motion, linear in the parameters, by regression over bands of lines.
-
-    As `weak_form_values`, with the response in place of the spectra: the input is 1 (times its hold), each output its
-    G. Nothing where the model's equations want an output that was not measured.
-
-    `known`: fixed values, SI. Returns all parameters, SI, as they come out (not always a plant).
+    """Yield start values by regression of the equations of motion over bands of lines, as `weak_form_values`, with
+    input 1 (times its hold) and outputs G: all parameters, SI, not always a plant; none where an output it needs was
+    not measured.
     """
     copies = max(1, _COPIES // ln.n_lines)
     omega = np.repeat(ln.omega, copies)
@@ -114,36 +108,24 @@ class PhysicalProblem:
     fractional: bool = False  # whether the delay is estimated as a real number, last in the vector
 
     def theta(self, v: Array) -> dict[str, float]:
-        """Return all physical parameters in SI.
-
-        `v`: (n_vector,).
-        """
+        """Return all physical parameters in SI."""
         x = v[: self.size.size]
         values = self.size * np.where(self.positive, np.exp(np.clip(np.where(self.positive, x, 0.0), -50.0, 50.0)), x)
         return {**self.known, **{p.name: float(x) for p, x in zip(self.estimated, values, strict=True)}}
 
     def delay_at(self, v: Array) -> float:
-        """Return the delay in samples.
-
-        `v`: (n_vector,).
-        """
+        """Return the delay in samples."""
         if not self.fractional:
             return self.delay
         return self.delay + (float(1 / (1 + np.exp(-v[-1]))) if self.lines.held else float(v[-1]))
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Return the vector for given parameters, without a delay.
-
-        `values`: SI. Returns (n_estimated,).
-        """
+        """Return the vector (n_estimated,) of parameters in SI, without a delay."""
         x = np.array([values[p.name] for p in self.estimated]) / self.size
         return np.where(self.positive, np.log(np.maximum(x, 1e-300)), x)
 
     def residual(self, v: Array) -> Array:
-        """Return whitened model - measured, then the priors'.
-
-        `v`: (n_vector,). Returns (n_rows,).
-        """
+        """Return whitened model - measured, then the priors', (n_rows,)."""
         n_rows = 2 * self.lines.n_lines * self.lines.entries
         try:
             with np.errstate(all="ignore"):  # a step too far overflows: the search turns back from what is not finite
@@ -154,10 +136,8 @@ class PhysicalProblem:
         return np.concatenate([np.where(np.isfinite(rows), rows, _FAR), self._prior(v)])
 
     def slope(self, v: Array, *, by_parameters: bool = False) -> Array:
-        """Return the derivative of `residual`.
-
-        `v`: (n_vector,); `by_parameters`: by parameters in SI and the delay in samples instead of the vector. Returns
-        (n_rows, n_vector).
+        """Return the derivative of `residual` (n_rows, n_vector), or `by_parameters` that by SI parameters and delay in
+        samples.
         """
         theta, names = self.theta(v), [p.name for p in self.estimated]
         _, d = response(self.model, theta, names, self.lines, self.channels, self.delay_at(v), moving=self.fractional)
@@ -209,10 +189,8 @@ def frequency_estimate(
     converged: bool,
     how: Literal["estimated", "given"],
 ) -> FrequencyEstimate:
-    """Put an estimate together.
-
-    `parameters`: what was known before, in the model's order; `cost`: at `v`, priors included; `v`: (n_vector,); `how`:
-    the delay.
+    """Put an estimate together; `parameters`: what was known before, in the model's order; `cost`: at `v`, priors
+    included; `how`: the delay.
     """
     ln, n = problem.lines, problem.size.size
     r, J = problem.residual(v), problem.slope(v, by_parameters=True)

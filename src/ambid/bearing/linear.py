@@ -1,9 +1,8 @@
 """Grey-box estimation of the physical parameters of a linear model (theory.md sec. 2; Ljung 1999, sec. 7.5).
 
-Innovations form: physical parameters, noise description, offsets, initial state and delay by maximum likelihood, for
-stable and unstable plants, in open and closed loop. Start values come from the data; the delay is searched, in whole
-samples and then as a real number; noise is described by disturbance and sensor levels, or by a free predictor gain
-where the data ask for it. Where the starts lead nowhere, a global search gives others (`ambid.bearing.rescue`).
+Maximum likelihood in innovations form of parameters, noise (disturbance and sensor levels, or a free predictor gain
+where the data ask for it), offsets, initial state and delay (whole samples, then a real number), for unstable plants
+and closed loops too. Starts come from the data, or from a global search where they fail (`ambid.bearing.rescue`).
 """
 
 from __future__ import annotations
@@ -134,9 +133,8 @@ def _follow(
     search_delay: bool,
     trial: bool = False,
 ) -> Fit:
-    """The best candidate searched, then delay as a real number, then a free gain, each only where the data pay.
-
-    `trial`: give up where no search converges, as those of a wrong record do, in hundreds of steps each.
+    """The best candidate searched, then delay as a real number, then a free gain, only where the data pay. `trial`:
+    give up where no search converges, as those of a wrong record do, in hundreds of steps each.
     """
     fit: Fit | None = None
     for candidate in candidates:
@@ -227,10 +225,7 @@ def _check(model: LinearModel, signals: Signals, parameters: Sequence[Parameter]
 
 
 def carry(fit: Fit, problem: PredictorProblem) -> Array:
-    """Write a fit's numbers in the vector of another problem of the same model and scales.
-
-    `problem`: may differ in delay, noise form and whether the delay is estimated. Returns (problem.size,).
-    """
+    """Write a fit's numbers in the vector of another `problem`, perhaps of another delay (or its freedom) or noise."""
     old, vector = fit.problem, np.zeros(problem.size)
     for group in ("physical", "offset", "initial"):
         vector[problem.slices[group]] = fit.vector[old.slices[group]]

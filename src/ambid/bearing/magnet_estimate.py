@@ -1,16 +1,11 @@
 """Strategy of the nonlinear grey box: laws compared by likelihood, extensions where they pay, delay as the data show.
 
 Prediction error with an extended Kalman predictor: consistent under feedback and for an unstable plant as far as the
-linearisation of the *noise* holds (the mean follows the full equations), because each prediction uses the past alone
-and the predictor, unlike the plant, is stable. Its gain follows the operating point through the Riccati recursion from
-four levels per record; a constant gain would be wrong by the change of k_x over the gap.
-
-Start values: the linear grey box near one operating point, and for one magnet the balance of gravity over all.
-
-The linear estimate gives R, L, delay and, where it is not known, the mass. One magnet that carries a weight shows its
-force law at rest: i(x) over all records is a straight line for the hyperbolic law, i = (x + s) sqrt(2 m g/k), and
-ln i is one for the exponential, 2 ln i = ln(2 m g zeta/L_g) + x/zeta. For a pair k_i = 2 k i0/s^2 and
-k_x = -2 k i0^2/s^3 (theory.md sec. 1, k = 2 k' cos(alpha)).
+*noise*'s linearisation holds (the mean follows the full equations). Its gain follows the operating point through the
+Riccati recursion from four levels per record; a constant one would be wrong by the change of k_x over the gap. Starts:
+R, L, delay and an unknown mass from the linear grey box near one point; for one magnet that carries a weight i(x) at
+rest, a line for the hyperbolic law, i = (x + s) sqrt(2 m g/k), and for the exponential, 2 ln i = ln(2 m g zeta/L_g) +
+x/zeta; for a pair k_i = 2 k i0/s^2 and k_x = -2 k i0^2/s^3 (theory.md sec. 1, k = 2 k' cos(alpha)).
 """
 
 from __future__ import annotations
@@ -60,13 +55,10 @@ def estimate_bearing(
     evaluations: int = EVALUATIONS,
     seed: int = 0,
 ) -> BearingFit:
-    """Estimate one nonlinear bearing from several records at once.
-
-    `records`: at least one of a rotor that is free to move; `parameters`: what is known of the numbers, by name;
-    `laws`: the likelihood chooses; `delay`: of the voltage in samples of the first record; None: found; `eddy`: force
-    behind a pole a/(s + a); `drift`: a force that walks slowly: what the law leaves over; `tick`: called after each
-    iteration; KeyboardInterrupt ends in the best so far; `seed`: of the global search, which `global_search` of the fit
-    tells of.
+    """Estimate one nonlinear bearing from several `records`, at least one of a free rotor. `laws`: the likelihood
+    chooses; `delay`: of the voltage in samples of the first record, None: found; `eddy`: force behind a pole a/(s + a);
+    `drift`: a slowly walking force, what the law leaves over; `seed`: of the global search, told by the fit's
+    `global_search`; a KeyboardInterrupt of `tick`, called after each iteration, ends in the best so far.
     """
     free = [r for r in records if not r.held]
     if not free:
@@ -284,10 +276,8 @@ class LinearStart:
 def linear_start(
     record: BearingRecord, known: Mapping[str, Parameter], delay: float | None, law: MagnetLaw
 ) -> LinearStart:
-    """Run the linear grey box on (the first part of) one record.
-
-    `record`: of a rotor that is free to move; `known`: what is known of m, R and c; `delay`: in samples; None:
-    searched.
+    """Run the linear grey box on (the first part of) a record of a free rotor; `known`: what is known of m, R and c;
+    `delay`: in samples; None: searched.
     """
     model, wrong_signs, doubtful = OneAxis(), list[float](), list[LinearStart]()
     parameters = [
@@ -356,10 +346,8 @@ def _stretches(record: BearingRecord) -> list[tuple[int, int]]:
 
 
 def balance(records: Sequence[BearingRecord], law: MagnetLaw, weight: float) -> tuple[float, float]:
-    """Find strength and length of a single magnet that carries a weight, from means over short windows.
-
-    `records`: of a rotor that is free to move; `weight`: m g in N, positive. Returns `strength, length`: k in N m^2/A^2
-    and s in m, or L_g in H and zeta in m.
+    """Find `strength, length` of a single magnet that carries `weight` (m g in N, positive) from means over short
+    windows of free-rotor records: k in N m^2/A^2 and s in m, or L_g in H and zeta in m.
     """
     x, i = [], []
     for record in records:
@@ -387,10 +375,8 @@ def balance(records: Sequence[BearingRecord], law: MagnetLaw, weight: float) -> 
 def start_numbers(
     law: MagnetLaw, rig: Mapping[str, Parameter], records: Sequence[BearingRecord], linear: LinearStart
 ) -> tuple[Number, ...]:
-    """Put start values and roles together.
-
-    `rig`: by name; what is not named takes the law's default role. Returns in the order of the law's names and
-    `BODY`.
+    """Put start values and roles together, in the order of the law's names and `BODY`; what `rig` does not name takes
+    the law's default role.
     """
     lin, free = linear.values, [r for r in records if not r.held]
     position, current = np.concatenate([r.kept for r in free]).T
@@ -456,9 +442,8 @@ def _number(name: str, parameter: Parameter | None, guess: float, law: MagnetLaw
 
 
 def with_noise(problem: BearingProblem, values: Mapping[str, float]) -> BearingProblem:
-    """Choose start levels of the noise: what the sensors' roughness says, and process noise by the criterion.
-
-    `values`: m in kg and L in H. Returns with other `noise_center`.
+    """Choose start levels of the noise: what the sensors' roughness says, and process noise by the criterion; m in kg,
+    L in H.
     """
     centre = np.zeros((len(problem.records), 5))
     for r, record in enumerate(problem.records):

@@ -1,12 +1,9 @@
 """The extended Kalman predictor of the nonlinear bearing and its exact sensitivities, compiled.
 
-Physical numbers `theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and
-the delay beyond whole samples.
-
-A sensitivity is a lane: of a number, of a delay that becomes shorter instead of longer (`EARLY`: the slopes differ
-where it is whole), or of the logarithm of a noise level. Lanes are the last axis of rows of constant length in one
-array `X`, and what multiplies them stands in an array `C`: so the compiler sees that nothing overlaps, and uses vector
-instructions. The number of states is the length of a tuple, so that it unrolls the loops over them.
+`theta` (20): the magnet's nine, then m, R, c, g, a, x_offset, i_offset, v_offset, v_drop, i_drop, and the delay beyond
+whole samples. A sensitivity is a lane: of a number, of a delay that becomes shorter instead of longer (`EARLY`: the
+slopes differ where it is whole), or of the logarithm of a noise level. Lanes are the last axis in `X`, factors stand in
+`C`, and states count by a tuple's length, so that the compiler can use vector instructions and unroll.
 """
 
 from __future__ import annotations
@@ -68,11 +65,9 @@ _energy: Callable[..., None] = compiled(coenergy_derivatives)
 
 @compiled
 def rates(z: Array, volt: float, th: Array, flags: Flags, w: Array, g: Array) -> tuple[float, float]:
-    """Write the right-hand side g (n,) at a state under a voltage, from the co-energy's derivatives w (12,) there.
-
-    Position, velocity and current, then the force behind the eddy pole, then a drifting force, where `flags`
-    (exponential, pair, eddy, drift, held) have them. Returns the share of v_drop that transistors and diodes take, and
-    its slope by the current.
+    """Write the right-hand side g (n,) at a state under a voltage, by the co-energy's derivatives w (12,): position,
+    velocity, current, force behind the eddy pole, drifting force, as `flags` (exponential, pair, eddy, drift, held)
+    have them. Returns the share of v_drop that transistors and diodes take, and its slope by the current.
     """
     v, i = z[1], z[2]
     if not flags[4]:
@@ -167,10 +162,9 @@ def _advance(
     states: States, p: int, z: Array, th: Array, active: Integers, chain: Array, flags: Flags, volts: Array, h: float,
     steps: int, w: Array, dw: Array, g: Array, at: Array, to: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
-    """Carry state and sensitivities over one sample in place by `steps` classical Runge-Kutta steps.
-
-    `volts`: mean and slope of the voltage over the sample, and their derivatives by a longer and by a shorter delay.
-    `_spread` has been where the sample begins: `w`, `dw` and the law's lanes are those.
+    """Carry state and sensitivities over one sample in place by `steps` Runge-Kutta steps, after `_spread` (`w`, `dw`,
+    lanes). `volts`: mean and slope of the voltage over the sample, and their derivatives by a longer and by a shorter
+    delay.
     """
     n, step = len(states), h / steps
     for k in range(steps):
@@ -336,11 +330,10 @@ def _spread(
     states: States, p: int, z: Array, P: Array, th: Array, active: Integers, chain: Array, flags: Flags, q2: Array,
     volts: Array, h: float, steps: int, w: Array, dw: Array, g: Array, C: Array, X: Array,
 ) -> None:  # fmt: skip
-    """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F and E of the linearised plant.
-
-    `q2`: variances of force, voltage and drift, with what is not known of force and voltage of this sample. A is the
-    Jacobian where the sample begins, under its mean voltage; F = I + h A + (h A)^2/2 and E = h (I + h A/2) B of a
-    step, put together over `steps` of them, a power of two.
+    """Carry the covariance over one sample in place: P <- F P F' + E q2 E', F = I + h A + (h A)^2/2 and E = h (I + h
+    A/2) B of a step, put together over `steps`, a power of two; A is the Jacobian where the sample begins, under its
+    mean voltage. `q2`: variances of force, voltage and drift, with what is not known of force and voltage of this
+    sample.
     """
     n = len(states)
     h /= steps
@@ -414,10 +407,9 @@ def _correct_lanes(states: States, p: int, e: float, s: float, C: Array, X: Arra
 def _correct(
     states: States, e: float, o: int, r2: float, p: int, z: Array, P: Array, C: Array, X: Array, rows: Array
 ) -> float:  # fmt: skip
-    """Take in one measured output, 0 position or 1 current; return its innovation variance.
-
-    `rows` (2, p + 1) gets the rows of the likelihood: innovation over its deviation, and (1 - e^2/s)/sqrt(2) with the
-    derivative ds/(s sqrt(2)): their inner products are gradient and Fisher information of (log s + e^2/s)/2.
+    """Take in output 0 (position) or 1 (current); return its innovation variance s. `rows` (2, p + 1) gets e over its
+    deviation, and (1 - e^2/s)/sqrt(2) with derivative ds/(s sqrt(2)): inner products are gradient and Fisher
+    information of (log s + e^2/s)/2.
     """
     n, at = len(states), 2 * o
     for a in range(n):
@@ -448,15 +440,13 @@ def predict(
     th: Array, active: Integers, chain: Array, noise2: Array, flags: Flags, h: float, steps: int, z: Array, P: Array,
     X: Array, e: Array, s: Array, rows: Array,
 ) -> bool:  # fmt: skip
-    """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite.
-
-    `states`: as many as there are; `u` (n,), `loose` (n,) variance of what is not known of it, `knock` (n, 2) of what
-    is not known of the force, and of the back-EMF; `y` (n, 2) position and current, `valid` (n, 2): which of
-    them are measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or twice the
-    square of a level; without lanes the criterion alone. `noise2` holds the squares of the levels of position, current,
-    force, voltage and drift (of one sample). `z`, `P` and `X` (`ROOM`,), which is zero at first, hold state, covariance
-    and their derivatives before sample `first`, and move along. `e`, `s` (n, 2) get innovations and their variances;
-    `rows` (4 (end - first), p + 1) the rows of the likelihood.
+    """Run the predictor from sample `first` to `end`; False where a gap closes or numbers cease to be finite. `u` (n,),
+    `loose` (n,) its unknown variance, `knock` (n, 2) that of force and back-EMF; `y`, `valid` (n, 2): position and
+    current, and whether measured; `active`, `chain` (p,): kind of each lane, and the derivative by it of a number, or
+    twice the square of a level; without lanes the criterion alone. `noise2`: squared levels of position, current,
+    force, voltage and drift (of one sample). `z`, `P`, `X` (`ROOM`,; zero at first), state, covariance and derivatives
+    before `first`, move along; `e`, `s` (n, 2) get innovations and variances, `rows` (4 (end - first), p + 1) the
+    likelihood's.
     """
     n = len(states)
     p = min((active.size + 7) // 8 * 8, PITCH)  # a few stay empty, so that vector instructions leave none over

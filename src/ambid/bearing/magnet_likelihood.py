@@ -1,8 +1,5 @@
-"""Maximum likelihood of the extended Kalman predictor over all records.
-
-Minimised is the sum of log s + e^2/s over all innovations e with their predicted variances s (Ljung 1999, sec. 7.4;
-Astrom 1980), exact in state and covariance. Its gradient and Fisher information are inner products of rows
-(`_kernels`), reduced by QR record by record.
+"""Maximum likelihood of the extended Kalman predictor over all records: least sum of log s + e^2/s over innovations e
+with predicted variances s (Ljung 1999, sec. 7.4; Astrom 1980), exact in state and covariance.
 """
 
 from __future__ import annotations
@@ -73,10 +70,7 @@ class Rows:
 
 
 def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
-    """Run the predictor over one record.
-
-    `vector`: (size,); `r`: which record. Returns none where there is no predictor.
-    """
+    """Run the predictor over record number `r`; None where there is no predictor."""
     n = problem.records[r].u.size
     innovations = Innovations(e=np.full((n, 2), np.nan), s=np.full((n, 2), np.nan))
     for part in sweep(problem, vector, r, innovations, slopes=False):
@@ -88,11 +82,9 @@ def run(problem: BearingProblem, vector: Array, r: int) -> Innovations | None:
 def sweep(
     problem: BearingProblem, vector: Array, r: int, innovations: Innovations, *, slopes: bool, delays: bool = False
 ) -> Iterator[Rows | None]:
-    """Run the predictor over one record block after block, so that memory does not grow with it.
-
-    `vector`: (size,); `r`: which record; `innovations`: filled; `slopes`: whether the likelihood's rows are wanted;
-    `delays`: with columns behind the vector's for a delay that is settled, see `Linear`. Yields None, and ends,
-    where there is no predictor.
+    """Run the predictor over record `r` block after block, filling `innovations`; yields None, and ends, where there is
+    none. `slopes`: whether the likelihood's rows are wanted; `delays`: with columns, behind the vector's, for a settled
+    delay, see `Linear`.
     """
     from ambid.bearing.magnet_kernels import EARLY, LATE, LEVEL, ROOM, predict
 
@@ -198,9 +190,8 @@ def _initial(problem: BearingProblem, r: int, begin: int) -> tuple[Array, Array]
 
 
 def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
-    """Return residual and Jacobian rows of the priors: those of the numbers, and the weak one on log noise levels.
-
-    `vector`: (size,). Returns `r`: (n_priors,); `J`: (n_priors, size).
+    """Return the priors' `r` (n_priors,) and `J` (n_priors, size): those of numbers, and the weak one on log noise
+    levels.
     """
     values, chain = problem.values(vector), problem.chain(vector)
     r, J = [], []
@@ -222,10 +213,7 @@ def prior_rows(problem: BearingProblem, vector: Array) -> tuple[Array, Array]:
 
 
 def criterion(problem: BearingProblem, vector: Array) -> float:
-    """Return the criterion at a vector: infinite where there is no predictor.
-
-    `vector`: (size,).
-    """
+    """Return the criterion at a vector: infinite where there is no predictor."""
     total = 0.0
     for r in range(len(problem.records)):
         innovations = run(problem, vector, r)
@@ -238,10 +226,7 @@ def criterion(problem: BearingProblem, vector: Array) -> float:
 
 
 def linearise(problem: BearingProblem, vector: Array) -> Linear | None:
-    """Return the criterion, its gradient and Fisher information at a vector, as rows.
-
-    `vector`: (size,). Returns none where there is no predictor.
-    """
+    """Return the criterion, its gradient and Fisher information as rows; None where there is no predictor."""
     prior, J_prior = prior_rows(problem, vector)
     total, scores, innovations = float(prior @ prior), list[Array](), list[Innovations]()
     parts = [np.column_stack([J_prior, np.zeros((prior.size, 2 * len(problem.settled))), prior])]
@@ -287,9 +272,8 @@ def _of_record(
 
 
 def promise(at: Linear, delay: int | None = None) -> float:
-    """Return the fall of the criterion that a full Fisher step promises (score test, where numbers were added).
-
-    `delay`: column of `J_delay` that may move, too.
+    """Return the criterion's fall by a full Fisher step (score test of added numbers); `delay`: column of `J_delay` to
+    move too.
     """
     J = at.J if delay is None else np.column_stack([at.J, at.J_delay[:, delay]])
     return directions(J).explain(at.r)
@@ -303,11 +287,8 @@ def search(
     damping: float = 1e-3,
     tick: Tick | None = None,
 ) -> BearingFit:
-    """Minimise the criterion from `start`.
-
-    `start`: (size,); `iterations`: bound on linearisations; `damping`: at the beginning, small where the start is good.
-    Returns with status ``"failed"`` where there is no
-    predictor at `start`.
+    """Minimise the criterion from `start` by at most `iterations` linearisations, `damping` at first (small for a good
+    start); status ``"failed"`` where there is no predictor at `start`.
     """
     objective = _Objective(problem)
     end = descend(
@@ -371,10 +352,7 @@ class BearingUncertainty:
     inflation: float  # largest ratio of robust to information standard deviation
 
     def covariance(self, *, robust: bool) -> Array:
-        """Return the covariance; the robust one is nowhere smaller than that of the information.
-
-        Returns (n, n), SI.
-        """
+        """Return the covariance (n, n), SI; the robust one is nowhere smaller than the information's."""
         if not robust:
             return self.information
         ratio = np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.robust), 1e-300))
@@ -383,10 +361,7 @@ class BearingUncertainty:
 
 
 def uncertainty(fit: BearingFit) -> BearingUncertainty:
-    """Compute the covariances of a fit.
-
-    `fit`: not failed.
-    """
+    """Compute the covariances of a fit that has not failed."""
     assert fit.at is not None
     problem, at = fit.problem, fit.at
     n, chain = len(problem.estimated), problem.chain(fit.vector)

@@ -1,19 +1,10 @@
 """What is estimated from what: records, magnet law, numbers, and the layout of the vector that the search moves.
 
-The vector holds, in this order: the free and prior numbers (the logarithm of those that physics needs positive, the
-others over their magnitudes), one delay for each sampling rate where delays are free, and the log noise levels of each
-record (position, current, force, voltage, drift; of a held rotor current and voltage alone).
-
-Samples in which the rotor touches a stop: a force acts there that the model does not have.
-
-A few touches in thousands of samples are enough to move every number by deviations, as each hits the predictor with a
-force hundreds of times the noise. They are not thrown away: position and current are measured on; force and
-back-EMF are what is unknown, as the speed ends somewhere within the sample. A rotor that lies on a stop is carried by a
-force that does not average out: those stretches are cut, and the predictor begins again where the rotor is free again.
-
-Whether the force of one magnet carries the weight shows over any stretch without touches: the impulse of the force is
-that of the weight and the momentum gained, so that the mean of f/(m g) is (v_end - v_begin)/(g T) - 1. Neither coil nor
-noise enter.
+The vector: free and prior numbers (the logarithm where physics needs them positive, else over their magnitudes), a free
+delay for each sampling rate, and each record's log noise levels (position, current, force, voltage, drift; of a held
+rotor current and voltage). Each touch of a stop hits the predictor with a force hundreds of times the noise: position
+and current are measured on, force and back-EMF are unknown; where the rotor lies on a stop, the record is cut. Any
+stretch without touches shows whether one magnet carries the weight: the mean of f/(m g) is (v_end - v_begin)/(g T) - 1.
 """
 
 from __future__ import annotations
@@ -86,10 +77,7 @@ class BearingRecord:
         return self.y if self.cut is None else self.y[~self.cut]
 
     def first(self, count: int) -> BearingRecord:
-        """Return the beginning of the record.
-
-        `count`: samples in it that are used.
-        """
+        """Return the beginning of the record, `count` used samples."""
         n = count if self.cut is None else int(np.searchsorted(np.cumsum(~self.cut), count)) + 1
         return replace(
             self,
@@ -191,37 +179,25 @@ class BearingProblem:
         return bounds
 
     def values(self, vector: Array) -> dict[str, float]:
-        """Return all numbers at a vector, SI.
-
-        `vector`: (size,).
-        """
+        """Return all numbers at a vector, SI."""
         values = {n.name: n.value for n in self.numbers}
         for n, v in zip(self.estimated, vector.tolist(), strict=False):
             values[n.name] = v * n.magnitude if n.signed else float(np.exp(v))
         return values
 
     def chain(self, vector: Array) -> Array:
-        """Return d(number)/d(vector) of the estimated numbers.
-
-        `vector`: (size,). Returns (n_estimated,).
-        """
+        """Return d(number)/d(vector) of the estimated numbers, (n_estimated,)."""
         values = self.values(vector)
         return np.array([n.magnitude if n.signed else values[n.name] for n in self.estimated])
 
     def delay_at(self, vector: Array, rate_hz: float) -> float:
-        """Return the delay in samples at a rate.
-
-        `vector`: (size,).
-        """
+        """Return the delay in samples at a rate."""
         if rate_hz in self.free_delay:
             return float(vector[len(self.estimated) + self.rates.index(rate_hz)])
         return self.delays[rate_hz]
 
     def theta(self, vector: Array, rate_hz: float) -> tuple[Array, int]:
-        """Return the kernels' numbers at a vector, and the whole samples of delay.
-
-        `vector`: (size,); `rate_hz`: whose delay. Returns `theta`: (20,).
-        """
+        """Return the kernels' numbers (20,) at a vector, and the whole samples of delay at a rate."""
         values, delay = self.values(vector), self.delay_at(vector, rate_hz)
         whole = int(np.floor(delay))
         body = [values[name] for name in BODY]
@@ -234,10 +210,7 @@ class BearingProblem:
         return np.array([self.law.gap == "exponential", self.law.pair, eddy, drift, held])
 
     def noise2(self, vector: Array, r: int) -> Array:
-        """Return the squared noise levels of one record.
-
-        `vector`: (size,); `r`: which record. Returns (5,).
-        """
+        """Return the squared noise levels (5,) of record number `r`."""
         squares = np.zeros(len(LEVELS))
         squares[list(self.levels(r))] = np.exp(2.0 * vector[self.noise_slices[r]])
         return squares
@@ -253,13 +226,9 @@ _LEAST = 50  # samples of a stretch that counts
 
 
 def touching(record: BearingRecord, stops: Interval) -> BearingRecord:
-    """Take the force as unknown while the rotor touches a stop, and cut out where it lies on one.
-
-    The acceleration of a touch is given the standard deviation of stopping within a sample from the speed seen about
+    """Take the force of a free rotor's record as unknown (`knock`) while the rotor touches a stop, and `cut` out where
+    it lies on one. A touch's acceleration has the standard deviation of stopping within a sample from the speed about
     it.
-
-    `record`: of a rotor that is free to move. Returns with `knock` and `cut` where that is so; the record as it was
-    where the rotor never touches.
     """
     x, noise = record.y[:, 0], float(noise_floor(record.y)[0])
     at = (x <= stops[0] + _NEAR * noise) | (x >= stops[1] - _NEAR * noise)
@@ -307,10 +276,8 @@ def _runs(on: NDArray[np.bool_]) -> list[tuple[int, int]]:
 
 
 def weight_carried(law: MagnetLaw, values: Mapping[str, float], record: BearingRecord) -> float | None:
-    """Return the mean force of one magnet over what it would have to be.
-
-    `law`: of one magnet; `values`: numbers, SI; m and g among them; `record`: of a rotor that is free to move. Returns
-    1 where the law carries the weight; None where no stretch is long enough to tell.
+    """Return the mean force of one magnet's `law` over what a free rotor needs, 1 where it carries the weight; None
+    where no stretch is long enough to tell. `values`: SI, m and g among them.
     """
     free = np.ones(record.u.size, dtype=np.bool_) if record.cut is None else ~record.cut
     if record.knock is not None:

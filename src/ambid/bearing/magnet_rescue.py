@@ -42,11 +42,9 @@ def rescue(
     evaluations: int,
     tick: Tick | None,
 ) -> BearingFit:
-    """Return the fit, or a better one from a global search where its start values failed.
-
-    `before`: of all records, at the end of the ordinary way; `finish`: what follows a search over all records; `seed`:
-    equal seeds give equal results; `evaluations`: of the likelihood in the global search, at most; 0 for none; `tick`:
-    a KeyboardInterrupt ends in the best so far.
+    """Return the fit, or a better one from a global search where its start values failed. `before`: of all records, at
+    the end of the ordinary way; `finish`: what follows a search over all; `evaluations`: of the likelihood, at most, 0
+    for none; `seed`: equal ones give equal results; a KeyboardInterrupt of `tick` ends in the best so far.
     """
     why, tick = failure(before) if evaluations else "", tick or silent
     if not why:
@@ -94,9 +92,8 @@ def _better(after: BearingFit, before: BearingFit) -> bool:
 
 
 def failure(fit: BearingFit) -> str:
-    """Return why a fit counts as failed.
-
-    Returns empty where it did not: it converged, or a linear regression on the past explains little of what it leaves.
+    """Return why a fit failed; empty where it converged, or a linear regression on the past explains little of what it
+    leaves.
     """
     if fit.status == "converged":
         return predictable(max(_unexplained(fit, r) for r in range(len(fit.problem.records))))
@@ -125,10 +122,7 @@ class BearingCost:
     best: BestByDelay = field(default_factory=BestByDelay)  # so that an interruption loses nothing
 
     def __call__(self, z: Array) -> float:
-        """Return the criterion per measured value.
-
-        `z`: (n_names,). Returns infinite where there is no predictor.
-        """
+        """Return the criterion per measured value at `z` (n_names,); infinite where there is no predictor."""
         problem = self.at(z)
         if problem is None:
             return np.inf
@@ -143,10 +137,7 @@ class BearingCost:
         return [p for p in places if p is not None]
 
     def at(self, z: Array) -> BearingProblem | None:
-        """Return the problem whose start lies at a vector.
-
-        `z`: (n_names,). Returns none where the gap would close.
-        """
+        """Return the problem that starts at `z` (n_names,); None where the gap would close."""
         low, high = np.array(self.bounds).T
         at = dict(zip(self.names, (low + z * (high - low)).tolist(), strict=True))
         problem = self.problem
@@ -190,10 +181,7 @@ def _levels(problem: BearingProblem, values: dict[str, float], force: float, vol
 
 
 def bearing_cost(fit: BearingFit, *, search_delay: bool) -> BearingCost:
-    """Set up what is searched globally, about the start values of a fit.
-
-    `fit`: of all records; its problem's numbers are the start values.
-    """
+    """Set up what is searched globally, about the start values of a fit of all records."""
     old = fit.problem
     count = max(_SAMPLES // len(old.records), _SHORTEST)
     whole = {r: float(round(d)) for r, d in old.delays.items()} if search_delay else old.delays
@@ -225,9 +213,8 @@ def bearing_cost(fit: BearingFit, *, search_delay: bool) -> BearingCost:
 
 
 def global_problems(cost: BearingCost, *, seed: int, evaluations: int, tick: Tick = silent) -> list[BearingProblem]:
-    """Search globally for problems whose start values are better.
-
-    `evaluations`: at most. Returns of the short records, the best of each of a few delays, best first.
+    """Search globally for problems with better start values: of the short records, the best of each of a few delays, in
+    order.
     """
     n = len(cost.names)
     global_search(cost, np.zeros(n), np.ones(n), seed=[seed, 7], evaluations=evaluations, tick=tick)

@@ -95,10 +95,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         By record: levels in m, A, N, V, N (rms of one sample).
     fit : Mapping[str, Mapping[str, OutputFit]]
         By record and output.
-    range : Mapping[str, (float, float)]
-        ``position`` and ``current`` between which the free rotor moved, SI.
-    usual : Mapping[str, (float, float)]
-        ``position`` and ``current`` between which the free rotor was for 95 % of the time, SI.
+    range, usual : Mapping[str, (float, float)]
+        ``position`` and ``current`` between which the free rotor moved, always and for 95 % of the time, SI.
     operating_point : Mapping[str, float]
         Means of ``position`` and ``current`` of the records in which the rotor moved, SI.
     hull, coil_hull : ndarray, shape (n_corners, 2)
@@ -146,27 +144,12 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
         return "one-axis"
 
     def dumps(self) -> str:
-        """Return the estimate as JSON text, schema ``ambid.estimate/1``.
-
-        Returns
-        -------
-        str
-        """
+        """Return the estimate as JSON text, schema ``ambid.estimate/1``."""
 
         return bearing_text(self)
 
     def delay_samples(self, rate_hz: float) -> float | None:
-        """Return the delay of the voltage at a sampling rate.
-
-        Parameters
-        ----------
-        rate_hz : float
-
-        Returns
-        -------
-        float or None
-            In samples; None at a rate that no record had.
-        """
+        """Return the delay of the voltage in samples at `rate_hz`; None at a rate that no record had."""
         delay = self.delay.get(f"{rate_hz:g} Hz")
         return None if delay is None else delay.samples + delay.fraction
 
@@ -175,9 +158,8 @@ class NonlinearBearingEstimate(Parametric, Judged, Predicting, Linear):
 
         Parameters
         ----------
-        position : array_like, shape (n_points,) or (), m
-        current : array_like, shape (n_points,) or (), A
-            As many as positions, or one for all; neither may have another shape.
+        position, current : array_like, shape (n_points,) or (), m and A
+            As many currents as positions, or one for all; neither may have another shape.
 
         Returns
         -------
@@ -236,10 +218,8 @@ def _within(hull: Array, points: Array) -> NDArray[np.bool_]:
 def linearised(
     estimate: NonlinearBearingEstimate, position: float | None = None, current: float | None = None
 ) -> Continuous:
-    """Return the plant about a point: m x'' = f - c x', L i' = V - R i - k_i x', f = k_i i - k_x x (thesis eq. 4.8).
-
-    `position`, `current`: in m and A; by default the operating point of the records. Returns with an eddy pole the
-    force is a fourth state, f' = a (k_i i - k_x x - f).
+    """Return the plant about a point in m and A, by default the records' operating point: m x'' = f - c x', L i' = V -
+    R i - k_i x', f = k_i i - k_x x (thesis eq. 4.8); an eddy pole adds the state f' = a (k_i i - k_x x - f).
     """
     x = estimate.operating_point["position"] if position is None else position
     i = estimate.operating_point["current"] if current is None else current
@@ -295,10 +275,8 @@ def _at_operating_point(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
 
 
 def curves_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
-    """Return force, k_i, k_x and L over a grid of where the free rotor usually was.
-
-    Returns ``position`` (m) and ``current`` (A) of the grid; each quantity with ``unit``, and ``value`` and ``sd`` in a
-    row for each position and a column for each current; ``inside``: whether the free rotor came there; ``coil_inside``:
+    """Return force, k_i, k_x and L over a grid of ``position`` (m) and ``current`` (A) where the free rotor usually
+    was, rows by position: ``unit``, ``value``, ``sd``; ``inside``: whether the free rotor came there; ``coil_inside``:
     whether any record did, which is what L needs.
     """
     x = np.linspace(*estimate.usual["position"], _POSITIONS)
@@ -317,9 +295,8 @@ def curves_json(estimate: NonlinearBearingEstimate) -> dict[str, Any]:
 
 
 def fit_over_all(estimate: NonlinearBearingEstimate) -> dict[str, dict[str, float | None]]:
-    """Return the fit of each output over all records that measure it, each about its own mean.
-
-    Returns by output: ``one_step``; ``simulation``, None; ``innovation_sd``, SI.
+    """Return each output's fit over all records that measure it, about their means: ``one_step``, ``innovation_sd`` in
+    SI, and ``simulation``, None.
     """
     fits_by_role: dict[str, dict[str, float | None]] = {}
     for role in _ROLES:

@@ -1,6 +1,5 @@
-"""A measured frequency response with what was fitted to it, what those models say, and its file ``ambid.frf/1``.
-
-A model is compared with a held input's response as that was measured: sampled under the hold, delay included.
+"""A measured frequency response with what was fitted to it, what those models say, and its file ``ambid.frf/1``;
+compared with a held input's response as that was measured: sampled under the hold, delay included.
 """
 
 from __future__ import annotations
@@ -133,10 +132,8 @@ class ModelResponse:
 
 
 def model_responses(measured: Measured, frequency_hz: Array) -> tuple[ModelResponse, ...]:
-    """Compute what the models fitted to a response say, in the same form as the response was measured.
-
-    `frequency_hz`: (n_frequencies,), Hz. Returns of the black-box fit and of the physical parameters, as far as there
-    are such.
+    """Return the responses at `frequency_hz` of the black-box fit and of the physical parameters, as far as there are
+    such, in the form that was measured.
     """
     responses = []
     if measured.fit is not None:
@@ -178,9 +175,8 @@ def _of_estimate(estimate: FrequencyEstimate, frf: FrequencyResponse, frequency_
 def with_spread(
     source: str, frequency_hz: Array, G: Complex, slope: Complex, covariance: Array | None
 ) -> ModelResponse:
-    """Return a response (n_f, n_y, n_u) with its spread, from slopes (n_f, n_y, n_u, n) and a covariance (n, n).
-
-    Real and imaginary part of d(ln G) are the changes of the logarithm of the magnitude and of the phase.
+    """Return a response (n_f, n_y, n_u) with its spread by slopes (n_f, n_y, n_u, n) and covariance (n, n): real and
+    imaginary part of d(ln G) are the changes of log magnitude and of phase.
     """
     return _along(source, frequency_hz, G, slope @ _root(covariance, slope.shape[-1]))
 
@@ -264,9 +260,8 @@ def measured_to_json(measured: Measured) -> dict[str, Any]:
 
 
 def measured_from_json(document: Mapping[str, Any], where: str) -> Measured:
-    """Read a measured response back; `where` is the name of its file, for messages.
-
-    Of several inputs or outputs the noise comes back without correlations between the pairs.
+    """Read a measured response back, from the file `where` for messages; of several inputs or outputs the noise comes
+    back without correlations between the pairs.
     """
     return read_whole(lambda: _from_json(document, where), where, "frequency response", "frf")
 

@@ -1,13 +1,9 @@
 """Many start values, one search: the weak-form candidates of all bands and delays are scored by the likelihood.
 
-Each candidate is scored on the busiest stretch of the record, the best on a longer one and at several noise levels;
-candidates that differ in more than chance are searched a little way, and the search goes on from the winner: first on
-the longer stretch, then on all of the record.
-
-The weak form: each equation of motion is integrated against Fourier modulating functions phi_k(t) = w(t) exp(-j w_k t),
-over all frequencies at once (theory.md sec. 2.7, thesis eq. 3.8; Shinbrot 1957; Pearson and Lee 1985). The window w
-spans the record and vanishes with three derivatives at both ends, so that integration by parts leaves no boundary terms
-and no measured signal is differentiated; all moments come from a few FFTs. Each band gives a candidate.
+Scores come from the busiest stretch, the best's from a longer one and several noise levels; those that differ in more
+than chance are searched a little, the winner on. Weak form: equations of motion are integrated against Fourier
+modulating functions phi_k(t) = w(t) exp(-j w_k t) (theory.md sec. 2.7, thesis eq. 3.8; Shinbrot 1957; Pearson and Lee
+1985). The window w vanishes with three derivatives at the record's ends: no boundary terms, no signal differentiated.
 """
 
 from __future__ import annotations
@@ -53,10 +49,8 @@ def weak_form_values(
     rate_hz: float,
     fixed: Mapping[str, float],
 ) -> Iterator[tuple[float, dict[str, float]]]:
-    """Yield start values for the named model, one set for each band and delay.
-
-    `model_name`: ``"one-axis"``, ``"coil"`` or ``"rotor"``; `delays`: of the input, in samples; `fixed`: fixed values,
-    SI; they are used, and returned unchanged. Yields the delay with all parameters of the model, SI.
+    """Yield the delay with all parameters (SI) of the model ``"one-axis"``, ``"coil"`` or ``"rotor"``, one set for each
+    band and delay; `delays`: of the input, in samples; `fixed`: fixed values, SI, used and returned unchanged.
     """
     damping = fixed.get("c", 0.0)
     steps = np.diff(delays, prepend=0.0).tolist()  # mostly one sample: products cost less than exponentials
@@ -100,9 +94,8 @@ class Regressors:
     """Terms that others are regressed on, over complex lines with real coefficients, reduced once by QR."""
 
     def __init__(self, terms: Sequence[Term], weight: Array, noise: Mapping[str, float]) -> None:
-        """Reduce terms.
-
-        `weight`: (n_lines,); `noise`: role -> noise standard deviation; empty: ordinary least squares.
+        """Reduce terms by `weight` (n_lines,); `noise`: role -> noise standard deviation; empty: ordinary least
+        squares.
         """
         a = np.stack([_real(t[2] * weight) for t in terms], axis=1)
         self.size = column_sizes(a)  # (n_terms,), what the columns are divided by
@@ -116,11 +109,9 @@ class Regressors:
         self.spread = sum(((f.conj().T @ f).real for f in self.filters.values()), np.zeros((len(terms),) * 2))
 
     def regress(self, first: Term) -> Array:
-        """Regress more terms on these, whose moments are columns, (n_lines,) or (n_lines, n_first).
-
-        With noise levels, generalised total least squares: the combination of terms that is smallest against what the
-        noise alone would leave (Van Huffel and Vandewalle 1991); without, ordinary least squares. Returns (n_first,
-        n_terms), NaN where the noise description cannot be used.
+        """Regress more terms, moments (n_lines,) or (n_lines, n_first), to (n_first, n_terms), NaN where the noise
+        description cannot be used: with noise levels by generalised total least squares, the combination smallest
+        against what noise alone would leave (Van Huffel and Vandewalle 1991); without, by ordinary least squares.
         """
         b, n = _real(first[2].reshape(self.weight.size, -1) * self.weight[:, None]), self.size.size
         length = np.linalg.norm(b, axis=0)
@@ -164,10 +155,7 @@ class Moments:
 
 
 def take_moments(signals: Mapping[str, Array], held: tuple[str, ...], rate_hz: float) -> Moments:
-    """Take the modulating-function moments of all signals.
-
-    `signals`: role -> samples, shape (n_samples,), SI, deviations from the operating point.
-    """
+    """Take modulating-function moments of all signals (role -> samples, SI, deviations from the operating point)."""
     n = len(next(iter(signals.values())))
     period, turn = 1.0 / rate_hz, 2 * np.pi * rate_hz / n
     omega = turn * np.arange(n // 2 + 1)
@@ -235,10 +223,8 @@ def starts(
     *,
     tick: Callable[[], None] | None = None,
 ) -> list[Candidate]:
-    """Score all start values and race the best that differ.
-
-    `tick`: called after each evaluation of a search. Returns best first; noise described by levels, delays whole where
-    they are searched.
+    """Score all start values and race the best that differ, best first; noise by levels, searched delays whole; `tick`:
+    called after each evaluation of a search.
     """
     delays = [float(d) for d in range(MAX_DELAY + 1)] if delay == "auto" else [float(delay)]
     scored = sorted(_scored(model, signals, parameters, delays), key=lambda c: c.criterion)
@@ -268,9 +254,8 @@ def _unlike(scored: Sequence[Candidate]) -> list[Candidate]:
 
 
 def _widen(candidate: Candidate, signals: Signals, tick: Callable[[], None] | None) -> Candidate:
-    """Search on the stretch that a candidate of a long record is for, and go on to all of it.
-
-    Passes over a long record cost most of the time: they are for the last steps.
+    """Search on the stretch that a candidate is for, then on all of a long record, whose costly passes are the last
+    steps.
     """
     part = candidate.problem
     if part.y.shape[0] == signals.y.shape[0]:
@@ -291,9 +276,8 @@ def _centre(signals: Signals) -> Signals:
 
 
 def race(candidate: Candidate, tick: Callable[[], None] | None) -> Candidate:
-    """Search a little way on a short stretch, and keep what does best on the whole record.
-
-    `tick`: called after each evaluation.
+    """Search a little on a short stretch, calling `tick` after each evaluation; keep what does best on the whole
+    record.
     """
     problem, vector = candidate.problem, candidate.vector
     stretch = busiest(problem.u, _SHORT)
@@ -397,10 +381,8 @@ def candidate_problem(
     delay: float,
     skip: int,
 ) -> PredictorProblem:
-    """Set up the problem of one candidate.
-
-    `signals`: means taken off; `sizes`: of the parameters, not negative, SI; `delay`: samples; `skip`: samples left out
-    at the start.
+    """Set up the problem of one candidate; `signals`: means taken off; `sizes`: of parameters, not negative, SI;
+    `delay`, and `skip` left out at the start, in samples.
     """
     estimated = [p for p in parameters if p.role != "fixed"]
     reference = model.references(sizes)
@@ -430,10 +412,7 @@ def _vector(problem: PredictorProblem, values: Mapping[str, float]) -> Array:
 
 
 def at_first_sample(problem: PredictorProblem, vector: Array) -> Array:
-    """Return a copy whose initial state is that of the problem's data: its outputs at the first sample.
-
-    `vector`: (size,). Returns (size,).
-    """
+    """Return a copy of `vector` whose initial state is that of the data: the outputs at the first sample."""
     out, model = vector.copy(), problem.model
     first, initial = problem.y[problem.skip], problem.slices["initial"].start
     for j, state in enumerate(model.states):

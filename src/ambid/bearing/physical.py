@@ -1,14 +1,9 @@
 """Physical parameters from any identified black-box model, with covariance (theory.md sec. 1).
 
-Matrices of a state space are not unique, transfer functions are: the frequency response of the physical model is laid
-through that of the black box, weighted by what the black box knows at each frequency; its whole covariance then gives
-that of the parameters (minimum distance; Ljung 1999, sec. 7.4 and 9.7). What is left over tells by a chi-square test
-whether the black box is this physics at all.
-
-Lay the frequency response of a physical model through that of a black box.
-
-Starts come from the weak-form regressions of `ambid.bearing.multistart`, on the response instead of spectra; the search
-is SciPy's Levenberg-Marquardt with exact derivatives.
+The physical model's frequency response is laid through the black box's, weighted by what that knows at each frequency;
+its whole covariance gives the parameters' (minimum distance; Ljung 1999, sec. 7.4 and 9.7), and a chi-square test of
+what is left tells whether it is this physics at all. Starts: `ambid.bearing.multistart`'s regressions on the response;
+search: SciPy's Levenberg-Marquardt with exact derivatives.
 """
 
 from __future__ import annotations
@@ -178,10 +173,8 @@ def _roughness(target: Target) -> float:
 
 
 def _misfit(fit: BlackBoxFit, model: LinearModel, target: Target, best: Match, own: Spread) -> tuple[Check, float]:
-    """Test of what the match leaves over, and by how much standard deviations widen.
-
-    A sum of chi-squares of several sizes is one chi-square by its mean and variance (Satterthwaite 1946); where the
-    sizes come from a jackknife, it is judged by Fisher's F.
+    """Test of what the match leaves over, and by how much standard deviations widen: a sum of chi-squares of several
+    sizes is one by mean and variance (Satterthwaite 1946), judged by Fisher's F where the sizes come from a jackknife.
     """
     from scipy.stats import chi2, f
 
@@ -260,10 +253,8 @@ class Spread:
 
 
 def spread(target: Target, best: Match) -> Spread:
-    """Propagate the black box's covariance S through a weighted match: (J'WJ)^-1 J'W S W J (J'WJ)^-1.
-
-    What the black box's covariance does not reach at all gets the weight's own noise, so that a direction without
-    information is not taken for one without error.
+    """Propagate the black box's covariance S through a weighted match: (J'WJ)^-1 J'W S W J (J'WJ)^-1. What S does not
+    reach gets the weight's own noise: a direction without information is not one without error.
     """
     norm = np.maximum(np.linalg.norm(best.J, axis=0), 1e-100)
     U, s, Vt = np.linalg.svd(best.J / norm, full_matrices=False)
@@ -284,9 +275,8 @@ def spread(target: Target, best: Match) -> Spread:
 
 
 def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], delay: float | Literal["auto"]) -> Match:
-    """Search from the best starts of all bands and delays; a delay is whole unless the response shows a fraction.
-
-    `delay`: samples.
+    """Search from the best starts of all bands and delays; a `delay` in samples is whole unless the response shows a
+    fraction.
     """
     free = [p for p in parameters if p.role != "fixed"]
     fixed = {p.name: float(p.value) for p in parameters if p.role == "fixed" and p.value is not None}
@@ -345,10 +335,7 @@ def match(target: Target, model: LinearModel, parameters: Sequence[Parameter], d
 
 
 def search(target: Target, start: Match) -> Match:
-    """Search from a start by Levenberg-Marquardt.
-
-    `start`: its `theta`, `delay` and `delay_free` count.
-    """
+    """Search by Levenberg-Marquardt from the `theta`, `delay` and `delay_free` of `start`."""
     from scipy.optimize import least_squares
 
     n = len(start.names)

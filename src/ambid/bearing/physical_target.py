@@ -1,7 +1,5 @@
-"""What a physical model has to meet: the response of a black box, reduced to the numbers that its covariance knows.
-
-Points of the response that the black box does not know itself are left out; the others are weighed by what the black
-box knows at each frequency, and come with their whole covariance, whose rank is that of the black box's.
+"""What a physical model has to meet: points of a black box's response that it knows itself, weighed by how well, with
+their whole covariance, whose rank is that of the black box's.
 """
 
 from __future__ import annotations
@@ -60,19 +58,15 @@ class Target:
         return float(used[0]), float(used[-1])
 
     def numbers(self, response: Complex) -> Array:
-        """Reduce a response, or a derivative of one, to the weighed numbers.
-
-        `response`: (n_frequencies, n_outputs, n_inputs, ...), complex. Returns (2 n_known, ...).
+        """Reduce a complex response (n_frequencies, n_outputs, n_inputs, ...), or its derivative, to weighed (2
+        n_known, ...).
         """
         points = response[self.known]
         return np.asarray((np.concatenate([points.real, points.imag]).T * self.root).T)
 
 
 def target_of(fit: BlackBoxFit, model: LinearModel, roles: Mapping[str, str]) -> Target:
-    """Extract from a black box what a physical model has to match.
-
-    `roles`: role -> channel, where names differ.
-    """
+    """Extract from a black box what a physical model has to match; `roles`: role -> channel, where names differ."""
     rows = [_place(role, fit.outputs, fit, model, roles, "output") for role in model.outputs]
     columns = [_place(role, fit.inputs, fit, model, roles, "input") for role in model.inputs]
     _check_poles(fit, model, rows, columns)
@@ -225,13 +219,9 @@ def physical_response(
     along: Sequence[str] = (),
     with_delay: bool = False,
 ) -> tuple[Complex, Complex]:
-    """Return G of a model at physical parameters, and its derivatives.
-
-    `theta`: every parameter, SI; `omega`: (n_frequencies,), rad/s; `dt`: sampling interval in s of the held input; None
-    for continuous time; `delay_s`: delay of the inputs, s; `along`: parameters by which derivatives are wanted;
-    `with_delay`: whether the derivative by the delay (per second) comes last. Returns `response`: (n_frequencies,
-    n_outputs, n_inputs), complex; `derivative`: (n_frequencies, n_outputs, n_inputs, n_along), complex, one more along
-    the last axis with `with_delay`.
+    """Return complex G (n_frequencies, n_outputs, n_inputs) at all parameters `theta` (SI) and `omega` (rad/s), and on
+    one more axis its derivatives by parameters `along`, `with_delay` by the delay (per second) last. `dt`: sampling
+    interval in s of the held input, None for continuous time; `delay_s`: of the inputs, s.
     """
     space = model.matrices(theta)
     slopes = [model.derivative(theta, name) for name in along]
@@ -281,11 +271,9 @@ def _stacked(rows: list[Complex], found: Complex) -> Complex:
 
 
 def point_weight(spread: Array, frequency: Indices, channel: Indices, omega: Array) -> Array:
-    """Return the weight of every point.
-
-    `spread`: (2 n_points, rank), half factor of the points' covariance, real parts first; full column rank;
-    `frequency`: (n_points,), place of each point in `omega`; `channel`: (n_points,), which way from input to output it
-    belongs to; `omega`: (n_frequencies,), rad/s, rising. Returns (n_points,), one over the unit of `spread` squared.
+    """Return the weight (n_points,) of every point, one over the unit of `spread` squared. `spread` (2 n_points, rank):
+    half factor of the covariance, real parts first, full column rank; `frequency`, `channel` (n_points,): place in the
+    rising `omega` (rad/s), and way from input to output.
     """
     from scipy.optimize import nnls  # a quarter of a second
 

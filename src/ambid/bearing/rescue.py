@@ -1,13 +1,9 @@
 """What the linear grey box does where its starts fail: tell that they did, search globally, take the better fit.
 
-A fit has failed if no search converged, or if a linear regression on past innovations and inputs explains much of its
-innovations: a predictor of high order then does much better than the physics at this place.
-
-Differential evolution looks for the physical parameters, written as rates between one over the record's length and a
-few times the sampling rate and as ratios of the signals' sizes (all logarithmic), for the level of the disturbances
-and, where it is searched, for the delay. The cost is the innovations likelihood: with a Riccati gain every plant has a
-stable predictor, unstable ones too, so that it is finite nearly everywhere. Offsets are zero and the initial state is
-that of the first sample; the searches that follow free all of them.
+Failed: no search converged, or a linear regression on past innovations and inputs explains much of the innovations.
+Differential evolution minimises the innovations likelihood, finite nearly everywhere by its Riccati gain, over the
+physical parameters (logarithms of rates, from one over the record's length to a few sampling rates, and of ratios of
+signal sizes), the disturbances' level and a searched delay; offsets are zero, the first sample gives the initial state.
 """
 
 from __future__ import annotations
@@ -54,10 +50,8 @@ def rescue(
     follow: Callable[[Sequence[Candidate]], Fit],
     tick: Callable[[], None] | None,
 ) -> Fit | None:
-    """Search globally, and locally from what was found.
-
-    `before`, `why`: see `rescued`; `follow`: the local search from several candidates; `tick`: a
-    KeyboardInterrupt ends in the best so far, where there is any.
+    """Search globally, then with `follow` locally from several candidates; `before`, `why`: see `rescued`; a
+    KeyboardInterrupt of `tick` ends in the best so far, where there is any.
     """
     cost = likelihood_cost(model, signals, parameters, delay) if how.evaluations else None
     if cost is None:
@@ -123,10 +117,7 @@ class LikelihoodCost:
     best: BestByDelay = field(default_factory=BestByDelay)
 
     def __call__(self, z: Array) -> float:
-        """Return the criterion per sample.
-
-        `z`: (n_coordinates,). Returns infinite where there is no predictor.
-        """
+        """Return the criterion per sample at `z` (n_coordinates,); infinite where there is no predictor."""
         candidate = self.candidate(z, shared=True)
         if candidate is None:
             return np.inf
@@ -135,10 +126,8 @@ class LikelihoodCost:
         return value
 
     def candidate(self, z: Array, *, shared: bool = False) -> Candidate | None:
-        """Return the place to search from at a vector.
-
-        `z`: (n_coordinates,); `shared`: reuse the workspace of that delay. Returns none where there is no
-        predictor.
+        """Return the place to search from at `z`, None where there is no predictor; `shared`: reuse that delay's
+        workspace.
         """
         at = {c.name: c.value(float(x)) for c, x in zip(self.coordinates, z, strict=True)}
         values = self.physical(at)
@@ -192,10 +181,7 @@ class LikelihoodCost:
 def likelihood_cost(
     model: LinearModel, signals: Signals, parameters: Sequence[Parameter], delay: Delay
 ) -> LikelihoodCost | None:
-    """Set up what is searched globally, with bounds from the data.
-
-    Returns none for a model whose numbers have no known bounds.
-    """
+    """Set up what is searched globally, bounds from the data; None for a model whose numbers have no known bounds."""
     if model.name not in ("one-axis", "coil", "rotor"):
         return None
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
@@ -259,20 +245,14 @@ def global_candidates(
     *,
     tick: Tick = silent,
 ) -> list[Candidate]:
-    """Search globally for places to search from: the best, then the best of each delay.
-
-    `signals`: the whole record, which they are places of.
-    """
+    """Search globally for places of the whole record to search from: the best, then the best of each delay."""
     low = np.array([-1.0 if c.signed else 0.0 for c in cost.coordinates])
     end = global_search(cost, low, np.ones(low.size), seed=[how.seed, 6], evaluations=how.evaluations, tick=tick)
     return candidates_at(cost, signals, (end.vector, *cost.best.vectors(), *end.best[: _TRIED // 5]))[:_TRIED]
 
 
 def candidates_at(cost: LikelihoodCost, signals: Signals, vectors: Sequence[Array]) -> list[Candidate]:
-    """Return the candidates of the whole record at several vectors of the search.
-
-    `signals`: the whole record; `vectors`: (n_coordinates,). Returns in that order; those that differ.
-    """
+    """Return the whole record's candidates at several vectors (n_coordinates,), in that order; those that differ."""
     centred = replace(signals, u=signals.u - signals.u.mean(axis=0), y=signals.y - signals.y.mean(axis=0))
     whole, out = replace(cost, signals=centred), list[Candidate]()
     for z in vectors:

@@ -1,9 +1,8 @@
 """Slips of commissioning that leave a sound fit: a channel in another unit than its column says.
 
-A factor on one channel is an exact symmetry of the model, and so is one on time: the same residuals belong to other
-parameters (`ambid.physics.sensor_errors`), and only sizes can tell. Each size below has a usual range over the
-machines that are built, wide because it holds micro-bearings and turbines alike; together they leave a factor of 1000
-hardly any room. What a rig says of a parameter is one more size, of a narrow range.
+A factor on one channel, or on time, is an exact symmetry of the model (`ambid.physics.sensor_errors`): only sizes can
+tell. Usual ranges, wide enough for micro-bearings and turbines, together leave a factor of 1000 hardly any room; what a
+rig says is one more, narrow.
 """
 
 from __future__ import annotations
@@ -113,10 +112,8 @@ class UnitSlip:
 def check_units(
     values: Mapping[str, float], parameters: Sequence[Parameter], signals: Signals, plant: LinearModel | None = None
 ) -> Check:
-    """Check that the sizes of parameters and signals are those of a bench, and name the slip of a unit if they are not.
-
-    `values`: estimates in SI, all of them free where a rig's value is to count as evidence; `parameters`: what the rig
-    says; `signals`: of the record; `plant`: default one-axis.
+    """Check that the sizes of parameters (SI, all free where a rig's value is to count as evidence) and of the record's
+    `signals` are those of a bench, else name the slip of a unit; `plant`: default one-axis.
     """
     plant = model("one-axis") if plant is None else plant
     sizes, largest = [*SIZES, *_said(parameters)], _seen(signals, plant)
@@ -222,10 +219,8 @@ def _said(parameters: Sequence[Parameter]) -> list[Size]:
 
 
 def _slips(far: Array, moves: Array, channels: Sequence[str]) -> list[UnitSlip]:
-    """The factors on one channel after which every size is usual: the most likely, and those that are nearly as likely.
-
-    `far`: (n,), distances from the middles of the ranges in half widths; `moves`: (n, 4), what a power of ten moves;
-    `channels`: those of the model, and time.
+    """The likeliest factors on one channel, or time, that make every size usual, and those nearly as likely; `far`
+    (n,): distances from the middles of the ranges in half widths; `moves` (n, 4): what a power of ten moves.
     """
     applies, slips = np.isfinite(far), []
     most = float(np.sum(far[applies] ** 2)) - _GAIN

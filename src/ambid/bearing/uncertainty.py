@@ -1,9 +1,8 @@
 """Covariance of the estimated physical parameters, what the data do not show, and the estimate made of both.
 
-The covariance is the inverse of the information matrix (for the right model and Gaussian noise: the Cramer-Rao bound;
-Ljung 1999, sec. 9.3), by singular values of the scaled Jacobian. Beside it stands the robust covariance from the scores
-of stretches of the record, which holds where the model is only near the truth (the sandwich of White 1982, by batches).
-What the data do not show is put into words, with the experiment that would show it.
+It is the inverse of the information matrix (right model, Gaussian noise: the Cramer-Rao bound; Ljung 1999, sec. 9.3),
+by singular values of the scaled Jacobian. Beside it the robust one, from the scores of stretches of the record, holds
+where the model is only near the truth (the sandwich of White 1982, by batches).
 """
 
 from __future__ import annotations
@@ -47,9 +46,8 @@ _ADVICE = {
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Uncertainty:
-    """What a fit knows of its physical parameters.
-
-    `memories`: length of the record in memories of the predictor; infinite where the gain is not estimated.
+    """What a fit knows of its physical parameters; `memories`: the record's length in memories of the predictor,
+    infinite where the gain is not estimated.
     """
 
     names: tuple[str, ...]  # estimated physical parameters
@@ -85,10 +83,8 @@ class Uncertainty:
         return float(np.max(np.sqrt(np.diag(self.robust) / np.maximum(np.diag(self.fisher), 1e-300))))
 
     def covariance(self, *, robust: bool) -> Array:
-        """Return the covariance that goes with `standard_deviations`.
-
-        `robust`: whether a check said that the model is only near the truth. Returns (n, n), SI, if robust:
-        correlations from the scores, the larger of both standard deviations, plus the disagreement.
+        """Return the covariance (n, n), SI, that goes with `standard_deviations`; if `robust`, as where the model is
+        only near the truth: correlations from the scores, the larger of both deviations, plus the disagreement.
         """
         if not robust:
             return self.information
@@ -97,31 +93,21 @@ class Uncertainty:
         return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
 
     def standard_deviations(self, *, robust: bool) -> Array:
-        """Return standard deviations: from the information matrix, or robust ones, which are never smaller.
-
-        `robust`: whether a check said that the model is only near the truth. Returns (n,), SI.
-        """
+        """Return deviations (n,), SI, from the information matrix, or `robust` ones, which are never smaller."""
         return np.asarray(np.sqrt(np.diag(self.covariance(robust=robust))))
 
     def relative_sd(self, *, robust: bool) -> Array:
-        """Return standard deviations over `scale`.
-
-        `robust`: as for `standard_deviations`. Returns (n,).
-        """
+        """Return standard deviations (n,) over `scale`."""
         return np.asarray(self.standard_deviations(robust=robust) / self.scale)
 
     def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
-        """Return which parameters have a relative standard deviation below 25 %.
-
-        `robust`: as for `standard_deviations`.
-        """
+        """Return which parameters have a relative standard deviation below 25 %."""
         return tuple(bool(r < WEAK) for r in self.relative_sd(robust=robust))
 
 
 def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
-    """Compute covariances and the identifiability verdict of a fit.
-
-    `fit`: not failed; `scores`: (n_stretches, size), of stretches of the record, where a pass over it gave them.
+    """Compute covariances and identifiability of a fit that has not failed; `scores` (n_stretches, size), where a pass
+    gave them.
     """
     problem, sl = fit.problem, fit.problem.slices
     n, size = problem.n_physical, problem.magnitude
@@ -150,10 +136,8 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
 
 
 def _left_open(fit: Fit) -> Array:
-    """Covariance that a short record adds by leaving the noise levels open, (n, n), over the magnitudes.
-
-    For each disturbance, at the upper end of what the likelihood allows for its level: by how much the information
-    shrinks, and how far the parameters move. Nothing for a long record, or where noise levels do not matter.
+    """Covariance (n, n), over the magnitudes, that a short record adds by leaving noise levels open: at the upper end
+    of what the likelihood allows each disturbance, how far information shrinks and parameters move; else nothing.
     """
     problem, predictor = fit.problem, assemble(fit.problem, fit.vector, with_derivatives=False)
     n, extra = problem.n_physical, np.zeros((problem.n_physical, problem.n_physical))
@@ -224,10 +208,8 @@ def _scatter(scores: Array) -> Array:
 def experiment_hint(
     u: Uncertainty, values: Mapping[str, float], band_hz: tuple[float, float, float], *, robust: bool
 ) -> str | None:
-    """Return the experiment that would make the weakest direction identifiable.
-
-    `values`: all parameters, SI; `robust`: which standard deviations count. Returns none where everything is
-    identifiable.
+    """Return the experiment that would make the weakest direction identifiable, None where all is; `values`: all
+    parameters, SI; `robust`: which deviations count.
     """
     unseen = [name for name, seen in zip(u.names, u.identifiable_at(robust=robust), strict=True) if not seen]
     if not unseen:
@@ -280,12 +262,9 @@ def estimate_of(
     record: Mapping[str, object],
     rig: Mapping[str, object],
 ) -> Estimate:
-    """Put an estimate together.
-
-    `fit`: not failed; `known`: of that fit; `parameters`: what was known before, in the model's order; `robust`: use
-    the larger of information and robust standard deviations; `means`: operating point that was taken off, by role, SI;
-    `one_step`, `simulation`: (n_outputs,), fits; `simulation` None where the plant is unstable; `record`, `rig`:
-    provenance.
+    """Put an estimate together of a `fit` that has not failed and what is `known` of it. `parameters`: what was known
+    before, in the model's order; `robust`: the larger of information and robust deviations; `means`: operating point
+    taken off, by role, SI; `one_step`, `simulation` (n_outputs,): fits, the latter None where the plant is unstable.
     """
     problem = fit.problem
     theta = problem.parameters(fit.vector)
