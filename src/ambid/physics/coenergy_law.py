@@ -1,18 +1,5 @@
-"""Magnets with leakage, saturation and a choice of gap law, from one co-energy; with the derivatives that a fit needs.
-
-W'(x, i) = sum over magnets of g(gap) h(current) + S(i): force dW'/dx, flux linkage dW'/di, k_i = d2W'/dx di,
-k_x = -d2W'/dx2, L = d2W'/di2 (thesis eq. 1.9, 2.7, 4.4 and 4.8 are the case g = k/gap, h = i^2/2, S = 0). So force and
-back-EMF cannot disagree, whatever the numbers.
-
-- gap law g(d): hyperbolic k/(s + d), an ideal gap of reluctance proportional to s + d; or exponential L_g exp(-d/zeta),
-  a small armature before a pole, whose flux spreads sideways.
-- iron h(j) = j^2/(1 + sqrt(1 + sigma j^2)): j^2/2 for small currents, growing as j for j^2 sigma >> 1 (saturated: flux
-  no longer grows). sigma = 0 is a linear magnet.
-- coil iron S''(i) = L_leak + L_rise i^2/(i^2 + i_knee^2): inductance that does not depend on the position, rising from
-  that of initial permeability to that of the open core; L_rise = 0 is plain leakage.
-
-One magnet: d = x (the position is the gap, up to s), j = i. A pair: d = -x, j = i0 + i0_asym + i with k (1 + k_asym),
-and d = x, j = i0 - i0_asym - i with k (1 - k_asym). Gaps that differ at x = 0 are a centre elsewhere (x_offset).
+"""Magnets with leakage, saturation and a choice of gap law, with the derivatives that a fit needs, all of one co-energy
+W'(x, i) (theory.md eq. 23): force dW'/dx, flux linkage dW'/di, k_i = d2W'/dx di, k_x = -d2W'/dx2, L = d2W'/di2.
 """
 
 from __future__ import annotations
@@ -41,11 +28,9 @@ _SIGN = np.array([1.0, -1.0, 1.0, 1.0])  # k_x = -W_xx
 
 
 def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: bool, w: Array, dw: Array) -> None:
-    """Write the derivatives of W' at one point; plain scalar code that the estimator's kernels compile.
-
-    `x`, `i`: position in m, axis current in A; `q`: (9,), SI, see `MAGNET_NUMBERS`; `exponential`, `pair`: gap law, and
-    whether two magnets oppose each other; `w`: (12,), written: the derivatives named in `ORDERS`; `dw`: (7, 9),
-    written: derivatives by `q` of those named in `SLOPED`.
+    """Write the derivatives of W' at `x` m and `i` A of the numbers `q` (9,), `MAGNET_NUMBERS` in SI: those of `ORDERS`
+    into `w` (12,), those by `q` of `SLOPED` into `dw` (7, 9). `pair`: two opposed magnets. Scalar code for compiled
+    callers.
     """
     for a in range(12):
         w[a] = 0.0
@@ -121,7 +106,12 @@ def coenergy_derivatives(x: float, i: float, q: Array, exponential: bool, pair: 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MagnetLaw:
-    """Which co-energy, without its numbers."""
+    """W'(x, i) = sum over magnets of g(d) h(j) + S(i) in m, A, J, without its numbers.
+
+    Gap law g: k/(s + d), ideal, or L_g exp(-d/zeta), a small armature before a pole; h = j^2/(1 + sqrt(1 + sigma j^2)),
+    sigma = 0 unsaturated; S'' = L_leak + L_rise i^2/(i^2 + i_knee^2). One magnet: d = x (up to s), j = i. A pair: d =
+    -+x, j = i0 +- i0_asym +- i, k (1 +- k_asym); gaps that differ at x = 0 are a centre elsewhere (x_offset).
+    """
 
     gap: Literal["hyperbolic", "exponential"] = "hyperbolic"  # how the inductance falls with the gap
     pair: bool = False  # two opposed magnets with currents i0 + i and i0 - i
@@ -151,18 +141,12 @@ class MagnetLaw:
         return ", ".join([f"{self.gap} {'pair' if self.pair else 'single magnet'}", *extras])
 
     def vector(self, values: Mapping[str, float]) -> Array:
-        """Write numbers as `q`, in shape (9,).
-
-        `values`: by name, SI; what the law does not have may be absent. Returns (9,).
-        """
+        """Return numbers, by name in SI, as `q` (9,); what the law does not have may be absent."""
         neutral = {"sigma": 0.0, "L_leak": 0.0, "L_rise": 0.0, "i_knee": 1.0, "i0": 0.0, "k_asym": 0.0, "i0_asym": 0.0}
         return np.array([values[n] if n in values else neutral[n] for n in self.names])
 
     def value(self, x: Number, i: Number, values: Mapping[str, float]) -> Number:
-        """Return W' in J, for real or complex arguments (of magnitude below the knee where complex).
-
-        `x`, `i`: position in m, axis current in A; `values`: as `vector`.
-        """
+        """Return W' in J at `x` m and `i` A, real or complex (of magnitude below the knee where complex)."""
         k, s, sigma, leak, rise, knee, bias, more, other = self.vector(values).tolist()
         sides: tuple[tuple[float, Number, Number], ...] = ((k, x, i),)
         if self.pair:
@@ -176,28 +160,20 @@ class MagnetLaw:
         return energy
 
     def force(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
-        """Return the force dW'/dx at many points, by a complex step.
-
-        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns (n_points,), N.
-        """
+        """Return the force dW'/dx in N (n_points,) at `x` m and `i` A, by a complex step."""
         step = 1e-30
         energies: Any = self.value(cast(Any, x + 1j * step), cast(Any, i), values)
         return np.asarray(energies.imag / step)
 
     def table(self, x: Array, i: Array, values: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return force, k_x, k_i, L at points, and their derivatives by `q`.
-
-        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns `values`: (n_points, 4), in N, N/m (k_x =
-        -df/dx), N/A and H; `slopes`: (n_points, 4, 9).
+        """Return force in N, k_x = -df/dx in N/m, k_i in N/A and L in H at `x` m and `i` A, (n_points, 4), and their
+        derivatives by `q`, (n_points, 4, 9).
         """
         table, slopes = self._derivatives(x, i, values)
         return table[:, :4] * _SIGN, slopes[:, :4] * _SIGN[:, None]
 
     def gradients(self, x: Array, i: Array, values: Mapping[str, float]) -> Array:
-        """Return the derivatives of force, k_x, k_i, L by position and current.
-
-        `x`, `i`: (n_points,), m and A; `values`: as `vector`. Returns (n_points, 4, 2).
-        """
+        """Return the derivatives of force, k_x, k_i, L by position (m) and current (A), (n_points, 4, 2)."""
         found, _ = self._derivatives(x, i, values)
         by_x, by_i = found[:, [1, 4, 5, 6]], found[:, [2, 5, 6, 7]]
         return np.stack([by_x * _SIGN, by_i * _SIGN], axis=2)
@@ -212,10 +188,8 @@ class MagnetLaw:
 
 
 def law_numbers(coenergy: CoEnergy) -> dict[str, float]:
-    """Return the numbers of the hyperbolic law that is a given ideal magnet.
-
-    `coenergy`: of a `SingleMagnet` or of a `DifferentialPair`. Returns k in N m^2/A^2, s in m, L_leak in H, i0 and
-    i0_asym in A, k_asym in 1.
+    """Return the numbers of the hyperbolic law that is a given ideal magnet: k in N m^2/A^2, s in m, L_leak in H, i0
+    and i0_asym in A, k_asym in 1.
     """
     w = coenergy
     if w.k_a == 0.0:

@@ -1,12 +1,4 @@
-"""A controller as a discrete-time state-space law, for what a PID cannot say: LQG, notches, tilting motion.
-
-    w[k] = C z[k] + D y[k],  u[k] = limited(u0 + w[k] + excitation[k]),
-    z[k+1] = A z[k] + B y[k] + G (u[k] - u0 - w[k] - excitation[k])
-
-y holds position less set point, then current less that at rest, of one axis after the other, as far as they are
-measured (`ambid.simulation.plant.signals_fed_back`). The last term acts where a command is limited (anti-windup). The
-sign is included: u follows w.
-"""
+"""A controller as a discrete-time state-space law, for what a PID cannot say: LQG, notches, tilting motion."""
 
 from __future__ import annotations
 
@@ -25,7 +17,14 @@ _RATE = 1e-6  # of the rate: how far that of a loop may be from that of its law
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class StateLaw:
-    """Linear law from what is fed back, y, to the commands of all axes; in SI."""
+    """Linear law from what is fed back to the commands of all axes, in SI:
+
+        w[k] = C z[k] + D y[k],  u[k] = limited(u0 + w[k] + excitation[k]),
+        z[k+1] = A z[k] + B y[k] + G (u[k] - u0 - w[k] - excitation[k])
+
+    y: position less set point, then current less that at rest, axis by axis, as far as measured
+    (`ambid.simulation.plant.signals_fed_back`). G acts where a command is limited (anti-windup); u follows w in sign.
+    """
 
     A: Array  # (n, n)
     B: Array  # (n, n_y)
@@ -106,9 +105,8 @@ _TAIL = 1e-4  # of an l1 norm that is not summed
 
 
 def l1_norms(A: Array, B: Array, C: Array | None = None) -> Array:
-    """Return the sums over all samples of |C A^k B|, (n_outputs, n_inputs); infinite where A is not stable.
-
-    What is not summed is taken to decay as the slowest pole does: a bound, however small that pole's part is.
+    """Return the sums over all samples of |C A^k B|, (n_outputs, n_inputs); infinite where A is not stable. What is not
+    summed is taken to decay as the slowest pole does: a bound, however small that pole's part is.
     """
     C = np.eye(A.shape[0]) if C is None else C
     total = np.zeros((C.shape[0], B.shape[1]))

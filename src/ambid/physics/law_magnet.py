@@ -1,7 +1,4 @@
-"""A magnet of `coenergy_law` with its numbers, as a plant asks for one: the only bridge between law and plant.
-
-Force and inductance come from `coenergy_derivatives`, the same code that the estimator compiles.
-"""
+"""A magnet of `coenergy_law` with its numbers, as a plant asks for one: the only bridge between law and plant."""
 
 from __future__ import annotations
 
@@ -56,9 +53,8 @@ _FARTHEST = 1e6  # A: a load that this current does not hold is held by none
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LawMagnet:
-    """A `MagnetLaw` with numbers; it is its own co-energy.
-
-    Positions are those of the sensor; the law's own are `x_offset` less. Arguments are real.
+    """A `MagnetLaw` with numbers, its own co-energy, for real arguments; its positions are the sensor's, less
+    `x_offset`.
     """
 
     law: MagnetLaw  # which co-energy
@@ -142,10 +138,7 @@ class LawMagnet:
         return coefficient
 
     def holding_current(self, x: float, load: float) -> float:
-        """Return the axis current that holds a load at rest, of a pair with both magnets conducting.
-
-        `x`: position in m; `load`: constant force along +x in N, such as the weight. Returns current in A.
-        """
+        """Return the axis current in A that holds `load` N (+x) at `x` m, of a pair with both magnets conducting."""
         from scipy.optimize import brentq
 
         low, high = self.range

@@ -1,8 +1,5 @@
-"""Linear models: parameters, physics as a function of them (theory.md sec. 1), and its exact discretisation.
-
-A model turns parameters into continuous-time matrices and their exact derivatives. It knows nothing of data. Under a
-zero-order hold the input is held over a sample and may reach the plant a fraction of a sample late: over one period the
-plant sees first the previous value, then the present one (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
+"""Linear models, which know no data: parameters, physics (theory.md sec. 1), exact discretisation. An input held over a
+sample may reach the plant a fraction late (Astrom and Wittenmark, Computer-Controlled Systems, ch. 2).
 """
 
 from __future__ import annotations
@@ -38,7 +35,6 @@ class Parameter:
     Attributes
     ----------
     name, unit : str
-        Name and SI unit.
     role : {"free", "fixed", "prior"}
         Estimated; held at `value`; estimated with a Gaussian prior (`value`, `sd`).
     value : float or None
@@ -139,10 +135,7 @@ class LinearModel(Protocol):
 
 
 def unknown_parameter(plant: LinearModel, parameter: str) -> ModelError:
-    """Return the error for a parameter that a model does not have.
-
-    `parameter`: what was asked for. Returns names the nearest known parameter.
-    """
+    """Return the error for a parameter that a model does not have; it names the nearest."""
     names = [p.name for p in plant.parameters]
     return ModelError(
         f"model {plant.name!r} has no parameter {parameter!r}; it has {', '.join(names)}.{nearest(parameter, names)}"
@@ -151,10 +144,8 @@ def unknown_parameter(plant: LinearModel, parameter: str) -> ModelError:
 
 @dataclass(frozen=True, slots=True)
 class OneAxis:
-    """Coil, magnet and mass on one axis (thesis eq. 4.4 and 4.8).
-
-    m x'' = k_i i - k_x x - c x' + f,  V = R i + L i' + k_i x'; both position and current are measured (the printed C =
-    [1 0 1]^T has to be two rows, theory.md sec. 1).
+    """Coil, magnet and mass on one axis (thesis eq. 4.4 and 4.8): m x'' = k_i i - k_x x - c x' + f, V = R i + L i' +
+    k_i x'; position and current are measured (the printed C = [1 0 1]^T has to be two rows, theory.md sec. 1).
     """
 
     name: str = "one-axis"  # as in `LinearModel`
@@ -171,10 +162,7 @@ class OneAxis:
         return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
-        """Return A, B, E, C of thesis eq. 4.8 with damping.
-
-        `theta`: m, k_x, k_i, R, L, c in SI units. Returns a (3, 3), B (3, 1), E (3, 2), C (2, 3).
-        """
+        """Return A (3, 3), B (3, 1), E (3, 2), C (2, 3) of thesis eq. 4.8, damped; m, k_x, k_i, R, L, c in SI."""
         m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
         return StateSpace(
             A=np.array([[0.0, 1.0, 0.0], [-k_x / m, -c / m, k_i / m], [0.0, -k_i / ell, -r / ell]]),
@@ -184,11 +172,7 @@ class OneAxis:
         )
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
-        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
-
-        `theta`: m, k_x, k_i, R, L, c in SI units; `parameter`: name of the parameter. Returns derivatives of A (3, 3),
-        B (3, 1), E (3, 2), C (2, 3).
-        """
+        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`."""
         m, k_x, k_i, r, ell, c = (theta[k] for k in ("m", "k_x", "k_i", "R", "L", "c"))
         d_a, d_b, d_e = np.zeros((3, 3)), np.zeros((3, 1)), np.zeros((3, 2))
         match parameter:
@@ -211,10 +195,8 @@ class OneAxis:
         return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((2, 3)))
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return the scale against which a damping near zero is judged: that of critical damping.
-
-        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
-        frequency.
+        """Return ``{"c": sqrt(m |k|)}`` in N s/m, critical damping, against which a damping near zero is judged; k is
+        the stiffness that sets the plant's frequency.
         """
         return {"c": float(np.sqrt(abs(theta["m"] * max(abs(theta["k_x"]), theta["k_i"] ** 2 / theta["L"]))))}
 
@@ -237,20 +219,14 @@ class Coil:
         return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
-        """Return A, B, E, C, each (1, 1), for R in ohm and L in H.
-
-        `theta`: R and L in SI units. Returns all of shape (1, 1).
-        """
+        """Return A, B, E, C, each (1, 1), for R in ohm and L in H."""
         r, ell = theta["R"], theta["L"]
         return StateSpace(
             A=np.array([[-r / ell]]), B=np.array([[1.0 / ell]]), E=np.array([[1.0 / ell]]), C=np.array([[1.0]])
         )
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
-        """Return dA, dB, dE, dC for one parameter, each (1, 1).
-
-        `theta`: R and L in SI units; `parameter`: ``"R"`` or ``"L"``. Returns all of shape (1, 1).
-        """
+        """Return dA, dB, dE, dC for ``"R"`` or ``"L"``, each (1, 1)."""
         r, ell = theta["R"], theta["L"]
         zero = np.zeros((1, 1))
         match parameter:
@@ -263,20 +239,15 @@ class Coil:
                 raise unknown_parameter(self, parameter)
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return no scales: neither R nor L may be zero.
-
-        `theta`: R and L in SI units. Returns empty.
-        """
+        """Return no scales: neither R nor L may be zero."""
         del theta
         return {}
 
 
 @dataclass(frozen=True, slots=True)
 class Rotor:
-    """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f.
-
-    The current is the input, as with a transconductance amplifier; the data show only ratios to m (theory.md sec. 1),
-    so m needs a fixed value or a prior.
+    """Mass on a current-driven magnet (thesis eq. 2.1, 2.14): m x'' = k_i i - k_x x - c x' + f. The current is the
+    input, as with a transconductance amplifier; data show only ratios to m (theory.md sec. 1): fix it, or give a prior.
     """
 
     name: str = "rotor"  # as in `LinearModel`
@@ -293,10 +264,7 @@ class Rotor:
         return UNITS
 
     def matrices(self, theta: Mapping[str, float]) -> StateSpace:
-        """Return A (2, 2), B (2, 1), E (2, 1), C (1, 2).
-
-        `theta`: m, k_x, k_i, c in SI units. Returns the continuous-time matrices.
-        """
+        """Return A (2, 2), B (2, 1), E (2, 1), C (1, 2) of m, k_x, k_i, c in SI."""
         m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
         return StateSpace(
             A=np.array([[0.0, 1.0], [-k_x / m, -c / m]]),
@@ -306,10 +274,7 @@ class Rotor:
         )
 
     def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
-        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`.
-
-        `theta`: m, k_x, k_i, c in SI units; `parameter`: name of the parameter. Returns the derivatives.
-        """
+        """Return dA, dB, dE, dC for one parameter, in the shapes of `matrices`."""
         m, k_x, k_i, c = (theta[k] for k in ("m", "k_x", "k_i", "c"))
         d_a, d_b, d_e = np.zeros((2, 2)), np.zeros((2, 1)), np.zeros((2, 1))
         match parameter:
@@ -327,11 +292,7 @@ class Rotor:
         return StateSpace(A=d_a, B=d_b, E=d_e, C=np.zeros((1, 2)))
 
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
-        """Return the scale against which a damping near zero is judged: that of critical damping.
-
-        `theta`: parameters in SI units. Returns ``{"c": sqrt(m |k|)}`` in N s/m, k the stiffness that sets the plant's
-        frequency.
-        """
+        """Return ``{"c": sqrt(m |k|)}`` in N s/m, as of `OneAxis`."""
         return {"c": float(np.sqrt(abs(theta["m"] * theta["k_x"])))}
 
 
@@ -360,7 +321,6 @@ def model(name: str) -> LinearModel:
     Returns
     -------
     LinearModel
-        The model.
 
     Raises
     ------
@@ -386,12 +346,8 @@ class DiscreteSpace:
 
 
 def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
-    """Discretise x' = A x + B u exactly, u held over a sample.
-
-    exp([[A, B], [0, 0]] T) holds both (Van Loan 1978).
-
-    `A`: (n_states, n_states), complex for a complex step; `B`: (n_states, n_inputs); `period_s`: sampling period in s.
-    Returns `A_d`: (n_states, n_states); `B_d`: (n_states, n_inputs).
+    """Return x' = A x + B u discretised exactly, u held over a sample: exp([[A, B], [0, 0]] T) holds both (Van Loan
+    1978). A may be complex for a complex step.
     """
     n, n_u = B.shape
     block = np.zeros((n + n_u, n + n_u), dtype=np.result_type(A, B))
@@ -403,15 +359,11 @@ def zero_order_hold(A: Array, B: Array, period_s: float) -> tuple[Array, Array]:
 def discretise(
     space: StateSpace, period_s: float, *, fraction: float | None = None, derivatives: Sequence[StateSpace] = ()
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
-    """Discretise exactly, together with the derivatives along given directions.
+    """Discretise exactly, with the derivatives along directions (dA, dB, dE), dC passed on, and along a `fraction` if
+    given.
 
-    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); the derivative along (dA, dB, dE) is the
-    upper right block of exp([[M, dM], [0, M]] T) (Mathias 1996).
-
-    `space`: continuous-time matrices; `period_s`: sampling period in s; `derivatives`: directions (dA, dB, dE); dC is
-    passed on. Without directions matrices may be stacked, (..., rows, columns). Returns `discrete`: the discrete
-    matrices; `directional`: their derivatives, one for each direction; where `fraction` is given, one more: along the
-    fraction itself.
+    exp([[A, B, E], [0, 0, 0]] T) holds A_d, B_d and E_d (Van Loan 1978); a derivative is the upper right block of
+    exp([[M, dM], [0, M]] T) (Mathias 1996). Without directions matrices may be stacked, (..., rows, columns).
     """
     n, nu = space.B.shape[-2:]
     size = n + nu + space.E.shape[-1]
@@ -448,9 +400,8 @@ def discretise(
 
 
 def delayed(space: StateSpace, period_s: float, delays: Sequence[float] | Array) -> DiscreteSpace:
-    """Discretise exactly, each input late by its delay in samples, whole and fraction.
-
-    Returns the states followed by the inputs on their way; B_late is zero.
+    """Discretise exactly, each input late by its delay in samples, whole and fraction: the states followed by the
+    inputs on their way; B_late is zero.
     """
     n, whole = space.A.shape[0], np.floor(delays).astype(int)
     line = whole + (np.asarray(delays) > whole)
@@ -475,10 +426,8 @@ _REACH = 0.95  # norm up to which it is right to rounding (Higham 2005)
 
 
 def _exponential(a: NDArray[Any], n: int) -> NDArray[Any]:
-    """Exponential of one or several matrices by scaling and squaring (Higham 2005).
-
-    Scaled by their first `n` rows and columns, which the others only follow: large inputs cost no digits.
-    `a`: (..., size, size).
+    """Exponential of matrices (..., size, size) by scaling and squaring (Higham 2005), scaled by their first `n` rows
+    and columns, which the others only follow: large inputs cost no digits.
     """
     norms = np.sum(np.abs(a[..., :n, :n]), axis=-2)
     norm = float(np.max(norms, initial=0.0, where=np.isfinite(norms)))

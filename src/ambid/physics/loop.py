@@ -86,10 +86,9 @@ class Loop:
         return -float(self.law.response(np.array([0.01 * self.law.rate_hz]))[0, 0, 0].real)
 
     def as_law(self, rate_hz: float, *, current: bool = True) -> StateLaw:
-        """Return the law of one axis, of the gains with the states I and tau D + kd x.
-
-        Its integral is tracked back with the time constant kp/ki where the command is limited, which a PID stops.
-        `current`: whether the axis feeds it back.
+        """Return the law of one axis, of the gains with the states I and tau D + kd x; `current`: whether the axis
+        feeds it back. Where the command is limited its integral is tracked back with time constant kp/ki, which a PID
+        stops.
         """
         if self.law is not None:
             return self.law
@@ -118,12 +117,12 @@ class Limits:
 
     Attributes
     ----------
-    voltage : (float, float)
-        What the amplifier can give, in V: the command is limited to it, and that is counted.
-    current : (float, float)
-        What the coil may carry, in A: going beyond is counted, not prevented.
-    position : (float, float)
-        Where the rotor touches, in m: it is stopped there without rebound, and the first contact is reported.
+    voltage : (float, float), V
+        What the amplifier can give: the command is limited to it, and that is counted.
+    current : (float, float), A
+        What the coil may carry: going beyond is counted, not prevented.
+    position : (float, float), m
+        Where the rotor touches: it is stopped there without rebound, and the first contact is reported.
     """
 
     voltage: Interval = UNLIMITED
@@ -214,15 +213,12 @@ def placed_loop(
         m, k_x, k_i, R, L, c in SI units.
     poles : Sequence of complex
         Four, in rad/s, complex ones in conjugate pairs.
-    derivative_cutoff_hz : float
-        Passed on to the loop, in Hz.
-    delay : float
-        Passed on to the loop, in samples.
+    derivative_cutoff_hz, delay : float
+        Passed on to the loop, in Hz and samples.
 
     Returns
     -------
     Loop
-        The gains.
 
     Raises
     ------

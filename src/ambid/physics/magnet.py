@@ -1,18 +1,5 @@
-"""Magnets on one axis: co-energy, and from it force, flux linkage and inductance that agree with each other.
-
-Everything follows from one co-energy W'(x, i): force f = dW'/dx along +x, flux linkage lambda = dW'/di, so that the
-force–current factor df/di and the back-EMF per velocity dlambda/dx are the same number k_i (as in thesis eq. 4.4
-and 4.8).
-
-Geometry. One attracting magnet with gap d has W' = k i^2 / (2 d): it pulls with k (i/d)^2 / 2 (thesis eq. 1.9, 2.7).
-With a single gap of area A, k = mu0 n^2 A. A horseshoe closes its flux over two gaps of pole area A in series, so its
-reluctance is 2 d/(mu0 A) and k = mu0 n^2 A / 2 = 2 k', with the k' = mu0 n^2 A / 4 of theory.md sec. 1.
-
-Poles at half-angle alpha pull along the axis with cos(alpha). The design formulas k_i = 4 k' i0/s0^2 cos(alpha) and
-k_s = 4 k' i0^2/s0^3 cos(alpha) hold one cosine each: the gap closes by the full x. The co-energy with just that force
-is W' = k' cos(alpha) i^2/(s0 -+ x). What it leaves out of a coil's inductance at the centre, 2 k' (1 - cos(alpha))/s0,
-is taken as constant and belongs to the leakage. (A gap s0 -+ x cos(alpha) would put cos(alpha)^2 into k_s: 1.19e5 N/m
-instead of the 1.29e5 N/m of the unstable-bearing preset.)
+"""Magnets on one axis: co-energy W'(x, i), and from it force f = dW'/dx along +x, flux linkage lambda = dW'/di and
+inductance; df/di and the back-EMF per velocity dlambda/dx are the same number k_i (thesis eq. 4.4, 4.8).
 """
 
 from __future__ import annotations
@@ -32,7 +19,6 @@ Number = TypeVar("Number", float, complex)
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CoEnergy:
     """W'(x, i) = k_a (i0 + j)^2 / (2 (s_a - x)) + k_b (i0 - j)^2 / (2 (s_b + x)) + leakage i^2 / 2, j = i0_asym + i.
-
     Both magnets of this file are cases of it, so that one compiled loop simulates them all.
     """
 
@@ -46,9 +32,8 @@ class CoEnergy:
 
     @classmethod
     def opposed(cls, *, k_i: float, k_x: float, L: float, gap: float, x: float = 0.0, i: float = 0.0) -> CoEnergy:
-        """Return two equal magnets `gap` away that have these numbers, and no force, at `x` and `i` (theory.md sec. 1).
-
-        i0 = -k_x s0/k_i, k = k_i s0²/(2 i0), and the leakage is what L has beyond k_i²/abs(k_x); `k_x` is negative.
+        """Return two equal magnets `gap` away that have these numbers (k_x < 0), and no force, at `x` and `i`
+        (theory.md sec. 1): i0 = -k_x s0/k_i, k = k_i s0²/(2 i0), leakage what L has beyond k_i²/abs(k_x).
         """
         bias = -k_x * gap / k_i
         k = 0.5 * k_i * gap**2 / bias
@@ -137,9 +122,8 @@ class Magnet(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SingleMagnet:
-    """One attracting magnet; the position is its gap and grows away from it.
-
-    f = -k (i/x)^2 / 2 along +x (thesis eq. 1.9, 2.7), lambda = (k/x + leakage) i, so k_i < 0 and k_x < 0.
+    """One attracting magnet; the position is its gap and grows away from it. f = -k (i/x)^2 / 2 along +x (thesis eq.
+    1.9, 2.7), lambda = (k/x + leakage) i, so k_i < 0 and k_x < 0.
     """
 
     k: float  # magnet constant in N m^2/A^2; see `from_geometry`
@@ -151,10 +135,10 @@ class SingleMagnet:
 
     @classmethod
     def from_geometry(cls, *, turns: float, area: float, leakage: float = 0.0) -> SingleMagnet:
-        """Return the magnet with k = mu0 n^2 A (thesis eq. 2.7).
+        """Return the magnet with k = mu0 n^2 A (thesis eq. 2.7) of one gap of `area` m^2, and `leakage` in H.
 
-        `turns`: turns of the winding; `area`: area of the one gap in m^2; `leakage`: inductance in H that does not
-        depend on the gap. Returns the magnet.
+        A horseshoe closes its flux over two gaps in series: its reluctance is 2 d/(mu0 A) and k = mu0 n^2 A / 2 = 2 k',
+        with the k' = mu0 n^2 A / 4 of theory.md sec. 1.
         """
         _positive("turns", turns, "1")
         _positive("area", area, "m^2")
@@ -171,10 +155,7 @@ class SingleMagnet:
         return 0.0, math.inf
 
     def holding_current(self, x: float, load: float) -> float:
-        """Return i = x sqrt(2 load / k), the current that holds `load` in N (away from the magnet) at gap `x` in m.
-
-        `x`: gap in m; `load`: constant force along +x in N, such as the weight. Returns current in A.
-        """
+        """Return i = x sqrt(2 load / k) in A, which holds `load` N (away from the magnet, along +x) at gap `x` m."""
         _open(x, self.range)
         if load <= 0.0:
             raise ModelError(
@@ -189,18 +170,21 @@ class DifferentialPair:
     """Two opposed magnets with currents i0 + i and i0 - i (theory.md sec. 1).
 
     f = k' cos(alpha) [((i0 + i)/(s0 - x))^2 - ((i0 - i)/(s0 + x))^2]. At the centre k_i = 4 k' i0/s0^2 cos(alpha) and
-    k_x = -4 k' i0^2/s0^3 cos(alpha).
+    k_x = -4 k' i0^2/s0^3 cos(alpha), one cosine each, as W' = k' cos(alpha) i^2/(s0 -+ x): the gap closes by the full
+    x. What that leaves out of a coil's inductance at the centre, 2 k' (1 - cos(alpha))/s0, is constant and belongs to
+    the leakage. (A gap s0 -+ x cos(alpha) would put cos(alpha)^2 into k_x: -1.19e5 N/m, not the -1.29e5 N/m of the
+    unstable-bearing preset.)
 
-    The bias is held by its source; the axis voltage is the difference V = V1 - V2 of the two coil voltages. Then
-    V = R i + dlambda/dt with lambda = lambda1 - lambda2 = dW'/di and R = 2 R_coil, and V = R i + L i' + k_i x' holds
-    with the k_i of the force and L = 2 L_coil. (One coil alone sees k_i/2 and L/2.) Without leakage L k_s = k_i^2.
+    The bias is held by its source; the axis voltage is the difference V = V1 - V2 of the two coil voltages. Then V = R
+    i + L i' + k_i x' with lambda = lambda1 - lambda2 = dW'/di, R = 2 R_coil, L = 2 L_coil and the k_i of the force.
+    (One coil alone sees k_i/2 and L/2.) Without leakage L k_s = k_i^2, k_s = -k_x.
 
     Attributes
     ----------
     turns : float
-        Turns of each magnet's winding.
+        Of each magnet's winding.
     area : float
-        Area of one pole face in m^2.
+        Of one pole face in m^2.
     bias : float
         Bias current i0 in A.
     gap : float
@@ -208,11 +192,11 @@ class DifferentialPair:
     half_angle : float
         Pole half-angle alpha in rad.
     leakage : float
-        Leakage inductance of the axis (both coils) in H.
+        Inductance of the axis (both coils) in H.
     k_asym : float
-        How the magnets differ in strength: k (1 + k_asym) along +x, k (1 - k_asym) along -x; between -1 and 1.
+        Strengths are k (1 + k_asym) along +x, k (1 - k_asym) along -x; between -1 and 1.
     bias_asym : float
-        How their bias currents differ, in A: i0 + bias_asym along +x, i0 - bias_asym along -x.
+        Bias currents are i0 + bias_asym along +x, i0 - bias_asym along -x, in A.
     """
 
     turns: float
@@ -254,15 +238,13 @@ class DifferentialPair:
     def holding_current(self, x: float, load: float) -> float:
         """Return the differential current that holds `load` in N (along +x) at `x` in m, with both coils conducting.
 
-        Solves a (i0 + j)^2 - b (i0 - j)^2 + load = 0 for j = i + bias_asym, with a = k_a/(2 (s0 - x)^2) and
-        b = k_b/(2 (s0 + x)^2).
+        Solves a (i0 + j)^2 - b (i0 - j)^2 + load = 0 for j = i + bias_asym, with a = k_a/(2 (s0 - x)^2) and b = k_b/(2
+        (s0 + x)^2).
 
         Parameters
         ----------
-        x : float
-            Position in m.
-        load : float
-            Constant force along +x in N.
+        x, load : float
+            Position in m, constant force along +x in N.
 
         Returns
         -------

@@ -1,13 +1,5 @@
-"""The nonlinear one-axis plant: voltage-driven magnet, mass, gravity (thesis eq. 4.9 in physical form).
-
-m x'' = f(x, i) - c x' + m g,  V = R i + dlambda(x, i)/dt, with f and lambda from one co-energy (`physics.magnet`).
-With an eddy pole a the force that acts is p, p' = a (f(x, i) - p) (thesis eq. 1.4). The stage of `physics.power_stage`
-may stand between the voltage that is commanded and V.
-
-A power stage does not give the voltage that it is told to: transistors, diodes and the dead time between two
-transistors act against the current, v = clip(u, low, high) + offset - v_drop tanh(i/i_drop). For a dead time t_d of a
-half bridge on the supply V_s at the switching frequency f_s, v_drop is V_s t_d f_s (Jeong and Park 1991); the sign
-changes over i_drop, about the ripple of the current.
+"""The nonlinear one-axis plant: voltage-driven magnet, mass, gravity (thesis eq. 4.9 in physical form): m x'' = f(x, i)
+- c x' + m g, V = R i + dlambda(x, i)/dt, with f and lambda from one co-energy.
 """
 
 from __future__ import annotations
@@ -25,7 +17,10 @@ from ambid.physics.magnet import Magnet, Number
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PowerStage:
-    """Limits, drop and offset of a power stage."""
+    """Makes v = clip(u, low, high) + offset - v_drop tanh(i/i_drop): devices and dead time act against the current.
+    v_drop is V_s t_d f_s for a dead time t_d on supply V_s at f_s (Jeong and Park 1991); i_drop is about the ripple of
+    the current.
+    """
 
     # between which the supply lets the voltage be, in V. The logged command may lie beyond.
     limits: Interval = UNLIMITED
@@ -45,18 +40,12 @@ class PowerStage:
             raise ModelError(f"stage.i_drop is {self.i_drop} A; it must be a positive number. Correct it")
 
     def drop(self, current: Number) -> Number:
-        """Return the voltage that is lost.
-
-        `current`: in A. Returns in V.
-        """
+        """Return the voltage in V that is lost at a current in A."""
         lost: Number = self.v_drop * np.tanh(current / self.i_drop)
         return lost
 
     def slope(self, current: float) -> float:
-        """Return d(drop)/di: what the drop adds to the resistance at a current.
-
-        `current`: in A. Returns in ohm.
-        """
+        """Return d(drop)/di in ohm at a current in A: what the drop adds to the resistance."""
         return self.v_drop / self.i_drop / math.cosh(min(abs(current / self.i_drop), 350.0)) ** 2
 
 
@@ -76,6 +65,8 @@ class OperatingPoint(NamedTuple):
 class NonlinearPlant:
     """Magnet, coil and mass on one axis, driven by a voltage.
 
+    With an eddy pole a the force that acts is p, p' = a (f(x, i) - p) (thesis eq. 1.4).
+
     Attributes
     ----------
     magnet : Magnet
@@ -87,7 +78,7 @@ class NonlinearPlant:
     c : float
         Mechanical damping in N s/m.
     gravity : float
-        Gravity along +x in m/s^2; 0 for a horizontal axis.
+        Along +x in m/s^2; 0 for a horizontal axis.
     eddy_pole : float
         Pole a in rad/s of the eddy currents between current and force; infinite for none.
     stage : PowerStage
@@ -123,9 +114,9 @@ class NonlinearPlant:
         state : tuple
             Position in m, velocity in m/s, current in A.
         voltage : float
-            Axis voltage in V, as the coil gets it.
+            In V, as the coil gets it.
         force : float
-            Disturbing force along +x in N.
+            Disturbance along +x in N.
 
         Returns
         -------
@@ -142,8 +133,7 @@ class NonlinearPlant:
 
         Parameters
         ----------
-        position : float
-            In m.
+        position : float, m
 
         Returns
         -------
@@ -166,8 +156,7 @@ class NonlinearPlant:
 
         Parameters
         ----------
-        position : float
-            In m.
+        position : float, m
 
         Returns
         -------
@@ -197,8 +186,7 @@ class NonlinearPlant:
 
         Returns
         -------
-        float
-            Energy in J, up to a constant.
+        float, J, up to a constant
         """
         x, v, i = state
         w = self.magnet.coenergy

@@ -1,6 +1,5 @@
-"""Named benches: plants of known truth with a loop that holds them, noise and limits.
-
-What a source prints is given with its source; everything else is chosen, and `Preset.sources` says so for every number.
+"""Named benches: plants of known truth with a loop that holds them, noise and limits. `Preset.sources` says of every
+number from where it is, or that it was chosen.
 """
 
 from __future__ import annotations
@@ -303,8 +302,7 @@ def _rmit() -> Preset:
 
 def _camb() -> Preset:
     """Each pole pair has W' = k i^2/(2 d) (thesis eq. 1.9); an axis current moves its coils by a unit combination.
-
-    Stator A pulls to -z, B to +z. With the cone angle c a radial axis has k_i = 2 k i0 cos(c)/s^2, the axial one, whose
+    Stator A pulls to -z, B to +z. With cone angle c a radial axis has k_i = 2 k i0 cos(c)/s^2, the axial one, whose
     current adds half of itself to every coil of B and takes it from every coil of A, k_i = 4 k i0 sin(c)/s^2.
     """
     axes, cone, gap, bias = ("ax", "ay", "bx", "by"), math.atan(0.5), 0.4e-3, 1.5
@@ -434,7 +432,6 @@ def preset_names(*, rotors: bool | None = None) -> tuple[str, ...]:
     Returns
     -------
     tuple of str
-        Names for the command line.
     """
     return tuple(name for name in _MAKERS if rotors in (None, name in _ROTORS))
 
@@ -450,7 +447,6 @@ def preset(name: str) -> Preset:
     Returns
     -------
     Preset
-        The bench.
 
     Raises
     ------

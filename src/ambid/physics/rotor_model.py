@@ -1,16 +1,4 @@
-"""The rotor in its bearings: rigid motion, bending modes, gyroscopic coupling, magnets and coils on many axes.
-
-z runs along the shaft, slopes alpha = dx/dz, beta = dy/dz (theory.md sec. 5). With W the speed:
-
-    m x'' = Σ f_x,   Id alpha'' + Ip W beta' = Σ (z_b - z_cg) f_x,   Id beta'' - Ip W alpha' = Σ (z_b - z_cg) f_y,
-    eta'' + 2 zeta w eta' + w² eta + gyroscopic terms = Σ phi(z_b) f,   modal mass 1 kg, the same shapes in both planes,
-    f = k_i i_eff - k_x x_b,   i_eff' = a (i - i_eff) where an eddy pole a is asked for (thesis eq. 1.4),
-    V = R i + L i' + k_i x_b' (thesis eq. 4.4),   sensors read gain·x(z_s), behind a pole where one is asked for.
-
-Where only the command of a current amplifier is logged, i' = p (g u - i) (thesis eq. 1.5: p = (R + K H)/L and
-g = K/(R + K H), voltages induced by motion neglected against K). Command and position show p, and of k_i and g only the
-product; K, H, R and L do not show one by one.
-"""
+"""The rotor in its bearings, magnets and coils on many axes (theory.md eq. 30, 31)."""
 
 from __future__ import annotations
 
@@ -63,7 +51,17 @@ def position_role(axis: str, k: int) -> str:
 
 @dataclass(frozen=True, kw_only=True)
 class RotorModel:
-    """A rotor in magnetic bearings on many axes, as a linear model."""
+    """A rotor in magnetic bearings on many axes, a linear model; z along the shaft, alpha = dx/dz, beta = dy/dz, speed
+    W:
+
+        m x'' = Σ f_x,   Id alpha'' + Ip W beta' = Σ (z_b - z_cg) f_x,   Id beta'' - Ip W alpha' = Σ (z_b - z_cg) f_y,
+        eta'' + 2 zeta w eta' + w² eta + gyroscopic terms = Σ phi(z_b) f,   modal mass 1 kg, f = k_i i_eff - k_x x_b,
+        i_eff' = a (i - i_eff) (thesis eq. 1.4),   V = R i + L i' + k_i x_b' (eq. 4.4),   sensors gain·x(z_s).
+
+    Where only the command of a current amplifier is logged, i' = p (g u - i), p = (R + K H)/L, g = K/(R + K H) (thesis
+    eq. 1.5, voltages induced by motion neglected): data show p, and of k_i and g the product, K, H, R, L not one by
+    one.
+    """
 
     bearings: tuple[Bearing, ...]  # in their order along the shaft
     speed: float = 0.0  # speed of rotation W, rad/s

@@ -1,21 +1,6 @@
-"""Errors of sensors: what each adds to the signals, how far it moves the parameters, which residuals it leaves.
-
-The plant is y = G(jw; theta) u. A channel that should log s(t) logs, to first order in the error e,
-
-    gain s + e s,   offset s + e,   lag (or a pole at 1/e) s - e s',   cross-talk s + e s_2,   time (1 + e) t,
-
-and a number of the model that is fixed, such as the plane of a sensor, is too large by e. Each adds a column c to the
-outputs beside G u. Least squares with the Jacobian J of the free parameters then moves them by J⁺c and leaves the
-residuals c - J J⁺c: along these, and no others, a score test sees the error (Rao 1948).
-
-A gain is a change of the channel's unit. Where every parameter that it scales is free nothing of c is left: no record
-shows it, and J⁺c are whole numbers, the powers of the parameters. A gain of the position sensor moves m and k_x by -2
-and k_i by -1: one k_i fixes both m x'' = k_i i - k_x x and u = R i + L i' + k_i x' (thesis eq. 4.4). Where one of them
-is held, such as a mass that was weighed, what happens depends on the record. An offset is a constant of the model and
-moves no parameter.
-
-`SensorGains` has the gains as parameters. With states in logged units, x_g = T x and T = diag(g of the state's sensor),
-the outputs stay what they were, A becomes T A T^-1, B and E become T B and T E.
+"""Errors of sensors: what each adds to the signals, how far it moves the parameters J⁺c (least squares with Jacobian
+J), and the residuals c - J J⁺c along which alone a score test sees it (Rao 1948); c is what e adds to y = G(jw; theta)
+u.
 """
 
 from __future__ import annotations
@@ -39,7 +24,13 @@ _GENERIC = {"m": 1.3, "k_x": -2.1, "k_i": 1.7, "R": 0.9, "L": 0.6, "c": 0.4}  # 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SensorError:
-    """An error of one channel, or of a number that the model takes for known."""
+    """An error e of one channel, or of a number that the model takes for known, such as a sensor's plane, too large by
+    e.
+
+    To first order a channel logs: gain s + e s, offset s + e, lag (or a pole at 1/e) s - e s', cross-talk s + e s_2,
+    time (1 + e) t. Where all that it scales is free, no record shows a gain: of the position sensor it moves m and k_x
+    by -2, k_i by -1 (one k_i fixes force and thesis eq. 4.4), if none is held. An offset moves no parameter.
+    """
 
     kind: Kind
     channel: str  # role of an input or output, "time", or the name of a fixed number
@@ -124,9 +115,8 @@ def error_moves(
 ) -> Array:
     """Return d ln(parameter) / d(error), (n_free, n_errors); of a parameter that is zero over its natural scale.
 
-    `theta`: parameters, SI; `free`: default all without a default value; `omega`: rad/s, default around the poles;
-    `excitation`: (n_lines, n_inputs, n_experiments), default each input alone; `whiten`: (n_lines, n_outputs,
-    n_outputs), default each output over its root mean square. Units: of a lag s, of an offset and a fixed number SI.
+    `omega` in rad/s, default around the poles; `excitation` (n_lines, n_inputs, n_experiments), default each input
+    alone; `whiten` (n_lines, n_outputs, n_outputs), default each output over its rms. Errors are in SI, a lag in s.
     Directions that the outputs do not show are not moved along.
     """
     free = [p.name for p in plant.parameters if p.default is None] if free is None else list(free)
@@ -152,9 +142,8 @@ def error_moves(
 
 
 def unit_powers(plant: LinearModel) -> Mapping[str, tuple[int, ...]]:
-    """Return by parameter the powers of gains on `CHANNELS` that it scales with; 0 for a channel that is not there.
-
-    All parameters are free, but for a mass that nothing shows: without a voltage only ratios to it are seen.
+    """Return by parameter the powers of the gains on `CHANNELS` that it scales with, 0 for a channel that is not there.
+    All are free but a mass that nothing shows: without a voltage only ratios to it are seen.
     """
     theta = {p.name: _GENERIC[p.name] for p in plant.parameters}
     free = [name for name in theta if name != "m" or "voltage" in plant.inputs]
@@ -165,7 +154,9 @@ def unit_powers(plant: LinearModel) -> Mapping[str, tuple[int, ...]]:
 
 
 class SensorGains:
-    """A linear model with one more parameter for each output: ``gain_<output>``, 1 for a sensor as calibrated."""
+    """A linear model with one more parameter for each output: ``gain_<output>``, 1 for a sensor as calibrated. In
+    logged units x_g = T x, T = diag(gain of the state's sensor), A becomes T A T^-1, B and E T B and T E; outputs stay.
+    """
 
     def __init__(self, base: LinearModel) -> None:
         """`base`: its outputs are states of it."""

@@ -1,11 +1,5 @@
-"""A rotor from its drawings: Timoshenko beam elements, discs, and the modes of the free shaft.
-
-One plane is enough: the other has the same mass, stiffness and polar-inertia matrices M, K, P, and rotation at W rad/s
-couples the two, M q_x'' + W P q_y' + K q_x = f_x, M q_y'' - W P q_x' + K q_y = f_y, as for a rigid rotor Id alpha'' +
-Ip W beta' and Id beta'' - Ip W alpha'. Coordinates of a node: deflection x, and rotation alpha of the section, which is
-the slope dx/dz without shear. Element matrices: Przemieniecki, Theory of Matrix Structural Analysis (1968), ch. 5.6 and
-11; Friswell, Penny, Garvey, Lees, Dynamics of Rotating Machines (2010), sec. 5.4; shear coefficient of a tube: Cowper,
-J. Appl. Mech. 33 (1966) 335.
+"""A rotor from its drawings (theory.md sec. 9): Timoshenko beam elements, discs, and the modes of the free shaft.
+Przemieniecki (1968), ch. 5.6, 11; Friswell and others (2010), sec. 5.4; Cowper, J. Appl. Mech. 33 (1966) 335.
 """
 
 from __future__ import annotations
@@ -119,10 +113,8 @@ class Disc:
 
         Parameters
         ----------
-        z : float
-            Its middle plane, m.
-        outer, inner, width : float
-            Diameters and width in m.
+        z, outer, inner, width : float
+            Its middle plane, diameters and width in m.
         rho : float
             Density in kg/m³.
 
@@ -155,17 +147,17 @@ class FreeRotor:
     ----------
     z_cg : float
         Centre of gravity, m from the datum.
-    mass : Array
-        Shape (n,): m in kg, Id in kg m², then 1.
-    omega, zeta : Array
-        Shape (n,): natural frequencies in rad/s, 0 for the rigid coordinates, and damping ratios.
-    gyro : Array
-        Shape (n, n): modal gyroscopic matrix; entry (1, 1) is Ip in kg m².
-    z : Array
-        Shape (n_nodes,): nodes in m from the datum, rising.
-    shape : Array
-        Shape (n_nodes, 2, n): deflection and rotation of each node in each coordinate: 1 and 0 of the translation,
-        z - z_cg and 1 of the tilt, and the mode shapes, whose left end deflects to +.
+    mass : Array, shape (n,)
+        m in kg, Id in kg m², then 1.
+    omega, zeta : Array, shape (n,)
+        Natural frequencies in rad/s, 0 for the rigid coordinates, and damping ratios.
+    gyro : Array, shape (n, n)
+        Modal gyroscopic matrix; entry (1, 1) is Ip in kg m².
+    z : Array, shape (n_nodes,)
+        Nodes in m from the datum, rising.
+    shape : Array, shape (n_nodes, 2, n)
+        Deflection and rotation of each node in each coordinate: 1 and 0 of the translation, z - z_cg and 1 of the tilt,
+        and the mode shapes, whose left end deflects to +.
     """
 
     z_cg: float
@@ -186,8 +178,7 @@ class FreeRotor:
 
         Returns
         -------
-        Array
-            Shape (n_planes, n).
+        Array, shape (n_planes, n)
 
         Raises
         ------
@@ -206,8 +197,7 @@ class FreeRotor:
 
         Returns
         -------
-        Array
-            Shape (n_planes, n), 1/m times the coordinate's unit.
+        Array, shape (n_planes, n), 1/m times the coordinate's unit
 
         Raises
         ------
@@ -235,7 +225,6 @@ class Shaft:
     steps : tuple of Step
         From the left end to the right.
     discs : tuple of Disc
-        Rigid masses on it.
     material : Material
         Of the steps that name none.
     z : float
@@ -298,13 +287,12 @@ class Shaft:
         planes : sequence of float
             Planes in m from the datum that get a node, so that the mode shapes are exact there.
         residual : bool
-            Whether further coordinates stand for the static response of all other modes to forces at the planes and
-            to gyroscopic moments. Bearings then act as on the whole shaft. Their frequencies are no natural ones.
+            Whether further coordinates stand for the static response of all other modes to forces at the planes and to
+            gyroscopic moments. Bearings then act as on the whole shaft. Their frequencies are no natural ones.
 
         Returns
         -------
         FreeRotor
-            Mass, inertia and modes.
 
         Raises
         ------

@@ -1,9 +1,5 @@
-"""Whirl of a rotor on supports over its speed: the Campbell diagram, critical speeds, how well both are known.
-
-The eigenvalues of both planes at each speed W (Friswell et al., Dynamics of Rotating Machines (2010), ch. 6; Genta,
-Dynamics of Rotating Systems (2005), ch. 2), in modal coordinates. A mode is followed from speed to speed by its shape;
-where two shapes come too close for that, speeds between are computed until they differ. A whirl is forward where
-its orbits turn with the shaft, from x to y.
+"""Whirl of a rotor on supports over its speed: the Campbell diagram, critical speeds, how well both are known: from the
+eigenvalues of both planes in modal coordinates (theory.md sec. 9; Friswell et al. 2010, ch. 6; Genta 2005, ch. 2).
 """
 
 from __future__ import annotations
@@ -53,16 +49,16 @@ class Support:
 class Campbell:
     """Whirl over speed, one line for each mode that oscillates at the first speed, by frequency there.
 
+    A mode is followed from speed to speed by its shape; where two come too close for that, speeds between are computed
+    until they differ. A whirl is forward where its orbits turn with the shaft, from x to y.
+
     Attributes
     ----------
-    speed : Array
-        Shape (n_speeds,): rotor speed in rad/s.
-    poles : NDArray of complex
-        Shape (n_speeds, n_lines): eigenvalues with positive imaginary part, rad/s; nan where a mode is so damped that
-        it does not oscillate.
-    direction : Array
-        Shape (n_speeds, n_lines): 1 for a forward circular orbit, -1 for a backward one, 0 for a straight line, between
-        for ellipses.
+    speed : Array, shape (n_speeds,), rad/s
+    poles : NDArray of complex, shape (n_speeds, n_lines), rad/s
+        With positive imaginary part; nan where a mode is so damped that it does not oscillate.
+    direction : Array, shape (n_speeds, n_lines)
+        1 for a forward circular orbit, -1 for a backward one, 0 for a straight line, between for ellipses.
     """
 
     speed: Array
@@ -110,8 +106,7 @@ class CriticalSpeed:
 
     Attributes
     ----------
-    speed : float
-        rad/s.
+    speed : float, rad/s
     line : int
         Line of the Campbell diagram.
     direction : float
@@ -138,7 +133,7 @@ def campbell(
     Parameters
     ----------
     rotor : FreeRotor or Shaft
-        In modal coordinates, as identified or from a drawing; of a shaft, as many modes are taken as the lines need.
+        As identified or from a drawing; of a shaft, as many modes are taken as the lines need.
     speeds : sequence of float or array of shape (n_speeds,)
         rad/s, not negative, rising.
     supports : sequence of Support
@@ -149,7 +144,6 @@ def campbell(
     Returns
     -------
     Campbell
-        Frequencies, damping and direction of whirl.
 
     Raises
     ------
@@ -207,13 +201,11 @@ def critical_speeds(
     Parameters
     ----------
     rotor : FreeRotor or Shaft
-        As in `campbell`.
     highest : float
         Up to which speed they are sought, rad/s.
     supports : sequence of Support
-        Bearings.
     lines : int, optional
-        As in `campbell`.
+        As in `campbell`, like rotor and supports.
 
     Returns
     -------
@@ -327,9 +319,8 @@ def _both(given: float | tuple[tuple[float, float], tuple[float, float]]) -> Arr
 
 
 def drawn_numbers(model: RotorModel, shaft: Shaft, planes: Mapping[str, float]) -> dict[str, float]:
-    """Return the parameters of a model that follow from a drawing: mass, inertia, centre of gravity, bending modes.
-
-    `planes`: where each of `model.places` lies, m from the datum. Shapes have modal mass 1 kg and rise at the left end.
+    """Return the parameters of a model that follow from a drawing: mass, inertia, centre of gravity, bending modes of
+    modal mass 1 kg that rise at the left end. `planes`: where each of `model.places` lies, m from the datum.
     """
     at = [planes[place] for place in model.places]
     rotor = shaft.free_rotor(model.n_modes, planes=at)
@@ -344,10 +335,8 @@ def drawn_numbers(model: RotorModel, shaft: Shaft, planes: Mapping[str, float]) 
 
 
 def free_rotor_of(model: RotorModel, theta: Mapping[str, float]) -> FreeRotor:
-    """Return the rotor of a model at parameters `theta` without its bearings, with the planes of the model as nodes.
-
-    Between planes its shapes are a guess, at planes they are the parameters. Gyroscopic terms are 0 where the model
-    has none.
+    """Return the rotor of a model at parameters `theta` without its bearings, with the planes of the model as nodes,
+    between which its shapes are a guess. Gyroscopic terms are 0 where the model has none.
     """
     planes = {theta[place]: place for place in reversed(model.places)}
     z = np.array(sorted(planes))
@@ -377,11 +366,9 @@ def free_rotor_of(model: RotorModel, theta: Mapping[str, float]) -> FreeRotor:
 def whirl_sd(
     model: RotorModel, theta: Mapping[str, float], names: Sequence[str], covariance: Array, whirl: Campbell
 ) -> Array:
-    """Return standard deviations of the frequencies of `whirl`, (n_speeds, n_lines), rad/s.
-
-    `whirl`: of `free_rotor_of(model, theta)` without supports; `covariance`: of the parameters `names`. To first order,
-    from the exact derivative of a pole: with D = s² + s (C - j d W G) + K for circular whirl in direction d = ±1, and
-    its null vectors l, r, ds = -l* dD r / (l* D' r).
+    """Return standard deviations (n_speeds, n_lines), rad/s, of the frequencies of a `whirl` of `free_rotor_of(model,
+    theta)` without supports, to first order in the parameters `names`: with D = s² + s (C - j d W G) + K for circular
+    whirl in direction d = ±1, and its null vectors l, r, ds = -l* dD r / (l* D' r).
     """
     rotor = free_rotor_of(model, theta)
     root = np.sqrt(rotor.mass)
@@ -401,9 +388,8 @@ def whirl_sd(
 
 
 def _moved(rotor: FreeRotor, G: Array, name: str) -> tuple[Array, Array, Array]:
-    """Derivatives by a parameter of stiffness, damping and gyroscopic matrix, all scaled with the masses.
-
-    Zero where the rotor does not have it, as of a mode left out or of a bearing.
+    """Derivatives by a parameter of stiffness, damping and gyroscopic matrix, all scaled with the masses; zero where
+    the rotor does not have it, as of a mode left out or of a bearing.
     """
     dK, dC, dG = np.zeros_like(G), np.zeros_like(G), np.zeros_like(G)
     place, _, what = name.partition(".")
