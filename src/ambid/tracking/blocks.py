@@ -1,9 +1,7 @@
-"""Blocks of samples on their way from acquisition to tracking, and records as streams of them.
+"""Blocks of samples on their way from acquisition to tracking, and records as streams of them, with all their damage.
 
-A record comes at the pace at which it was taken or as fast as possible, with all its damage. Sample numbers come from
-the time column where there is one: a stamp that lies k periods after the one before it has a number larger by k. A
-stamp that runs back means repeated samples if the rows are the same as before, late samples if they fill a gap, and
-otherwise a clock that was set back.
+Numbers come from the time column where there is one: a stamp k periods after the one before has a number larger by k;
+one that runs back means repeated samples (same rows), late ones (they fill a gap), or else a clock set back.
 """
 
 from __future__ import annotations
@@ -118,11 +116,8 @@ def blocks_of(
     channels: Sequence[str] | None = None,
     time_s: ArrayLike | None = None,
 ) -> Replay:
-    """Return a record as a stream.
-
-    `record`: rows in the order in which they were written; may hold NaN; `block_samples`: samples of a block;
-    `channels`: which, in which order; default all; `time_s`: (n_samples,). Returns samples are numbered from 0 at the
-    first row.
+    """Return a record, rows as they were written (perhaps NaN), as a stream numbered from 0 at the first row;
+    `block_samples`: samples of a block; `channels`: which, in which order, default all; `time_s`: (n_samples,).
     """
     if block_samples < 1:
         raise RecordError(f"a block of {block_samples} samples holds nothing; it must have at least one. Correct it")
@@ -153,12 +148,10 @@ def blocks_of(
 
 
 def numbers_from_time(time_s: Array, values: Array, rate_hz: float) -> tuple[NDArray[np.int64], NDArray[np.bool_], int]:
-    """Number the rows of a damaged record by their stamps.
-
-    `time_s`: (n_rows,); `values`: (n_rows, n_channels), tell repeated rows from a clock that was set back. Returns
-    `numbers`: (n_rows,), int64, sample numbers, 0 for the first row. A row without a stamp follows on the one before
-    it; `placed`: (n_rows,), bool, false for rows without a stamp where those beside it leave open which samples they
-    are; `irregular`: number of intervals that are off a whole number of periods by more than 1 % of a period.
+    """Number the rows of a damaged record by their stamps; `values` tell repeated rows from a clock that was set back.
+    Returns int64 `numbers`, 0 for the first row, those without a stamp following the one before; bool `placed`, false
+    where it stays open which samples these are; `irregular`: intervals off a whole number of periods by more than 1 %
+    of one.
     """
     stamped = np.flatnonzero(np.isfinite(time_s))
     rows = np.diff(stamped)
@@ -218,13 +211,9 @@ def _known(values: Array, k: int, target: int, runs: Sequence[tuple[int, int, in
 
 
 def paced(blocks: Iterable[Block], rate_hz: float, *, stopped: Callable[[], bool] = lambda: False) -> Iterator[Frame]:
-    """Yield blocks at the time at which an acquisition would have them.
-
-    The pace is that of the sample numbers. A gap takes its time, at most one second; numbers that run back take none
-    but that of their samples.
-
-    `stopped`: asked while waiting; True ends the stream. Returns with the time at which it was due, however late it is
-    taken.
+    """Yield blocks, with the time at which they were due, when an acquisition would have them, until `stopped`, asked
+    while waiting, is True. A gap takes its time, at most one second; numbers that run back none but that of their
+    samples.
     """
     due, after = time.perf_counter(), None
     for block in blocks:

@@ -1,9 +1,7 @@
 """What a block shows that the estimate does not explain, and what is done about it.
 
-A number of the bench that jumped is searched in the samples after the jump; a disturbance is given its freedom; and
-where nothing explains the data nothing is learned. A block with much larger innovations than usual is set aside and the
-predictor starts again after it: it may be a passing knock. If that goes on, and no change of the bench explains it, it
-is treated as noise as long as that is plausible.
+A jumped number is searched in the samples since; a disturbance is given its freedom; else nothing is learned. A block
+of much larger innovations is set aside: perhaps a knock. If that goes on unexplained, it is noise while plausible.
 """
 
 from __future__ import annotations
@@ -27,18 +25,14 @@ _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.1, 10.0  # until the next search while nothin
 
 
 def unexplained(evidence: Evidence) -> float:
-    """Return the variance of what no number explains in a block.
-
-    Returns 1 as at identification, also where a block is too short to tell.
-    """
+    """Return the variance of what no number explains in a block: 1 as at identification, or if too short to tell."""
     return evidence.rest / evidence.freedom if evidence.freedom else 1.0
 
 
 class Unexplained:
-    """Keeps count of blocks that the model does not explain.
-
-    `blocks`: wild blocks on end; `deaf`: whether nothing is learned: the error is larger than could be believed to be
-    noise; `noise`: variance of the noise over that at identification, as it was taken: 1 if it never rose.
+    """Keeps count of blocks that the model does not explain: `blocks` wild ones on end, whether it is `deaf` (learns
+    nothing: the error is beyond believable noise), and `noise`, the variance taken over that at identification, 1 if it
+    never rose.
     """
 
     def __init__(self) -> None:
@@ -95,13 +89,10 @@ _UNKNOWN = 0.3  # relative standard deviation of a parameter of which nothing is
 
 
 class Diagnosis:
-    """Watches the evidence of a working estimate, and deals with what it finds.
-
-    `t0`: time of sample 0, s of record.
-
-    `settling`: whether a disturbance is being learned; `renewed`: whether the working estimate was put elsewhere by the
-    last block; `changes`: changes found, the name being that of the number which explains the data after it;
-    `update_s`: computing time of the slowest search after a change, s.
+    """Watches the evidence of a working estimate, and deals with what it finds; `t0`: time of sample 0, s of record.
+    `settling`: a disturbance is being learned; `renewed`: the last block put the estimate elsewhere; `changes`: each
+    with the name of the number that explains the data after it; `update_s`: time of the slowest search after a change,
+    s.
     """
 
     def __init__(
@@ -146,17 +137,11 @@ class Diagnosis:
         return self.unexplained.noise
 
     def keep(self, samples: Samples, last: int) -> None:
-        """Keep samples for a search.
-
-        `samples`: those that follow the ones before; `last`: number of the sample after them.
-        """
+        """Keep samples for a search; `last`: number of the sample after them."""
         self._recent.add(samples, last)
 
     def restart(self, sample: int) -> None:
-        """Start the predictor again, as after a gap; a search waits for samples from then on.
-
-        `sample`: number of the next sample.
-        """
+        """Start the predictor again, as after a gap; a search waits for samples from `sample`, the next, on."""
         self._rpem.stream.restart(sample)
         self._recent.clear()
         if self._recovery is not None:
@@ -168,10 +153,7 @@ class Diagnosis:
         self._detector.restart(sample)
 
     def look(self, evidence: Evidence, t: float) -> bool:
-        """Judge a block before it is used.
-
-        `t`: its end, s of record. Returns whether the recursion may learn from it.
-        """
+        """Judge a block before it is used, `t` its end in s of record: whether the recursion may learn from it."""
         rpem, self.renewed = self._rpem, False
         self._history.append((evidence, rpem.filter.copy()))
         if self._recovery is not None:
@@ -197,10 +179,8 @@ class Diagnosis:
         return True
 
     def _undecided(self, alarm: Alarm) -> bool:
-        """Wait for another block where the first ones leave open what happened.
-
-        A jump somewhere in its block looks like many things: one whole block behind it tells most. A disturbance and a
-        fault of the bench that explain the first blocks alike get two.
+        """Wait for another block where the first leave open what happened: a jump inside a block looks like many
+        things. A disturbance and a fault of the bench that explain the first blocks alike get two.
         """
         if alarm.by == "noise":
             return False

@@ -1,7 +1,6 @@
 """The engine around a tracker: blocks go source -> ring -> guard -> consumer, timed, until they end or are interrupted.
 
-In process, the blocks come straight from the source. With a producer of its own, another process, they
-come through the ring, so that the source is never kept waiting by the consumer. Every wait is one that can be ended.
+The ring serves a producer in another process, never kept waiting by the consumer. Every wait can be ended.
 """
 
 from __future__ import annotations
@@ -34,11 +33,9 @@ _DECADES = 11  # up to 10 000 s; what is beyond is in the last bin
 
 
 class LatencyStatistics:
-    """Counts latencies, overruns and late blocks.
-
-    `count`: blocks; `largest`: s; `overruns`: blocks that were lost because the ring was full; `late`: blocks that came
-    before the work on the one before had ended; `start`: largest latency until `caught_up`, s, which the others leave
-    out; None before.
+    """Counts latencies: `count` of blocks; `largest`, s; `overruns`: lost because the ring was full; `late`: come
+    before the work on the one before had ended; `start`: largest until `caught_up`, s, left out of the others, None
+    before.
     """
 
     def __init__(self) -> None:
@@ -67,10 +64,8 @@ class LatencyStatistics:
         self.count += 1
 
     def quantile(self, fraction: float) -> float:
-        """Return the latency that this fraction of the blocks does not exceed.
-
-        `fraction`: 0 to 1. Returns s; upper edge of its bin, or the largest latency if that is less; NaN without any
-        block.
+        """Return the latency in s that this fraction of blocks does not exceed: upper edge of its bin, or the largest
+        latency if less; NaN without any block.
         """
         if not 0 <= fraction <= 1:
             raise EstimationError(f"the fraction of a quantile is {fraction}; it must lie within 0 and 1. Correct it")
@@ -101,9 +96,8 @@ _PATIENCE_S = 5.0  # for a producer that was asked to stop
 
 @contextmanager
 def produced_beside(source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace) -> Iterator[_Producer]:
-    """Run a source, which can be pickled, in another process while the context lasts.
-
-    On leaving, it is told to stop; an exception of the source is raised then, unless another is on its way.
+    """Run a source, which can be pickled, in another process while the context lasts; on leaving, tell it to stop and
+    raise its exception, unless another is on its way.
     """
     maker = _Producer(source, ring, rate_hz, pace)
     try:
@@ -121,10 +115,7 @@ def produced_beside(source: Iterable[Block], ring: BlockRing, rate_hz: float, pa
 def fill(
     source: Iterable[Block], ring: BlockRing, rate_hz: float, pace: Pace, *, alone: Callable[[], bool] = lambda: False
 ) -> None:
-    """Put the blocks of a source into a ring until they end or the consumer wants no more.
-
-    `alone`: tells whether the consumer is dead.
-    """
+    """Put a source's blocks into a ring until they end or the consumer wants no more, or is dead, by `alone`."""
 
     def stopped() -> bool:
         return ring.stopping or alone()
@@ -243,16 +234,11 @@ def run(
     block_samples: int = 200,
     stopped: Callable[[], bool] = lambda: False,
 ) -> StreamReport:
-    """Pump blocks from a source through the guard to a consumer.
-
-    An interrupt (Ctrl-C) between two blocks ends the stream: what was acquired up to then is delivered, and the report
-    says so. A second one interrupts the consumer itself. An exception of source or consumer ends everything and is
-    raised again; the ring is removed in any case.
-
-    `source`: blocks; with the fastest pace also frames, which keep their time of arrival; `consume`: given each clean
-    stretch; `reject`: given each rejection; `guard`: a fresh one, of this stream; `pace`: of a source that is no ring;
-    `ring_blocks`, `block_samples`: capacity of the ring, with a producer; `stopped`: asked between blocks; True ends
-    the stream as an interrupt does.
+    """Pump blocks (of the fastest pace also frames, with their time of arrival) through a fresh `guard` to `consume`,
+    given each clean stretch, and `reject`, given each rejection. An interrupt (Ctrl-C), or `stopped` asked between
+    blocks, ends the stream: what was acquired is delivered, and the report says so; a second one interrupts the
+    consumer. Exceptions of source or consumer are raised again; the ring, of `ring_blocks` times `block_samples`, is
+    removed in any case. `pace`: of a source that is no ring.
     """
     pump = _Pump(guard, consume, reject)
     with _Interrupt() as interrupt:

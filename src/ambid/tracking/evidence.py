@@ -1,8 +1,7 @@
 """From samples to evidence: the predictor runs along the stream and every block of samples leaves a triangle.
 
-At a point `at` of the tracked numbers q the weighted innovations of a block are e + Ψ (q - at) up to second order, with
-unit covariance if the model is right. QR of [Ψ e] leaves J, r and the length of what no change of q explains:
--2 log-likelihood = rest + |r + J (q - at)|² + constant.
+At a point `at` of the tracked numbers q weighted innovations are e + Ψ (q - at) up to second order, of unit covariance
+if the model is right. QR of [Ψ e] leaves J, r: -2 log-likelihood = rest + |r + J (q - at)|² + constant.
 """
 
 from __future__ import annotations
@@ -75,9 +74,8 @@ class RecentSamples:
         self._filled = 0
 
     def since(self, first: int) -> Samples | None:
-        """Return the samples from number `first` on, as views that the next `add` may overwrite.
-
-        Returns none where they are no longer, or not yet, there.
+        """Return samples from number `first` on, views that the next `add` may overwrite; None where they are not
+        there.
         """
         if not self.first <= first < self.last:
             return None
@@ -87,10 +85,7 @@ class RecentSamples:
 
 
 def checked(numbers: TrackedNumbers, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None) -> Samples:
-    """Put one sample or a block into the shape of a block.
-
-    `outputs`: a number, or (n_samples,), where there is one column.
-    """
+    """Put one sample or a block into the shape of a block; a single output column may be a number or (n_samples,)."""
     if forcing is None and not numbers.synchronous:
         # one sample as it mostly comes: the checks below would take as long as its use
         n_u, n_y = numbers.problem.u.shape[1], numbers.problem.y.shape[1]
@@ -155,10 +150,7 @@ class Evidence:
 
 
 class EvidenceSum:
-    """Evidence of several blocks folded into one triangle at one point.
-
-    `T`: (p, p + 1), [J r]; `at`: (p,), the point; `rest`, `freedom`, `blocks`: sums.
-    """
+    """Evidence of several blocks folded into one triangle `T` (p, p + 1), [J r], at the point `at` (p,), with sums."""
 
     __slots__ = ("T", "_rows", "at", "blocks", "freedom", "rest")
 
@@ -202,10 +194,8 @@ class Linearisation:
 
 
 def linearise(numbers: TrackedNumbers, q: Array, near: Array | None = None) -> Linearisation | None:
-    """Assemble the predictor and its derivatives at a point.
-
-    `q`: (p,); `near`: (n, n_outputs), predictor gain of a point near this one. Returns none where there is no stable
-    predictor or no physical plant.
+    """Assemble the predictor and its derivatives at `q` (p,), None where none is stable or the plant not physical;
+    `near` (n, n_outputs): predictor gain of a point near this one.
     """
     problem = numbers.problem
     with one_thread():  # matrices of a few rows, and the next block waits
@@ -242,11 +232,8 @@ _ROOM = 128  # samples whose rows are folded at once: they stay in the first-lev
 
 
 class EvidenceStream:
-    """The predictor of a bench, running.
-
-    `at`: where the predictor starts; `block`: samples of one evidence.
-
-    `sample`: number of the next sample of the stream; `latest`: of the last block.
+    """The predictor of a bench, running from `at`; `block`: samples of one evidence; `sample`: number of the next
+    sample of the stream; `latest`: of the last block.
     """
 
     def __init__(self, numbers: TrackedNumbers, at: Linearisation, block: int) -> None:
@@ -283,11 +270,7 @@ class EvidenceStream:
         self.at, self._M = at, self._stacked(at)
 
     def restart(self, sample: int) -> None:
-        """Begin again after a gap: signals before it are forgotten, and a part of the block that was begun is
-        dropped.
-
-        `sample`: number of the next sample.
-        """
+        """Begin again after a gap at number `sample`: signals before it are forgotten, a begun block is dropped."""
         self.sample, self._fresh = sample, True
         self._triangle[:] = 0.0
         self._counts[1:3] = 0
@@ -303,10 +286,8 @@ class EvidenceStream:
         return int(self._lags.max()) + int(np.ceil(SETTLING * self.at.memory))
 
     def feed(self, samples: Samples) -> tuple[int, Array, Evidence | None]:
-        """Take samples until a block is complete, they are used up, or one is not finite.
-
-        Returns `n`: samples taken; fewer than given, without evidence, where the next one is not finite; `errors`:
-        (used, n_outputs), innovations, SI; `evidence`: of the block that these samples complete.
+        """Take samples until a block is complete, they are used up, or one is not finite: `n` taken, without evidence
+        if it is that; `errors` (used, n_outputs), innovations, SI; `evidence` of the completed block.
         """
         u, y = samples.u, samples.y
         if self._fresh and y.shape[0]:
@@ -328,9 +309,8 @@ class EvidenceStream:
         return n, errors[:n], self._evidence() if counts[2] == counts[4] else None
 
     def close(self, block: int) -> Evidence | None:
-        """Return the evidence of the samples since the last block, and go on with blocks of another length.
-
-        `block`: samples of the blocks to come. Returns none where nothing but settling has happened.
+        """Return the evidence since the last block, None if there was only settling, and go on with blocks of `block`
+        samples.
         """
         evidence = None
         if self._counts[2]:

@@ -1,9 +1,8 @@
 """From the working estimate to the published one: candidates, their validation, and the operator's orders.
 
-The working estimate goes on whatever happens here; only what later data have confirmed, or the operator has ordered,
-is published, and every decision is logged with its reason. A candidate is compared with the accepted numbers on later
-evidence. Their difference in loss is normal, with mean and variance known from the triangle and the candidate's
-covariance: what chance may do is told from what it may not. After acceptance comes a probation, which may go back.
+Only what later data confirmed, or the operator ordered, is published; decisions are logged with reasons. The difference
+in loss between candidate and accepted numbers on later evidence is normal, mean and variance known from triangle and
+covariance. Acceptance is followed by a probation, which may go back.
 """
 
 from __future__ import annotations
@@ -73,19 +72,15 @@ class Comparison:
 class Gate:
     """Hold the accepted numbers; let others pass only if later data agree.
 
-    A candidate passes if it predicts the later blocks no worse than the accepted numbers do, but for what chance allows
-    (`level` of the normal distribution of the difference; twice that distance for one that claims nothing new, as the
-    recursion proposes such every few blocks), and if its own residual is no larger than chance allows
-    (`level` of chi-squared). Where it claims to be another number (by its covariance and that of the accepted) and the
-    later data cannot tell the two apart, it waits, and is refused after `longest` blocks. After acceptance the numbers
-    before it are kept on trial for `probation` blocks: if they predict better than chance allows, the gate goes back.
+    A candidate passes if it predicts later blocks no worse than the accepted numbers but for chance (`level` of the
+    normal distribution of the difference; twice that distance for one that claims nothing new), and if its own residual
+    is within chance (`level` of chi-squared). One that claims to be another number, which data cannot yet tell, waits,
+    and is refused after `longest` blocks. For `probation` blocks the gate goes back if the numbers before predict
+    better than chance.
 
-    `names`: the p numbers; `start`: (p,), accepted at the start; `covariance`: (p, p), of them; `t`: time of the start,
-    s; `kept`: accepted numbers kept to go back to, the present ones included; `level`: probability that a right
-    candidate is refused by one of the two tests; `overdispersion`: of quiet statistics, 1 or more; may be set anew at
-    any time.
-
-    `last`: numbers behind the last decision.
+    `start`, `covariance`: (p,), (p, p), accepted at time `t`, s; `kept`: accepted numbers to go back to, the present
+    ones included; `level`: probability that one of the two tests refuses a right candidate; `overdispersion`: of quiet
+    statistics, 1 or more, may be set anew; `last`: numbers behind the last decision.
     """
 
     def __init__(
@@ -142,10 +137,8 @@ class Gate:
         return self._before is not None
 
     def propose(self, candidate: ArrayLike, covariance: ArrayLike, t: float, why: str) -> Event | None:
-        """Offer numbers; from now on `judge` has to be given each block that comes, and none from before.
-
-        `candidate`: (p,); `covariance`: (p, p); `t`: when it was formed, s of record; `why`: reason for the change.
-        Returns refusal of the candidate that was waiting, if one was: the newer one takes its place.
+        """Offer numbers formed at `t` (s of record) for the reason `why`; from now on `judge` has to be given each
+        block that comes, none from before. Returns the refusal of a candidate that waited: the newer takes its place.
         """
         values, P = self._checked(candidate, covariance)
         earlier, n = self._candidate, self._trial.blocks
@@ -162,10 +155,8 @@ class Gate:
         self._candidate = self._before = None
 
     def judge(self, evidence: Evidence, t: float) -> Event | None:
-        """Take in a block that came after the candidate was formed.
-
-        `t`: its end, s of record. Returns ``accepted``, ``refused``, or ``reverted`` by probation; None while there is
-        nothing to decide.
+        """Take in a block, ended at `t` (s of record), from after the candidate was formed: ``accepted``, ``refused``,
+        or ``reverted`` by probation; None while there is nothing to decide.
         """
         if self._candidate is None and self._before is None:
             return None
@@ -195,9 +186,8 @@ class Gate:
         return self._accept(new, t, f"{new.why}: {comparison.text}", comparison)
 
     def accept(self, t: float) -> Event:
-        """Accept the waiting candidate unjudged, as the operator may order; probation follows all the same.
-
-        `t`: s of record. Returns ``accepted``, or ``refused`` if none waits.
+        """Accept the waiting candidate unjudged at `t` (s of record), as the operator may order, probation following
+        all the same: ``accepted``, or ``refused`` if none waits.
         """
         if self._candidate is None:
             return Event(kind="refused", t=t, why="no candidate is waiting for acceptance")
@@ -206,10 +196,8 @@ class Gate:
         )
 
     def revert(self, t: float | None = None, why: str = "by order") -> Event:
-        """Go back to the numbers accepted before; a waiting candidate is dropped.
-
-        `t`: s of record; by default when the present numbers were accepted. Returns ``reverted``, or ``refused`` if
-        there are no earlier ones.
+        """Go back to the numbers accepted before, dropping a candidate; `t`: s of record, default when the present ones
+        were accepted. Returns ``reverted``, or ``refused`` if there are no earlier ones.
         """
         left = self.accepted
         t = left.t if t is None else t
@@ -350,12 +338,9 @@ _FLAGS: tuple[str, ...] = get_args(Flag)
 
 
 class Operator:
-    """Flags of the operator; all methods may be called from any thread.
-
-    ``track`` and ``hold`` are states: in ``hold`` the published numbers stay as they are. ``accept`` (the candidate,
-    now and unjudged) and ``revert`` (to the numbers accepted before) are orders, carried out once.
-
-    `hold`: whether to begin in ``hold``.
+    """Flags of the operator, to be set from any thread; begins in ``hold`` or ``track``. In ``hold`` the published
+    numbers stay; ``accept`` (the candidate, now and unjudged) and ``revert`` (to the numbers before) are orders,
+    carried out once.
     """
 
     def __init__(self, *, hold: bool = False) -> None:
@@ -417,10 +402,8 @@ def published(
 def beside(
     numbers: TrackedNumbers, accepted: Accepted, active: NDArray[np.bool_], *, stale: bool = False
 ) -> dict[str, TrackedValue]:
-    """Return what is tracked beside the parameters: gains of sensors that were found to have changed, unbalance.
-
-    `active`: (p,), which numbers the recursion may move; `stale`: whether they are no longer informed, or known to be
-    no longer right. Returns SI; the unbalance in kg m, its phase in rad.
+    """Return what is tracked beside the parameters, SI: gains of sensors found changed, and unbalance in kg m, phase in
+    rad. `active`: numbers the recursion may move; `stale`: whether no longer informed, or known to be no longer right.
     """
     gains = tuple(numbers.names[j] for j in numbers.places("gain") if active[j])
     if not gains and not numbers.synchronous:
@@ -448,12 +431,9 @@ _SHORT_BLOCKS = 1.5
 
 
 class Publication:
-    """The published numbers of a tracker.
-
-    `rpem`: the working estimate; what it starts from is published first; `t0`: time of the start, s of record.
-
-    `unconfirmed`: numbers were found again after a change, and no later data have confirmed them yet; `updates`: times
-    that published parameters or gains moved.
+    """The published numbers of a tracker, first those that `rpem`, the working estimate, starts from at `t0`, s of
+    record. `unconfirmed`: found again after a change, not yet confirmed by later data; `updates`: times that they
+    moved.
     """
 
     def __init__(self, rpem: PhysicalRpem, operator: Operator, log: DecisionLog, t0: float) -> None:
@@ -486,10 +466,8 @@ class Publication:
             self._log.add(refused)
 
     def judge(self, evidence: Evidence, t: float) -> bool:
-        """Decide on the candidate with one more block; offer the next.
-
-        `evidence`: already taken in by the working estimate; `t`: its end, s of record. Returns whether numbers that
-        were found again have been confirmed.
+        """Decide on the candidate with one more block, already taken in, ended at `t` (s of record); offer the next.
+        Returns whether numbers that were found again have been confirmed.
         """
         if self._operator.holding:
             self._held = True
@@ -523,10 +501,8 @@ class Publication:
         return True
 
     def obey(self, t: float, *, searching: bool) -> bool:
-        """Carry out what the operator ordered.
-
-        `t`: s of record; `searching`: whether the working estimate is that from before a change whose search goes on.
-        Returns whether something else is published now.
+        """Carry out the operator's orders at `t` (s of record); `searching`: the working estimate is that from before a
+        change. Returns whether something else is published now.
         """
         order = self._operator.take()
         if order is None:

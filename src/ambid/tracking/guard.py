@@ -1,11 +1,8 @@
 """Guard of a stream: whatever happens to the blocks, only clean samples under their right numbers go on, in order.
 
-Three judgements: is it a block of this stream, where does it belong (order.py), and which rows are sound: not those
-that hold NaN, are absurd, or belong to a frozen channel.
-
-A frozen channel repeats its last value. It is noticed where a channel that normally moves holds one value much longer
-than it ever did; the rows of such a run are refused from the first repetition on, so a run that has not been decided
-at the end of a block is held back until the next.
+It judges whether a block is this stream's, where it belongs (order.py), and which rows are sound: not NaN, absurd or
+frozen. A frozen channel holds one value much longer than it ever did: the run is refused from its first repetition on,
+and held back to the next block where a block's end leaves that open.
 """
 
 from __future__ import annotations
@@ -35,9 +32,8 @@ _NEVER = np.iinfo(np.int64).max
 
 
 class RowCheck:
-    """Judges rows in the order of their numbers, remembering what each channel last held and how long.
-
-    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI.
+    """Judges rows in order, remembering what each channel last held and how long; `limits`: largest credible
+    magnitudes, SI.
     """
 
     def __init__(self, n_channels: int, *, limits: ArrayLike | None = None, stuck: Stuck = "auto") -> None:
@@ -69,11 +65,8 @@ class RowCheck:
         self._run = np.zeros(n_channels, dtype=np.int64)
 
     def judge(self, values: Array, *, last: bool = False) -> tuple[dict[RowKind, Mask], int]:
-        """Say which rows must not be used, and how many at the end are not decided yet.
-
-        `values`: (n_samples, n_channels), follows on the rows that were decided before. Returns (n_samples,), rows
-        refused, by kind; a kind without any is not there, and no row is in two kinds; rows at the end that have to be
-        given again, before the next ones.
+        """Say which of the next rows (n_samples, n_channels) must not be used, by kind, each row in one and no kind
+        empty, and how many at the end are undecided and have to be given again before the next.
         """
         refused: dict[RowKind, Mask] = {}
         # The peak is NaN if anything is: one comparison tells that all is well.
@@ -169,14 +162,10 @@ _WHY: Mapping[RowKind, str] = MappingProxyType(
 
 
 class StreamGuard:
-    """Takes blocks as they come and gives out clean stretches, with a record of everything that it does not give.
-
-    Every sample given out stands under its own number, later than all before. Blocks in wrong order are put right as
-    far as `reorder` blocks wait for a missing one. After any damage the stream goes on with the next sound block; only
-    an acquisition that sets both its counter and its clock back is taken for a repetition until `patience_s` is over.
-
-    `limits`: (n_channels,), or float, largest credible magnitude of each channel, SI; `reorder`: blocks that may wait
-    for a missing one; a gap delays as many. `n_received`: samples that came.
+    """Takes blocks as they come and gives out clean stretches, later than all before, and a record of what it does not
+    give. Up to `reorder` blocks wait for a missing one, and a gap delays as many. After damage the next sound block
+    goes on; only counter and clock both set back are taken for a repetition until `patience_s` is over. `limits`:
+    largest credible magnitude of each channel, SI; `n_received`: samples that came.
     """
 
     def __init__(
@@ -253,10 +242,8 @@ class StreamGuard:
         return self._clock.drift
 
     def take(self, block: Block) -> list[Passed]:
-        """Take in a block.
-
-        `block`: possibly damaged; not modified and not kept. Returns in the order of the stream; may be empty while a
-        block waits.
+        """Take in a block, possibly damaged, neither modified nor kept; returns what follows in order, perhaps nothing
+        yet.
         """
         part = self._part(block)
         if part is not None:

@@ -1,10 +1,8 @@
 """Compiled loops of the tracker: predictor with exact sensitivities, folded block by block into a triangle; the filter
 of the tracked numbers, on the square-root core of all recursions; and windows of triangles, tested for a change.
 
-One step of the predictor is x+ = M w, w = [x; inputs at their lags; y; 1; unbalance forcing]; the derivative by number
-q is s_q+ = F s_q + D_q w. Weighted innovations and their derivatives are the rows that Householder reflections take
-into the triangle, at fixed counts of samples, so that numbers do not depend on how the stream is cut into calls.
-Matrices have five to fifteen rows: a call of the linear algebra library would cost more than the sums themselves.
+x+ = M w, w = [x; inputs at their lags; y; 1; unbalance forcing], s_q+ = F s_q + D_q w for number q. Householder
+reflections take rows at fixed counts of samples: numbers do not depend on how the stream is cut into calls.
 """
 
 from __future__ import annotations
@@ -29,15 +27,12 @@ def advance(
     first: int, u: Array, y: Array, forcing: Array, M: Array, D: Array, scale: Array, lags: Integers, history: Array,
     s: Array, rows: Array, counts: Integers, unit: Array, errors: Array, w: Array, f: Array,
 ) -> int:  # fmt: skip
-    """Run from sample `first` until a block is complete, `rows` are full, samples are used up, or one is not finite.
-
-    Returns the sample that comes next.
-
-    `u`, `y` in SI; `scale` (2, n_u + n_y) holds the operating point and the scales. `M` (n_x + n_y, n_l) gives the next
-    state and the weighted innovations, `s` (n_x, p + 1) holds the sensitivities and in its last column the state.
-    `errors` (n_samples, n_y) gets the innovations in SI, the triangle `unit` times weighted ones. `rows` (p + 1, room)
-    holds rows that are not folded yet. `counts`: place of the next input in `history`, rows and samples of the present
-    block, samples still to settle, samples of a block. `w` (n_l,) and `f` (n_x + n_y, p + 1) are scratch.
+    """Run from sample `first` until a block is complete, `rows` are full, samples end, or one is not finite; return the
+    next. `u`, `y` in SI; `scale` (2, n_u + n_y): operating point and scales. `M` (n_x + n_y, n_l) gives next state and
+    weighted innovations, `s` (n_x, p + 1) holds sensitivities, last the state; `errors` (n_samples, n_y) gets
+    innovations in SI, the triangle `unit` times weighted ones; `rows` (p + 1, room) are not folded yet. `counts`: place
+    of the next input in `history`, rows and samples of the block, samples to settle, samples of a block. `w`, `f` (n_x
+    + n_y, p + 1): scratch.
     """
     n_x, n_u, n_y, p = s.shape[0], u.shape[1], y.shape[1], s.shape[1] - 1
     depth, n_f, room, high, n_l = history.shape[0], forcing.shape[1], rows.shape[1], f.shape[0], w.size
@@ -102,9 +97,8 @@ def advance(
 
 @compiled(error_model="numpy", fastmath={"contract", "reassoc", "nsz"})
 def fold(R: Array, w: Array, n: int, begun: int) -> None:
-    """Take `n` rows into the upper triangle R (p, width), width >= p; `w` (width, room) has them in columns, used up.
-
-    Entry j of a row is zero in all but the first `begun` + j of them: `n` for any rows, 1 for those of a triangle.
+    """Take `n` rows, columns of `w` (used up), into the triangle R (p, width >= p); entry j of a row is zero in all but
+    the first `begun` + j of them: `n` for any rows, 1 for those of a triangle.
     """
     p, width = R.shape
     for j in range(p):
@@ -135,13 +129,10 @@ def fold(R: Array, w: Array, n: int, begun: int) -> None:
 def absorb(
     q: Array, F: Array, J: Array, r: Array, at: Array, active: Flags, positive: Flags, noise: float, K: Array
 ) -> tuple[float, float]:
-    """Update q and the factors F of its covariance by the rows r + J (q* - at) ~ N(0, noise I), J upper triangular.
-
-    Return rho^T V^-1 rho, where rho = r + J (q - at) and V = noise I + J P J^T, and the part of the step that is taken.
-    The gain is optimal for the numbers that are active and zero for the others (Schmidt). Where the step would take a
-    positive number below half of what it is, gain and step are made smaller: so far a first-order step is not to be
-    believed. With a gain D K, K optimal and D diagonal, the covariance is that of K plus (I - D) K V K^T (I - D), and
-    K V K^T the sum of what the rows have taken off one by one (Joseph's form). `K` (p + 2, p) is scratch.
+    """Update q and its covariance's factors F by rows r + J (q* - at) ~ N(0, noise I), J upper triangular; return rho^T
+    V^-1 rho, rho = r + J (q - at), V = noise I + J P J^T, and the part of the step taken. The gain is optimal for
+    active numbers, zero for others (Schmidt); where a positive number would lose more than half, gain and step shrink.
+    With a gain D K the covariance is K's plus (I - D) K V K^T (I - D) (Joseph's form). `K` (p + 2, p) is scratch.
     """
     p, total, part, schmidt = q.size, 0.0, 1.0, False
     step, f = K[p], K[p + 1]
@@ -178,11 +169,9 @@ def absorb(
 def filter_ring(
     J: Array, r: Array, at: Array, count: int, first: int, q: Array, P: Array, step: Array, noise: float, K: Array
 ) -> None:
-    """Take `q` (p,) and `P` (p, p) from before a ring of `count` blocks to behind it.
-
-    Kalman filter over blocks `first`, ..., their rows one by one, with a random walk of variance step^2 from one block
-    to the next. J (size, p, p) upper triangular; `K` (size, p, p + 2) keeps gains, residuals and their variances. Inner
-    loops run along rows of symmetric matrices: they take no sums, so that vector instructions fit.
+    """Take `q` (p,) and `P` (p, p) from before a ring of `count` blocks to behind it: Kalman filter from block `first`,
+    rows one by one, random walk of variance step^2 a block. J (size, p, p) upper triangular; `K` (size, p, p + 2) keeps
+    gains, residuals and their variances.
     """
     size, p = r.shape
     for b in range(count):
@@ -212,10 +201,9 @@ def filter_ring(
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def smooth_ring(J: Array, count: int, first: int, K: Array, sums: Array, N: Array) -> None:
-    """Fill the first rows of `sums` (4, p) with the sums of lambda_j^2 and of N_jj, twice the score their difference.
-
-    Disturbance smoother backward over what `filter_ring` kept (Koopman and Shephard 1992; Durbin and Koopman 2012, sec.
-    4.5 and 6.4). `N` (p, p) is scratch.
+    """Fill `sums` (4, p) with the sums of lambda_j^2 and of N_jj, twice the score their difference, by the disturbance
+    smoother over what `filter_ring` kept (Koopman and Shephard 1992; Durbin and Koopman 2012, sec. 4.5, 6.4); `N`:
+    scratch.
     """
     size, p, squares, powers, lam, drop = J.shape[0], J.shape[1], sums[0], sums[1], sums[2], sums[3]
     for a in range(p):
@@ -260,10 +248,8 @@ _SETTLE_GAIN = 12.0  # over the number of tests, while settling: one over the de
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def whiten(T: Array, before: Array, drift: Array, blocks: int, M: Array, X: Array) -> None:
-    """Fill `X` (p, p + 1) with M^-1/2 [J rho], where M = I + J P J^T and rho = r + J q.
-
-    `T` (p, p + 1) is [J r], `before` (p, p + 1) is [P q], P grows by `drift` (p,) in each block, `M` is scratch.
-    All pivots of M are at least one whatever P is: rounding below that is put right.
+    """Fill `X` (p, p + 1) with M^-1/2 [J rho], M = I + J P J^T, rho = r + J q. `T` is [J r], `before` [P q], P grows by
+    `drift` (p,) a block, `M` is scratch; pivots of M are at least one, rounding below that is put right.
     """
     p = T.shape[0]
     for i in range(p):
@@ -352,17 +338,14 @@ def watch(
     bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array, tested: Counts,
     drift: Array, longest: int, gain: float, noise: float, acc: Array, other: Array, M: Array, X: Array, tests: Array,
 ) -> bool:  # fmt: skip
-    """Test the windows that end with the newest block, learn how much larger than chance quiet statistics are.
-
-    `bases` (4 levels, p, p + 1): of each level the last four triangles [J r] of 2^level blocks, the newest block among
-    them; `notes` (4 levels, 4): their rest, freedom, first sample, first block. `counts` (levels,): bases so far.
-    `history` (ring, p, p + 1): [P q] before each block; all q relative to the point of the triangles. `learned`
-    (windows, tests): log of overdispersion. `marks` (2, tests): threshold of each test, and the point that few quiet
-    statistics pass. `tested` (hypotheses,): column of each. `drift` (p,): growth of variance per block. `longest`
-    window, blocks; `gain` of learning, below 0 while settling; `noise` level. `acc` (p, p + 1), `other` (p + 1, p), `M`
-    (p, p), `X` (p, p + 1) are scratch. `tests` (windows, 10 + tests), of the windows that were looked at: whether a
-    threshold was passed, blocks, first sample, likeliest hypothesis, its statistic, size, sd, joint, rest, noise; all
-    statistics. Returns whether any was passed.
+    """Test the windows that end with the newest block, learn how much larger than chance quiet statistics are; return
+    whether any passed. `bases` (4 levels, p, p + 1): each level's last four triangles [J r] of 2^level blocks, `counts`
+    (levels,) so far; `notes` (4 levels, 4): rest, freedom, first sample, first block. `history` (ring, p, p + 1): [P q]
+    before each block, q relative to the triangles' point. `learned` (windows, tests): log of overdispersion; `marks`
+    (2, tests): thresholds, and points that few quiet statistics pass; `tested`: column of each hypothesis; `drift`:
+    variance per block; `longest` window, blocks; `gain` of learning, below 0 while settling; `noise` level. `tests`
+    (windows, 10 + tests): passed, blocks, first sample, likeliest hypothesis, its statistic, size, sd, joint, rest,
+    noise; all statistics. `acc` (p, p + 1), `other` (p + 1, p), `M` (p, p), `X` (p, p + 1) are scratch.
     """
     levels, alarm = counts.size, False
     for level in range(levels):

@@ -1,8 +1,7 @@
 """A track as JSON lines, schema ``ambid.track/1`` (contracts.md), written as the numbers come, counted, and read back.
 
-First the header, then one line per reporting interval, last the summary. A track is a stream that other programs may
-follow, so it is written in place, each line flushed; a run that was killed leaves a file that can still be read. Only
-the end of a file may be missing; anything else that does not fit is refused on one line.
+First the header, then a line per reporting interval, last the summary, each flushed, so that others may follow. Only
+the end of a file may be missing, as of a run that was killed; anything else that does not fit is refused on one line.
 """
 
 from __future__ import annotations
@@ -42,10 +41,8 @@ def header_json(header: TrackHeader) -> dict[str, Any]:
 
 
 def line_json(line: TrackLine) -> dict[str, Any]:
-    """Return the line of one reporting interval.
-
-    ``event`` is the most important of ``events``, None without any; ``ci95`` is value ± 1.96 sd; a number that is not
-    known is None.
+    """Return the line of one interval: ``event``, the most important of ``events`` or None; ``ci95``, value ± 1.96 sd;
+    None for what is not known.
     """
     document: dict[str, Any] = {
         "t": plain_json(line.t),
@@ -97,11 +94,8 @@ def _value(v: TrackedValue) -> dict[str, Any]:
 
 
 class TrackWriter:
-    """A file or stream to which a track is written line by line, each flushed, so that it can be followed.
-
-    The file is opened with the header, not before: a run that is refused leaves an older file as it was.
-
-    `target`: a stream is not closed.
+    """A file, or a stream (not closed), to which a track is written line by line, each flushed; opened with the header,
+    not before: a run that is refused leaves an older file as it was.
     """
 
     def __init__(self, target: str | Path | TextIO) -> None:
@@ -174,9 +168,8 @@ def most_important(events: Sequence[Event]) -> Event:
 
 
 class Tally:
-    """Counts of a track, as its lines come.
-
-    `updates`: lines in which the published values differ from those before; `counts`: how many events of each kind.
+    """Counts of a track: `updates`, lines whose published values differ from those before; `counts`, events of each
+    kind.
     """
 
     def __init__(self, header: TrackHeader) -> None:
@@ -216,9 +209,8 @@ class Tally:
                 self._open.pop(event.parameter, None)
 
     def summary(self, *, computing_s: float = float("nan"), complete: bool = True) -> TrackSummary:
-        """Return what was counted, without latency; `samples` follows from time and rate, `updates` counts lines.
-
-        `computing_s`: time that was spent on it, s; `complete`: whether the run came to the end of its record.
+        """Return what was counted, without latency; `samples` from time and rate, `updates` in lines. `computing_s`:
+        time spent, s; `complete`: whether the run came to the end of its record.
         """
         seconds = 0.0 if self._begin_s is None else self._end_s - self._begin_s
         return TrackSummary(
@@ -344,11 +336,9 @@ _NOTABLE = ("change", "disturbed", "reverted", "operator")  # told one by one; o
 
 
 class LiveState:
-    """State of a run, to be drawn. One thread adds to it, another may read it meanwhile.
-
-    `header`: of the track; `line`: the last one, None before the first; `tally`: what was counted; `lag_s`: time from
-    the last sample of a block to the end of its work, s, None where it is not measured; `begin_s`: begin of the first
-    reporting interval, s of record.
+    """State of a run, to be drawn; one thread adds, another may read: `header`; the last `line`, None before the first;
+    `tally`; `lag_s`: from a block's last sample to the end of its work, s, None if not measured; `begin_s`: begin of
+    the first reporting interval, s of record.
     """
 
     def __init__(self, header: TrackHeader) -> None:

@@ -1,12 +1,9 @@
 """Monitors of the evidence: what recent data inform, whether the model error is acceptable, whether something jumped.
 
-Without information there is no update, and what is published is marked stale. The triangles of recent blocks are
-gathered in an exponential window by QR; the standard deviation that this window alone would give each number, all
-others unknown, says how much the data tell of it now. The error has a level with hysteresis (thesis figs 3.1 and 5.8).
-
-A change of one number is found by a generalised likelihood ratio. Every window of recent blocks is tested against the
-estimate and covariance as they were before it began: whatever came after the change has not touched them, so quiet
-statistics are exactly chi-squared (Basseville & Nikiforov 1993, ch. 7).
+Without information there is no update, and what is published is marked stale: QR gathers triangles in an exponential
+window, whose standard deviations, all others unknown, say what data tell now. The error's level has hysteresis (thesis
+figs 3.1 and 5.8). A change is found by a generalised likelihood ratio of windows against the estimate from before them,
+so that quiet statistics are exactly chi-squared (Basseville & Nikiforov 1993, ch. 7).
 """
 
 from __future__ import annotations
@@ -29,12 +26,8 @@ from ambid.tracking.kernels import absorb, fold, watch
 
 
 class ErrorLevel:
-    """Root mean square of the normalised innovations over recent blocks, and whether it is too large.
-
-    `limit`, `release`: too large from `limit` on, until it has come down to `release`; `window_blocks`: blocks in the
-    mean; nothing is judged before that many.
-
-    `above`: whether the error is too large; `n_blocks`: blocks used.
+    """Root mean square of the normalised innovations over `window_blocks`, before which nothing is judged. It is too
+    large (`above`) from `limit` on, until it comes down to `release`; `n_blocks`: blocks used.
     """
 
     def __init__(self, limit: float, release: float, window_blocks: int) -> None:
@@ -54,10 +47,8 @@ class ErrorLevel:
         return math.sqrt(max(self._square, 0.0) / self._weight) if self._weight else math.nan
 
     def update(self, evidence: Evidence, estimate: Array) -> float:
-        """Take in a block.
-
-        `estimate`: (p,), numbers whose error is watched: those in use. Returns the level over the window. A block that
-        is not finite changes nothing.
+        """Take in a block, judged at `estimate` (p,), the numbers in use; return the level. One that is not finite
+        changes nothing.
         """
         square, weight = evidence.loss(estimate), evidence.n_samples * evidence.n_outputs
         if not math.isfinite(square) or weight <= 0:
@@ -89,18 +80,14 @@ _FILLED = 0.5  # part of the window that has to be filled before anything is jud
 
 
 class ExcitationMonitor:
-    """Tell fresh parameters from frozen ones.
+    """Tell fresh parameters from frozen ones. A parameter's information rate is 1/(sd² window), sd the marginal
+    (relative) standard deviation by the exponential window alone, offsets and all other numbers unknown. It freezes
+    below `freeze` and thaws above `thaw` times the rate at identification, unless the window gives it better than
+    `enough` (relative): fresh.
 
-    A parameter's information rate is 1/(sd² window), with sd the marginal standard deviation (relative, as all numbers
-    are of order one) that the exponential window alone would give, offsets and all other numbers unknown. It freezes
-    below `freeze` and thaws above `thaw` times the rate at identification, unless the window alone gives it better than
-    `enough`: then it is fresh.
-
-    `names`: all numbers of the evidence; `block_s`: duration of a block, s; `window_s`: time constant of the window, s;
-    `freeze`, `thaw`: parts of the reference; `enough`: relative standard deviation.
-
-    `fresh`: of each parameter; all are at the start; `sd`: (p,), relative standard deviation that the window alone
-    gives each number (about a thousand: nothing); `duration_s`: of the data in the window.
+    `names`: all numbers of the evidence; `block_s`, `window_s`: a block and the window's time constant, s; `fresh`: of
+    each parameter, all at the start; `sd`: (p,) by the window alone (about a thousand: nothing); `duration_s`: of its
+    data.
     """
 
     def __init__(
@@ -256,27 +243,23 @@ class Alarm:
 class ChangeDetector:
     r"""Watch for a jump of one of the tracked numbers.
 
-    For a window with triangle (J, r) and the estimate q, covariance P as of before it, :math:`\rho = r + J(q - at)` has
-    covariance :math:`M = I + J P J^T`; a jump of number j by δ gives it the mean :math:`-J e_j δ`. The statistic
-    :math:`T_j = (a_j^T M^{-1} ρ)^2 / (a_j^T M^{-1} a_j)`, :math:`a_j = J e_j`, is twice the gain in log-likelihood,
-    chi-squared with one degree of freedom in quiet times. Windows are 1, 2, 3, 4, 6, 8, 12, 16, ... blocks long; those
-    of 3 and 4 times 2^n blocks are looked at every 2^n blocks. Beside T_j two statistics find what no one number
-    explains: :math:`ρ^T M^{-1} ρ` (chi-squared, p) and the unexplained part of the innovations against its usual level.
+    For a window with triangle (J, r) and q, covariance P from before it, :math:`\rho = r + J(q - at)` has covariance
+    :math:`M = I + J P J^T`; a jump δ of number j gives it the mean :math:`-J e_j δ`. :math:`T_j = (a_j^T M^{-1} ρ)^2 /
+    (a_j^T M^{-1} a_j)`, :math:`a_j = J e_j`, is twice the gain in log-likelihood, chi-squared with one degree of
+    freedom in quiet times. Windows are 1, 2, 3, 4, 6, 8, 12, 16, ... blocks; those of 3 and 4 times 2^n are looked at
+    every 2^n. For what no one number explains: :math:`ρ^T M^{-1} ρ` (chi-squared, p), and the unexplained innovations
+    against their level.
 
-    Where the model is not perfect quiet statistics are larger than chance makes them. Every statistic is therefore
-    divided by its overdispersion, at least 1: learned for each window and number from quiet times (the point which
-    three in a hundred pass, in steps of bounded size, so that a change is not learned away), or the unexplained part of
-    the window itself per degree of freedom where that is larger (noise that rises does not look like a parameter).
-    Blocks should have several times as many rows (samples times outputs) as there are numbers: without degrees of
-    freedom beside them, the second guard is not there.
+    Statistics are divided by their overdispersion, at least 1, for an imperfect model: learned for each window and
+    number in quiet times (the point that three in a hundred pass, in bounded steps, so that no change is learned away),
+    or a window's unexplained part per degree of freedom where larger (rising noise looks like no parameter). Without
+    several times as many rows a block (samples times outputs) as numbers the second guard is not there.
 
-    `names`: all numbers of the evidence; `block_s`: duration of a block, s; `false_alarms_per_hour`: allowed rate in
-    quiet running with Gaussian evidence; `longest_s`: longest window, s; `drift`: (p,), or float; `overdispersion`:
-    where learning starts.
-
-    `threshold`: of T_j; `drift`: (p,); `windows`: lengths, blocks; `overdispersion`: (n_windows, n_hypotheses + 2),
-    present factors; the last two columns are all numbers together and the unexplained part; `noise`: present usual
-    level of the unexplained part per degree of freedom. May be set again at any time..
+    `names`: all numbers of the evidence; `block_s`, `longest_s`: a block and the longest window, s;
+    `false_alarms_per_hour`: in quiet running with Gaussian evidence; `drift`: (p,), or float; `threshold`: of T_j;
+    `windows`: lengths, blocks; `overdispersion`: where learning starts, then (n_windows, n_hypotheses + 2), the last
+    two all numbers together and the unexplained part; `noise`: its usual level per degree of freedom. May be set again
+    any time.
     """
 
     def __init__(
@@ -336,10 +319,8 @@ class ChangeDetector:
         self._drift[:] = value
 
     def update(self, evidence: Evidence, estimate: Array, covariance: Array) -> Alarm | None:
-        """Take in one block.
-
-        `estimate`: (p,), predicted for this block from all data before it; `covariance`: (p, p), of that prediction.
-        Returns as long as some window passes its threshold: until `restart`, or until the estimate has followed.
+        """Take in a block; `estimate` (p,), `covariance` (p, p): predicted for it from all data before. Returns a
+        change as long as a window passes its threshold: until `restart`, or until the estimate has followed.
         """
         if evidence.first < self._from:
             return None
@@ -380,9 +361,8 @@ class ChangeDetector:
         return None
 
     def restart(self, from_sample: int) -> None:
-        """Forget all windows, as after a change that was handled; what was learned of quiet times stays.
-
-        `from_sample`: blocks that begin before it are not looked at.
+        """Forget windows, as after a change that was handled, not what was learned; blocks before `from_sample` are not
+        looked at.
         """
         self._counts[:], self._blocks = 0, 0
         self._wait = 0

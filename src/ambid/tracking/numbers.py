@@ -1,13 +1,9 @@
 """What is tracked beside the physical parameters, where tracking begins, and how sure one is of that.
 
-The tracked numbers q are, in this order: physical parameters that are not fixed, gains of the sensors (1 unless a fault
-is found), the delay where it was estimated as a real number (what is known of the parameters depends on it), the noise
-description, constant disturbances (offsets), and unbalance where the angle is known. All are in
-units of their own magnitude. The noise is that of the start estimate, where its predictor forgets soon enough.
-
-The force of unbalance is f = m e (speed^2) cos(angle + phase) (theory.md sec. 1). With a = m e cos(phase) and
-b = -m e sin(phase) it is a speed^2 cos(angle) + b speed^2 sin(angle): linear in a and b, with regressors that need no
-filter and follow the rotor through a spin-up. The force is held over a sample at its middle.
+q, over magnitudes: physical parameters not fixed, sensor gains (1 unless a fault is found), a delay estimated as a real
+number, noise description (the start estimate's, where its predictor forgets soon enough), offsets, and unbalance where
+the angle is known: f = m e (speed^2) cos(angle + phase) (theory.md sec. 1) is a speed^2 cos(angle) + b speed^2
+sin(angle), a = m e cos(phase), b = -m e sin(phase), held over a sample at its middle.
 """
 
 from __future__ import annotations
@@ -48,9 +44,8 @@ def rate_of(estimate: Estimate) -> float:
 
 
 def overdispersion_of(estimate: Estimate) -> float:
-    """Return how much larger than the model says the variance of weighted innovations' sums is.
-
-    Returns 1 where the model explains its record.
+    """Return by how much the variance of weighted innovations' sums exceeds the model's; 1 where it explains its
+    record.
     """
     if estimate.covariance_method == "information":
         return 1.0
@@ -58,9 +53,8 @@ def overdispersion_of(estimate: Estimate) -> float:
 
 
 def noise_numbers(plant: SensorGains, estimate: Estimate, scales: Scales) -> NoiseNumbers:
-    """Return the noise with which tracking begins.
-
-    Returns form "given" with a gain that forgets where the estimate's own predictor does not forget soon enough.
+    """Return the noise with which tracking begins: form "given", with a gain that forgets, where the estimate's own
+    predictor does not forget soon enough.
     """
     noise = estimate.noise
     gain = noise.gain * scales.output / scales.state[:, None]
@@ -99,10 +93,8 @@ def _memory(F: Array) -> float:
 
 
 def _bounded_gain(A: Array, C: Array, E: Array, longest: float) -> Array:
-    """Gain of a predictor that forgets soon enough: disturbances are taken a little larger than they are.
-
-    An estimate without disturbances remembers its initial state for ever. The larger variance of the innovations that
-    this costs is about the number of states over the memory in samples.
+    """Gain of a predictor that forgets soon enough, disturbances taken a little larger: without any, the initial state
+    is remembered for ever. It costs innovation variance, about the number of states over the memory in samples.
     """
     for level in 10.0 ** np.arange(-4.0, 2.1, 0.25):
         try:
@@ -130,10 +122,7 @@ class Forcing:
 
 
 def forcing_of(record: Record) -> Forcing | None:
-    """Return the regressors of a record that holds the speed or the angle of its rotor.
-
-    Returns none where the record holds neither, or the rotor stands still.
-    """
+    """Return the regressors of a record with its rotor's speed or angle; None without either, or at standstill."""
     if "angle" not in record.names and "speed" not in record.names:
         return None
     period = 1.0 / record.rate_hz
@@ -182,11 +171,8 @@ def _check_agreement(speed: Array, angle: Array, period: float) -> None:
 
 
 def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, float, float, float]:
-    """Return the unbalance as amplitude and phase.
-
-    `a`, `b`: m e cos(phase) and -m e sin(phase), kg m; `covariance`: (2, 2), of a and b. Returns `amplitude,
-    amplitude_sd`: kg m; `phase, phase_sd`: rad; the standard deviation is pi where the amplitude is within its own of
-    zero.
+    """Return the unbalance's `amplitude, amplitude_sd` in kg m and `phase, phase_sd` in rad (sd pi where the amplitude
+    is within its own of zero), from `a`, `b`, m e cos(phase) and -m e sin(phase), and their `covariance`.
     """
     size = float(np.hypot(a, b))
     if size == 0.0:
@@ -255,10 +241,7 @@ class TrackedNumbers:
         return np.asarray(q[own] * self.magnitude[own])
 
     def physical_covariance(self, covariance: Array) -> Array:
-        """Return the covariance of the physical parameters in SI units.
-
-        `covariance`: (p, p), of q. Returns (n_parameters, n_parameters).
-        """
+        """Return the physical parameters' covariance in SI units by that of q."""
         own = self.places("parameter")
         return np.asarray(covariance[np.ix_(own, own)] * np.outer(self.magnitude[own], self.magnitude[own]))
 
@@ -271,10 +254,8 @@ class TrackedNumbers:
 
 
 def tracked_numbers(estimate: Estimate, *, synchronous: bool = False, top_speed: float = 1.0) -> TrackedNumbers:
-    """Set up tracking from an off-line estimate.
-
-    `estimate`: parameters, covariance, noise, delay and operating point are taken from it; `synchronous`: track an
-    unbalance too: the angle of the rotor is known; `top_speed`: speed at which the unbalance is felt most, rad/s.
+    """Set up tracking from an off-line estimate's parameters, covariance, noise, delay and operating point.
+    `synchronous`: the angle is known, track an unbalance too; `top_speed`: at which it is felt most, rad/s.
     """
     from scipy.linalg import block_diag
 

@@ -1,10 +1,8 @@
 """Blocks in the order of their samples, each placed by its sample number and its time stamp together.
 
-A stamp of sample n is t_0 + (n - n_0) T (1 + d) + jitter: T = 1 / rate as it is stated, d the drift of the crystal.
-A Kalman filter of the two states (t_0, d), moved from block to block, predicts the next stamp with its spread.
-
-A block that contradicts the stream is doubted until the next one confirms it (then clock or counter have jumped) or
-the stream goes on without it (then it was damaged). Missing blocks are waited for as far as a small buffer reaches.
+The stamp of sample n is t_0 + (n - n_0) T (1 + d) + jitter, T = 1 / rate as stated, d the crystal's drift; a Kalman
+filter of (t_0, d) predicts the next. A block that contradicts the stream is doubted until the next confirms it (clock
+or counter jumped) or not (damaged). Missing blocks are waited for as far as a small buffer reaches.
 """
 
 from __future__ import annotations
@@ -41,12 +39,8 @@ class Part:
 
 
 class Ledger:
-    """Collects what is given in the order of the stream, and counts.
-
-    `rate_hz`: turns sample numbers into times.
-
-    `events`: rejections of each kind, and samples in them; `samples`: rejections of each kind, and samples in them;
-    `n_given`: samples in stretches.
+    """Collects what is given in the order of the stream, and counts: `events`, rejections by kind; `samples` in them;
+    `n_given`, samples in stretches. `rate_hz` turns sample numbers into times.
     """
 
     def __init__(self, rate_hz: float) -> None:
@@ -79,11 +73,8 @@ _SIGMAS = 4.0
 
 
 class SampleClock:
-    """Predicts the time stamp of a sample number, and learns from stamps that agree.
-
-    `rate_hz`: as stated.
-
-    `drift`: estimated relative deviation of the stamps' period from the stated one.
+    """Predicts the time stamp of a sample number, and learns from stamps that agree; `rate_hz`: as stated; `drift`:
+    estimated relative deviation of the stamps' period from it.
     """
 
     def __init__(self, rate_hz: float, tolerance_s: float) -> None:
@@ -98,44 +89,28 @@ class SampleClock:
         self.start(0, 0.0)
 
     def start(self, number: int, time_s: float) -> None:
-        """Begin again at one stamp, keeping what is known of the drift.
-
-        `number`: sample number; `time_s`: its stamp, s.
-        """
+        """Begin again at one stamp, s, of sample `number`, keeping what is known of the drift."""
         self._number, self._time = number, time_s
         self._p00, self._p01, self._p11 = self._jitter, 0.0, DRIFT_SD**2
 
     def deviation(self, number: int, time_s: float) -> float:
-        """Return how far a stamp lies from its prediction.
-
-        `number`: sample number; `time_s`: its stamp, s. Returns s; positive if the stamp is late.
-        """
+        """Return how far a stamp lies from its prediction, s; positive if it is late."""
         return time_s - self._time - (number - self._number) * self._period * (1.0 + self.drift)
 
     def agrees(self, number: int, time_s: float) -> bool:
-        """Tell whether a stamp lies within the tolerance of its prediction, and what the drift may have added.
-
-        `number`: sample number; `time_s`: its stamp, s. Returns false for a stamp that is not a number.
-        """
+        """Tell whether a stamp, s, lies within tolerance of its prediction and the drift's addition; NaN does not."""
         dt = (number - self._number) * self._period
         # The spread of the offset is left out: it is jitter, which the tolerance covers, and one sample must stand out.
         return abs(self.deviation(number, time_s)) <= self._tolerance + _SIGMAS * sqrt(self._p11) * abs(dt)
 
     def agree(self, number: int, time_s: float, other: int, other_s: float) -> bool:
-        """Tell whether two stamps agree with each other, whatever was known before.
-
-        `number`, `other`: sample numbers; `time_s`, `other_s`: their stamps, s. Returns false if one of the stamps is
-        not a number.
-        """
+        """Tell whether two stamps, s, agree with each other, whatever was known before; not if one is NaN."""
         dt = (other - number) * self._period
         between = other_s - time_s - dt * (1.0 + self.drift)
         return abs(between) <= self._tolerance + _SIGMAS * DRIFT_SD * abs(dt)
 
     def learn(self, number: int, time_s: float) -> None:
-        """Take in a stamp that agrees.
-
-        `number`: sample number; below that of the last stamp, nothing is learned; `time_s`: its stamp, s.
-        """
+        """Take in a stamp, s, that agrees; nothing is learned from a number below that of the last stamp."""
         if number <= self._number:
             return
         error = self.deviation(number, time_s)
@@ -159,13 +134,9 @@ _LEAP_S = 1.0  # a number that leads by more is doubted where no clock says that
 
 
 class BlockOrder:
-    """Places blocks: each sample once, later than all before.
-
-    `depth`: blocks that may wait for a missing one; `ledger`: takes the
-    rejections; `place`: given each part in order, less what had been passed before.
-
-    `next`: number of the sample that is wanted next; `offset`: of the stream's numbers against the acquisition's;
-    `n_reordered`: blocks that had been missed and came in time.
+    """Places blocks, each sample once, later than all before; `depth`: blocks that may wait for a missing one; `place`:
+    given each part in order, less what had been passed. `next`: number wanted next; `offset`: of the stream's numbers
+    against the acquisition's; `n_reordered`: missed blocks that came in time.
     """
 
     def __init__(

@@ -1,8 +1,7 @@
 """After a change: find the moved number again from the raw samples since, beside what was known before.
 
-Each suspect alone is given its freedom back; the one that explains the stretch best is the one that moved. Where none
-does, all physical parameters are freed. An explanation has to bring the innovations down to what they were. The search
-is the off-line Gauss-Newton step on a few thousand samples at most, so that it takes milliseconds.
+Each suspect alone is freed, and the one that explains the stretch best moved; if none does, all are. Innovations have
+to come down to what they were. It is the off-line Gauss-Newton step on a few thousand samples: milliseconds.
 """
 
 from __future__ import annotations
@@ -59,12 +58,10 @@ def refine(
     noise: float = 1.0,
     gain: Array | None = None,
 ) -> Refined | None:
-    """Find the numbers that explain a stretch, given what is known from before it.
-
-    `before`: what is known without the stretch; the search starts there; `samples`: the stretch; its first part settles
-    the predictor; `first`: number of its first sample in the stream; `block`: samples of one evidence of the stream
-    that is given back; `noise`: variance of the evidence's residual; `gain`: (n_states, n_outputs), a predictor gain
-    near the one looked for. Returns none where the stretch is too short to settle, or no step leads to a predictor.
+    """Find the numbers that explain a stretch (`samples`, the first of which settle the predictor) from `before`, known
+    without it; None where it is too short to settle, or no step leads to a predictor. `first`: its first sample's
+    number; `block`: samples of one evidence; `noise`: the residual's variance; `gain` (n_states, n_outputs): near the
+    one looked for.
     """
     q, near, last = before.q.copy(), gain, 0.0
     for iteration in range(1, _ITERATIONS + 1):
@@ -107,10 +104,8 @@ def begin(
     size: float = 0.0,
     blocks: int = 0,
 ) -> Recovery:
-    """Prepare the search after an alarm.
-
-    `history`: recent blocks, each with what was known before it; `event`: what was said of the change; `onset`: first
-    sample of the window in which it was found; `blocks`: length of that window; 0 where it does not matter.
+    """Prepare the search after an alarm; `history`: recent blocks, with what was known before each; `event`: what was
+    said; `onset`, `blocks`: first sample and length of its window, 0 where that does not matter.
     """
     before = next((f for e, f in reversed(history) if e.first <= onset), history[0][1])
     # the change lies somewhere in the block in which it shows first: what comes after it is clean
@@ -160,10 +155,7 @@ class Recovery:
     attempts: int = 0
 
     def attempt(self, rpem: PhysicalRpem, recent: RecentSamples) -> Recovered | None:
-        """Search in all samples since the onset.
-
-        Returns none where nothing explains them; the next attempt is due when twice as many are there.
-        """
+        """Search in all samples since the onset; None where nothing explains them: the next is due at twice as many."""
         begun = time.thread_time()
         self.attempts += 1
         if self.attempts > 1:  # something in the first half does not belong to what holds now
@@ -183,10 +175,7 @@ class Recovery:
         return Recovered(refined=best[0], moved=best[1], computing_s=time.thread_time() - begun)
 
     def restart(self, sample: int, rpem: PhysicalRpem) -> None:
-        """Wait for samples behind a gap: those before it cannot be used together with them.
-
-        `sample`: first one behind the gap.
-        """
+        """Wait for samples from `sample` on, behind a gap: those before it cannot be used together with them."""
         self.onset = sample
         self.ready = sample + rpem.stream.settling_samples + _BLOCKS_AFTER * rpem.block_samples
         self.attempts = max(self.attempts - 1, 0)

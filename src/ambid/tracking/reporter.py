@@ -1,7 +1,5 @@
-"""From samples to lines: feeds the supervisor, and reports once in every reporting interval.
-
-Intervals are counted from the beginning of the stream, so that lines come at the same times whatever the blocks. Where
-samples are missing or rejected the lines go on: they say so.
+"""From samples to lines: feeds the supervisor, and reports once in every interval, counted from the stream's beginning
+whatever the blocks; where samples are missing or rejected the lines go on, and say so.
 """
 
 from __future__ import annotations
@@ -25,15 +23,11 @@ _EXTRA_UNITS = {"unbalance": "kg m", "unbalance_phase": "rad"}
 
 
 class Reporter:
-    """Feeds a supervisor and makes lines of what it says.
-
-    `supervisor`: its `log` calls `Reporter.note`; `every_s`: reporting interval, s; `on_line`: called with each line;
-    may return flags that an operator set; `flags`: what an operator sets and when, s of record; `t0`: time of sample 0,
-    s of record; `first`: number of the first sample that is tracked; `foreseen`: events that are known before, each
-    told in the line of its time.
-
-    `every_s`: reporting interval, at least one sample long; `lines`: lines made, samples used, samples rejected;
-    `samples`: lines made, samples used, samples rejected; `rejected`: lines made, samples used, samples rejected.
+    """Feeds a supervisor, whose `log` calls `Reporter.note`, and makes lines of what it says. `every_s`: reporting
+    interval, s, at least a sample; `on_line`: called with each line, may return the operator's flags; `flags`: what is
+    set when, s of record; `t0`: time of sample 0, s of record; `first`: number of the first tracked sample; `foreseen`:
+    events known before, told in the line of their time. `lines`, `samples`, `rejected`: lines made, samples used,
+    samples rejected.
     """
 
     def __init__(
@@ -64,9 +58,8 @@ class Reporter:
         self._events.append(event)
 
     def consume(self, samples: Samples, first: int, *, restart: bool = False) -> None:
-        """Take in consecutive samples and make the lines that they complete.
-
-        `samples`: finite; `first`: number of the first one; `restart`: samples are missing before it.
+        """Take in finite samples from number `first` on and make the lines that they complete; `restart`: some are
+        missing before.
         """
         self._pass(first)
         self._obey(first)
@@ -170,9 +163,8 @@ def header(
     record: Mapping[str, object],
     warnings: Sequence[str] = (),
 ) -> TrackHeader:
-    """Return the first line of a track.
-
-    `supervisor`: before its first sample; `warnings`: what to mistrust of the start.
+    """Return the first line of a track by a supervisor before its first sample; `warnings`: what to mistrust of the
+    start.
     """
     numbers = supervisor.rpem.numbers
     start: dict[str, TrackedValue] = supervisor.parameters

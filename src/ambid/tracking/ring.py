@@ -1,8 +1,7 @@
 """Ring of blocks in shared memory between one process that acquires and one that tracks.
 
-No lock is on the way of the data: each counter has one writer. The producer never waits; a block that finds the ring
-full is dropped and counted. Dropping the newest rather than overwriting the oldest leaves the queued blocks to the
-consumer alone, so that nothing is torn under its hands and one gap, seen in the sample numbers, is all that is lost.
+Each counter has one writer: no lock. The producer never waits; a block that finds the ring full is dropped and counted,
+so that nothing is torn under the consumer's hands and one gap in the numbers is all that is lost.
 
     header     "AMBIDRNG", version, slots, samples and channels of a block, rate, names
     producer   blocks written, blocks dropped, ended, process
@@ -150,13 +149,9 @@ _RETRIES = 100  # of a frame whose check fails: its last bytes may be on their w
 
 
 class BlockRing:
-    """Blocks in shared memory, one producer and one consumer. Made by `create` or `attach`; closed by ``with``.
-
-    `segment`: that holds a ring; `owner`: whether to remove it in the end.
-
-    `name`: of the shared segment, for `attach`; `slots`: capacity in blocks, and the longest block that goes into one;
-    `block_samples`: capacity in blocks, and the longest block that goes into one; `torn`: blocks that were passed over
-    because their check value was wrong.
+    """Blocks in shared memory, one producer and one consumer, made by `create` or `attach`, closed by ``with``.
+    `owner`: whether to remove the `segment` in the end; `name`: of it, for `attach`; `slots`, `block_samples`: capacity
+    in blocks, and the longest of them; `torn`: blocks passed over for a wrong check value.
     """
 
     def __init__(self, segment: SharedMemory, *, owner: bool) -> None:
@@ -179,10 +174,8 @@ class BlockRing:
 
     @classmethod
     def create(cls, *, rate_hz: float, channels: Sequence[str], slots: int = 64, block_samples: int = 200) -> Self:
-        """Make a ring; whoever makes it removes it.
-
-        `channels`: their names, in the order of the columns; `slots`: capacity in blocks; `block_samples`: longest
-        block that goes into one slot; longer ones are divided.
+        """Make a ring, to be removed by its maker; `channels`: in the order of the columns; `slots`: capacity in
+        blocks; `block_samples`: of the longest block in a slot; longer ones are divided.
         """
         if slots < 1 or block_samples < 1 or not channels or not 0 < rate_hz < float("inf"):
             raise EstimationError(
@@ -257,13 +250,9 @@ class BlockRing:
         self._consumed[_STOP] = 1
 
     def put(self, block: Block, arrived_s: float | None = None) -> bool:
-        """Write a block without ever waiting; one longer than a slot is divided.
-
-        Damaged blocks are carried as they are, for the guard to judge; only values that no slot can hold arrive as an
-        empty array of a wrong type.
-
-        `arrived_s`: when its last sample was there, by `time.perf_counter`; default now. Returns false if the ring was
-        full and (a part of) the block was dropped and counted.
+        """Write a block without ever waiting, divided if longer than a slot, damaged ones as they are; values that no
+        slot can hold arrive as an empty array of a wrong type. `arrived_s`: of its last sample, `time.perf_counter`,
+        default now. Returns false if the ring was full and (a part of) the block was dropped and counted.
         """
         self._claim(self._produced, _PRODUCER, "produces")
         arrived = time.perf_counter() if arrived_s is None else arrived_s
@@ -292,10 +281,8 @@ class BlockRing:
         return self._wait(lambda: self.filled < self.slots, timeout_s)
 
     def read(self, timeout_s: float) -> Frame | None:
-        """Take the next block out of the ring.
-
-        `timeout_s`: how long to wait for it. Returns none if none came in time, or none will come (`ended`). A torn
-        block is passed over and counted in `torn`; its numbers are then missing.
+        """Take out the next block, None if none comes within `timeout_s`, or ever (`ended`). A torn block is passed
+        over and counted in `torn`; its numbers are then missing.
         """
         self._claim(self._consumed, _CONSUMER, "consumes")
         if not self.filled and not self._wait(lambda: self.filled or self._produced[_ENDED], timeout_s):

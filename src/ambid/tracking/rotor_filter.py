@@ -1,14 +1,9 @@
 """A rotor's numbers from one block of periods to the next: an extended Kalman filter on the likelihood of its spectra.
 
-State: all numbers of the start estimate with their covariance, over their sizes. Those that age (force factors,
-stiffnesses, resistances, modes) are forgotten: from block to block P becomes D P D, D = exp(T/2M) for them and 1 for
-geometry and mass, M the memory (Jazwinski 1970, sec. 8.12). Several memories run side by side; the likelihood of their
-predictions says which one is published.
-
-A change is found by `ambid.tracking.monitors.ChangeDetector`, on blocks as its evidence. Then the numbers that age are
-released and the blocks since are fitted again, so that a jump far beyond the linear range is followed; a block that no
-numbers explain, such as that in which the jump is, is left out. Which numbers jumped is told one by one by the gain in
-likelihood, at the new point.
+Numbers that age (force factors, stiffnesses, resistances, modes) are forgotten: P becomes D P D a block, D = exp(T/2M)
+for them, 1 for geometry and mass, M the memory (Jazwinski 1970, sec. 8.12); of several, the predictions' likelihood
+says which is published. After a change (`ambid.tracking.monitors.ChangeDetector`) those are released and the blocks
+since fitted again, however far it jumped, unexplained ones left out; gains in likelihood tell which numbers jumped.
 """
 
 from __future__ import annotations
@@ -81,10 +76,8 @@ class Step:
 
 @dataclass(slots=True, kw_only=True, eq=False)
 class RotorFilter:
-    """Follow a rotor through blocks.
-
-    `ages`: of each of `unknowns.names`, whether it moves; `weight`: of one block; `memory`: in blocks, None: found from
-    the data; `time`: seconds at a sample of the record.
+    """Follow a rotor through blocks; `ages`: whether each of `unknowns.names` moves; `weight`: of a block; `memory`: in
+    blocks, None: found from the data; `time`: seconds at a sample of the record.
     """
 
     unknowns: Unknowns
@@ -234,10 +227,7 @@ class RotorFilter:
     def _fit(
         self, blocks: Sequence[Block], before: State, released: Array, near: Array | None = None
     ) -> tuple[State, list[Block]]:
-        """Fit blocks one after the other from a state with some numbers released; return those that are explained.
-
-        `near`: where the search of the first begins.
-        """
+        """Fit blocks in turn from a state with some numbers released, the first from `near`; return those explained."""
         state = replace(before, P=before.P + np.diag(np.where(released, _RELEASED**2, 0.0)))
         explained: list[Block] = []
         for block in blocks:

@@ -1,15 +1,11 @@
 """Recursive prediction error estimation of physical parameters (Ljung and Söderström 1983, ch. 3; Ljung 1999, ch. 11).
 
-The innovations-form predictor of the off-line estimator runs along the stream with exact sensitivities. Every block
-leaves its evidence, which a Kalman filter of the tracked numbers takes in: square-root covariance, Joseph's form
-(Bierman 1977, ch. 5); numbers that are held enter with their uncertainty but are not moved (Schmidt). The predictor is
-assembled again where the estimate has moved so far that second-order terms matter. It is as consistent in closed loop
-as the off-line estimator, and with unlimited memory it ends where that does.
-
-How fast each number walks is found by maximum likelihood: over a window of merged evidence the score by each walk
-variance w_j is half the difference of sum(lambda_j^2) and sum(N_jj) of the disturbance smoother (Koopman and Shephard
-1992). At the maximum the two agree; their ratio, raised to a power below one, therefore takes each w_j towards it and
-keeps it positive.
+A Kalman filter of the tracked numbers takes in each block's evidence: square-root covariance, Joseph's form (Bierman
+1977, ch. 5); held numbers enter with their uncertainty, unmoved (Schmidt). The predictor is assembled again where
+second-order terms matter. It is as consistent in closed loop as the off-line estimator, and with unlimited memory ends
+where that does. Walk variances w_j are found by maximum likelihood: the score over a window is half the difference of
+sum(lambda_j^2) and sum(N_jj) of the disturbance smoother (Koopman and Shephard 1992), whose ratio to a power below one
+moves w_j.
 """
 
 from __future__ import annotations
@@ -33,13 +29,9 @@ Flags = NDArray[np.bool_]
 
 
 class ParameterFilter:
-    """Estimate and covariance of the tracked numbers.
-
-    `start`: (p,); `covariance`: (p, p), positive definite; `positive`: (p,), numbers that are positive and stay so;
-    default none.
-
-    `q`: (p,); `active`: (p,), which numbers evidence may move, and which may walk; `n_shortened`: steps that were
-    shortened because a positive number would have lost more than half of itself.
+    """Estimate `q` (p,) and covariance of the tracked numbers, from `start` and a positive definite one; `positive`:
+    which stay so, default none; `active`: which evidence may move, and which may walk; `n_shortened`: steps shortened
+    because a positive number would have lost more than half.
     """
 
     def __init__(self, start: Array, covariance: Array, positive: Flags | None = None) -> None:
@@ -66,10 +58,8 @@ class ParameterFilter:
         walk(self._F, np.where(self.active, time * variance, 0.0), self._scratch[0])
 
     def absorb(self, evidence: Evidence, noise: float = 1.0) -> float:
-        """Take in a block's evidence.
-
-        Returns squared length of the residual before, normalised: chi-squared with p degrees of freedom if the model
-        and the covariance are right.
+        """Take in a block's evidence; return the residual's squared length before, chi-squared with p degrees of
+        freedom if model and covariance are right.
         """
         misfit, part = absorb(
             self.q, self._F, evidence.J, evidence.r, evidence.at, self.active, self._positive, noise, self._scratch
@@ -78,10 +68,8 @@ class ParameterFilter:
         return float(misfit)
 
     def far(self, at: Array, J: Array, curved: Array, most: float) -> bool:
-        """Return whether the estimate has left the neighbourhood of a point.
-
-        `at`: (p,); `J`: (p, p), upper triangle of a block's evidence; `curved`: (p,), squared moves over standard
-        deviations that are too much; `most`: |J (q - at)|^2 that is too much.
+        """Return whether the estimate has left the neighbourhood of `at`; `J`: triangle of a block's evidence; too much
+        are `curved` (p,), squared moves over standard deviations, and `most`, |J (q - at)|^2.
         """
         move = self.q - at
         length = J @ move
@@ -120,13 +108,9 @@ _NOTICED = 3.0  # factor of a variance from which the recent past is filtered an
 
 
 class DriftRates:
-    """Variances per second of the walks.
-
-    `start`: (p,), first variances per second; `floor`, `ceiling`: (p,), bounds; where floor equals ceiling nothing is
-    adapted; `block_s`: length of the evidence that will come, s.
-
-    `variance`: (p,), per second; `adapts`: whether the variances are found from the data; `walks`: whether any variance
-    is, or may become, positive.
+    """Variances per second of the walks, from `start` (p,) within `floor` and `ceiling` (p,): equal ones are not
+    adapted. `block_s`: length of the evidence to come, s; `adapts`: whether they are found from the data; `walks`:
+    whether any variance is, or may become, positive.
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
@@ -161,9 +145,8 @@ class DriftRates:
         self._since += 1
 
     def adapt(self, present: ParameterFilter, noise: float) -> None:
-        """Look at the window where a look is due; where something walks faster than thought, filter its end again.
-
-        `noise`: variance of the evidence's residual.
+        """Look at the window when due; where something walks faster than thought, filter its end again with the
+        residual's variance `noise`.
         """
         if self._chunk.blocks or self._count < _FEWEST or self._since < _EVERY:
             return
@@ -225,15 +208,11 @@ _OFFSET_RATE = 1e-4  # information per second of an offset, in its own units, of
 
 
 class PhysicalRpem:
-    """Recursive estimator of a bench's physical parameters, started from an off-line estimate.
-
-    `memory`: time constant with which old data are forgotten, s; "auto": found for each number by maximum likelihood;
-    "all": all data count alike. `block`: samples of one evidence; by default 5 ms, and enough innovations to tell noise
-    from numbers.
-
-    `noise_level`: variance of the innovations over that at identification, followed through what no number explains;
-    `n_linearised`: times that the predictor was assembled again; `n_unreached`: times that there was no predictor at
-    the estimate: the one in use is the nearest that was found on the way.
+    """Recursive estimator of a bench's physical parameters, started from an off-line estimate. `memory`: time constant
+    of forgetting, s; "auto": found for each number by maximum likelihood; "all": all data count alike. `block`: samples
+    of one evidence, by default 5 ms and enough innovations to tell noise from numbers. `noise_level`: variance of
+    innovations over that at identification, by what no number explains; `n_linearised`: times the predictor was
+    assembled again; `n_unreached`: times there was none at the estimate, and the nearest found on the way is used.
     """
 
     def __init__(self, start: Estimate | TrackedNumbers, *, memory: Memory = "auto", block: int | None = None) -> None:
@@ -276,10 +255,8 @@ class PhysicalRpem:
         return copy.deepcopy(self, {id(self.numbers): self.numbers})
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike, forcing: ArrayLike | None = None) -> Array:
-        """Take in one sample or a block, SI; return innovations, NaN for a rejected sample.
-
-        `forcing`: (2,) or (n_samples, 2), where the unbalance is tracked: (speed/top speed)^2 times cosine and sine of
-        the angle.
+        """Take in one sample or a block, SI; return innovations, NaN for a rejected sample. `forcing` (2,) or
+        (n_samples, 2), for a tracked unbalance: (speed/top speed)^2 times cosine and sine of the angle.
         """
         samples = checked(self.numbers, inputs, outputs, forcing)
         k, n = 0, samples.y.shape[0]
@@ -339,10 +316,8 @@ class PhysicalRpem:
                 self.filter.q = self.stream.at.at.copy()  # numbers without a predictor are none of a bench
 
     def noise_of(self, evidence: Evidence) -> float:
-        """Return the variance with which a block's residual is taken.
-
-        The usual one; where much more is left unexplained than usual, so much larger: a transient that the model does
-        not know must not move the numbers.
+        """Return the variance with which a block's residual is taken: the usual, or so much larger as is left
+        unexplained: a transient that the model does not know must not move the numbers.
         """
         own = evidence.rest / evidence.freedom if evidence.freedom else 0.0
         usual = max(self.noise_level, _LOWEST_NOISE)
@@ -372,10 +347,8 @@ class PhysicalRpem:
 
 
 def _rates(numbers: TrackedNumbers, memory: Memory, block_s: float) -> DriftRates:
-    """Walk variances per second: 1/(information rate x memory^2) gives a filter of that memory.
-
-    The information is that on a number if the others are known. Where only ratios of the parameters are known well, a
-    walk as wide as each alone is known would loosen the ratios.
+    """Walk variances per second, 1/(information rate x memory^2), by the information on a number if the others are
+    known: where only ratios are known well, walks as wide as each alone would loosen them.
     """
     size = np.sqrt(np.diag(numbers.covariance))
     information = 1.0 / np.diag(np.linalg.inv(numbers.covariance / np.outer(size, size))) * size**2

@@ -1,8 +1,7 @@
 """The supervised tracker: what follows the parameters, what watches it, and who decides (thesis figs 3.1 and 5.8).
 
-Each block's evidence is judged before it is used: does it show that something jumped, does it inform the parameters at
-all? What the recursion makes of it is published only after later data have confirmed it. The operator's flags stand
-above all. Every decision is an event with its reason.
+Evidence is judged before use: did something jump, does it inform? Only what later data confirm is published; the
+operator's flags stand above all, and every decision is an event with its reason.
 """
 
 from __future__ import annotations
@@ -27,12 +26,9 @@ _LEVEL_S = 0.1  # over which the error is taken
 
 
 class Supervisor:
-    """Tracks the parameters of a bench and decides what is published.
-
-    `limit`: acceptable error, in multiples of that at identification; `t0`: time of sample 0, s of record; `listener`:
-    called with each event.
-
-    `rpem`: the working estimate.
+    """Tracks the parameters of a bench by `rpem`, the working estimate, and decides what is published; `limit`:
+    acceptable error, in multiples of that at identification; `t0`: time of sample 0, s of record; `listener`: called
+    with each event.
     """
 
     def __init__(
@@ -107,10 +103,8 @@ class Supervisor:
         return not (self._silent or self.diagnosis.doubted)
 
     def feed(self, samples: Samples, first: int, *, restart: bool = False) -> Array:
-        """Take in consecutive samples.
-
-        `samples`: all finite; `first`: number of the first one; `restart`: samples are missing before it. Returns
-        (n_samples, n_outputs), SI, innovations of the working predictor.
+        """Take in finite samples from number `first` on (`restart`: some are missing before); return the working
+        predictor's innovations (n_samples, n_outputs), SI.
         """
         if restart or first != self.rpem.stream.sample:
             rpem = self.rpem
@@ -139,10 +133,7 @@ class Supervisor:
         return np.asarray(errors * self.rpem.numbers.problem.scales.output)
 
     def wait(self, sample: int) -> None:
-        """Let time pass: without samples, or with samples on which the predictor only settles.
-
-        `sample`: number of the sample up to which nothing more comes now.
-        """
+        """Let time pass up to number `sample`: without samples, or with those on which the predictor only settles."""
         missing = sample > self.rpem.stream.sample
         self._deaf_s = (sample - self._heard) / self._rate
         if not missing and self._deaf_s <= self.rpem.block_s:
@@ -216,9 +207,8 @@ _QUIET = 0.01  # of the innovations' standard deviation
 
 
 def warm_up(numbers: TrackedNumbers, memory: Memory = "auto") -> None:
-    """Track a rotor at rest, and search a change in it: what is compiled or loaded late is there when samples come.
-
-    The noise is far below that of the bench: as large as that, without the motion of the bench, it is a change.
+    """Track a rotor at rest, and search a change in it, so that what is compiled or loaded late is there when samples
+    come. Its noise is far below the bench's: as large as that, without the bench's motion, it is a change.
     """
     supervisor = Supervisor(PhysicalRpem(numbers, memory=memory))
     rpem, before = supervisor.rpem, supervisor.rpem.filter.copy()
