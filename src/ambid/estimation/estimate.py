@@ -1,10 +1,5 @@
-"""The estimate: parameters with covariance, model, fit, checks, warnings, timings, provenance; its parts and its JSON.
-
-JSON: one writer and one reader for frozen dataclasses, driven by their annotations.
-
-A field becomes an entry of the same name; what a schema writes in another shape (a check's numbers beside its verdict,
-parameters by name) stands in the two tables below. Numbers that are not finite are null, and null is read as NaN where
-a number has to stand.
+"""The estimate: parameters with covariance, model, fit, checks, warnings, timings, provenance; and its JSON, written
+and read by annotations of frozen dataclasses. Numbers that are not finite are null; null is read as NaN for a number.
 """
 
 from __future__ import annotations
@@ -61,11 +56,7 @@ class EstimatedParameter:
         identifiable: Mapping[str, bool],
         alone: Mapping[str, float] | None = None,
     ) -> EstimatedParameter:
-        """Return a parameter as estimated.
-
-        `theta`, `sd`, `identifiable`: by name; `alone`: standard deviations that the data alone would give, for the
-        share of a prior.
-        """
+        """Return a parameter as estimated; `alone`: standard deviations of the data alone, for the share of a prior."""
         value, spread, share = theta[p.name], sd.get(p.name, 0.0), None
         if alone is not None and p.role == "prior" and p.sd:
             share = float(1 / (1 + (alone[p.name] / p.sd) ** 2))
@@ -225,10 +216,7 @@ COVARIANCE = types.MappingProxyType(
 
 
 def plain_json(value: Any) -> Any:
-    """Return dicts, lists, strings, booleans, numbers and None for anything that a result holds.
-
-    Dataclasses become objects, complex numbers pairs; a number that is not finite becomes None.
-    """
+    """Return anything that a result holds as plain JSON values: complex numbers as pairs, None where not finite."""
     if isinstance(value, (bool, str)) or value is None:
         return value
     if isinstance(value, float):
@@ -344,10 +332,8 @@ def read_whole(read: Callable[[], T], where: str, what: str, job: str) -> T:
 
 
 def read_as(kind: type[T], value: Any, at: str = "") -> T:
-    """Read JSON as what an annotation says: dataclasses, arrays, mappings, tuples, unions, literals, plain values.
-
-    Raises ValueError with the path of the entry that is missing or of another type. Kinds that no rule is for, such as
-    ``object``, take the value as it is.
+    """Read JSON as what an annotation says, or raise ValueError with the path of an entry that is missing or of another
+    type. Kinds that no rule is for, such as ``object``, take the value as it is.
     """
     return cast("T", _read(kind, value, at))
 
@@ -684,9 +670,8 @@ def _check_consistent(estimate: Estimate) -> None:
 
 
 def warnings_of(fit: Any, checks: Mapping[str, Check], inflated_by: str) -> tuple[str, ...]:
-    """Return what a reader has to know before using the values, most important first.
-
-    `fit`: of either estimator; `inflated_by`: where its robust standard deviations come from; empty if not used.
+    """Return what a reader has to know of a `fit` before using its values, most important first. `inflated_by`: where
+    its robust standard deviations come from; empty if not used.
     """
     warnings = [] if fit.status == "converged" else ["the search did not converge: treat the values as a first guess"]
     warnings += [] if fit.global_search is None else [describe_search(fit.global_search)]

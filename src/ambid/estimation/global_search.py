@@ -1,7 +1,6 @@
-"""Global search by differential evolution (Storn and Price 1997), and the rescue of fits whose ordinary starts fail.
-
-Numbers are searched for between bounds, scaled to 0 .. 1; SciPy's `differential_evolution` does it, strategy best1bin
-with dithered mutation, from a Sobol sequence; the result depends on the seed alone. Local refinement is the caller's.
+"""Global search by SciPy's differential evolution (Storn and Price 1997; best1bin, dithered mutation, Sobol start)
+between bounds, scaled to 0 .. 1, and the rescue of fits whose ordinary starts fail. The result depends on the seed
+alone.
 """
 
 from __future__ import annotations
@@ -50,10 +49,8 @@ def global_search(
     tick: Tick = silent,
     stage: str = STAGE,
 ) -> GlobalFound:
-    """Search for the least cost between bounds.
-
-    `low`, `high`: (n,), finite, low below high. Scale what spans decades before (logarithm, inverse hyperbolic sine);
-    `seed`: equal seeds give equal results; `evaluations`: of `cost`, at most.
+    """Search for the least cost between finite bounds `low` and `high` (n,), in at most `evaluations`; equal seeds give
+    equal results. Scale before what spans decades (logarithm, inverse hyperbolic sine).
     """
     from scipy.optimize import differential_evolution
     from scipy.stats import qmc
@@ -112,12 +109,9 @@ def rescued(
     better: Callable[[F, F], bool],
     tick: Tick,
 ) -> F | None:
-    """Return the better of a fit and of one from a global search, with what was done in its `global_search`.
-
-    `before`: what the ordinary starts led to; `why`: why that is not enough; `look`: searches; `so_far`: the best that
-    it has, where a KeyboardInterrupt ends it; `better`: whether the first of two fits is. The report: ``why``,
-    ``evaluations``, ``seconds``, ``criterion_before`` and ``criterion_after`` (per value, None where there is none),
-    ``taken``, ``interrupted``. None where nothing was found at all.
+    """Return the better of a fit, not enough for `why`, and of one that `look` finds, None without either; where a
+    KeyboardInterrupt ends it, `so_far` gives its best. Its `global_search` has ``why``, ``evaluations``, ``seconds``,
+    ``criterion_before`` and ``criterion_after`` (per value, None where there is none), ``taken``, ``interrupted``.
     """
     began, count, interrupted = perf_counter(), 0, False
 
@@ -150,10 +144,7 @@ def _per_value(fit: PhysicalFit | None) -> float | None:
 
 
 def describe_search(report: Mapping[str, object]) -> str:
-    """Return what a global search did, in one sentence.
-
-    `report`: `global_search` of a fit.
-    """
+    """Return what a fit's `global_search` did, in one sentence."""
     before, after = report["criterion_before"], report["criterion_after"]
     out = f"the ordinary start values failed ({report['why']}): "
     if report["interrupted"]:

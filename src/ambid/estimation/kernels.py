@@ -1,8 +1,5 @@
-"""Compiled recursions of the innovations-form predictor and its exact sensitivities.
-
-One step of the predictor is x+ = F x + G z; its derivative by estimated number q is s_q+ = F s_q + f_q, with a forcing
-f_q that is linear in x and z. Drive and forcing of a whole block are matrix products; only the recursion itself is
-compiled.
+"""Compiled recursions of the innovations-form predictor, x+ = F x + G z, and its exact sensitivities s_q+ = F s_q +
+f_q, forcing f_q linear in x and z. Drive and forcing of a block are matrix products; only recursions are compiled.
 """
 
 from __future__ import annotations
@@ -15,11 +12,9 @@ from ambid.compiled import compiled
 
 @compiled(fastmath={"contract"})
 def state_scan(M: Array, w: Array, x: Array) -> None:
-    """Run the predictor over one block.
-
-    `w` (block, n + n_z) holds z in its last columns and gets the state before each sample in its first n; `x` (n,)
-    moves along in place. M = [F G] is (n, n + n_z). Three states, the one-axis plant, are spelled out: they stay in
-    registers, and what z drives is summed while the state before is still on its way.
+    """Run the predictor over one block: `w` (block, n + n_z) holds z in its last columns and gets the state before each
+    sample in its first n; `x` (n,) moves along in place; M = [F G]. Three states, the one-axis plant, stay in
+    registers.
     """
     n, n_l = M.shape
     if n == 3:
@@ -56,13 +51,12 @@ def state_scan(M: Array, w: Array, x: Array) -> None:
 
 @compiled(fastmath={"contract"})
 def sensitivity_scan(F: Array, w: Array, y: Array, s: Array, rows: Array, last: int) -> None:
-    """Turn forcings into sensitivities in place, many at once, and put the residual beside them.
+    """Turn forcings into sensitivities in place, and put the residual beside them.
 
-    `s` (n, width) holds the sensitivities at the first sample and moves along in place. `rows` (n, block, width) holds
-    the forcing, s[k + 1] = F s[k] + rows[:, k], and gets s[k] of the first states, which are the outputs; its column
-    `last` gets y[k, o] + w[k, o]. Estimated numbers run along the last axis, so that vector instructions serve them.
-    The compiler can use them because results go where their own forcing was: with an array more, or fewer than 16
-    numbers, checking that nothing overlaps would cost more than they gain.
+    `s` (n, width) holds the sensitivities at the first sample and moves along. `rows` (n, block, width) holds the
+    forcing, s[k + 1] = F s[k] + rows[:, k], and gets s[k] of the outputs, the first states; its column `last` gets y[k,
+    o] + w[k, o]. Estimated numbers run along the last axis, for vector instructions: results go where their forcing
+    was.
     """
     (n, width), n_y = s.shape, y.shape[1]
     if n == 3 and n_y == 2:

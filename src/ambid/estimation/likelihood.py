@@ -1,14 +1,5 @@
-"""Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2): innovations, their slopes, the search.
-
-The determinant of the innovation covariance is minimised, with exact Jacobians weighted by the innovation covariance at
-the same vector. A trial step costs one run of the predictor; slopes are taken only where the criterion fell.
-
-Jacobians are compressed to a triangle block after block: away from everything known by QR; near a place whose triangle
-T is known, sensitivities are taken along the columns of T^-1, which are nearly orthonormal: their Gram matrix then
-loses no digits, and costs a fifth.
-
-Predictions further ahead than one sample: from x+ = A x + B u + K e, y = C x + D u + e the error k steps ahead, inputs
-known, is the sum of the innovations since, e(t) + C K e(t-1) + ... + C A^(k-2) K e(t-k+1) (Ljung 1999, sec. 3.2).
+"""Maximum likelihood over one predictor problem (Ljung 1999, sec. 7.4 and 10.2): the determinant of the innovation
+covariance is minimised with exact weighted Jacobians, compressed to a triangle block by block.
 """
 
 from __future__ import annotations
@@ -33,12 +24,10 @@ _TURNED = 1e-9  # least singular value, over the largest, of the scaled triangle
 
 
 class Workspace:
-    """What repeated evaluations of one problem share: scaled data, and the last triangle with its inverse, along
-    whose columns the next Jacobian is taken.
-
-    `y`: (n_used, n_outputs), scaled outputs; `w`: (n_used, n_states + n_lags n_inputs + n_outputs + 1), room for the
-    states of the predictor, and what drives it: inputs at the problem's lags, y, 1; `z`: (n_used, n_lags n_inputs +
-    n_outputs + 1), what drives the predictor, a view of `w`.
+    """What evaluations of one problem share: scaled outputs `y` (n_used, n_outputs), room for the states and what
+    drives the predictor, `w` (..., n_states + n_lags n_inputs + n_outputs + 1) with its view `z` (inputs at the lags,
+    y, 1), and the last triangle T: the next Jacobian is taken along the columns of T^-1, whose Gram matrix loses no
+    digits.
     """
 
     def __init__(self, problem: PredictorProblem) -> None:
@@ -78,19 +67,13 @@ class Workspace:
         self.turn = _turn(triangle)
 
     def buffers(self, *shapes: tuple[int, ...]) -> tuple[Array, ...]:
-        """Return scratch arrays, the same ones as long as the shapes stay the same: fresh pages cost more than sums.
-
-        Returns not initialised.
-        """
+        """Return scratch arrays, not initialised, kept while shapes stay the same: fresh pages cost more than sums."""
         if tuple(b.shape for b in self._buffers) != shapes:
             self._buffers = tuple(_aligned(shape) for shape in shapes)
         return self._buffers
 
     def weighted(self, weight: Array) -> Array:
-        """Return the outputs times a weight, kept while the weight stays the same.
-
-        `weight`: (n_outputs, n_outputs). Returns (n_used, n_outputs).
-        """
+        """Return outputs (n_used, n_outputs) times a weight (n_outputs, n_outputs), kept while that stays the same."""
         if not np.array_equal(weight, self._weight):
             self._weight, self._weighted = weight.copy(), self.y @ weight.T
         return self._weighted
@@ -107,10 +90,8 @@ def _aligned(shape: tuple[int, ...]) -> Array:
 def innovations(
     problem: PredictorProblem, vector: Array, work: Workspace | None = None, predictor: Predictor | None = None
 ) -> Array | None:
-    """Return the innovations in scaled output units.
-
-    `vector`: (size,); `work`, `predictor`: of this problem, to save making them again. Returns (n_used,
-    n_outputs), or None where there is no predictor at `vector`.
+    """Return the innovations (n_used, n_outputs) in scaled output units, None without a predictor at `vector` (size,);
+    `work` and `predictor` save making them again.
     """
     from ambid.estimation.kernels import state_scan
 
@@ -124,11 +105,7 @@ def innovations(
 
 
 def run(M: Array, z: Array, x0: Array) -> Array:
-    """Run the recursion x+ = M [x; z].
-
-    `M`: (n, n + n_z); `z`: (n_samples, n_z); `x0`: (n,). Returns (n_samples + 1, n), states before each sample, and
-    after the last.
-    """
+    """Run x+ = M [x; z] and return the states before each sample and after the last, (n_samples + 1, n)."""
     from ambid.estimation.kernels import state_scan
 
     n = x0.size
@@ -152,10 +129,8 @@ class Linearisation:
 def linearise(
     problem: PredictorProblem, vector: Array, weight: Array, work: Workspace | None = None
 ) -> Linearisation | None:
-    """Return the compressed weighted residual and its exact Jacobian.
-
-    `vector`: (size,); `weight`: (n_outputs, n_outputs), lower triangular W with W^T W the inverse innovation covariance
-    (scaled); `work`: of this problem.
+    """Return the compressed weighted residual at `vector` (size,) and its exact Jacobian. `weight` (n_outputs,
+    n_outputs): lower triangular W with W^T W the inverse innovation covariance (scaled).
     """
     work = work or Workspace(problem)
     p, moment = problem.size, np.zeros_like(weight)
@@ -231,11 +206,9 @@ def products(
     lagged: Sequence[tuple[Array, tuple[int, ...]]] = (),
     stretches: int = 1,
 ) -> Products | None:
-    """Return all scalar products that checks and robust covariances are made of, from one pass of sensitivities.
-
-    `lagged`: signals, (n_used, n_signals), with the lags at which they become columns, lag by lag, zero before the
-    record; `stretches`: into about how many the record is cut. None where there is no predictor, or the data do not
-    tell all numbers apart.
+    """Return all scalar products of checks and robust covariances from one pass of sensitivities; None without a
+    predictor, or where the data do not tell all numbers apart. `lagged`: signals (n_used, n_signals) with lags, zero
+    before the record; `stretches`: into about how many it is cut.
     """
     p, n_used, n_y = problem.size, problem.n_used, work.y.shape[1]
     if work.turn is None and linearise(problem, vector, weight, work) is None:
@@ -276,10 +249,8 @@ def _lagged_block(lagged: Sequence[tuple[Array, tuple[int, ...]]], first: int, m
 
 
 def reduce_rows(rows: Array, *, last: bool = False) -> Array:
-    """Replace rows by fewer that differ by an orthogonal matrix (QR of short stacks).
-
-    `rows`: (n_rows, n_columns); `last`: reduce to at most n_columns rows, instead of that many for each stack. Returns
-    (fewer, n_columns).
+    """Replace rows (n_rows, n_columns) by fewer that differ by an orthogonal matrix (QR of short stacks); `last`: by at
+    most n_columns of all instead of each stack.
     """
     if last:
         return np.asarray(np.linalg.qr(rows, mode="r"))
@@ -293,11 +264,9 @@ def reduce_rows(rows: Array, *, last: bool = False) -> Array:
 def residual_blocks(
     problem: PredictorProblem, vector: Array, weight: Array, work: Workspace, turn: Array | None = None
 ) -> Iterator[Array]:
-    """Yield rows [W de/dq, W e] block after block, so that memory does not grow with the record.
-
-    `vector`: (size,); `weight`: (n_outputs, n_outputs); `turn`: (size, size), directions along whose columns the
-    derivatives are taken, instead of by each number. Returns (block, n_outputs, size + 1), a view, overwritten by
-    the next block. Nothing is yielded where there is no predictor at `vector`.
+    """Yield rows [W de/dq, W e] (block, n_outputs, size + 1), views that the next block overwrites, so that memory does
+    not grow; none without a predictor at `vector`. `turn` (size, size): directions of the derivatives, along its
+    columns.
     """
     from ambid.estimation.kernels import sensitivity_scan, state_scan
 
@@ -345,10 +314,7 @@ def residual_blocks(
 
 
 def null_space(a: Array) -> Array:
-    """Return orthonormal rows that complete the row space of a full-rank wide matrix.
-
-    `a`: (r, n), r <= n. Returns (n - r, n).
-    """
+    """Return orthonormal rows (n - r, n) that complete the row space of a full-rank `a` (r, n), r <= n."""
     q, _ = np.linalg.qr(a.T, mode="complete")
     return np.ascontiguousarray(q[:, a.shape[0] :].T)
 
@@ -379,10 +345,7 @@ class Fit(PhysicalFit):
 
 
 def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
-    """Return residual and Jacobian rows of the priors: those of the rig, and a weak one on log noise levels.
-
-    `vector`: (size,). Returns `r`: (n_priors,); `J`: (n_priors, size).
-    """
+    """Return residual (n_priors,) and Jacobian rows of the priors: the rig's, and a weak one on log noise levels."""
     n = problem.n_physical
     mean, inverse_sd = np.zeros(problem.size), np.zeros(problem.size)
     mean[:n] = problem.prior_mean / problem.magnitude
@@ -399,10 +362,7 @@ def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:
 
 
 def criterion(problem: PredictorProblem, vector: Array, covariance: Array) -> float:
-    """Return n log det(covariance) plus the squared prior residuals.
-
-    `vector`: (size,); `covariance`: (n_outputs, n_outputs), scaled output units.
-    """
+    """Return n log det(covariance), in scaled output units, plus the squared prior residuals."""
     r, _ = prior_rows(problem, vector)
     return float(problem.n_used * np.linalg.slogdet(covariance)[1] + r @ r)
 
@@ -410,10 +370,8 @@ def criterion(problem: PredictorProblem, vector: Array, covariance: Array) -> fl
 def evaluate(
     problem: PredictorProblem, vector: Array, work: Workspace | None = None, predictor: Predictor | None = None
 ) -> tuple[float, Array | None]:
-    """Return the criterion and the innovation covariance at a vector, without a Jacobian.
-
-    `vector`: (size,); `work`, `predictor`: of this problem, to save making them again. Returns `criterion`:
-    infinite where there is no predictor; `covariance`: (n_outputs, n_outputs), or None.
+    """Return the criterion at a vector (size,), infinite without a predictor, and the innovation covariance (n_outputs,
+    n_outputs) or None, without a Jacobian.
     """
     e = innovations(problem, vector, work, predictor)
     if e is None:
@@ -426,10 +384,7 @@ def evaluate(
 
 
 def weight_of(covariance: Array) -> Array:
-    """Return lower triangular W with W^T W = covariance^-1.
-
-    `covariance`: (n, n), positive definite. Returns (n, n).
-    """
+    """Return lower triangular W with W^T W = covariance^-1, of a positive definite one."""
     return np.linalg.solve(np.linalg.cholesky(covariance), np.eye(covariance.shape[0]))
 
 
@@ -453,9 +408,8 @@ def workspace_near(fit: Fit, problem: PredictorProblem) -> Workspace:
 def extend(
     fit: Fit, problem: PredictorProblem, vector: Array, work: Workspace | None = None
 ) -> tuple[Array, Array] | None:
-    """Return Jacobian and residual of a larger problem at a fit, compressed, priors included; None without predictor.
-
-    `vector`: (size,), the fit's numbers written in that problem; `work`: of that problem.
+    """Return compressed Jacobian and residual, priors included, of a larger problem at a fit; None without a predictor.
+    `vector` (size,): the fit's numbers written in that problem.
     """
     work = workspace_near(fit, problem) if work is None else work
     at = linearise(problem, vector, weight_of(fit.covariance), work)
@@ -466,13 +420,9 @@ def extend(
 
 
 def score_statistic(fit: Fit, problem: PredictorProblem, vector: Array) -> float:
-    """Return the fall of the criterion that freeing all numbers of `problem` promises to second order.
-
-    The score (Lagrange multiplier) test: one evaluation decides whether an extension is worth a search.
-
-    `fit`: of the smaller problem; `problem`: the extended one; `vector`: (size,), the fit's numbers written in it.
-    Returns chi-squared with as many degrees of freedom as numbers were added, if they are not needed; 0 where
-    undefined.
+    """Return the fall of the criterion that freeing all numbers of the extended `problem` promises to second order, 0
+    where undefined: the score (Lagrange multiplier) test, chi-squared with the numbers added as degrees of freedom if
+    they are not needed. `vector` (size,): the fit's numbers written in that problem.
     """
     return promise_of(extend(fit, problem, vector))
 
@@ -483,10 +433,8 @@ def promise_of(rows: tuple[Array, Array] | None) -> float:
 
 
 def free_one(fit: Fit, name: str) -> tuple[float, float]:
-    """Return what the data say of a parameter that was fixed, to second order.
-
-    `name`: one of the problem's known parameters. Returns `statistic`: fall of the criterion that freeing it promises:
-    chi-squared with one degree of freedom if the fixed value is right; `value`: where one Newton step puts it, SI:
+    """Return what the data say of a fixed parameter, to second order: the fall of the criterion that freeing it
+    promises (chi-squared with one degree of freedom if its value is right), and where one Newton step puts it, SI:
     right in direction, in size only near the fixed value.
     """
     old = fit.problem
@@ -513,10 +461,7 @@ def free_one(fit: Fit, name: str) -> tuple[float, float]:
 
 
 def with_linear_part(problem: PredictorProblem, vector: Array, work: Workspace) -> Array:
-    """Return a copy with the offsets and the initial state that fit best.
-
-    `vector`: (size,). Returns (size,), unchanged where there is no predictor at `vector`.
-    """
+    """Return a copy with the offsets and the initial state that fit best, unchanged without a predictor at `vector`."""
     rows, out = _Objective(problem, work, None).triangle(vector), vector.copy()
     if np.all(np.isfinite(rows)):
         linear = problem.slices["offset"].start
@@ -532,11 +477,9 @@ def search(
     tick: Callable[[], None] | None = None,
     work: Workspace | None = None,
 ) -> Fit:
-    """Minimise the likelihood criterion from `start`.
-
-    `start`: (size,); `steps`: iterations at most; `tick`: called after each evaluation (progress, interruption);
-    `work`: of this problem, or of one with the same data. Returns with status ``"failed"`` where there is no predictor
-    at `start`.
+    """Minimise the likelihood criterion from `start` (size,); status ``"failed"`` where there is no predictor. A trial
+    step costs one run of the predictor; slopes are taken only where the criterion fell. `tick` is called after each
+    evaluation.
     """
     objective = _Objective(problem, Workspace(problem) if work is None else work.of(problem), tick)
     linear = problem.slices["offset"].start
@@ -631,10 +574,8 @@ def sparse_gain(fit: Fit, stride: int) -> Array:
 
 
 def simulation_error(fit: Fit) -> Array | None:
-    """Return y minus its simulation from the input, offsets and initial state alone, SI.
-
-    Returns (n_used, n_outputs); None where the plant is unstable in open loop: its simulation runs away and says
-    nothing.
+    """Return y minus its simulation from input, offsets and initial state alone, SI, (n_used, n_outputs); None where
+    the plant is unstable in open loop: its simulation runs away.
     """
     predictor = _predictor(fit)
     A = predictor.A
@@ -649,10 +590,10 @@ def simulation_error(fit: Fit) -> Array | None:
 
 
 def prediction_error(fit: Fit, steps: int) -> Array:
-    """Return y minus its prediction `steps` samples ahead, SI, with the inputs known up to then.
+    """Return y minus its prediction `steps` ahead with known inputs, SI: row k of (n_used - steps + 1, n_outputs) is
+    sample t = k + steps - 1 predicted from outputs before k.
 
-    Returns (n_used - steps + 1, n_outputs), row k is the error at sample k + steps - 1, predicted from outputs before
-    sample k.
+    It is e(t) + C K e(t-1) + ... + C A^(steps-2) K e(t-steps+1) for x+ = A x + B u + K e (Ljung 1999, sec. 3.2).
     """
     predictor, e = _predictor(fit), innovations(fit.problem, fit.vector)
     if e is None:
@@ -688,9 +629,8 @@ def failure(fit: Fit) -> str:
 
 
 def unexplained(fit: Fit) -> float:
-    """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains.
-
-    About 0 where a search ended well: a linear model of high order predicts no better; 1 without a predictor.
+    """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains:
+    about 0 where a search ended well, as no linear model of high order predicts better; 1 without a predictor.
     """
     work = None if fit.work is None else fit.work.of(fit.problem)
     e = None if fit.status == "failed" else innovations(fit.problem, fit.vector, work)

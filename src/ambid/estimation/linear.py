@@ -42,10 +42,7 @@ class Directions:
         return float(self.s[0] / max(self.s[-1], 1e-300)) if self.s.size else 1.0
 
     def solve(self, b: Array, damping: float = 0.0) -> Array:
-        """Return x of the smallest |A x - b|² + damping |size x|², zero along directions that nobody sees.
-
-        `b`: (n_rows,) or (n_rows, n_columns).
-        """
+        """Return x of the smallest |A x - b|² + damping |size x|², zero along directions that nobody sees."""
         gain = np.where(self.seen, self.s / (self.s**2 + damping), 0.0) if damping else self._inverse_values()
         return np.asarray(((self.Vt.T * gain) @ (self.U.T @ b)).T / self.size).T
 
@@ -55,9 +52,8 @@ class Directions:
         return float(np.sum(along**2))
 
     def root(self, least: float = _ROUNDING) -> Array:
-        """Return H with H Hᵀ = (AᵀA)⁻¹; a direction without information gets a huge length, not an infinite one.
-
-        `least`: smallest singular value that counts, over the largest.
+        """Return H with H Hᵀ = (AᵀA)⁻¹, huge but finite along a direction without information: of a singular value
+        under `least` of the largest.
         """
         s = np.maximum(self.s, max(least * (self.s[0] if self.s.size else 1.0), 1e-300))
         size = np.where(self.empty, _NOTHING, self.size)
@@ -87,10 +83,7 @@ def column_sizes(A: Array) -> Array:
 
 
 def least_squares(A: Array, b: Array) -> Array:
-    """Solve A x = b in least squares, the smallest scaled x where the data do not tell.
-
-    `A`: (n_rows, n), `b`: (n_rows,) or (n_rows, n_right). Tall matrices are reduced by QR before.
-    """
+    """Solve A x = b in least squares, the smallest scaled x where the data do not tell; tall matrices by QR first."""
     n, right = A.shape[1], b.reshape(b.shape[0], -1)
     if A.shape[0] > n + right.shape[1]:
         R = triangle_of([np.hstack([A, right])])
@@ -100,10 +93,7 @@ def least_squares(A: Array, b: Array) -> Array:
 
 
 def triangle_of(rows: Sequence[Array]) -> Array:
-    """Return the triangle of stacked rows.
-
-    `rows`: (n_rows, n_columns). Returns (at most n_columns, n_columns).
-    """
+    """Return the triangle (at most n_columns, n_columns) of stacked rows (n_rows, n_columns)."""
     small = [
         part if part.shape[0] <= part.shape[1] else np.asarray(np.linalg.qr(part, mode="r"))
         for block in rows
@@ -113,9 +103,8 @@ def triangle_of(rows: Sequence[Array]) -> Array:
 
 
 def information_inverse(R: Array) -> tuple[Array | None, float]:
-    """Return the inverse of RᵀR, None where a direction is not seen at all, and the condition number of the scaled R.
-
-    `R`: (n_rows, n), a triangle without its last column.
+    """Return (RᵀR)⁻¹, None where a direction is not seen, and the condition number of the scaled R (n_rows, n), a
+    triangle without its last column.
     """
     if R.shape[0] < R.shape[1] or not np.all(np.isfinite(R)) or not np.all(np.linalg.norm(R, axis=0) > _TINY):
         return None, np.inf

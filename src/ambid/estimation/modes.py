@@ -1,8 +1,4 @@
-"""A mode of vibration with its uncertainty, and how much two modes are alike.
-
-The value that every estimator of modes gives: from a frequency response, from outputs alone, or from a rotor's physical
-parameters. Likeness of shapes is the modal assurance criterion (Allemang and Brown 1982).
-"""
+"""A mode of vibration with its uncertainty, as every estimator of modes gives it, and the likeness of two."""
 
 from __future__ import annotations
 
@@ -21,9 +17,8 @@ from ambid.estimation.result import NORMAL_95
 
 
 def assurance(one: Sequence[complex], other: Sequence[complex]) -> float:
-    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982).
-
-    Returns 1 for equal shapes, whatever their size; 0 for orthogonal ones.
+    """Return the modal assurance criterion |a* b|^2 / (a* a b* b) of two mode shapes (Allemang and Brown 1982): 1 for
+    equal shapes, whatever their size; 0 for orthogonal ones.
     """
     a, b = np.asarray(one, dtype=np.complex128), np.asarray(other, dtype=np.complex128)
     size = float(np.vdot(a, a).real * np.vdot(b, b).real)
@@ -109,9 +104,8 @@ def _mark(p: TrialPole, before: Sequence[TrialPole], near: Tolerance) -> TrialPo
 
 
 def clusters(poles: Sequence[TrialPole], models: Sequence[int], near: Tolerance) -> tuple[PoleCluster, ...]:
-    """Gather stable poles: from the highest order down, each joins the cluster it is near to, or begins one.
-
-    `models`: their orders. Returns clusters that enough orders share, lowest frequency first.
+    """Gather stable poles of models of these orders: from the highest order down, each joins the cluster it is near to,
+    or begins one. Returns those that enough orders share, lowest frequency first.
     """
     gathered = list[list[TrialPole]]()
     for p in sorted((p for p in poles if p.stable), key=lambda p: -p.order):
@@ -158,10 +152,8 @@ class EstimatedNumber:
     def of(
         cls, value: float, sd: float, *, quantile: float = NORMAL_95, size: float | None = None, visible: bool = True
     ) -> EstimatedNumber:
-        """Return a number with its interval, value -+ quantile sd.
-
-        `size`: what the standard deviation is judged against where that is not the value itself; `visible`: False where
-        something else says that the data do not show it.
+        """Return a number with its interval, value -+ quantile sd. `size`: what the sd is judged against where not the
+        value; `visible`: False where something else says that the data do not show it.
         """
         judged = abs(value) if size is None else size
         sound = bool(np.isfinite(sd) and np.isfinite(value))
@@ -204,11 +196,9 @@ def mode_of(
     *,
     visible: bool = True,
 ) -> Mode:
-    """Return a pole, rad/s, as a mode, its shape scaled so that the largest output is 1.
-
-    `spreads`: covariances of real and imaginary part, (2, 2), with the quantile that makes an interval of a standard
-    deviation; the widest counts; `shape`, `variance`: (n_outputs,), variance of the complex number; `visible`: False
-    where something says that the data do not show the mode.
+    """Return a pole, rad/s, as a mode, its shape (n_outputs,) scaled so that the largest output is 1. `spreads`:
+    covariances (2, 2) of real and imaginary part, each with its interval's quantile, the widest counts; `variance`: of
+    the complex shape; `visible`: as `EstimatedNumber.of`.
     """
     size = abs(pole)
     of_frequency = np.array([pole.real, pole.imag]) / (2 * np.pi * size)
@@ -258,9 +248,8 @@ def student(freedom: int) -> float:
 def plant_modes(
     A: Array, C: Array, outputs: Sequence[str], band_hz: tuple[float, float], most_damped: float
 ) -> tuple[Mode, ...]:
-    """Return the oscillating modes of x' = A x, y = C x in a band, without standard deviations: those of an estimate.
-
-    `A`, `C`: (n, n) and (n_outputs, n); `most_damped`: ratio from which a mode is none of vibration.
+    """Return the oscillating modes of x' = A x, y = C x in a band, of less than `most_damped`, without standard
+    deviations.
     """
     poles, vectors = np.linalg.eig(A)
     none, still = np.zeros((2, 2)), np.zeros(len(outputs))
@@ -273,10 +262,8 @@ def plant_modes(
 
 
 def mac(ones: Sequence[Mode], others: Sequence[Mode], outputs: Sequence[str] | None = None) -> Array:
-    """Return the modal assurance criterion of each mode with each of others, on the outputs that both have.
-
-    `outputs`: those that count; default all. Returns (n_ones, n_others), 0 to 1. EstimationError where fewer than two
-    outputs have the same name: with one, all shapes are alike.
+    """Return the modal assurance criterion of each mode with each of others, (n_ones, n_others), on `outputs`, default
+    those that both have. EstimationError where they share fewer than two: with one, all shapes are alike.
     """
     criteria = np.zeros((len(ones), len(others)))
     for i, a in enumerate(ones):

@@ -1,12 +1,5 @@
-"""The innovations-form predictor of a linear model: what is estimated, its gain, and it, with exact derivatives.
-
-The vector of estimated numbers holds, in this order: free and prior physical parameters (over their magnitudes), the
-delay where it is estimated, the noise description (log levels, or the gain itself), constant disturbances (offsets),
-initial state. States, inputs and outputs are scaled to order one before anything is factorised.
-
-From noise levels to the gain: the filter Riccati equation is solved by Newton steps from a gain nearby, from the stable
-subspace of the symplectic matrix or from SciPy's solution, and differentiated implicitly: with F = A - K C, dP = F dP
-F^T + dA P F^T + F P dA^T + dQ + K dR K^T (a Lyapunov equation, because the gain is stationary in P).
+"""The innovations-form predictor of a linear model with exact derivatives: what is estimated, its gain, and it. States,
+inputs and outputs are scaled to order one before anything is factorised.
 """
 
 from __future__ import annotations
@@ -39,7 +32,10 @@ class Scales:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class PredictorProblem:
-    """Data, model and what is to be estimated."""
+    """Data, model and what is estimated, a vector in this order: free and prior physical parameters (over their
+    magnitudes), the delay if estimated, noise (log levels, or the gain itself), constant disturbances (offsets),
+    initial state.
+    """
 
     model: LinearModel
     rate_hz: float
@@ -111,18 +107,12 @@ class PredictorProblem:
         return int(-(-(self.y.shape[0] - self.skip) // self.stride))
 
     def parameters(self, vector: Array) -> dict[str, float]:
-        """Return all physical parameters in SI at `vector`.
-
-        `vector`: (size,).
-        """
+        """Return all physical parameters in SI at `vector` (size,)."""
         values = vector[self.slices["physical"]] * self.magnitude
         return {**self.known, **dict(zip(self.estimated, values.tolist(), strict=True))}
 
     def lags_at(self, vector: Array) -> Array:
-        """Return the delay of each input in samples beyond `delay` at a vector, (n_inputs,).
-
-        `vector`: (size,).
-        """
+        """Return the delay of each input in samples beyond `delay` at a vector (size,), (n_inputs,)."""
         out = np.empty(self.u.shape[1])
         out[:] = self.lag
         if self.fractional:
@@ -130,19 +120,13 @@ class PredictorProblem:
         return out
 
     def delay_samples(self, vector: Array) -> float:
-        """Return the whole delay of the first input in samples at a vector.
-
-        `vector`: (size,).
-        """
+        """Return the whole delay of the first input in samples at a vector (size,)."""
         return self.delay + float(self.lags_at(vector)[0])
 
 
 def noise_floor(y: Array) -> Array:
-    """Return about the white noise of each output.
-
-    Third differences remove smooth motion and amplify white noise by sqrt(1 + 9 + 9 + 1).
-
-    `y`: (n_samples, n_outputs). Returns (n_outputs,), positive, in the unit of `y`.
+    """Return about the white noise of each output (n_outputs,), positive, by third differences of (n_samples,
+    n_outputs): they remove smooth motion and amplify white noise by sqrt(1 + 9 + 9 + 1).
     """
     squares, rows = np.zeros(y.shape[1]), max(y.shape[0] - 3, 1)
     for first in range(0, y.shape[0] - 3, _BLOCK):
@@ -154,10 +138,7 @@ def noise_floor(y: Array) -> Array:
 
 
 def busiest(u: Array, length: int) -> slice:
-    """Return the stretch of at most `length` samples in which the inputs move most.
-
-    `u`: (n_samples, n_inputs).
-    """
+    """Return the stretch of at most `length` samples in which inputs (n_samples, n_inputs) move most."""
     n = u.shape[0]
     if n <= length:
         return slice(0, n)
@@ -169,12 +150,9 @@ def busiest(u: Array, length: int) -> slice:
 def scales_for(
     model: LinearModel, values: Mapping[str, float], inputs: Array, outputs: Array, rate_hz: float
 ) -> Scales:
-    """Return the scales of a predictor.
-
-    Sensor noise for outputs and states; for disturbances, what moves the outputs by that within two samples.
-
-    `values`: rough parameters, SI; `inputs`: (n_inputs,), SI, standard deviations of the inputs; `outputs`:
-    (n_outputs,), SI, about the noise of the outputs, see `noise_floor`.
+    """Return a predictor's scales from rough parameters, standard deviations of `inputs` and the noise of `outputs`,
+    SI, see `noise_floor`: sensor noise for outputs and states; for disturbances, what moves outputs by that within two
+    samples.
     """
     return all_scales(model, [values], inputs, outputs, rate_hz)[0]
 
@@ -211,11 +189,8 @@ class Innovations:
 
 
 def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None = None) -> Innovations:
-    """Solve P = A P A^T - A P C^T (C P C^T + R)^-1 C P A^T + Q and return the predictor gain.
-
-    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `Q`: (n_states, n_states), process noise covariance; `R`:
-    (n_outputs, n_outputs), measurement noise covariance, positive definite; `near`: (n_states, n_outputs). Returns K, P
-    and S; A - K C is stable.
+    """Solve P = A P A^T - A P C^T (C P C^T + R)^-1 C P A^T + Q; return the gain K, P and S, A - K C stable. By Newton
+    steps from a gain `near`, the stable subspace of the symplectic matrix, or SciPy's solution; R is positive definite.
     """
     K = near if near is not None and stable(A - near @ C) else None
     P = None if K is None else _newton(A, C, Q, R, K)
@@ -237,10 +212,8 @@ def predictor_gain(A: Array, C: Array, Q: Array, R: Array, *, near: Array | None
 
 
 def predictor_gains(A: Array, C: Array, Q: Array, R: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Return the predictor gains of several plants at once, and for which of them the quick way leads to one.
-
-    `A`, `Q`: (n_plants, n_states, n_states); `C`, `R`: as for `predictor_gain`, of all of them. Returns (n_plants,
-    n_states, n_outputs).
+    """Return the predictor gains (n_plants, n_states, n_outputs) of several plants `A`, `Q` with one `C`, `R`, and for
+    which of them the quick way leads to one.
     """
     P = _stable_subspace(A, C, Q, R)
     if P is None:
@@ -262,9 +235,8 @@ def _turned(a: NDArray[Any]) -> NDArray[Any]:
 
 
 def _stable_subspace(A: Array, C: Array, Q: Array, R: Array) -> Array | None:
-    """P from the eigenvectors of the symplectic matrix (Vaughan 1970): quick, and rough where poles crowd.
-
-    Of one plant, or of several stacked; None where that is impossible for one of them.
+    """P of one plant or several from eigenvectors of the symplectic matrix (Vaughan 1970): quick, rough where poles
+    crowd; None where that is impossible for one.
     """
     n = A.shape[-1]
     try:
@@ -298,10 +270,7 @@ def _gain_of(A: Array, C: Array, P: Array, R: Array) -> Array:
 
 
 def solve_lyapunov(F: Array, Q: Array) -> Array:
-    """Solve P = F P F^T + Q for one or several symmetric right-hand sides, or for several plants with one each.
-
-    `F`: (n, n), stable, or (n_plants, n, n); `Q`: symmetric right-hand sides. Returns symmetric solutions.
-    """
+    """Solve P = F P F^T + Q, F (n, n) stable, for symmetric right-hand sides, or (n_plants, n, n) for one each."""
     n = F.shape[-1]
     if n > _KRONECKER:
         return _doubled(F, Q)
@@ -326,11 +295,10 @@ def _doubled(F: Array, Q: Array) -> Array:
 def gain_derivatives(
     A: Array, C: Array, at: Innovations, dA: Array, dQ: Array, dR: Array, dC: Array | None = None
 ) -> Array:
-    """Differentiate the predictor gain exactly along p directions.
+    """Return dK (p, n_states, n_outputs) along p directions `dA`, `dQ`, `dR`, `dC` (None where C stays) at a solution.
 
-    `A`: (n_states, n_states); `C`: (n_outputs, n_states); `at`: solution at the point; `dA`, `dQ`: (p, n_states,
-    n_states); `dR`: (p, n_outputs, n_outputs); `dC`: (p, n_outputs, n_states), none where no parameter moves C. Returns
-    (p, n_states, n_outputs), dK = (dF P C^T + F dP C^T + F P dC^T - K dR) S^-1 with dF = dA - K dC.
+    dK = (dF P C^T + F dP C^T + F P dC^T - K dR) S^-1 with F = A - K C, dF = dA - K dC and the Lyapunov equation dP = F
+    dP F^T + dA P F^T + F P dA^T + dQ + K dR K^T, as the gain is stationary in P.
     """
     F, dF = A - at.K @ C, dA if dC is None else dA - at.K @ dC
     cross = dF @ at.P @ F.T
@@ -342,18 +310,12 @@ def gain_derivatives(
 
 
 def stable(F: Array) -> bool:
-    """Return whether all eigenvalues of `F` lie inside the unit circle.
-
-    `F`: (n, n). Returns true where the spectral radius is below one.
-    """
+    """Return whether all eigenvalues of `F` (n, n) lie inside the unit circle."""
     return bool(np.abs(np.linalg.eigvals(F)).max() < 1.0)
 
 
 def stack(matrices: Sequence[Array], shape: tuple[int, ...]) -> Array:
-    """Stack matrices along a new first axis, keeping the shape where there is none.
-
-    Returns (p, *shape).
-    """
+    """Stack matrices along a new first axis, (p, *shape), keeping the shape where there is none."""
     return np.array(matrices) if matrices else np.zeros((0, *shape))
 
 
@@ -387,11 +349,8 @@ class Step:
 def assemble(
     problem: PredictorProblem, vector: Array, *, near: Array | None = None, with_derivatives: bool = True
 ) -> Predictor | None:
-    """Build the predictor and its derivatives at `vector`.
-
-    `vector`: (size,); `near`: (n_states, n_outputs), a gain near the one looked for: it starts the Riccati solve;
-    `with_derivatives`: leave the derivatives out where only innovations are wanted. Returns none where the vector makes
-    no stable predictor or no physical plant (mass or inductance not positive).
+    """Build the predictor and, if wanted, its derivatives at `vector` (size,); None where it is not stable or the plant
+    not physical (mass or inductance not positive). `near` (n_states, n_outputs): a gain to start the Riccati solve.
     """
     sl = problem.slices
     theta, lag = problem.parameters(vector), problem.lags_at(vector)
@@ -407,9 +366,8 @@ def assemble(
 
 
 def assemble_all(problems: Sequence[PredictorProblem], vectors: Sequence[Array]) -> list[Predictor | None]:
-    """Build the predictors of several problems, without derivatives: together, as small matrices cost less in stacks.
-
-    `problems`: of one model, noise described by levels, delays equal but for whole samples; `vectors`: (size,) each.
+    """Build the predictors of several problems of one model at vectors (size,), without derivatives: stacks of small
+    matrices cost less. Noise is described by levels; delays are equal but for whole samples.
     """
     first, sl = problems[0], problems[0].slices
     lag, pairs = first.lags_at(vectors[0]), list(zip(problems, vectors, strict=True))
@@ -524,9 +482,8 @@ def _discrete_all(pairs: Sequence[tuple[PredictorProblem, Array]], C: Array, fra
 def _sampled(
     space: StateSpace, problem: PredictorProblem, fraction: Array | None, derivatives: Sequence[StateSpace] = ()
 ) -> tuple[DiscreteSpace, tuple[DiscreteSpace, ...]]:
-    """Discretise a plant of a trial step, or raise LinAlgError where it passes all numbers within a sample.
-
-    `fraction`: (n_inputs,). The slopes by the delays come last.
+    """Discretise a plant of a trial step, slopes by the delays last, or raise LinAlgError where it passes all numbers
+    within a sample; `fraction` (n_inputs,).
     """
     period = 1.0 / problem.rate_hz
     with np.errstate(over="ignore", invalid="ignore"):

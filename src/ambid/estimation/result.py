@@ -1,7 +1,5 @@
 """What every result of every verb is: a verdict, a text, a figure, a page, a file and a table, under the same names.
-
-Results stand low, texts and figures high. A method of a result asks for what shows it when it is called, through
-`_shown` and `_predicted` below: the one place of the package that reaches upward (ARCHITECTURE.md).
+Only `_shown` and `_predicted`, through which methods ask for texts and figures, reach upward (ARCHITECTURE.md).
 """
 
 from __future__ import annotations

@@ -1,11 +1,5 @@
 """One Gauss-Newton search for all estimators, on triangles: steps are damped in the lengths of the columns
-(Levenberg-Marquardt; More 1978), or bounded in the numbers' own units (trust region; Nocedal and Wright 2006, sec.
-10.3), which logarithms of levels need that the data hardly show.
-
-A problem gives its criterion at a vector, and there the triangle of [J | r]: a step d lowers the criterion by about
-|r|² - |r - J d|². For least squares J is the slope of the prediction and r = target - prediction, both weighted to
-unit variance; for a likelihood JᵀJ is the information matrix and Jᵀr minus half the gradient. Priors and penalties are
-rows like others.
+(Levenberg-Marquardt; More 1978), or bounded in the numbers' own units (Nocedal and Wright 2006, sec. 10.3).
 """
 
 from __future__ import annotations
@@ -34,19 +28,21 @@ _PATIENCE = 6  # iterations in a row in which held-out errors may grow
 
 
 class Problem(Protocol):
-    """What is searched in."""
+    """A criterion and the triangle of [J | r]: a step d lowers the criterion by about |r|² - |r - J d|².
+
+    Of least squares J is the prediction's slope and r = target - prediction, both of unit variance; of a likelihood JᵀJ
+    is the information matrix and Jᵀr minus half the gradient. Priors and penalties are rows like others.
+    """
 
     def cost(self, theta: Array) -> float:
-        """Return the criterion, infinite where the model diverges.
-
-        `theta`: (n_theta,). For least squares the sum of squared rows.
+        """Return the criterion at `theta` (n_theta,), infinite where the model diverges; of least squares the sum of
+        squares.
         """
         ...
 
     def triangle(self, theta: Array) -> Array:
-        """Return the triangle of [J | r], (at most n_theta + 1, n_theta + 1).
-
-        `theta`: (n_theta,); where `cost` was asked for last, or before.
+        """Return the triangle of [J | r], (at most n_theta + 1, n_theta + 1), where `cost` was asked for last, or
+        before.
         """
         ...
 
@@ -134,23 +130,18 @@ def search(
     left: float | None = None,
     keep_best: bool = False,
 ) -> Found:
-    """Search for the least criterion.
+    """Search for the least criterion from `theta` (n_theta,).
 
-    `theta`: (n_theta,), start; `stage`: for `tick`; `most`: iterations; `tolerance`, `enough`: relative and absolute
-    gain of a step below which the search is over; `settled`: what a full step promises below which it is over, in the
-    criterion's unit (squared Newton decrement: the step's squared length in standard deviations); `judged`: with it the
-    search is over where a step gains or promises no more than `enough` and a full one moves none of the first `judged`
-    numbers by more than the root of `settled` in its standard deviations, whatever the others still do; `left`: what
-    a full step may promise where none goes down and the search is over all the same, in the criterion's unit; default
-    1e-6 of a sum of squares (a likelihood, which has no such scale, names it); `damping`: at
-    the beginning, for columns of unit length; small where the start is good; `bounded`: instead of damping, so many
-    numbers, the first, stay in a trust region, of radius 1 at first in their own units, and the others, which enter
-    linearly, follow; `upper`: (n_theta,), bounds; what stands at its bound and would go beyond rests; `longest`: change
-    of any number in one step; `move`: takes a step along J's columns from a vector, by its own rules (shortened,
-    projected, in a tangent space), None where it cannot; `held_out`: error on other data; training ends where it grows;
-    `tick`: called before each iteration, with the share of this search that is over; `keep`: given each better vector;
-    `solved`: sets the first `n_linear` numbers, which enter linearly, to their best; `keep_best`: a KeyboardInterrupt
-    ends in the best so far.
+    It is over where a step gains less than `tolerance` (relative) or `enough` (absolute), or a full one promises less
+    than `settled`, the squared Newton decrement in the criterion's unit; with `judged`, where a step gains or promises
+    at most `enough` and a full one moves none of the first `judged` numbers by more than the root of `settled` in its
+    standard deviations; or where none goes down and a full one promises at most `left` (default 1e-6 of a sum of
+    squares; a likelihood names it). `damping`: at the beginning, for unit columns; `bounded`: instead, the first so
+    many numbers (for logarithms of levels that the data hardly show) keep to a trust region, radius 1 in their units,
+    the linear others follow; `upper` (n_theta,): what would go beyond rests; `longest`: change of any number in a step;
+    `move`: takes a step by its own rules, None where it cannot; `held_out`: error on other data, which ends training
+    where it grows; `keep`: given each better vector; `solved`: sets the first `n_linear` numbers to their best;
+    `keep_best`: so a KeyboardInterrupt ends.
     """
     began, converged, interrupted = perf_counter(), False, False
     theta = theta if upper is None else np.minimum(theta, upper)
@@ -287,9 +278,8 @@ class _Steps:
     left: float | None
 
     def step(self, theta: Array, cost: float, gained: float) -> tuple[Array | None, float, bool]:
-        """Return a better vector, None without one, its cost, and whether there is nothing to gain.
-
-        `gained`: by the last step.
+        """Return a better vector, None without one, its cost, and whether nothing is to gain; `gained`: by the last
+        step.
         """
         R = self.problem.triangle(theta)
         if not np.all(np.isfinite(R)):

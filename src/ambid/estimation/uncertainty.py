@@ -1,28 +1,5 @@
-"""Statistics of a fit: information criteria, and covariances where errors are not taken as white.
-
-Covariances come from the scores of a fit (slope of each sample's error times the error), where errors are not
-taken as white: the sandwich in closed form, and a bootstrap in blocks of time.
-
-Both keep the correlation of the scores over about n^0.6 samples (Kuensch 1989; Newey and West 1987). The inputs are
-what was measured and are never made again, so that a controller's reaction to the noise stays in: no residual bootstrap
-that holds the inputs fixed would be right under feedback.
-
-Information criteria, so defined that all structures on the same data compare.
-
-With N samples, n_y outputs, S = (1/N) sum e e' of the one-step errors and d estimated numbers (offsets and initial
-states, which every structure has, not counted), the Gaussian log likelihood at its maximum is
-log L = -(N/2) (log det S + n_y (1 + log 2 pi)), and k = d + n_y (n_y + 1)/2 counts the numbers in S too:
-
-- AIC = -2 log L + 2 k (Akaike 1974);
-- AICc = -2 log L + 2 k N/(N - d/n_y - n_y - 1), exact to second order for regressions (Bedrick and Tsai 1994); for one
-  output it is AIC + 2 k (k + 1)/(N - k - 1) (Hurvich and Tsai 1989);
-- BIC = -2 log L + k log N (Schwarz 1978);
-- MDL = det S (1 + (d/n_y) log N/N)^n_y (Rissanen 1978; Ljung 1999, sec. 16.4);
-- FPE = det S ((N + d/n_y)/(N - d/n_y))^n_y (Akaike 1971; Ljung 1999, sec. 16.4; Luetkepohl 2005, sec. 4.3).
-
-The first samples are left out, equally for every structure, because there the initial states fit the errors away, more
-so the more states there are. AIC, AICc and BIC are in nats times two, MDL and FPE in the outputs' units squared,
-multiplied.
+"""Statistics of a fit: information criteria, and covariances (sandwich, bootstrap in blocks of time) that keep the
+correlation of scores over n^0.6 samples (Kuensch 1989; Newey and West 1987). Inputs stay as measured under feedback.
 """
 
 from __future__ import annotations
@@ -51,11 +28,15 @@ def skipped(n_samples: int) -> int:
 
 
 def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
-    """Compute the criteria.
+    """Return ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe`` of one-step errors `e` (n_samples, n_outputs), SI, so that
+    all structures on the same data compare; ``aicc`` and ``fpe`` are left out where samples are too few.
 
-    `e`: (n_samples, n_outputs), SI, one-step errors; `y`: (n_samples, n_outputs), SI, outputs, to tell an error from
-    rounding; `n_estimated`: numbers estimated, offsets and initial states not counted. Returns ``aic``, ``aicc``,
-    ``bic``, ``mdl``, ``fpe``; ``aicc`` and ``fpe`` are left out where the samples are too few for them.
+    With S = (1/N) sum e e', d = `n_estimated` numbers (offsets and initial states not counted), k = d + n_y (n_y + 1)/2
+    and log L = -(N/2) (log det S + n_y (1 + log 2 pi)): AIC = -2 log L + 2 k (Akaike 1974); AICc = -2 log L + 2 k N/(N
+    - d/n_y - n_y - 1) (Bedrick and Tsai 1994; of one output Hurvich and Tsai 1989); BIC = -2 log L + k log N (Schwarz
+    1978); MDL = det S (1 + (d/n_y) log N/N)^n_y (Rissanen 1978); FPE = det S ((N + d/n_y)/(N - d/n_y))^n_y (Akaike
+    1971; Ljung 1999, sec. 16.4; Luetkepohl 2005, sec. 4.3). The first samples, which initial states fit, are left out
+    equally. The first three are in nats times two, MDL and FPE in the outputs' units squared, multiplied.
     """
     settled = e[skipped(e.shape[0]) :]
     N, n_y = settled.shape
@@ -74,28 +55,21 @@ def criteria(e: Array, y: Array, n_estimated: int) -> dict[str, float]:
 
 
 def log_determinant(e: Array, y: Array) -> float:
-    """Return log det of the error covariance, no error counted smaller than rounding.
-
-    `e`: (n_used, n_outputs), SI; `y`: (n_samples, n_outputs), SI.
-    """
+    """Return log det of the covariance of errors `e` (n_used, n_outputs), SI, none smaller than the rounding of `y`."""
     size = np.maximum(np.max(np.abs(y), axis=0), 1e-300)
     s = np.linalg.svd(e / size, compute_uv=False) / np.sqrt(e.shape[0])
     return float(2 * np.sum(np.log(np.maximum(s, _FLOOR))) + 2 * np.sum(np.log(size)))
 
 
 def information(criterion: str, left: float, k: int, n: int, m: int) -> float:
-    """Return an information criterion of a least-squares fit, up to a constant.
-
-    `criterion`: one of `CRITERIA`; `left`: mean square error, in any unit; `k`, `n`, `m`: terms, samples, candidates.
+    """Return a criterion of `CRITERIA` up to a constant; `left`: mean square error; `k`, `n`, `m`: terms, samples,
+    candidates.
     """
     return n * log(max(left, EXACT)) + penalty(criterion, k, n, m)
 
 
 def penalty(criterion: str, k: int, n: int, m: int) -> float:
-    """Return what k of m candidates cost on n samples.
-
-    Returns infinite where there are too few samples.
-    """
+    """Return what k of m candidates cost on n samples, infinite where these are too few."""
     if criterion in ("bic", "mdl"):
         return k * log(n)
     if criterion == "ebic":
@@ -135,12 +109,10 @@ def p_text(p: float) -> str:
 def explained_by_past(
     parts: Sequence[tuple[Array, Sequence[tuple[Array, int]]]], *, least: float = 4.0
 ) -> tuple[float, float, int]:
-    """Return what a linear regression on the past makes of errors; little where a search ended well.
-
-    `parts`: by record the errors (n_samples, n_outputs), and signals (n_samples, n) each with how many of its last
-    samples are looked at; rows that are not finite are left out; `least`: rows that each column asks for. Returns the
-    part of the variance that it explains, corrected for chance, and chi-squared with its degrees of freedom if the past
-    says nothing; 0 where rows are fewer.
+    """Return the part of errors' variance that a linear regression on the past explains, corrected for chance, little
+    where a search ended well, and chi-squared with its degrees of freedom if the past says nothing; 0 where rows are
+    fewer than `least` a column. `parts`: by record errors (n_samples, n_outputs) and signals, each with how many past
+    samples.
     """
     rows, targets = [], []
     for e, signals in parts:
@@ -171,22 +143,16 @@ _SHOWN_ALONE = 0.1  # share of a direction's information that all other blocks c
 
 
 def block_length(n: int) -> int:
-    """Return the samples over which scores are taken to hang together.
-
-    `n`: of a record.
-    """
+    """Return the samples over which scores are taken to hang together, of a record of `n`."""
     length: int = max(min(round(float(n) ** 0.6), n // _FEWEST), 1)
     return length
 
 
 def score_covariance(scores: Sequence[Array], part: float = 0.0, slopes: Sequence[Array] | None = None) -> Array:
-    """Return the covariance of the sum of all scores, from blocks of time that begin at several places.
-
-    With `slopes`, each block's sum is that which the estimate moves by when the block is left out (jackknife; Cameron,
-    Gelbach and Miller 2008, CV3): errors at samples that pull the fit towards themselves are too small.
-
-    `scores`: (n_samples, n_theta), of each record; `slopes`: (n_samples, n_outputs, n_theta). Returns (n_theta,
-    n_theta).
+    """Return the covariance (n_theta, n_theta) of the sum of all scores (n_samples, n_theta), of each record, from
+    blocks of time that begin at several places. With `slopes` (n_samples, n_outputs, n_theta) a block's sum is what
+    leaving it out moves (jackknife; Cameron, Gelbach and Miller 2008, CV3): errors that pull the fit towards themselves
+    are too small.
     """
     by_record = len(scores) >= _MANY
     lengths = _lengths(scores, part)
@@ -222,10 +188,8 @@ def _left_out(slopes: Array, score: Array) -> Array:
 
 
 def widening(scores: Sequence[Array], part: float = 0.0) -> float:
-    """Return what a covariance from few blocks is to be multiplied by, so that 1.96 deviations still hold 95 %.
-
-    `scores`: (n_samples, n_theta); `part`: as for `score_covariance`. Returns square of Student's quantile over the
-    normal one.
+    """Return Student's quantile over the normal one, squared, by which a covariance from few blocks is multiplied so
+    that 1.96 deviations still hold 95 %; arguments as `score_covariance`.
     """
     from scipy.special import stdtrit
 
@@ -236,12 +200,9 @@ def widening(scores: Sequence[Array], part: float = 0.0) -> float:
 def sandwich(
     R: Array, scores: Sequence[Array], prior: Array | None = None, slopes: Sequence[Array] | None = None
 ) -> tuple[Array | None, float]:
-    """Return the covariance of the estimate, inverse information times score covariance times inverse information.
-
-    `R`: (n_rows, n_theta), triangle of the slopes, priors included; `scores`: (n_samples, n_theta), of each record,
-    without those of priors; `prior`: (n_theta, n_theta), information of the priors, which counts as that much data;
-    `slopes`: (n_samples, n_outputs, n_theta). Returns `covariance`: (n_theta, n_theta), or None, none where a direction
-    is not seen.
+    """Return inverse information times score covariance times inverse information, (n_theta, n_theta), None where a
+    direction is not seen. `R`: triangle of the slopes, priors included; `scores`, `slopes`: as `score_covariance`,
+    without priors; `prior` (n_theta, n_theta): their information, which counts as that much data.
     """
     P, condition = information_inverse(R)
     if P is None:
@@ -263,15 +224,13 @@ def sandwich(
 def bootstrapped(
     rows: Sequence[Array], priors: Array, seed: int, tick: Tick | None = None, *, repeats: int = REPEATS
 ) -> Array:
-    """Return the covariance of weights after a Gauss-Newton step on blocks of time drawn with replacement.
+    """Return the covariance (n_theta, n_theta) of weights after a Gauss-Newton step on blocks of time drawn with
+    replacement, from `rows` (n_samples, n_outputs, n_theta + 1) of slopes and errors of unit variance, and rows of
+    priors that stay.
 
-    One step from the optimum stays where the network is linear in its weights: whole trainings end in weights that
-    differ while the function does not, and their covariance says nothing of the function. Errors of a block are those
-    of a fit without it, and few blocks widen, as in the sandwich. The first block of a record is always there: it alone
-    shows the first state. Whole records are drawn where there are 20 or more.
-
-    `rows`: (n_samples, n_outputs, n_theta + 1), slopes and errors of each record, of unit variance; `priors`:
-    (n_priors, n_theta + 1), rows that stay as they are. Returns (n_theta, n_theta).
+    One step stays where the network is linear in its weights: whole trainings end in other weights of the same
+    function. Errors of a block are those of a fit without it; few blocks widen, as in the sandwich. The first block,
+    which alone shows the first state, is always there. Whole records are drawn where there are 20 or more.
     """
     whole = len(rows) >= _MANY
     blocks = [_triangles(r, r.shape[0] if whole else block_length(r.shape[0])) for r in rows]
@@ -318,17 +277,13 @@ def _triangles(rows: Array, length: int) -> list[Array]:
 
 
 def natural_sizes(names: Sequence[str], theta: Mapping[str, float], reference: Mapping[str, float]) -> Array:
-    """Return what standard deviations are judged against: the value, or the natural scale of one that may be zero.
-
-    `theta`, `reference`: values and natural scales by name, SI. Returns (n,).
-    """
+    """Return (n,) what standard deviations are judged against: the value, or a natural scale where it may be zero."""
     return np.array([max(abs(theta[k]), reference.get(k, 0.0), 1e-300) for k in names])
 
 
 def weakest_direction(names: Sequence[str], covariance: Array, size: Array) -> tuple[Array, dict[str, float]]:
-    """Return 1 over the relative standard deviation along each direction, largest first, and the last direction.
-
-    `covariance`: (n, n); `size`: (n,), see `natural_sizes`; the share of each parameter, largest in magnitude 1.
+    """Return 1 over the relative standard deviation along each direction, largest first, and the last direction: the
+    share of each parameter, largest in magnitude 1. `size` (n,): see `natural_sizes`.
     """
     eigenvalues, axes = np.linalg.eigh(covariance / np.outer(size, size))
     weak = axes[:, -1] / axes[np.argmax(np.abs(axes[:, -1])), -1]
