@@ -52,7 +52,7 @@ def refused(found, folder, *words):
         (("--validate", "units.csv"), "'u' is in A in the second record, in V in the first"),
         (("--validate", "slow.csv"), "the second record is sampled at 500 Hz, the first at 1000 Hz"),
         (("--validate", "still.csv"), "'y' is constant in the second record"),
-        (("--validate-from", "0.1"), "need a second record. Give --validate"),
+        (("--validate-from", "0.1"), "is now 'ambid validate RESULT RECORD' with --from and --to. Give that"),
         (("--criterion", "bicc"), "Did you mean 'bic'?"),
         (("--criterion", "aic"), "orders are given"),
         (("--input", "u"), "named twice"),

@@ -160,11 +160,12 @@ def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     for more, said in (
         (("./r0.csv",), "record r0.csv is given twice and would count twice. Omit one"),
         (("--validate", "r0.csv"), "--validate r0.csv is used for fitting too"),
-        (("--validate", "r0.csv", "--to", "3", "--validate-from", "2"), "--validate r0.csv is used for fitting too"),
+        (("--validate", "r0.csv", "--to", "3"), "--validate r0.csv is used for fitting too"),
     ):
         found = ambid(*words, *more)
         assert (found.code, said in found.err) == (2, True), found.err
-    found = ambid(*words, "--to", "3", "--validate", "r0.csv", "--validate-from", "3")
+    assert ambid(*words, "--to", "3", "--json", at / "fit.json").code == 0
+    found = ambid("validate", at / "fit.json", "r0.csv", "--from", "3")
     assert found.code == 0, found.err
 
 

@@ -38,7 +38,6 @@ def test_records_are_read_cut_fitted_and_judged_together(folder) -> None:
         open_loop=True,
         from_s=0.5,
         validate=folder / "r2.csv",
-        validate_to_s=3.0,
         tick=lambda stage, done=None: stages.append(stage),
     )
     assert found.passed
@@ -89,7 +88,6 @@ def test_equal_seeds_give_equal_fits_and_files_are_read_back(folder, tmp_path) -
         ({"structure": "narmx"}, "Did you mean 'narmax'"),
         ({"orders": {"degre": 2}}, "Did you mean 'degree'"),
         ({"seed": -1}, "seed"),
-        ({"validate_from_s": 1.0}, "Give validate"),
         ({"output": "z"}, "z"),
         ({"from_s": 100.0}, "100"),
     ],

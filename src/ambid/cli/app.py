@@ -14,7 +14,7 @@ import typer
 from ambid import compiled
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
-from ambid.settings.jobs import RENAMED
+from ambid.settings.jobs import FORMER
 
 VERBS = {
     "demo": "identify the embedded record, and compare with the true parameters",
@@ -106,12 +106,12 @@ def run_verb(words: Sequence[str]) -> int:
 
 
 def _refuse_former(words: Sequence[str]) -> None:
-    """Refuse an option by its name of the release before, and say the new one."""
-    job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in RENAMED), "")
+    """Refuse an option of a release before, and say what it is now."""
+    job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in FORMER), "")
     for word in words if job else ():
-        new = RENAMED[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
+        new = FORMER[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
         if new is not None:
-            raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is now --{new}. Give that")
+            raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is now {new}. Give that")
 
 
 def refusal(error: Exception) -> str | None:

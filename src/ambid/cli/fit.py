@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
-from math import inf
 from typing import Any
 
 import typer
@@ -41,13 +40,16 @@ def command(v: Values) -> None:
     with Outputs(*v.records, v.validate, v.rig, **v.outputs) as outputs:
         outputs.claim(v.stabilisation, "stabilisation", FIGURE_ENDINGS)
         refuse_twice(v.records)
-        if nonlinear:
-            _check_second(v)
+        if nonlinear and v.validate is not None and v.validate.resolve() in {x.resolve() for x in v.records}:
+            raise EstimationError(
+                f"--validate {v.validate} is used for fitting too, so it cannot validate. Give another record, or fit "
+                "to --to and judge the rest by 'ambid validate' with --from"
+            )
         bench = None if v.rig is None else load_rig(v.rig)
         how = v.only(
             "structure input output orders criterion fix at_rest seed open_loop reference from_s to_s validate"
         )
-        how |= v.only("validate_from_s validate_to_s rate_hz gaps layout")
+        how |= v.only("rate_hz gaps layout")
         with signals(stop.take) if nonlinear else nullcontext(), progress("fit") as show:
             found: Any = fit(v.records, rig=bench, tick=interruptible(show, stop) if nonlinear else show, **how)
             stop.torn()
@@ -64,19 +66,6 @@ def command(v: Values) -> None:
     if stop.wished():
         raise typer.Exit(stop.code)
     end(failed=found.status == "failed" or (v.strict and not found.passed))
-
-
-def _check_second(v: Values) -> None:
-    """Refuse to judge on samples that are fitted to; another part of a record is another record."""
-    if v.validate is None or v.validate.resolve() not in {x.resolve() for x in v.records}:
-        return
-    begin = max(v.from_s or -inf, v.validate_from_s or -inf)
-    last = min(inf if x is None else x for x in (v.to_s, v.validate_to_s))
-    if not begin >= last:
-        raise EstimationError(
-            f"--validate {v.validate} is used for fitting too, so it cannot validate. Give another record, or parts "
-            "that do not overlap (--from, --to, --validate-from, --validate-to)"
-        )
 
 
 def _poles_by_order(found: Any, data: Any, tick: Callable[[str], None]) -> Any:

@@ -58,8 +58,6 @@ def fit(
     units: Mapping[str, str] | None = None,
     layout: Mapping[str, str] | None = None,
     validate: Source | None = None,
-    validate_from_s: float | None = None,
-    validate_to_s: float | None = None,
     tick: Tick | None = None,
 ) -> BlackBoxFit | NonlinearFit:
     """Fit a black-box model to one record, or a nonlinear one to one or several, and check it.
@@ -103,9 +101,7 @@ def fit(
     layout : Mapping of str to str, optional
         What files leave open, as `ambid.record.read_record` takes it.
     validate : as `records`, optional
-        A further record to validate on; may be one of the first, with another part.
-    validate_from_s, validate_to_s : float, optional
-        Part of it to use, in s; default all of it.
+        A further record to validate on, all of it; `ambid.validate` takes a part.
     tick : callable, optional
         Called with the name of the present stage and, where it is known, the share of the job that is over:
         ``tick(stage, done)``; may raise to interrupt. A KeyboardInterrupt during the search of a nonlinear structure
@@ -141,16 +137,11 @@ def fit(
         _check_criterion(criterion, wanted)
         taken = channels.inputs if channels.rig is None else channels.inputs or channels.rig.plant.inputs
         _check_use(structure_named(structure), taken, fixed, at_rest=at_rest)
-    if validate is None and (validate_from_s, validate_to_s) != (None, None):
-        raise EstimationError(
-            f"{setting('validate_from_s')} and {setting('validate_to_s')} need a second record. Give "
-            f"{setting('validate')}, or omit them"
-        )
     clock, data = Clock(), list[Any]()
     for record in sources:
         (say if nonlinear else silent)("read")
         data.append(channels.read(record, (from_s, to_s)))
-    second = None if validate is None else channels.read(validate, (validate_from_s, validate_to_s))
+    second = None if validate is None else channels.read(validate, (None, None))
     for other in data[1:] if second is None else (*data[1:], second):
         check_same_bench(data[0].units, data[0].dt, other)
     clock.lap("read")

@@ -31,7 +31,7 @@ _JOBS = (
     declare(
         "fit",
         "records structure input output orders seed criterion fix rig reference open_loop at_rest from_s to_s "
-        "rate_hz gaps layout validate validate_from_s validate_to_s json plot report stabilisation sensitivity "
+        "rate_hz gaps layout validate json plot report stabilisation sensitivity "
         "strict",
         records={
             "help": "Record: .csv, .csv.gz, .h5, .mat, .tdms, .mf4, .mdf, .parquet, .feather or .arrow; nonlinear"
@@ -277,11 +277,13 @@ _JOBS = (
     ),
 )
 JOBS = {job.name: job for job in _JOBS}
-# Words of the release before, by job: what each is called now.
-RENAMED: Mapping[str, Mapping[str, str]] = {
-    "fit": {"settings": "orders"}, "history": {"export": "tables"}, "export": {"to": "library"},
-    "design controller": {"method": "kind", "export": "law"}, "fleet run": {"limit": "time-limit"},
-    "fleet simulate": {"limit": "time-limit"},
+_PART = "'ambid validate RESULT RECORD' with --from and --to"
+# Words of the releases before, by job: what each is now.
+FORMER: Mapping[str, Mapping[str, str]] = {
+    "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
+    "history": {"export": "--tables"}, "export": {"to": "--library"},
+    "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
+    "fleet simulate": {"limit": "--time-limit"},
 }  # fmt: skip
 
 

@@ -461,8 +461,6 @@ SETTINGS = (
         default=0.3,
     ),
     Setting("validate", "path", "RECORD2", "Validate on this record too, on all of it."),
-    Setting("validate_from_s", "number", "S", "Use the second record from here on, in s."),
-    Setting("validate_to_s", "number", "S", "Use the second record up to here, in s."),
     Setting(
         "widest",
         "positive",
