@@ -1,7 +1,6 @@
 """What every recursive estimator promises: the same numbers from single samples and from blocks, and a way back.
-
-And what all of them stand on: signals and settings in the one form that the compiled recursions know (float64, C order,
-writable), and covariances in U-D factors, as `ambid.recursive.square_root_kernels` carries them, to and from matrices.
+Signals and settings are float64, C order, writable; covariances go to and from the U-D factors of
+`square_root_kernels`.
 """
 
 from __future__ import annotations
@@ -191,9 +190,8 @@ def forgetting_factor(factor: float | None, memory: float | None) -> float:
 
 
 def factors_of(P: Array) -> Array:
-    """Return the factors F (n, n) of a covariance: column j of U before the diagonal of row j, D_j on it.
-
-    Where rounding has left the matrix without a Cholesky factor, its smallest eigenvalues are raised to rounding.
+    """Return the factors F (n, n) of a covariance: column j of U before the diagonal of row j, D_j on it. Where
+    rounding has left no Cholesky factor, the smallest eigenvalues are raised to rounding.
     """
     sd = np.sqrt(np.diag(P))
     unit = P / np.outer(sd, sd)

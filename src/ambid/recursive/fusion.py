@@ -1,9 +1,6 @@
-"""One position from two or more sensors that look at the same displacement, by a Kalman filter that knows faults.
-
-State: motion, a slowly walking offset of each sensor, perhaps a temperature that all share. Each sensor is tested
-against the others at every sample; a faulty one is left out, its influence since the fault is taken back, and it is
-used again once it has agreed with the others long enough. A sensor gives offset + gain x (+ warmth · temperature) +
-drift + noise, x positive in one direction for all: of a pair on opposite sides of the rotor one has a negative gain.
+"""One position from two or more sensors of one displacement, by a Kalman filter of motion, each sensor's walking
+offset, perhaps a shared temperature, that tests each sensor against the others at every sample and leaves faulty ones
+out.
 """
 
 from __future__ import annotations
@@ -44,7 +41,8 @@ _RULES = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FusedSensor:
-    """One sensor; [u] is the unit of what it gives.
+    """One sensor: offset + gain x (+ warmth · temperature) + drift + noise, x positive in one direction for all; [u] is
+    the unit of what it gives.
 
     Attributes
     ----------
@@ -57,10 +55,8 @@ class FusedSensor:
     resolution : float
         Smallest step of the values, [u]; 0 where they are continuous. A value that stands still is a fault only if
         rounding does not explain it.
-    offset : float
-        What it gives at x = 0, [u].
-    offset_sd : float
-        What is not known of `offset` when fusion begins, [u].
+    offset, offset_sd : float
+        What it gives at x = 0, [u], and what is not known of that when fusion begins.
     drift_rate : float
         The offset walks: standard deviation after one second, [u]/√s.
     warmth : float
@@ -91,12 +87,9 @@ class FusedSensor:
 
 
 def still_samples(sensor: FusedSensor, rate_hz: float, quiet_samples: float) -> float:
-    """Return how many values have to equal the one before them until that is a fault.
-
-    A sound sensor at rest gives the same step again with probability p of at most erf(step/(2 √2 noise)), wherever in
-    the step it stands; p^n is brought below one in `quiet_samples`.
-
-    Returns 0 where the steps are so coarse that standing still says nothing within two seconds.
+    """Return how many values have to equal the one before until that is a fault, 0 where steps are so coarse that
+    standing still says nothing within two seconds. A sound sensor at rest repeats a step with probability p of at most
+    erf(step/(2 √2 noise)), wherever in the step it stands; p^n is brought below one in `quiet_samples`.
     """
     if sensor.resolution == 0.0:
         return _CONTINUOUS
@@ -111,17 +104,17 @@ class SensorFusion(Copied):
     """Kalman filter of several position sensors with detection and exclusion of faulty ones.
 
     **What cannot be seen.** If the position rises and all sensors' readings of it fall by the same, nothing changes:
-    the offset that all have in common (along `unobservable`) is known from calibration only (`offset_sd`) and from
-    then on grows as the sensors' drift allows. `sd` holds it; `relative_sd` is without it: of the position against the
-    mean of the working sensors' zeros. For a pair on opposite sides with equal `warmth` the shared temperature *is*
-    seen, in the sum of both, and its drift does not reach the position.
+    the offset that all have in common (along `unobservable`) is known from calibration only (`offset_sd`) and then
+    grows as the sensors' drift allows. `sd` holds it; `relative_sd` is without it: of the position against the mean of
+    the working sensors' zeros. For a pair on opposite sides with equal `warmth` the shared temperature *is* seen, in
+    the sum of both, and its drift does not reach the position.
 
-    **Faults.** With three or more working sensors they are compared with each other alone, so that no shock to the
-    rotor accuses one: log-likelihood CUSUMs for a step, more noise and a loss of gain of each sensor, plus missing
-    values, rails and values that stand still. With two, the motion model takes part; where it does not decide, the
-    event says "one of", both are used, and the standard deviation covers either being right until they agree. One that
-    is alone is only excluded if it gives nothing, stands at a rail or stands still. A single value beyond 4 standard
-    deviations is not used. A fault that is slower than the sensor's drift is taken for drift.
+    **Faults.** Three or more working sensors are compared with each other alone, so that no shock to the rotor accuses
+    one: log-likelihood CUSUMs for a step, more noise and a loss of gain, plus missing values, rails and values that
+    stand still. With two, the motion model takes part; where it does not decide, the event says "one of", both are
+    used, and the standard deviation covers either being right until they agree. One that is alone is only excluded if
+    it gives nothing, stands at a rail or stands still. A single value beyond 4 standard deviations is not used; a
+    fault's influence is taken back; a fault slower than the sensor's drift is taken for drift.
 
     **False alarms.** Each sum alarms in the mean no sooner than after e^h quiet samples; h follows from
     `false_alarms_per_hour`. That needs noise that is white and no larger than stated; look at `levels`.
@@ -343,9 +336,8 @@ class SensorFusion(Copied):
         return cause, why, {"shift": shift, "position": x}
 
     def _exclude(self, i: int, onset: float) -> None:
-        """Leave sensor i out, from its fault on as far as the filter can go back.
-
-        The sooner after its return, the longer it has to agree before the next.
+        """Leave sensor i out, from its fault on as far as the filter can go back; the sooner after its return, the
+        longer.
         """
         at, w, clock, now = self._at, self._watch[i], self._clock, self.n_samples
         again = w[at.NEED] > 0.0 and now - w[at.SINCE] < 10.0 * w[at.NEED]

@@ -1,9 +1,5 @@
-"""Compiled fusion of position sensors: a Kalman filter, and tests of every sensor against the others.
-
-The state is [motion, temperature (if modelled), one offset of each sensor]; `memory` (n + 1, n) holds the factors of
-its covariance and, in the last row, its mean. Offsets come last, so that moving the motion one sample on leaves their
-part of the factors alone. What happens seldom is decided in `ambid.recursive.fusion`: the scan stops where a decision
-is due, and goes on from there.
+"""Compiled fusion of position sensors. The state is [motion, temperature (if modelled), one offset of each sensor],
+whose factors and, in the last row, mean `memory` (n + 1, n) holds; the scan stops where `fusion` has to decide.
 """
 
 from __future__ import annotations
@@ -69,9 +65,8 @@ def absorb(z: Array, sensors: Array, memory: Array, H: Array, f: Array, b: Array
 
 @compiled(fastmath={"contract"})
 def advance(memory: Array, A: Array, G: Array, walks: Array, stride: int, now: int, W: Array, w: Array) -> None:
-    """Move mean and covariance one sample on.
-
-    `walks` (n_states,) is what temperature and offsets walk in `stride` samples, and they do so in such steps.
+    """Move mean and covariance one sample on; `walks` (n_states,): what temperature and offsets walk in each `stride`
+    samples.
     """
     last, n = memory.shape[1], A.shape[0]
     for i in range(n):
@@ -88,11 +83,10 @@ def advance(memory: Array, A: Array, G: Array, walks: Array, stride: int, now: i
 
 @compiled(fastmath={"contract"})
 def _compare(now: Array, W: Array, apart: bool) -> tuple[float, int]:
-    """Find each used sensor's residual against the others, over its standard deviation 1/per.
-
-    t = (W e)/√diag W, W = S⁻¹ (Basseville and Nikiforov 1993, sec. 7.2). With `apart`, what all have in common is
-    taken off first: W = S⁻¹ - S⁻¹ 1 1ᵀ S⁻¹/(1ᵀ S⁻¹ 1), and no motion of the rotor enters. Also the squared residual
-    of all together, and how many were compared. `W` becomes -S⁻¹ of those that are used.
+    """Find each used sensor's residual against the others, over its standard deviation 1/per, t = (W e)/√diag W, W =
+    S⁻¹ (Basseville and Nikiforov 1993, sec. 7.2), the squared residual of all and how many; `W` becomes -S⁻¹ of those
+    used. With `apart`, W = S⁻¹ - S⁻¹ 1 1ᵀ S⁻¹/(1ᵀ S⁻¹ 1): what all share, and so any motion of the rotor, is taken off
+    first.
     """
     used, e, t, per, S = now[USED], now[E], now[T], now[PER], now[S_0:]
     m, count = e.size, 0
@@ -177,9 +171,8 @@ def _gate(now: Array, W: Array, watch: Array, clock: Array, apart: bool) -> int:
 
 @compiled
 def _sum_up(watch: Array, i: int, t: float, per: float, x: float, now: float) -> None:
-    """Cumulative sums of the log likelihood ratios of a step either way, more noise, and a lower gain.
-
-    Each passes h on the mean no sooner than after e^h quiet samples (Lorden 1971).
+    """Sum log likelihood ratios of a step either way, more noise, a lower gain; each passes h on the mean no sooner
+    than after e^h quiet samples (Lorden 1971).
     """
     s = min(max(t, -_CLIP), _CLIP)
     phi = min(max(-_LOSS_PART * x * per, -2.0), 2.0)

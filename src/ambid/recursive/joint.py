@@ -1,9 +1,5 @@
-"""Joint Kalman filters of plant states, physical parameters and offsets at once: extended and unscented.
-
-z = [x, o, q] with x+ = A(q) x + B(q) u + E(q) (o + w), y = C x + v. The extended filter's matrices are exact at a
-linearisation point and first-order about it. Points of the scaled unscented transform go through the plant's own A(q)
-by the Taylor series of its matrix exponential (no linearisation point), so that mean and covariance keep their
-second-order terms (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
+"""Joint Kalman filters of plant states, physical parameters and offsets, z = [x, o, q], x+ = A(q) x + B(q) u + E(q) (o
++ w), y = C x + v: extended, or scaled unscented (Julier and Uhlmann 2004; van der Merwe and Wan 2001).
 """
 
 from __future__ import annotations
@@ -156,10 +152,7 @@ def _check_covariance(start: JointStart) -> None:
 
 
 def parameter_scales(start: JointStart) -> Array:
-    """Return the size of each free parameter: its value, or the model's reference where that is larger.
-
-    Returns (n_free,), SI.
-    """
+    """Return the size (n_free,), SI, of each free parameter: its value, or the model's reference where larger."""
     reference = start.model.references(start.values)
     positive = {p.name for p in start.model.parameters if p.positive}
     return np.array(
@@ -171,19 +164,17 @@ def parameter_scales(start: JointStart) -> Array:
 
 
 class JointFilter(Copied):
-    """A Kalman filter of plant states, parameters and offsets at once, in square-root form; see its two kinds.
+    """A Kalman filter of plant states, parameters and offsets (`names`) at once, in square-root form; see its two
+    kinds.
 
-    Parameters that must be positive are carried as logarithms: they cannot leave, and no step has to be refused.
-    Parameters and offsets make a step of their random walk every 32 samples, counted from the first; the walk of a
-    number rests while its standard deviation is over a tenth of its size (or over that at the start), so that the
-    covariance does not wind up where nothing excites.
+    Parameters that must be positive are carried as logarithms. Parameters and offsets make a step of their random walk
+    every 32 samples; it rests while the standard deviation is over a tenth of the number's size (or over that at the
+    start), so that the covariance does not wind up where nothing excites.
 
-    A sample of which one output is missing is used with the other. One without any output moves only the state. One
-    without input is rejected, and the state begins again from the next outputs, as it does after 32 samples without
-    outputs and after an innovation of both outputs that no noise makes (a thousand standard deviations). Smaller
-    errors of sensors are taken for noise: screen the samples before.
-
-    `names`: parameters, then offsets of the disturbances.
+    A missing output leaves the other in use; a sample without any moves only the state. One without input is rejected,
+    and the state begins again from the next outputs, as after 32 samples without outputs and after an innovation of
+    both beyond a thousand standard deviations. Smaller errors of sensors are taken for noise: screen the samples
+    before.
     """
 
     def __init__(self, start: JointStart) -> None:
@@ -300,10 +291,9 @@ class JointFilter(Copied):
 
     @property
     def error(self) -> float:
-        """Root mean square of the innovations over what the filter expects of them, over about 1000 samples.
-
-        One where model and noise levels are right. It does not show every wrong estimate: sixty thousand innovations
-        can be ordinary to a per cent and yet speak against an estimate by many standard deviations.
+        """Root mean square of the innovations over what is expected, over about 1000 samples: one where model and noise
+        are right. Not every wrong estimate shows: sixty thousand can be ordinary to a per cent and yet speak clearly
+        against it.
         """
         return float(np.sqrt(np.mean(self._io[2, self._past.shape[1] :])))
 
@@ -346,17 +336,17 @@ class JointFilter(Copied):
 
 
 class JointEkf(JointFilter):
-    """Joint extended Kalman filter.
+    """Joint extended Kalman filter, its matrices exact at a linearisation point and first-order about it.
 
     Consistent under feedback where the noise levels are right and the start lies where the plant is about linear in its
     parameters: an off-line estimate is such a start. It leaves out how its own gain depends on the parameters, and is
-    therefore biased where the levels are wrong and the noise itself is what moves the plant (Ljung 1979): on the
-    unstable bearing without excitation, a force level three times too low moves the mass by 12 % while 2 % are claimed;
-    with excitation far above the noise a factor of ten does not move it. Where the start is wrong by more than the
-    plant is linear (20 % on that bearing, 5 % on a lightly damped resonance), it settles beside the truth and claims a
-    standard deviation that is far too small; `warnings` says so where it must be feared. `JointUkf` keeps the second
-    order. The recursive prediction error method of `ambid.tracking.rpem`, whose noise is estimated off-line with the
-    parameters and whose gain knows of them, is the one to prefer.
+    therefore biased where the levels are wrong and the noise itself moves the plant (Ljung 1979): on the unstable
+    bearing without excitation, a force level three times too low moves the mass by 12 % while 2 % are claimed; with
+    excitation far above the noise a factor of ten does not move it. From a start that is further off (20 % on that
+    bearing, 5 % on a lightly damped resonance), it settles beside the truth and claims far too small a standard
+    deviation; `warnings` says so where it must be feared. `JointUkf` keeps the second order. Prefer the recursive
+    prediction error method of `ambid.tracking.rpem`, whose noise is estimated off-line with the parameters and whose
+    gain knows of them.
 
     Parameters
     ----------
@@ -441,13 +431,13 @@ class JointEkf(JointFilter):
 
 
 class JointUkf(JointFilter):
-    """Joint unscented Kalman filter.
+    """Joint unscented Kalman filter, which keeps the second-order terms of mean and covariance.
 
-    Of the augmented state only the parameters enter nonlinearly, so that points are needed along their columns alone;
-    along the others (states, offsets) the points of the full transform are known in closed form, and the result is that
-    of all 2 n + 1 points. Measurements are linear and are taken in exactly. It converges from farther than `JointEkf`
-    (5 % on a lightly damped resonance) at about a quarter of its speed; near the truth they agree to a hundredth of a
-    standard deviation. What is said there of wrong noise levels holds here too: prefer `ambid.tracking.rpem`.
+    Only the parameters enter nonlinearly: points are needed along their columns alone, go through the plant's A(q) by
+    the Taylor series of its exponential, and give the result of all 2 n + 1. Measurements are linear and taken in
+    exactly. It converges from farther than `JointEkf` (5 % on a lightly damped resonance) at about a quarter of its
+    speed; near the truth they agree to a hundredth of a standard deviation. What is said there of wrong noise levels
+    holds here too: prefer `ambid.tracking.rpem`.
 
     Parameters
     ----------
@@ -499,10 +489,8 @@ class JointUkf(JointFilter):
 
 
 def powers_of(model: LinearModel, at: Mapping[str, float], free: Sequence[str]) -> tuple[Ints, Array, Ints]:
-    """Return the entries of [A, B, E] that are not zero, each a product of powers of the free parameters.
-
-    Their places (n_entries, 2), their values at the parameters `at`, none of the free ones zero, and their exponents
-    (n_entries, n_free).
+    """Return places (n_entries, 2), values at parameters `at` (no free one zero) and exponents (n_entries, n_free) of
+    the entries of [A, B, E] that are not zero, each a product of powers of the free parameters.
     """
     here = _joined(model.matrices(at))
     rows, columns = np.nonzero(here)

@@ -1,8 +1,5 @@
-"""Kalman filters over the square-root core, for samples and blocks with gaps: of a linear state, and of a scalar.
-
-x⁺ = A x + B u + w, y = C x + v. The covariance is carried in factors, so that it is symmetric and positive by
-construction however long it runs. The scalar Kalman-Bucy filter (thesis eq. 5.3) of x' = a x + w·noise of intensity q,
-measured as y = c x + noise of intensity r, is stationary and is fed with held samples; so is the passive low-pass.
+"""Kalman filters over the square-root core, for samples and blocks with gaps: of a linear state x⁺ = A x + B u + w, y =
+C x + v, and the stationary scalar Kalman-Bucy filter (thesis eq. 5.3), fed with held samples as the passive low-pass.
 """
 
 from __future__ import annotations
@@ -42,13 +39,12 @@ class LinearState:
 
 
 def linear_state(A: ArrayLike, C: ArrayLike, Q: ArrayLike, R: ArrayLike, *, B: ArrayLike | None = None) -> LinearState:
-    """Check and keep the matrices of a sampled state.
+    """Check and keep the matrices of a sampled state, a `LinearState`.
 
     Parameters
     ----------
-    A : array_like, shape (n_states, n_states)
+    A, Q : array_like, shape (n_states, n_states)
     C : array_like, shape (n_outputs, n_states)
-    Q : array_like, shape (n_states, n_states)
     R : array_like, shape (n_outputs, n_outputs)
     B : array_like, shape (n_states, n_inputs), optional
 
@@ -97,8 +93,7 @@ def constant_velocity(rate_hz: float, *, q: float, r: float) -> LinearState:
 
     Returns
     -------
-    LinearState
-        States position in m, velocity in m/s.
+    LinearState, of position in m and velocity in m/s
 
     Raises
     ------
@@ -254,10 +249,9 @@ def _start_covariance(model: LinearState, covariance: ArrayLike | None) -> Array
 
 
 class StreamingFilter(Copied):
-    """A first-order filter x⁺ = decay x + forward y that runs on each of several channels alone.
-
-    Splitting a stream into samples and blocks in another way does not change any number. A value that is not finite is
-    missing: x⁺ = alone x, and `n_missing` counts it. `first` is the state over the first value, where none is given.
+    """A first-order filter x⁺ = decay x + forward y on each of several channels; cutting the stream differently changes
+    no number. `first` is the state over the first value, where none is given; a value that is not finite is missing,
+    counted in `n_missing`: x⁺ = alone x.
     """
 
     def __init__(
@@ -274,10 +268,7 @@ class StreamingFilter(Copied):
         return self._state.copy()
 
     def update(self, measurement: ArrayLike) -> Array | float:
-        """Take in one sample or a block and return it filtered.
-
-        `measurement`: (channels,), or (n_samples, channels) for a block.
-        """
+        """Return one sample (channels,), or a block (n_samples, channels), filtered."""
         y = np.asarray(measurement, dtype=np.float64)
         block = as_block(y, self.channels, self.name)
         out = np.empty(block.shape)
@@ -335,17 +326,16 @@ def kalman_bucy_gain(*, a: float = 0.0, c: float = 1.0, w: float = 1.0, q: float
 class ScalarKalman(StreamingFilter):
     """Stationary Kalman-Bucy filter of one or several channels that have nothing to do with each other.
 
-    x̂' = A x̂ + L (y - C x̂) is solved exactly, each sample of y held until the next; what comes out is x̂ at the sampling
-    instants, from the samples before. The defaults are the thesis's (5.3.2):
-    A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 = 7.746 1/s. `KalmanFilter` has the discrete and the varying form.
+    x̂' = A x̂ + L (y - C x̂) is solved exactly, y held over a sample; what comes out is x̂ at the sampling instants,
+    from the samples before. The defaults are the thesis's (5.3.2): A = 0, W = C = 1, R = 1, Q = 60, so that L = √60 =
+    7.746 1/s. `KalmanFilter` has the discrete and the varying form.
 
     Parameters
     ----------
     rate_hz : float
         Sampling rate in Hz.
     a, c, w, q, r : float
-        As in `kalman_bucy_gain`: intensities, not variances of samples. White noise of variance σ² in
-        samples of f Hz has r = σ²/f.
+        As in `kalman_bucy_gain`: intensities, not variances of samples; r = σ²/f of white noise.
     start : float, optional
         Estimate before the first sample; y/c of the first sample by default.
     channels : int

@@ -1,10 +1,5 @@
-"""Compiled recursions of the Kalman filters over the square-root core: linear, scalar, extended and unscented.
-
-One pass over a block, state moved along in place. A value that is not finite is missing: the filter predicts over it.
-
-The augmented state of the joint filters is z = [x, o, q]: plant states, offsets, scaled parameters. Parameters and
-offsets stand last: they are carried on unchanged, so that a time update touches the leading states alone. Sensor noise
-is one in scaled units.
+"""Compiled recursions of the Kalman filters over the square-root core, one pass over a block; over a missing (not
+finite) value the filter predicts. Joint filters have z = [x, o, q], q scaled, o and q carried on; sensor noise is one.
 """
 
 from __future__ import annotations
@@ -31,8 +26,7 @@ _BLIND = 32  # samples without any output after which the state is taken for los
 
 @compiled(fastmath={"contract"})
 def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
-    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x. Returns how many were missing.
-
+    """x+ = decay x + forward y, output x before y; over a missing y, x+ = alone x; return how many were missing.
     `state` (m,) is NaN where none is given: the first value then gives it.
     """
     decay, forward, alone, first = constants
@@ -57,10 +51,9 @@ def hold_scan(y: Array, out: Array, state: Array, constants: Array) -> int:
 
 @compiled(fastmath={"contract"})
 def state_scan(y: Array, u: Array, out: Array, model: Array, memory: Array, work: Array, tally: Array) -> None:
-    """Kalman filter over the square-root core: outputs one by one, what their noises have in common taken off first.
-
-    `model`: A, B, C, G with G Gᵀ = Q, and R, one behind the other. `memory`: factors of the covariance, predicted
-    state, and what `_correct` keeps. `tally`: whether the covariance has stopped changing, values missing.
+    """Run a Kalman filter output by output, what their noises share taken off first. `model`: A, B, C, G with G Gᵀ = Q,
+    and R; `memory`: factors of the covariance, predicted state, what `_correct` keeps; `tally`: whether the covariance
+    stands still, values missing.
     """
     (n_samples, m), n, n_u = y.shape, out.shape[1], u.shape[1]
     A, at = model[: n * n].reshape(n, n), n * n
@@ -108,10 +101,8 @@ def state_scan(y: Array, u: Array, out: Array, model: Array, memory: Array, work
 
 @compiled(fastmath={"contract"})
 def _correct(y: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: Array, steady: bool) -> None:
-    """Take in what was measured, with the gains of before where these are steady.
-
-    A row of `rest` holds one of L with L Lᵀ = R of the measured outputs, one of H = L⁻¹ C, the gain P h and the
-    variance of its whitened innovation, and the whitened output.
+    """Take in what was measured, with the gains of before where steady. A row of `rest` holds one of L with L Lᵀ = R of
+    the measured outputs, of H = L⁻¹ C, gain P h, variance of the whitened innovation, whitened output.
     """
     (m, n), row, one = C.shape, 0, 1.0
     for i in range(m):
@@ -153,9 +144,8 @@ def _correct(y: Array, C: Array, R: Array, F: Array, x: Array, rest: Array, f: A
 
 @compiled(fastmath={"contract"})
 def _steady(k: int, y: Array, out: Array, A: Array, C: Array, x: Array, rest: Array) -> int:
-    """One or two states, one output, a constant gain: a linear recursion in registers, up to the first missing value.
-
-    Where there is one state, all that belongs to a second is zero and falls on the first before that is written.
+    """Run one or two states, one output, a constant gain in registers up to the first missing value. Of one state, all
+    that belongs to a second is zero and falls on the first before that is written.
     """
     last = x.size - 1
     two = 1.0 if last > 0 else 0.0
@@ -193,9 +183,8 @@ def _take(
     u: Array, y: Array, e: Array, z: Array, F: Array, C: Array, io: Array, wide: Array, past: Array, counts: Ints,
     f: Array, b: Array, move: Array,
 ) -> bool:  # fmt: skip
-    """Take in one sample; leave scaled innovations in `e`, inputs in `past`; return whether there is a step to make.
-
-    A missing output is NaN in `e`; `io` holds a running mean of the squared innovations over what is expected of them.
+    """Take in one sample, scaled innovations into `e` (NaN: missing), inputs into `past`; return whether to make a
+    step. `io` holds a running mean of squared innovations over what is expected.
     """
     (n_y, n_x), n_u, one = C.shape, u.size, 1.0
     missing = 0
@@ -274,9 +263,8 @@ def ekf_block(
     first: int, u: Array, y: Array, e: Array, z: Array, F: Array, at: Array, M: Array, dM: Array, C: Array, dist: Array,
     walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, amount: float,
 ) -> int:  # fmt: skip
-    """Run the extended filter from sample `first` on; return before which sample the matrices are to be renewed.
-
-    x+ = M(q) [x; u; u late; o], M(q) = M + sum dM_j (q_j - at_j).
+    """Run the extended filter from sample `first` on; return before which sample the matrices are to be renewed: x+ =
+    M(q) [x; u; u late; o], M(q) = M + sum dM_j (q_j - at_j).
     """
     n, p, (n_x, columns) = z.size, dM.shape[0], M.shape
     s, n_u, n_y, n_d = n - p, u.shape[1], y.shape[1], dist.size
@@ -374,9 +362,8 @@ def ukf_block(
     dist: Array, walk: Array, io: Array, wide: Array, past: Array, counts: Ints, every: int, terms: int,
     fraction: float,
 ) -> None:  # fmt: skip
-    """Run the unscented filter with points at √n standard deviations.
-
-    The central one has no weight in the mean, and 2 in the covariance, as a Gaussian needs.
+    """Run the unscented filter with points at √n standard deviations, the central one without weight in the mean, and 2
+    in the covariance, as a Gaussian needs.
     """
     n, p, n_x, n_d, n_u, n_y = z.size, logs.size, C.shape[1], dist.size, u.shape[1], y.shape[1]
     s = n_x + n_d

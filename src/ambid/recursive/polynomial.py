@@ -1,9 +1,6 @@
-"""Recursive prediction error method for A y = (B/F) u + (C/D) e + constant (Ljung & Söderström 1983, ch. 3).
-
-Every sample makes one Gauss-Newton step theta += P psi e in U-D form, psi the exact gradient of the prediction (thesis
-eq. 3.12 ff.), filtered with the coefficients of the moment. From nothing, a first window is stored and fitted off-line:
-the recursion then begins inside the valley of the criterion, with that fit's covariance as its prior, and every sample
-counts once.
+"""Recursive prediction error method for A y = (B/F) u + (C/D) e + constant (Ljung & Söderström 1983, ch. 3): each
+sample a Gauss-Newton step theta += P psi e in U-D form, psi exact (thesis eq. 3.12 ff.), begun by a first window fitted
+off-line.
 """
 
 from __future__ import annotations
@@ -48,19 +45,19 @@ _NUMBERS = (float, np.float64)
 
 
 class RecursivePolynomial(Copied):
-    """Recursive prediction error estimator of one output, any structure of thesis table 3.1, any number of inputs.
+    """Recursive prediction error estimator of one output, an `ambid.recursive.RecursiveEstimator`: any structure of
+    thesis table 3.1, any number of inputs.
 
     The covariance is that of the error of the estimate if the coefficients stand still and the structure holds the
-    noise, whatever is forgotten; how far the estimate lags behind coefficients that move is not in it. `fir` and `oe`
-    have no noise model: they are biased under feedback, and `warnings` says so unless `open_loop` is given. ARMAX, BJ
-    and the others are consistent under feedback as long as their noise model holds the true one. An unstable plant
-    needs A (arx, armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
+    noise, whatever is forgotten; the lag behind coefficients that move is not in it. `fir` and `oe` have no noise
+    model: they are biased under feedback, and `warnings` says so unless `open_loop` is given. ARMAX, BJ and the others
+    are consistent under feedback as long as their noise model holds the true one. An unstable plant needs A (arx,
+    armax, ararmax): C and F have to be stable, and are kept so; A and D need not be.
 
     A root of C or F near the border means a long memory: after a start without `prime`, and after every gap, nothing is
-    learnt until the unknown states of the filters have died away (`counts`).
-
-    Where no search of the largest first window converged, `fit` says "stalled" and standard deviations are as large as
-    the coefficients, until one of a later window does.
+    learnt until the unknown states of the filters have died away (`counts`). Where no search of the largest first
+    window converged, `fit` says "stalled" and standard deviations are as large as the coefficients, until a later one
+    does.
 
     Parameters
     ----------
@@ -77,8 +74,8 @@ class RecursivePolynomial(Copied):
         Weight of the last sample beside the present one; 1 forgets nothing. Below 20 samples of memory for each
         coefficient `warnings` tells of C, D and F.
     burn_in : int or None, optional
-        Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to
-        the memory, are stored and fitted again at every doubling: then one `update` takes some ms.
+        Samples of the first window; None: 100 for each coefficient, at least 500. Up to 16 times as many, or up to the
+        memory, are stored and fitted again at every doubling: then one `update` takes some ms.
     open_loop : bool, optional
         Say that no feedback is at work.
 
@@ -280,23 +277,8 @@ class RecursivePolynomial(Copied):
         return tuple(notes)
 
     def update(self, inputs: ArrayLike, outputs: ArrayLike) -> Array:
-        """Take in one sample or a block.
-
-        Parameters
-        ----------
-        inputs : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
-            A number, or (n_samples,), where there is one input; ignored for a time series.
-        outputs : array_like, shape () or (n_samples,) or (n_samples, 1)
-
-        Returns
-        -------
-        ndarray, shape of `outputs`
-            Errors of prediction made before each sample was used; NaN while history is gathered.
-
-        Raises
-        ------
-        EstimationError
-            If the shapes do not fit.
+        """As `RecursiveEstimator.update`, of one output; inputs of a time series are ignored, errors NaN during
+        history.
         """
         if type(outputs) in _NUMBERS and type(inputs) in _NUMBERS and self._window is None and self._n_u == 1:
             u, y, e = self._one  # the way of a loop that lives: no checks, no new arrays
@@ -392,10 +374,8 @@ class RecursivePolynomial(Copied):
 
 
 class _Window:
-    """Samples without a gap, and the counts at which they are fitted.
-
-    `first`, `last`: samples at the first and at most at the last fit. `filled` of `u` (last, n_inputs) and `y` (last,)
-    are stored; `target` is where the next fit is.
+    """Samples `u` (last, n_inputs), `y` (last,) without a gap, `filled` of them, and the counts at which they are
+    fitted: at `first`, at most at `last`, next at `target`.
     """
 
     def __init__(self, *, first: int, last: int, n_inputs: int) -> None:
@@ -403,9 +383,8 @@ class _Window:
         self.first, self.filled, self.target = first, 0, first
 
     def take(self, u: Array, y: Array) -> tuple[int, bool]:
-        """Take samples until the next fit, or up to and without one that is not finite.
-
-        `u`: (n_samples, n_inputs); `y`: (n_samples,). Returns samples taken, and whether the next one is not finite.
+        """Take samples until the next fit, or up to and without one that is not finite; return how many, and whether
+        the next is not finite.
         """
         n = min(y.size, self.target - self.filled)
         bad = np.flatnonzero(~(np.isfinite(y[:n]) & np.all(np.isfinite(u[:n]), axis=1)))
@@ -422,10 +401,7 @@ class _Window:
         return n
 
     def grow(self) -> bool:
-        """Move the next fit to twice as many samples.
-
-        Returns false where the window cannot grow: it is at its largest.
-        """
+        """Move the next fit to twice as many samples; False where the window is at its largest."""
         at_end = self.target >= self.y.size
         self.target = min(2 * self.target, self.y.size)
         return not at_end
@@ -439,10 +415,8 @@ class _Window:
         return n
 
     def fit(self, who: Identity, near: Array | None, *, stalled: bool) -> BlackBoxFit | None:
-        """Return the off-line fit of the window.
-
-        `near`: (n_theta,), or None, coefficients to begin with; None: the search finds its own start. Returns none
-        where the window does not hold what it needs, or the search did not converge and more samples may help.
+        """Return the off-line fit of the window, from coefficients `near` (n_theta,) or its own start; None where it
+        does not hold what it needs, or the search did not converge and more samples may help.
         """
         try:
             data = IOData(

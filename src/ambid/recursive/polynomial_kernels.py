@@ -1,8 +1,5 @@
-"""Compiled recursion of the polynomial predictor, its gradients and the U-D filter of its coefficients.
-
-Every signal is a row of one buffer that is written from column to column; when it is full, its end becomes the history
-of a new beginning, so that a sample costs the same whether it comes alone or in a block. What is filtered by what is a
-table of whole numbers, see `plan_of`; only the coefficients `coef` = 1, -1, free ones, constant move.
+"""Compiled recursion of the polynomial predictor, its gradients and the U-D filter of its coefficients. Each signal is
+a row of one buffer, whose end becomes the history of a new beginning; `plan_of` tells what is filtered by what.
 """
 
 from __future__ import annotations
@@ -86,10 +83,9 @@ def follow(plan: Table, meta: Table, theta: Array, coef: Array, work: Array) -> 
 
 @compiled
 def _wait(plan: Table, meta: Table, coef: Array, s: Array, t: int, count: Table) -> None:
-    """One more sample of history: the noise is taken as zero, so the first w that has a memory is what is left of A y.
-
-    From then on the error of w is of the size of the noise, not of the signal. When history is long enough, ones stand
-    for the unknown states of F and C: their response shows when those are forgotten, which ends the waiting.
+    """Take one more sample of history: noise counts as zero, so that the first w with a memory is what is left of A y,
+    its error of the noise's size. Once it is long enough, ones stand for the unknown states of F and C: when their
+    response is forgotten, the waiting ends.
     """
     count[_WAITED] += 1
     if count[_FILL] < meta[_LONGEST]:
@@ -131,9 +127,8 @@ def _learn(
     gain: Array,
     work: Array,
 ) -> None:
-    """One Gauss-Newton step (Ljung & Söderström 1983, sec. 3.4), from where the filters stand to where the data say.
-
-    The two differ only while C or F would be unstable: what the data said is then kept and not lost.
+    """Make one Gauss-Newton step (Ljung & Söderström 1983, sec. 3.4), from where the filters stand to where the data
+    say: two places only while C or F would be unstable.
     """
     n, e = theta.size, s[meta[_E], t]
     for j in range(n):

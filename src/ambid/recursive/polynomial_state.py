@@ -1,13 +1,5 @@
-"""What a recursive polynomial estimator carries from sample to sample, packed for the compiled recursion.
-
-P is the covariance of the coefficients in units of the noise variance; S = sum of (product of the forgetting
-factors)^2 (noise variance at that time) psi psi'. Where nothing is forgotten, the error of the estimate has covariance
-P times the noise variance; otherwise P S P: a calm after the samples that told the coefficients changes nothing.
-
-What is filtered by what (theory.md 2.5): w = (B/F) u, v = A y - sum of w - constant, e = (D/C) v. Gradients of the
-prediction, all lags of one polynomial being one signal, shifted: by a_k -(D/C) y(t-k), by b_k D/(C F) u(t-k), by c_k
-e(t-k)/C, by d_k -v(t-k)/C, by f_k -D/(C F) w(t-k), by the constant D/C. The filters run with the coefficients of the
-moment, so they are written as a table in which only coefficients change.
+"""What a recursive polynomial estimator carries from sample to sample, packed for the compiled recursion; what is
+filtered by what (theory.md 2.5, `plan_of`) is a table in which only coefficients change.
 """
 
 from __future__ import annotations
@@ -57,10 +49,12 @@ class _Writer:
 
 
 def plan_of(layout: Layout) -> tuple[Table, Table, int]:
-    """Write down the recursion of a structure: its table, where the parts of it begin, and how many signals it has.
+    """Return the table of a structure's recursion, where its parts begin, and how many signals it has: w = (B/F) u, v =
+    A y - sum of w - constant, e = (D/C) v, and gradients, lags of one polynomial being one shifted signal.
 
-    Rows of the table (5,): filters (destination, first coefficient and length of the denominator, first and last term),
-    terms, columns of the gradient (row, lag, sign), polynomials that have to be stable (first coefficient, length).
+    Gradients by a_k -(D/C) y(t-k), by b_k D/(C F) u(t-k), by c_k e(t-k)/C, by d_k -v(t-k)/C, by f_k -D/(C F) w(t-k), by
+    the constant D/C. Rows (5,): filters (destination, first coefficient and length of the denominator, first and last
+    term), terms, columns of the gradient (row, lag, sign), polynomials kept stable (first coefficient, length).
     """
     n_u, n = layout.n_inputs, layout.free.size + 1
     place: dict[tuple[str, int | None], tuple[int, int]] = {}  # first free coefficient of each polynomial, how many
@@ -170,11 +164,8 @@ def new_state(
     centre: Array,
     forgetting: float,
 ) -> State:
-    """Return a state with no past signals.
-
-    `theta`: (n,), free coefficients, then the constant; `P`: (n, n), covariance over noise variance; `limit`: (n,);
-    `weight`: samples that the noise variance is worth; `centre`: (1 + n_inputs,), levels of output and inputs that are
-    taken off.
+    """Return a state with no past signals: `theta` (n,), free coefficients, then the constant; `P` (n, n) over the
+    noise variance, worth `weight` samples; `limit` (n,); `centre` (1 + n_inputs,), levels taken off output and inputs.
     """
     from ambid.recursive.polynomial_kernels import follow
 
@@ -203,9 +194,10 @@ def new_state(
 
 
 def covariance_of_state(state: State, *, doubtful: bool = False) -> Array:
-    """Return the covariance (n, n) of the coefficients, symmetric and positive definite by construction.
-
-    It is that of a recursion that began near enough to the truth; `doubtful` adds what is not known where it did not.
+    """Return the covariance (n, n) of the coefficients, positive definite by construction: P times the noise variance,
+    or, where something is forgotten, P S P, S = sum of (product of forgetting factors)^2 (noise variance then) psi
+    psi': a calm changes nothing. It supposes a start near the truth; `doubtful` adds what is not known where it was
+    not.
     """
     G = root_of_factors(state.F)
     if state.S.size:

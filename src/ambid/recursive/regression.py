@@ -1,17 +1,5 @@
-"""Recursions for y = φᵀθ + e: least squares with a choice of forgetting, LMS and NLMS, instrumental variables.
-
-Least squares minimises the sum of squared errors over past samples, older ones with less weight, and the distance from
-the start; every sample costs O(p²) and nothing is inverted (Bierman 1977, ch. V; Ljung & Söderström 1983, sec. 6.2).
-LMS steps along the regressor, θ(t) = θ(t-1) + μ(t) φ(t) e(t): robust, but slow where regressors are correlated (Widrow
-& Stearns 1985, ch. 6; Haykin 2002, ch. 5 and 6). Both stand on the square-root core.
-
-With instruments ζ, e may be coloured and in the regressor: Σ λ^(t-k) ζ (y - φᵀθ) = 0 is solved, with more instruments
-than coefficients in the sense of two-stage least squares. The rows [ζᵀ φᵀ y] are rotated into a triangle, so nothing is
-squared and no unsymmetric P, which can pass through infinity, is carried (Söderström & Stoica 1983, ch. 4 and 8).
-
-ARX models are estimated as their signals come, by any of these: A(q) y = B(q) u + constant + v, φ(t) =
-[-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7). Least squares needs white v; instruments
-leave v free.
+"""Recursions for y = φᵀθ + e over the square-root core: least squares with forgetting (Bierman 1977, ch. V; Ljung &
+Söderström 1983, sec. 6.2), LMS, NLMS, instrumental variables, and ARX models estimated by any of these.
 """
 
 from __future__ import annotations
@@ -114,10 +102,8 @@ class Recursion(Copied):
         return max(float(self._s[self._at.NOISE_SUM] / self._s[self._at.NOISE_WEIGHT]), _SMALLEST_VARIANCE)
 
     def update(self, phi: ArrayLike, y: ArrayLike) -> Array:
-        """Take in one sample or a block.
-
-        `phi`: (p,), or (n_samples, p) for a block, regressors; `y`: (), or (n_samples,) or (n_samples, 1) for a block.
-        Returns y - φᵀθ with the θ from before each sample; NaN where the sample was rejected.
+        """Take in a regressor (p,) and output, or a block (n_samples, p) and (n_samples,) or (n_samples, 1); return y -
+        φᵀθ with the θ from before each sample, NaN where it was rejected.
         """
         if isinstance(y, float) and type(phi) is np.ndarray and phi.shape == self._shape and phi.dtype is _FLOAT:
             row, value = self._one
@@ -151,7 +137,7 @@ class _Factored(Recursion):
 
 
 class RecursiveLeastSquares(_Factored):
-    """Recursive least squares, a `RecursiveEstimator`.
+    """Recursive least squares, a `RecursiveEstimator`: O(p²) a sample, nothing inverted.
 
     What is forgotten:
 
@@ -163,18 +149,14 @@ class RecursiveLeastSquares(_Factored):
       excitation nothing is (Cao & Schwartz 2000, Automatica 36, 1725). Under the same `limit`.
 
     The covariance is that of the estimate's error for coefficients that do not move, e white and independent of past
-    regressors: σ²C with the error's own recursion C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ. With forgetting it is less than
-    σ²P, by 1 + factor in the stationary state. The lag behind moving coefficients is not in it.
-
-    Where something is forgotten, every sample counts with the σ² of its own time, once σ² is known (after a memory): a
-    calm makes no coefficient surer.
+    regressors: σ²C, C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ; with forgetting less than σ²P, by 1 + factor in the stationary
+    state. The lag behind moving coefficients is not in it. Where something is forgotten, every sample counts with the
+    σ² of its own time, once known (after a memory): a calm makes no coefficient surer.
 
     σ² is tracked on errors e over 1 + φᵀCφ, each with the weight of what it says of the estimate: silence does not
-    lower it. Biased like all least squares where e is coloured and correlated with the regressor, as under feedback
-    or for noisy regressors: then take `RecursiveInstrumentalVariables`.
-
-    Numbers: factors U and D > 0 are updated without subtraction of D, so that P stays positive definite whatever is
-    rounded; forgetting divides D and damps old rounding errors; the limit bounds P from above, the data from below.
+    lower it. Biased like all least squares where e is coloured and correlated with the regressor, as under feedback or
+    for noisy regressors: then take `RecursiveInstrumentalVariables`. Factors U and D > 0 keep P positive definite
+    whatever is rounded; the limit bounds P from above, the data from below.
 
     Parameters
     ----------
@@ -187,10 +169,8 @@ class RecursiveLeastSquares(_Factored):
         nothing is known of the coefficients, whatever the units of the signals: the start has no weight.
     forgetting : {"none", "exponential", "directional"}, optional
         Exponential if not given but `factor` or `memory` is.
-    factor : float, optional
-        Of forgetting, 0 < factor < 1.
-    memory : float, optional
-        The same as a time constant in samples, 1 / (1 - factor).
+    factor, memory : float, optional
+        Of forgetting, 0 < factor < 1; the same as a time constant in samples, 1 / (1 - factor).
     limit : float
         Of forgetting: largest mean of P_ii over its prior; over 1e9 times the best P_ii so far where no prior is given.
         Without effect where nothing is forgotten.
@@ -288,13 +268,14 @@ class _Gradient(_Factored):
 
 
 class Lms(_Gradient):
-    """Least mean squares, a `RecursiveEstimator`: θ += step φ e.
+    """Least mean squares, a `RecursiveEstimator`: θ += step φ e; robust, but slow where regressors are correlated
+    (Widrow & Stearns 1985, ch. 6; Haykin 2002, ch. 5 and 6).
 
     A sample with step φᵀφ > 1 is used with the step 1 / φᵀφ, beyond which a single step overshoots; `n_limited` counts
-    them. The covariance is σ²C, C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ with K = step φ, the exact covariance of the error
-    given the regressors, for coefficients that do not move and white e independent of past regressors: from the
-    prior down to the misadjustment, about step σ²/2 for small steps. The lag behind moving coefficients is not in it.
-    Biased like least squares where e is coloured and correlated with the regressor, as under feedback.
+    them. The covariance is σ²C, C = (I - Kφᵀ) C (I - Kφᵀ)ᵀ + K Kᵀ with K = step φ, exact given the regressors, for
+    coefficients that do not move and white e independent of past regressors: from the prior down to the misadjustment,
+    about step σ²/2 for small steps. The lag behind moving coefficients is not in it. Biased like least squares where e
+    is coloured and correlated with the regressor, as under feedback.
 
     Parameters
     ----------
@@ -387,16 +368,17 @@ class Nlms(_Gradient):
 
 
 class RecursiveInstrumentalVariables(Recursion):
-    """Recursive instrumental variables, a `RecursiveEstimator` whose inputs are [φ, ζ].
+    """Recursive instrumental variables, a `RecursiveEstimator` whose inputs are [φ, ζ]: Σ λ^(t-k) ζ (y - φᵀθ) = 0, with
+    more instruments than coefficients by two-stage least squares (Söderström & Stoica 1983, ch. 4 and 8).
 
-    Consistent where ζ is uncorrelated with v and correlated with φ: with an external reference of a loop, past
-    inputs in open loop. Instruments that say little of the regressor give a large covariance.
+    Consistent where ζ is uncorrelated with v and correlated with φ: with an external reference of a loop, past inputs
+    in open loop. Instruments that say little of the regressor give a large covariance.
 
-    The covariance is that of the estimate's error for coefficients that do not move, A N Aᵀ with
-    θ̂ = A Σ λ^(t-k) ζ y and N the covariance of Σ λ^(t-k) ζ v: the long-run covariance of ζ v (Bartlett's weights over
-    `correlation` samples; Newey & West 1987), tracked with ten times the memory of the estimate, times the sum of
-    squared weights. So v may be coloured. The lag behind moving coefficients is not in it. While instruments are
-    silent the information is forgotten until the variances reach `limit`. Nothing is known before the first sample.
+    The covariance is that of the estimate's error for coefficients that do not move, A N Aᵀ with θ̂ = A Σ λ^(t-k) ζ y
+    and N the covariance of Σ λ^(t-k) ζ v: the long-run covariance of ζ v (Bartlett's weights over `correlation`
+    samples; Newey & West 1987), tracked with ten times the memory of the estimate, times the sum of squared weights. So
+    v may be coloured. The lag behind moving coefficients is not in it. While instruments are silent the information is
+    forgotten until the variances reach `limit`. Nothing is known before the first sample.
 
     Parameters
     ----------
@@ -404,10 +386,8 @@ class RecursiveInstrumentalVariables(Recursion):
         Names of the p coefficients, or p.
     n_instruments : int, optional
         m, p or more; p if not given.
-    factor : float, optional
-        Of forgetting, 0 < factor < 1; nothing is forgotten if neither it nor `memory` is given.
-    memory : float, optional
-        The same as a time constant in samples, 1 / (1 - factor).
+    factor, memory : float, optional
+        Of forgetting, 0 < factor < 1; the same as a time constant in samples, 1 / (1 - factor). Neither: nothing is.
     limit : float
         Of the wind-up, see above: of the mean of the variances over 1e9 times the best so far.
     correlation : int
@@ -511,10 +491,8 @@ class RecursiveInstrumentalVariables(Recursion):
 
 
 class _OnSignals(Copied):
-    """A recursion on regressors that is fed with signals: names, estimate and counts are its own.
-
-    `columns`: channel, lag and sign of each column of the regressor; channel 0 is the output, then come the inputs, and
-    -1 is the constant 1.
+    """A recursion on regressors that is fed with signals; `columns`: channel (0: output, then inputs, -1: constant 1),
+    lag and sign of each column of the regressor.
     """
 
     def __init__(
@@ -532,10 +510,8 @@ class _OnSignals(Copied):
         return np.hstack([outputs, inputs, np.zeros((outputs.shape[0], self._spare))]), outputs[:, 0], shape
 
     def _rows(self, x: Array, theta: Array = _NO_MODEL, first: int = 0) -> Array:
-        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels).
-
-        With `theta` (p,), the last channel of x is filled in: the output of a model without noise, of these
-        coefficients, whose regressor begins at column `first`.
+        """Return the columns (n_samples, n_columns) for the next samples x (n_samples, n_channels). With `theta` (p,),
+        the last channel is filled in: the output of a model without noise, whose regressor begins at column `first`.
         """
         rows = np.empty((x.shape[0], self._table.shape[0]))
         kernels("regression").tapped(self._past, self._table, x, rows, theta, first)
@@ -568,7 +544,8 @@ class _OnSignals(Copied):
 
 
 class RecursiveArx(_OnSignals):
-    """A recursion on regressors, fed with signals: a `RecursiveEstimator` of an ARX model.
+    """A recursion on regressors, fed with signals: a `RecursiveEstimator` of A(q) y = B(q) u + constant + v, φ(t) =
+    [-y(t-1) ... -y(t-na), u(t-nk) ... u(t-nk-nb+1), 1] (Ljung 1999, eq. 4.7).
 
     Biased where v is coloured, and under feedback with noise that is not white: see `RecursiveIvArx`.
 
@@ -635,7 +612,7 @@ class RecursiveArx(_OnSignals):
 
 
 class RecursiveIvArx(_OnSignals):
-    """An ARX model by recursive instrumental variables, a `RecursiveEstimator`; v may be coloured.
+    """An ARX model by recursive instrumental variables, as `ambid.recursive.RecursiveArx`; v may be coloured.
 
     Instruments:
 
@@ -705,24 +682,7 @@ class RecursiveIvArx(_OnSignals):
             self._past[:, 2] = 0.0
 
     def update(self, u: ArrayLike, y: ArrayLike) -> Array:
-        """Take in one sample or a block.
-
-        Parameters
-        ----------
-        u : array_like, shape (n_inputs,), or (n_samples, n_inputs) for a block
-            The input, and the reference where it is the instrument; a number, or (n_samples,), for the input alone.
-        y : array_like, shape (), or (n_samples,) or (n_samples, 1) for a block
-
-        Returns
-        -------
-        ndarray, shape of `y`
-            Errors of prediction one sample ahead; NaN where the sample was rejected.
-
-        Raises
-        ------
-        EstimationError
-            If the shapes do not fit.
-        """
+        """As `RecursiveArx.update`; where the reference is the instrument, it is the last column of `u`."""
         x, outputs, shape = self._signals(u, y)
         if not self._spare:
             return self._estimator.update(self._rows(x), outputs).reshape(shape)

@@ -1,13 +1,5 @@
-"""Compiled recursions of linear regressions: least squares and LMS, instrumental variables, delay lines.
-
-A recursion is one array, since a call from Python costs by the number of arrays. Over the square-root core: head |
-estimate p | factors of P p p | factors of its companion p p | prior variance p | scratch 4 p. The companion is the
-information of squared weights for least squares, else the covariance of the error. Least squares of four coefficients
-stay in registers.
-
-Instrumental variables: head | estimate p | R m (m + p + 1) | T p p | long-run covariance m m | ring lags m | its sum m
-| prior p | size of the instruments m | work. R is the upper part of the triangle of the weighted rows [ζᵀ φᵀ y], T the
-triangle of its columns of φ.
+"""Compiled recursions of linear regressions, each one array: head | estimate p | factors of P p p | companion p p |
+prior p | scratch 4 p, the companion information of squared weights (least squares) or covariance of the error.
 """
 
 from __future__ import annotations
@@ -147,9 +139,8 @@ def _four(s: Array, phi: Array, y: Array, out: Array, t: int, until: float) -> i
 
 @compiled(error_model="numpy")
 def _forget(s: Array, F: Array, x: Array, a: Array) -> None:
-    """Widen P before a sample so that the information that x meets is forgotten (Cao and Schwartz 2000).
-
-    P becomes P + (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
+    """Widen P before a sample so that the information that x meets is forgotten (Cao and Schwartz 2000): P becomes P +
+    (1/λ - 1) x xᵀ / (xᵀ P⁻¹ x).
     """
     p = x.size
     for j in range(p):
@@ -242,9 +233,8 @@ def _any(s: Array, p: int, phi: Array, y: Array, out: Array, t: int, until: floa
 
 @compiled(error_model="numpy")
 def regress(s: Array, phi: Array, y: Array, out: Array) -> None:
-    """Take in rows of phi (n, p) and y (n,); write errors of prediction into out (n,), NaN where one is rejected.
-
-    At fixed counts the factor is chosen with which P cannot pass its limit before the next look.
+    """Take in rows of phi (n, p) and y (n,); write errors of prediction into out (n,), NaN where one is rejected. At
+    fixed counts the factor is chosen with which P cannot pass its limit before the next look.
     """
     p, t = int(s[SIZE]), int(0.0)  # a plain 0 has a type of its own: what takes it would be compiled twice
     four, a, q = p == 4 and s[KIND] == LEAST_SQUARES, HEAD + p, p * p
@@ -319,7 +309,11 @@ def _length(T: Array, x: Array, solved: Array) -> float:
 
 @compiled(error_model="numpy")
 def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
-    """Take in rows [φ, ζ] (n, p + m) and y (n,); errors of prediction into out (n,)."""
+    """Take in rows [φ, ζ] (n, p + m) and y (n,); errors of prediction into out (n,).
+
+    `s`: head | estimate p | R m (m + p + 1), the triangle of weighted rows [ζᵀ φᵀ y], not squared | T p p, that of its
+    φ | long-run covariance m m | ring lags m | its sum m | prior p | size of the instruments m | work.
+    """
     p, m, lags = int(s[SIZE]), int(s[INSTRUMENTS]), int(s[LAGS])
     a = HEAD
     theta = s[a : a + p]
@@ -386,9 +380,8 @@ def instrumental(s: Array, rows: Array, y: Array, out: Array) -> None:
 def _account(
     s: Array, R: Array, omega: Array, ring: Array, total: Array, zeta: Array, e: float, w: float, solved: Array
 ) -> None:
-    """Track noise and weights, a sample by what its instruments add to those of before.
-
-    The long-run covariance of ζ e has Bartlett's weights: the mean square of its sums over `lags` samples.
+    """Track noise and weights, a sample by what its instruments add to those before. The long-run covariance of ζ e has
+    Bartlett's weights: the mean square of its sums over `lags` samples.
     """
     m, lags, factor = zeta.size, ring.shape[0], s[FACTOR_NOW]
     leverage = _length(R, zeta, solved)
@@ -415,11 +408,9 @@ def _account(
 
 @compiled(error_model="numpy")
 def tapped(past: Array, table: Table, x: Array, rows: Array, theta: Array, first: int) -> None:
-    """Fill rows (n, n_columns) from signals x (n, n_channels) and from what came before, past (n_lags, n_channels).
-
-    `table` holds a channel, a lag and a sign for each column; channel -1 is the constant 1. With `theta` (p,), the last
-    channel of x is made here: the output of a model without noise, from columns `first`, ... and these coefficients.
-    The row of a sample that holds a number that is not finite begins with NaN.
+    """Fill rows (n, n_columns) from signals x (n, n_channels) and those before, past (n_lags, n_channels), by `table`:
+    channel (-1: 1), lag, sign. With `theta` (p,), the last channel is made here: a model's output without noise, from
+    columns `first`, .... The row of a sample that is not finite begins with NaN.
     """
     lags, last = past.shape[0], x.shape[1] - 1
     for t in range(x.shape[0]):

@@ -1,8 +1,5 @@
-"""The square-root core of all recursions: a covariance P = U D Uᵀ, changed by rank-one steps and carried over time.
-
-U is a unit upper triangle. `F` (n, n) holds it so that a column lies together in memory: row j has column j of U before
-its diagonal, and D_j on it; what stands behind is never read. D stays positive whatever is rounded, and nothing takes a
-root (Bierman 1977, ch. III, V and VI). Functions that take fewer than n numbers work on the leading states.
+"""The square-root core of all recursions: P = U D Uᵀ by rank-one steps (Bierman 1977, ch. III, V, VI), D > 0 whatever
+is rounded, no roots. Row j of `F` (n, n) has column j of unit upper U before its diagonal, D_j on it, the rest unread.
 """
 
 from __future__ import annotations
@@ -50,9 +47,8 @@ def deviations(F: Array, sd: Array) -> None:
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def shrink(F: Array, f: Array, r: float, k: Array) -> float:
-    """Take in a measurement of noise variance r > 0 that sees f = Uᵀ h (Bierman 1977, sec. V.3).
-
-    P becomes P - P h hᵀ P / α. Leaves P h in k and returns α = r + hᵀ P h.
+    """Take in a measurement of noise variance r > 0 that sees f = Uᵀ h (Bierman 1977, sec. V.3): P becomes P - P h hᵀ P
+    / α; leave P h in k and return α = r + hᵀ P h.
     """
     alpha, inverse = r, 1.0 / r
     for j in range(f.size):
@@ -105,11 +101,9 @@ def walk(F: Array, q: Array, a: Array) -> None:
 
 @compiled(error_model="numpy", fastmath={"contract"})
 def propagate(F: Array, A: Array, J: Array, G: Array, W: Array, w: Array) -> None:
-    """Move P over one step of x⁺ = A x + J z + G noise, x the leading states and z those behind them, which stay.
-
-    The noise has covariance one; `J` may have fewer columns than there are z. `W` (n_x, n_x + n_noise) and
-    `w` (n_x + n_noise,) are scratch. The new factors of x are those of W diag(w) Wᵀ by modified weighted Gram-Schmidt
-    (Bierman 1977, sec. VI.4): as stable as reflections, and without roots.
+    """Move P over x⁺ = A x + J z + G noise of covariance one, x the leading states, z those behind, which stay; `J` may
+    have fewer columns. The new factors of x are those of W diag(w) Wᵀ by modified weighted Gram-Schmidt (Bierman 1977,
+    sec. VI.4): stable, without roots. `W` (n_x, n_x + n_noise) and `w` (n_x + n_noise,) are scratch.
     """
     n, columns, known = A.shape[0], W.shape[1], A.shape[0] + J.shape[1]
     for j in range(n, F.shape[0]):
