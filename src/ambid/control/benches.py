@@ -1,8 +1,7 @@
 """An identified plant and a loop on the nonlinear simulator: magnets that linearise to the plant's own numbers.
 
-A law of the rig's [magnet] is scaled, W'(x, i) -> a W'(x, b i) + c i²/2, so that k_x, k_i and L at rest are those of
-the plant. Without one the magnets are two opposed ones (theory.md sec. 1) around the point of rest. Either way what
-lies beyond the neighbourhood of rest is assumed, not identified; `Workbench.assumed` says what.
+The rig's [magnet] law is scaled, W'(x, i) -> a W'(x, b i) + c i²/2, to the plant's k_x, k_i and L at rest; without one
+two opposed magnets (theory.md sec. 1) stand there. What lies beyond is assumed; `Workbench.assumed` says what.
 """
 
 from __future__ import annotations
@@ -66,10 +65,7 @@ class Workbench:
 
     @property
     def room(self) -> Array:
-        """The force in N that each axis can hold for long, by the limits of current and voltage, (n_axes,).
-
-        Without limits it is five times the weight.
-        """
+        """The force in N that each axis can hold for long by the limits, (n_axes,); without any 5 times the weight."""
         plant = self.plant
         prefixes = [f"{axis}." for axis in plant.axes] if isinstance(plant.model, RotorModel) else [""]
         return np.array([self._holds(prefix) for prefix in prefixes])
@@ -87,18 +83,15 @@ class Workbench:
         self, n: int, *, load: Array | None = None, start: Array | None = None, speed: float | Array | None = None,
         seed: int | None = None, linear: bool = False,
     ) -> Answer:  # fmt: skip
-        """Simulate `n` samples, with noise where a seed is given.
-
-        `load` (n, n_axes), N; `start` (n_axes,) from rest, m, without current and speed; `speed` of rotation, or (n,)
-        where it changes, default the plant's own.
+        """Simulate `n` samples, with noise where a seed is given: `load` (n, n_axes), N; `start` (n_axes,) from rest,
+        m, without current and speed; `speed` of rotation, or (n,), default the plant's own.
         """
         raise NotImplementedError
 
 
 def workbench(plant: Plant, rig: Rig, loop: Loop, *, nonlinear: bool = True) -> Workbench:
-    """Return the bench of a plant in a loop, the plant's delay in place of the loop's.
-
-    `rig`: its limits, noise, point of rest and magnet are used. ModelError for a plant without a position.
+    """Return the bench of a plant in a loop, its delay in place of the loop's, with the rig's limits, noise, point of
+    rest and magnet. ModelError for a plant without a position.
     """
     plant = _without_fast_eddies(plant)
     loop = replace(loop, delay=float(plant.delays.max(initial=0.0)))

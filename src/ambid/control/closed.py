@@ -1,12 +1,11 @@
 """A closed loop in the frequency domain: an estimated plant and its controller; sensitivity, openings, compliance.
 
-With positions p and other outputs q of the plant y = H u, and the controller u = F r - K y, the sensitivity at the
-position signals with all else closed is
+With positions p and other outputs q of y = H u, and u = F r - K y, the sensitivity at the positions, all else closed,
+is
 
-    S = (I + P C)⁻¹,   P C = H_p (I + K_q H_q)⁻¹ K_p,
+S = (I + P C)⁻¹, P C = H_p (I + K_q H_q)⁻¹ K_p,
 
-in which F cancels: its diagonal is what ISO 14839-3 measures axis by axis. The loop of one axis, opened alone while the
-others stay closed, is L = 1/S_jj - 1. At the commands the same is said of (I + K H)⁻¹.
+without F: its diagonal is that of ISO 14839-3, an axis opened alone L = 1/S_jj - 1; at the commands (I + K H)⁻¹.
 """
 
 from __future__ import annotations
@@ -139,9 +138,8 @@ class ClosedLoop:
 
     @classmethod
     def of(cls, plant: Plant, controller: Controller) -> ClosedLoop:
-        """Return the loop on the plant's grid, closer where the loop resonates, peaks, or passes a margin.
-
-        A resonance of the loop between two frequencies turns det(I + K H), however narrow it is.
+        """Return the loop on the plant's grid, closer where it resonates (det(I + K H) turns, however narrow), peaks,
+        or passes a margin.
         """
         f = plant.grid()
         loop = cls(plant=plant, controller=controller, frequency_hz=f)
@@ -252,9 +250,8 @@ class ClosedLoop:
 
     @cached_property
     def pushed(self) -> tuple[Complex, Complex]:
-        """What plant outputs and magnets do in open loop, (n, n_y + n_axes, ...), by disturbances and by inputs.
-
-        Disturbances: those of the model, held over a sample; then a harmonic force at each magnet, (j omega - A)⁻¹.
+        """What outputs and magnets do in open loop, (n, n_y + n_axes, ...), by disturbances (the model's, held over a
+        sample; then a harmonic force at each magnet, (j omega - A)⁻¹) and by inputs.
         """
         plant_model, space, n = self.plant.model, self.plant.space, len(self.plant.axes)
         if isinstance(plant_model, RotorModel):
@@ -291,9 +288,8 @@ class ClosedLoop:
         return np.asarray(np.diagonal(self.motions[:, n_y:, n_d : n_d + n], axis1=1, axis2=2))
 
     def _sd_db(self, j: int) -> float:
-        """Return the standard deviation of 20 lg |S_jj| at the one frequency of this loop (delta method).
-
-        dS = -S [I, -H_p (I + K_q H_q)⁻¹ K_q] dH (I + K_q H_q)⁻¹ K_p S, and likewise by dK.
+        """Return the standard deviation of 20 lg |S_jj| at this loop's one frequency (delta method) by dS = -S [I, -H_p
+        (I + K_q H_q)⁻¹ K_q] dH (I + K_q H_q)⁻¹ K_p S, and likewise by dK.
         """
         p, q, back, S = self._parts
         H, K = self.H[0], self.K[0]
@@ -356,9 +352,8 @@ class MeasuredSensitivity:
 
     @property
     def peak(self) -> tuple[float, float, float] | None:
-        """Ratio, frequency in Hz and standard deviation of the peak; None where noise hides it.
-
-        It is hidden too where lines that are too noisy to show a peak stand higher, taken together, than the one found.
+        """Ratio, frequency in Hz and standard deviation of the peak; None where noise hides it, as do lines too noisy
+        to show a peak that together stand higher.
         """
         measured = self.ratio > 0.0
         relative = np.divide(self.sd, self.ratio, out=np.zeros_like(self.sd), where=measured)
@@ -371,11 +366,9 @@ class MeasuredSensitivity:
         return None if np.any(surely[noise > _SEEN] > top[0] ** 2) else top
 
     def _found(self, measured: NDArray[np.bool_], noise: Array) -> tuple[float, float, float] | None:
-        """Return the peak by the relative noise of the lines.
-
-        It is sought at the line that surely stands highest: the largest of many noisy lines is that of the largest
-        noise, the largest lower bound is not. Around it a polynomial is fitted to 1/S, whose poles, those of the plant
-        and the controller, are farther away than the poles of S; the noise of 1/S is circular, and has no bias.
+        """Return the peak by the lines' relative noise, sought at the largest lower bound (the largest line is that of
+        the largest noise). There a polynomial is fitted to 1/S, whose poles, plant's and controller's, are farther away
+        than those of S, and whose noise is circular, without bias.
         """
         f = self.frequency_hz
         k = int(np.argmax(self.ratio * (1.0 - _BOUND * noise)))
@@ -394,9 +387,8 @@ class MeasuredSensitivity:
 
 
 def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | None:
-    """Return height, place and standard deviation of the top of |S| by a polynomial of 1/S; None where none fits.
-
-    `noise`: relative standard deviation of |S|. The order is Akaike's.
+    """Return height, place and standard deviation of the top of |S| by a polynomial of 1/S of Akaike's order, None
+    where none fits; `noise`: relative standard deviation of |S|.
     """
     reach, weights = float(np.abs(x).max()), np.abs(S) / noise
     best: tuple[float, int, Any, Any, float] | None = None
@@ -421,10 +413,8 @@ def _top(x: Array, S: Complex, noise: Array) -> tuple[float, float, float] | Non
 def measured_sensitivity(
     spectra: PeriodSpectra, loop: ClosedLoop, *, silent: float = _SILENT
 ) -> tuple[MeasuredSensitivity | None, ...]:
-    """Return the sensitivity of each axis as measured, None of an axis without a reference of its own.
-
-    `loop`: at the lines of the spectra; its controller is used, its plant is not; `silent`: part of the largest line
-    below which a reference has no power.
+    """Return each axis's measured sensitivity, None without a reference of its own; of `loop`, at the spectra's lines,
+    only the controller is used; `silent`: part of the largest line below which a reference has no power.
     """
     sensors = loop.plant.sensors
     if spectra.R is None or spectra.R.shape[1] != len(sensors):
@@ -441,10 +431,8 @@ def measured_sensitivity(
 def _of_axis(
     spectra: PeriodSpectra, loop: ClosedLoop, columns: dict[int, Complex], C: Complex, on: Array, j: int
 ) -> MeasuredSensitivity:
-    """Return the sensitivity of axis `j`.
-
-    Other axes' terms are interpolated period by period, with the bend between their lines, so that the scatter is that
-    of all terms together.
+    """Return the sensitivity of axis `j`; other axes' terms are interpolated period by period, with the bend between
+    their lines, so that the scatter is that of all.
     """
     at, f = np.flatnonzero(on[:, j]), spectra.frequency_hz
     through = C[at] @ loop.together[:, j]  # (n_lines, n_references): what a disturbance of the axis' sensors orders
@@ -491,9 +479,8 @@ def _column(spectra: PeriodSpectra, on: Array, mine: int, p: list[int]) -> Compl
 
 
 def measured_locally(response: FrequencyResponse, loop: ClosedLoop) -> tuple[MeasuredSensitivity | None, ...]:
-    """Return the sensitivity by a measured response from references to positions, of a record that is not periodic.
-
-    `response`: (n, n_p, n_references); `loop`: at its frequencies.
+    """Return the sensitivity by a response (n, n_p, n_references) from references to positions, `loop` at its
+    frequencies, of a record that is not periodic.
     """
     p = [k for group in loop.plant.sensors for k in group]
     K, F = loop.controller.response(response.frequency_hz)

@@ -1,11 +1,7 @@
 """The controller of a loop: as the rig's [loop] says, or identified from a record of it.
 
-Each input obeys a rational law of the logged signals, in d = 1 - 1/z,
-
-    A(d) u = F(d) r - B(d) y,
-
-an almost noise-free relation where the controller computes with what is logged, so that least squares over the excited
-lines find it to the last digits (Ljung 1999, sec. 10.1). A logged voltage with noise of its own is weighted by 1/|A|
+Each input obeys A(d) u = F(d) r - B(d) y of logged signals, d = 1 - 1/z, almost without noise: least squares over the
+excited lines find it to the last digits (Ljung 1999, sec. 10.1). A voltage with noise of its own is weighted by 1/|A|
 again and again (Sanathanan and Koerner 1963). The reference may act anywhere inside the controller.
 """
 
@@ -120,9 +116,8 @@ class Controller:
 
 
 def controller_of_loop(loop: Loop, plant_model: LinearModel, rate_hz: float) -> Controller:
-    """Return the controller of a rig's [loop], of which a PID is the same on every axis; see `ambid.physics.loop.Loop`.
-
-    The reference of an axis is what is added to the controller's output.
+    """Return the controller of a rig's [loop] (`ambid.physics.loop.Loop`; a PID is the same on every axis), references
+    added to its output.
     """
     n_u, n_y = len(plant_model.inputs), len(plant_model.outputs)
     law = law_on(loop, plant_model, rate_hz)
@@ -151,11 +146,9 @@ def controller_of_loop(loop: Loop, plant_model: LinearModel, rate_hz: float) -> 
 def identify_controller(
     frequency_hz: Array, u: Complex, y: Complex, r: Complex, *, rate_hz: float, own: Sequence[Sequence[int]]
 ) -> Controller:
-    """Identify the controller from spectra of inputs, outputs and references at the excited lines.
-
-    `u` (n_lines, n_inputs), `y` (n_lines, n_outputs), `r` (n_lines, n_references): of one stretch of the record, or
-    means over periods; `own`: the outputs beside each input. Reference j belongs to input j where there are as many.
-    EstimationError where there are too few lines.
+    """Identify the controller from spectra `u`, `y`, `r` (n_lines, n) at excited lines, of one stretch or means over
+    periods; `own`: the outputs beside each input. Reference j belongs to input j where there are as many.
+    EstimationError for too few lines.
     """
     d = np.asarray(1.0 - np.exp(-2j * np.pi * frequency_hz / rate_hz))
     n_u, n_y, n_r = u.shape[1], y.shape[1], r.shape[1]
@@ -204,10 +197,8 @@ def _law(
 
 
 def _fit(d: Complex, signals: Complex, n: int) -> tuple[float, Array, Array, Array, float]:
-    """Fit A u + B y - F r = T, all of degree `n`; T is what differs between the ends of the stretch.
-
-    Returns scale of d, coefficients, their covariance, residual power over the input's (no less than exact) by line,
-    and its root mean.
+    """Fit A u + B y - F r = T, all of degree `n`, T from the stretch's ends. Returns scale of d, coefficients,
+    covariance, residual power over the input's (no less than exact) by line, and its root mean.
     """
     scale = float(np.max(np.abs(d)))
     x = (d / scale)[:, None] ** np.arange(n + 1)

@@ -1,10 +1,9 @@
 """How far the magnet's curvature moves a linear estimate from its numbers at the operating point.
 
-What a magnet does beyond its tangent, f - k_i i + k_x x of the force and λ - L i - k_i x of the flux linkage, is to the
-linear model a disturbance w = (of the force, less the slope of that of the flux) of known course: the law's at the
-motion. It reaches the prediction error as v = C (q - A + K C)⁻¹ E w, and moves the estimate to first order by
+Beyond the tangent, f - k_i i + k_x x and λ - L i - k_i x are to the linear model a disturbance w = (of the force, less
+the slope of that of the flux). It reaches the prediction error as v = C (q - A + K C)⁻¹ E w and moves the estimate by
 -(JᵀJ)⁻¹ Jᵀ v, J the slopes of the weighted errors: the best linear approximation (Pintelon and Schoukens 2012, ch. 3)
-as it is seen through the predictor, theory.md sec. 11.
+through the predictor, theory.md sec. 11.
 """
 
 from __future__ import annotations
@@ -34,9 +33,8 @@ _STEP = 1e-30  # of complex differences, which lose no digits
 
 
 def beyond_tangent(law: Law, moved: Array, rate_hz: float) -> Array:
-    """Return what the magnet does beyond its tangent from each sample to the next, force in N and voltage in V.
-
-    `moved`: (n, 2), position and current from rest, SI. Returns (n - 1, 2).
+    """Return what the magnet does beyond its tangent to the next sample, (n - 1, 2), force in N and voltage in V;
+    `moved` (n, 2): position and current from rest, SI.
     """
     x, i = moved.T
     (x0, i0), w, (k_x, k_i, L) = law.rest, law.energy, law.numbers(*law.rest)
@@ -46,9 +44,8 @@ def beyond_tangent(law: Law, moved: Array, rate_hz: float) -> Array:
 
 
 def expected_shift(task: Task, lines: Lines, c: Complex, information: Information, law: Law) -> Array:
-    """Return the shift of what is estimated from a record of an excitation, in standard deviations, (n,).
-
-    `information`: information of the lines.
+    """Return the shift (n,), in standard deviations, of what is estimated from an excitation, by its lines'
+    `information`.
     """
     plant = task.loops[0].plant
     waves = task.limited(lines, [0]).waves(c)[:, :2]
@@ -67,10 +64,9 @@ def expected_shift(task: Task, lines: Lines, c: Complex, information: Informatio
 
 
 def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
-    """Return the shift of each physical parameter, SI, the part of the law that the record shows, and its sd.
-
-    `e`: (n_used, 2), innovations at the fit, scaled. The motion is that of the predictor, which does not know the noise
-    of the sample that it predicts: the part is then not biased by that.
+    """Return each physical parameter's shift, SI, the part of the law that the record shows, and its sd. `e` (n_used,
+    2): innovations at the fit, scaled; motion is the predictor's, which does not know its sample's noise: no bias from
+    that.
     """
     problem, weight = fit.problem, weight_of(fit.covariance)
     at = assemble(problem, fit.vector, with_derivatives=False)
@@ -92,11 +88,9 @@ def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
 
 
 def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Array) -> Check | None:
-    """Check that curvature moves no number by more than its standard deviation allows; None where no law is known.
-
-    `e`: as for `seen_shift`; `at`: operating point; `sd`: (n_physical,), SI. The law of a rig counts unless the record
-    contradicts it; one with an assumed gap only as far as the record shows it. What a record shows beyond all of a
-    rig's law is of second order in the shift, and no larger one.
+    """Check that curvature moves no number by more than its `sd` (n_physical,), SI, allows; None where no law is known.
+    `e`: see `seen_shift`. A rig's law counts unless the record contradicts it; with an assumed gap only as far as the
+    record shows it, and what that shows beyond the law is of second order in the shift, and no larger one.
     """
     theta = fit.problem.parameters(fit.vector)
     plant = Plant(model=fit.problem.model, theta=theta, delays=np.zeros(1), rate_hz=fit.problem.rate_hz)

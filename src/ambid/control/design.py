@@ -1,10 +1,8 @@
 """What is asked of a controller, what it does on one plant and on many, and the design as a result.
 
-A design is judged on plants of `ambid.control.drawn` that its method has not seen. Figures that are to be small are
-minimised together, as the largest over the plants of each over that of the present loop, of the peak no more than zone
-A allows: one plant that the present loop hardly holds would else make any peak a good one. All figures are limited, by
-what the present loop has where nothing else is said. So the peak of the sensitivity, which is smallest without an
-integrator, is never the only thing that is looked at.
+It is judged on plants of `ambid.control.drawn` that its method has not seen. Figures to be small are minimised
+together, the largest over the plants of each over that of the present loop, of the peak no more than zone A allows; all
+are limited, by the present loop's where nothing else is said, as the peak alone is smallest without an integrator.
 """
 
 from __future__ import annotations
@@ -158,9 +156,8 @@ def closed_loop_of(plant: Plant, loop: Loop, frequency_hz: Array | None = None) 
 
 
 def noise_of(noise: Noise | None, sensor_sd: Mapping[str, float]) -> tuple[float, float, str]:
-    """Return the noise of position and current, m and A rms, with what is assumed of it.
-
-    `noise`: the rig's; `sensor_sd`: as estimated, where the rig says nothing.
+    """Return the noise of position and current, m and A rms, with what is assumed of it: the rig's, else the estimated
+    `sensor_sd`.
     """
     noise_given = noise or Noise()
     values = [
@@ -227,9 +224,8 @@ def noise_in_command(loop: ClosedLoop, noise: tuple[float, float]) -> Array:
 
 
 def force_step(plant: Plant, z: Array, n: int, doublings: int = 0) -> Array:
-    """Return the positions of the axes after a step of 1 N on each, one at a time, (n, n_axes), m.
-
-    `z`: matrix of the closed loop. Samples by doubling: x[k + m] = z^m x[k] + x[m]; of each 2^`doublings` the last.
+    """Return positions (n, n_axes), m, after a step of 1 N on each axis in turn; `z`: matrix of the closed loop.
+    Samples by doubling, x[k + m] = z^m x[k] + x[m]; of each 2^`doublings` the last.
     """
     whole = float(np.max(plant.delays))
     d, _ = discretise(plant.space, 1.0 / plant.rate_hz, fraction=whole - math.floor(whole))
@@ -403,13 +399,9 @@ class Design(Judged):
         return loop
 
     def to_control(self) -> Any:
-        """Return the new controller for python-control; needs the extra ``ambid[control]``.
+        """Return the new controller as a discrete-time control.StateSpace; needs the extra ``ambid[control]``.
 
-        Returns
-        -------
-        control.StateSpace
-            In discrete time, SI units, from what is fed back (position and current of each axis) to the commands, the
-            sign included.
+        SI units, from what is fed back (position and current of each axis) to the commands, the sign included.
         """
         law = self.law
         return discrete_to_control(law.A, law.B, law.C, law.D, 1.0 / law.rate_hz)

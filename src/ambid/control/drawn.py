@@ -1,13 +1,10 @@
-"""Plants that a loop must hold: drawn around an estimate, each with what was changed.
+"""Plants that a loop must hold: drawn around an estimate (draw 0), each with what was changed.
 
-What was identified scatters by its covariance. What matters more was not in the record: a rotor away from its rest
-and another load, at which k_x, k_i and L are those of the co-energy there (thesis eq. 1.9, 2.7); a delay that the
-controller realises only roughly; eddy currents; a coil that became warm; bending modes of another assembly, less
-damped. Draw 0 is the estimate itself.
-
-Without the numbers of a magnet the law is that of two opposed ones: k_i = 4 k' i0/s0² cos alpha and -k_x = 4 k' i0²/s0³
-cos alpha give i0/s0 = -k_x/k_i and, without leakage, L = -k_i²/k_x, so that the gap s0 alone has to be assumed: twice
-the travel inside the limits, as touch-down bearings stand at half of the gap.
+Beside the covariance: a rotor away from rest and another load, at k_x, k_i and L of the co-energy there (thesis eq.
+1.9, 2.7); a roughly realised delay; eddy currents; a warm coil; less damped bending modes of another assembly. Without
+a magnet's numbers the law is two opposed ones': k_i = 4 k' i0/s0² cos alpha and -k_x = 4 k' i0²/s0³ cos alpha give
+i0/s0 = -k_x/k_i and, without leakage, L = -k_i²/k_x; the gap s0 is assumed, twice the travel inside the limits, as
+touch-down bearings stand at half of it.
 """
 
 from __future__ import annotations
@@ -119,10 +116,9 @@ def draw_plants(
     plant: Plant, rig: Rig, n: int, *, seed: int, spread: Spread | None = None,
     point: Mapping[str, float] | None = None,
 ) -> Draws:  # fmt: skip
-    """Return `n` plants, the estimate first; draw k of a seed is the same whatever `n` is.
-
-    `rig`: its magnet and limits are used; `point`: where rotor and current rest, as an estimate's ``operating_point``;
-    default: the rig's. EstimationError where hardly any draw is physical.
+    """Return `n` plants, the estimate first, by the rig's magnet and limits; draw k of a seed is the same whatever `n`
+    is. `point`: of rest, as an estimate's ``operating_point``, default the rig's. EstimationError if hardly any is
+    physical.
     """
     spread = spread or Spread()
     at = rig.operating_point if point is None else point
@@ -148,8 +144,7 @@ _NONE: Mapping[str, float] = MappingProxyType({})
 
 
 def over_speeds(draws: Draws, speeds: Interval) -> Draws:
-    """Return the plants of a rotor at speeds in rad/s between two: the estimate at its own, two draws at the ends.
-
+    """Return a rotor's plants between two speeds in rad/s: the estimate at its own, two draws at the ends.
     EstimationError where the estimate does not know what a turning rotor does.
     """
     plants = list(draws.plants[:1])
@@ -234,10 +229,8 @@ def _drawn(plant: Plant, rig: Rig, laws: Mapping[str, Law], spread: Spread, rng:
 
 
 def _scattered(plant: Plant, factor: float, rng: np.random.Generator) -> tuple[dict[str, float], Array]:
-    """Return numbers and delays drawn from the covariance, through the correlations.
-
-    Well-known and positive numbers scatter in their logarithm, so that a direction that only scales all of them stays
-    that direction.
+    """Return numbers and delays drawn from the covariance, through the correlations; well-known positive numbers in
+    their logarithm, so that a direction that scales all stays that.
     """
     theta, delays = dict(plant.theta), plant.delays.copy()
     if plant.covariance is None or not plant.names:
@@ -282,9 +275,8 @@ class _EddyAxis(OneAxis):
 def _lagged(
     plant: Plant, rig: Rig, theta: dict[str, float], spread: Spread, rng: np.random.Generator
 ) -> tuple[LinearModel, float]:
-    """Return the model with eddy currents, whose pole is written into `theta`, and their further time constant in s.
-
-    A model of an estimate that has their pole keeps it: the covariance says how it scatters.
+    """Return the model with eddy currents, their pole written into `theta`, and their further time constant in s; a
+    pole that the estimate has is kept: the covariance says how it scatters.
     """
     pole = None if rig.magnet is None or not rig.magnet.eddy else rig.magnet.known("a")
     own = 1.0 / plant.rate_hz if pole is None or not pole.value else 1.0 / pole.value

@@ -1,10 +1,9 @@
 """The excitation that shows the parameters of a model best within limits; file schema ``ambid.experiment/1``.
 
-An excitation Re Σ c_k exp(jω_k t) moves signal s as Re Σ T_sk c_k exp(jω_k t). Its use of the limits is the largest
-part of the way to any of them; a criterion that falls with the squared amplitude is best where the use is 1, so that
-ln criterion + 2 ln use is minimised over amplitudes and phases at once, the use as a p-norm whose p rises (Guillaume,
-Schoukens, Pintelon and Kollar 1991 for phases alone), by L-BFGS with exact gradients. A part of the power is spread
-evenly: few lines would blind the tests of delay and residuals.
+Re Σ c_k exp(jω_k t) moves signal s as Re Σ T_sk c_k exp(jω_k t); its use is the largest part of the way to any limit.
+As criteria fall with the squared amplitude, ln criterion + 2 ln use is minimised over amplitudes and phases by L-BFGS,
+the use as a p-norm of rising p (Guillaume, Schoukens, Pintelon and Kollar 1991 for phases alone). A part of the power
+is spread evenly: few lines would blind the tests of delay and residuals.
 """
 
 from __future__ import annotations
@@ -604,9 +603,8 @@ def hardest(task: Task, lines: Lines, c: Complex) -> list[int]:
 
 
 def uses(task: Task, lines: Lines, c: Complex) -> Array:
-    """Return the largest part of each signal's way to its limits, (n_plants, 2, n_signals): steady, and from rest.
-
-    From rest are the plant itself and those drawn ones that use most in steady state.
+    """Return the largest part of each signal's way to its limits, (n_plants, 2, n_signals), steady and from rest: the
+    plant and those drawn ones that use most in steady state.
     """
     steady = np.array([task.limited(lines, [k]).use(c) for k in range(len(task.loops))])
     parts = np.repeat(steady[:, None], 2, axis=1)
@@ -618,9 +616,8 @@ def uses(task: Task, lines: Lines, c: Complex) -> Array:
 
 
 def played(design: Design, task: Task, quantum: float | None) -> tuple[Array, Table | None]:
-    """Return one period of the excitation, (period, n_inputs), and the controller's table that plays it.
-
-    `quantum`: step of the voltage that the controller orders; None: there is no table.
+    """Return one period of the excitation, (period, n_inputs), and the controller's table that plays it, by voltage
+    steps of `quantum`; None: there is no table.
     """
     n_u, X = task.loops[0].e.shape[1], np.zeros((task.period // 2 + 1, task.loops[0].e.shape[1]), dtype=complex)
     X[design.lines, task.inputs(design.lines)] = 0.5 * task.period * design.c

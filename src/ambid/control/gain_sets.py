@@ -1,15 +1,12 @@
 """PIDs on many axes as one law: the same gains on all, a set a bearing, or sets for parallel and tilting motion.
 
-The axes are turned into coordinates c = T y by an orthogonal T, each coordinate has the PID of one set, and commands
-go back by its transpose: equal sets are the decentralised loop, whatever T is. Of the bearings of a plane, those forces
-p with the smallest squares that push without tilting, p = R⁺ (1, 0) with the rows R of ones and of levers z_b - z_cg,
-make the parallel coordinate (of two bearings their mean weighted with the other's lever); all else of the plane tilts.
-As P = pp'/p'p is symmetric, the damping takes energy out wherever sensors and magnets stand together.
+Coordinates c = T y of an orthogonal T have a set's PID each, and commands go back by T's transpose: equal sets are the
+decentralised loop. The least forces p of a plane that push without tilting, p = R⁺ (1, 0), rows of R ones and levers
+z_b - z_cg, make the parallel coordinate; all else tilts. P = pp'/p'p is symmetric: damping takes energy out wherever
+sensors and magnets stand together. A filter in the position of every set, around a bending mode, is a notch, or turns
+the phase where zeros and poles stand apart:
 
-A filter in the position of every set, around a bending mode, is a notch where its zeros and poles meet, and turns the
-phase where they stand apart:
-
-    F(s) = (w_p/w_z)² (s² + 2 zeta_z w_z s + w_z²)/(s² + 2 zeta_p w_p s + w_p²),   s = (2/T) (z - 1)/(z + 1),
+F(s) = (w_p/w_z)² (s² + 2 zeta_z w_z s + w_z²)/(s² + 2 zeta_p w_p s + w_p²), s = (2/T) (z - 1)/(z + 1),
 
 in frequencies that are bent beforehand (Franklin, Powell and Workman 1998, sec. 6.1).
 """
@@ -351,11 +348,9 @@ class RotorLoops:
         return figures, slopes
 
     def decays(self, at: Array, *, integrates: bool) -> tuple[Array, Array]:
-        """Return how fast force steps settle on each plant, 1/s, and its slopes, (n_plants, n).
-
-        A pole with the part c in a step over its peak is settled after ln(c/`SETTLED`)/decay: of all poles the slowest
-        so (a smooth minimum: axes have almost the same poles), in decays of one with the whole step. c falls with the
-        square of the frequency, as inertia does: a bending mode that hardly takes part may decay slowly.
+        """Return how fast force steps settle on each plant, 1/s, and its slopes, (n_plants, n). A pole of part c in a
+        step over its peak takes ln(c/`SETTLED`)/decay; the slowest counts (a smooth minimum), in decays of one with the
+        whole step. c falls with the squared frequency: a bending mode that hardly takes part may decay slowly.
         """
         laws, decays, slopes = self._laws(at), [], []
         for sampled in self.sampled:

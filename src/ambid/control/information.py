@@ -1,14 +1,12 @@
 """What a periodic excitation tells of a model's parameters, line by line, before a record is made.
 
-With the innovations form y = G u + H e, S = cov e, the prediction error moves with a parameter as H⁻¹ dG/dθ u (Ljung
-1999, sec. 9.4 and 13.4); the parameters of H alone do not enter, nor do offsets, which stand at frequency 0. An
-excitation c exp(jωt) that reaches the inputs as T c gives of each sample the information
+Of y = G u + H e, S = cov e, the prediction error moves as H⁻¹ dG/dθ u (Ljung 1999, sec. 9.4 and 13.4), without
+parameters of H alone and offsets, which stand at frequency 0. Inputs T c exp(jωt) give of each sample
 
-    M = |c|² Re(Φ* S⁻¹ Φ)/2,   Φ = H⁻¹ dG/dθ T,   H⁻¹ = I - C (z - A + K C)⁻¹ K,
+M = |c|² Re(Φ* S⁻¹ Φ)/2, Φ = H⁻¹ dG/dθ T, H⁻¹ = I - C (z - A + K C)⁻¹ K,
 
-K the gain of the stationary predictor. Lines add up: M is linear in the powers, and the best powers are a convex
-problem (Fedorov 1972; Goodwin and Payne 1977, ch. 6). What feedback of the noise tells and what the initial state costs
-is left out.
+K the stationary predictor's gain: linear in the powers, a convex problem (Fedorov 1972; Goodwin and Payne 1977, ch. 6).
+What feedback of the noise tells and what the initial state costs is left out.
 """
 
 from __future__ import annotations
@@ -155,11 +153,9 @@ class Information:
 
 
 def power_design(information: Information, cost: Array, samples: float) -> tuple[Array, float]:
-    """Return the powers of lines with the least criterion at a total cost of 1, and how far that is proven.
-
-    Multiplicative algorithm (Silvey, Titterington and Torsney 1978; Yu 2010): each share of the cost grows with the
-    root of its slope. By the equivalence theorem (Kiefer 1974) no design is better by more than the largest slope less
-    the mean, over the mean. `cost` (n_lines,): of unit power. Returns powers (n_lines,) and that bound.
+    """Return powers (n_lines,) of the least criterion at a total cost of 1, `cost` being that of unit power, and the
+    largest slope less the mean, over the mean: no design is better by more (equivalence theorem, Kiefer 1974). Each
+    share of the cost grows with the root of its slope (Silvey, Titterington and Torsney 1978; Yu 2010).
     """
     lines = information.lines / cost[:, None, None]
     share, gap = np.full(cost.size, 1.0 / cost.size), np.inf

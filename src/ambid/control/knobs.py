@@ -1,10 +1,7 @@
-"""Laws of an optimal method, whose few knobs are set by the worst of many plants.
+"""Laws of an optimal method, whose few knobs are set by the worst of many plants, as LQG promises nothing on others
+than its own (Doyle 1978): a grid, then along each knob. Of responses computed once, y = H w and w = W y:
 
-A method such as LQG promises nothing on another plant than its own (Doyle 1978). So its knobs are searched on a grid
-and then along each of them, for the goals of a design: largest over the plants, with the limits as penalties. Responses
-of the plants are computed once; with y = H w and w = W y,
-
-    S = (I - H W)⁻¹ at the positions,  x/f = G_x + H_x W (I - H W)⁻¹ G_y,  w/n = W (I - H W)⁻¹.
+S = (I - H W)⁻¹ at the positions, x/f = G_x + H_x W (I - H W)⁻¹ G_y, w/n = W (I - H W)⁻¹.
 
 At the commands (I - W H)⁻¹ is limited beside.
 """
@@ -89,9 +86,8 @@ class Family:
         return np.max(np.abs(signals), axis=(1, 2)), np.max(np.abs(commands), axis=(1, 2))
 
     def figures(self, law: StateLaw) -> dict[str, float]:
-        """Return the worst of each of `FIGURES`, the peak at the commands and the largest pole.
-
-        Settling is that of the slowest pole. The pole is alone where a plant is not held.
+        """Return the worst of each of `FIGURES` (settling by the slowest pole), the peak at the commands, and the
+        largest pole, which is alone where a plant is not held.
         """
         largest = float(np.max(self.poles(law)))
         if largest >= 1.0:
@@ -165,9 +161,8 @@ class Score:
 
 
 def _search(tries: _Tries, score: Score, grid: Sequence[Knobs]) -> Knobs:
-    """Return the knobs of least score: the best of a grid, then by smaller and smaller steps.
-
-    The first two knobs change together too, as the border of a limit may run between them.
+    """Return the knobs of least score: the best of a grid, then by ever smaller steps, of the first two together too,
+    as the border of a limit may run between them.
     """
 
     def at(knobs: Knobs) -> float:
@@ -241,9 +236,8 @@ def _refusal(tries: _Tries, score: Score, grid: Sequence[Knobs], name: str) -> s
 
 
 def _design(plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, law_of: LawOf, name: str) -> Loop:
-    """Return the law of a method for the first of some plants, its knobs set by all of them.
-
-    The knobs: effort, strength of the disturbances, and the time of the integral.
+    """Return a method's law for the first of some plants, its knobs (effort, disturbances, time of the integral) set by
+    all.
     """
     limits, settling = rig.limits, goals.limits.get("settling", goals.reference["settling"])
     if limits is None:
@@ -334,9 +328,8 @@ class FixedPointLaw:
 
 
 def fixed_point(law: StateLaw, plant: Plant, counts: Counts, words: LawWords | None = None) -> FixedPointLaw:
-    """Return the law of one axis in words, with what they do to its loop on a plant; RigError where it does not fit.
-
-    `words`: others than those that the controller is given.
+    """Return the law of one axis in words and what they do to its loop on a plant; RigError where it does not fit;
+    `words`: others than the controller's.
     """
     words = words or law_words(counts.of(law))
     realised, family = counts.to_si(words.law(law.rate_hz)), Family(plants=(plant,))
@@ -350,10 +343,8 @@ def fixed_point(law: StateLaw, plant: Plant, counts: Counts, words: LawWords | N
 
 
 def _rounding(sampled: SampledPlant, law: StateLaw, counts: Counts) -> tuple[float, float, float]:
-    """Return V rms in the command by rounding of states, m of a limit cycle by that, and by all that rounds.
-
-    (A - 1) and C see the difference of a state from its upper part; then there is the last bit of the state itself. The
-    converter rounds position and current, the pulse width the command.
+    """Return V rms in the command by rounding of states, m of a limit cycle by that, and by all that rounds: a state's
+    difference from its upper part, seen by (A - 1) and C, its last bit, converter and pulse width.
     """
     from scipy.linalg import solve_discrete_lyapunov
 

@@ -1,13 +1,11 @@
 """LQG with integral action, in discrete time: a `StateLaw` from a plant, physical weights and noise.
 
-The plant over one sample, x+ = A x + B u + n, y = C x + e, has its own states and the commands still on their way
-(delay). With q+ = q + T p the integral of the positions, u = -K [x̂, q] minimises
+Over a sample x+ = A x + B u + n, y = C x + e (states and delayed commands), q+ = q + T p; u = -K [x̂, q] minimises
 
-    Σ p'p/p₁² + i'i/i₁² + q'q/(p₁ τ)² + effort² u'u/u₁²,
+Σ p'p/p₁² + i'i/i₁² + q'q/(p₁ τ)² + effort² u'u/u₁²,
 
-K = (R + B'P B)⁻¹ B'P A, and x̂ is that of the stationary Kalman filter (Kwakernaak and Sivan 1972, ch. 6; Franklin,
-Powell and Workman 1998, ch. 9). Its separation holds for this plant alone and promises no margins (Doyle 1978): the two
-knobs, effort and how strong disturbances are taken, are set by the worst of many plants.
+K = (R + B'P B)⁻¹ B'P A, x̂ the stationary Kalman filter's (Kwakernaak and Sivan 1972, ch. 6; Franklin, Powell and
+Workman 1998, ch. 9). It promises no margins (Doyle 1978): effort and disturbances are set by the worst of many plants.
 """
 
 from __future__ import annotations
@@ -107,10 +105,8 @@ class Lqg:
 
 
 def lqg(plant: Plant, weights: Weights, noise: Noise, *, effort: float = 1.0, disturbance: float = 1.0) -> Lqg:
-    """Return the law for a plant.
-
-    `effort`: factor on the price of the command: small is fast; `disturbance`: factor on the process noise: large
-    trusts the sensors, small the model. EstimationError where the equations have no good solution.
+    """Return the law for a plant. `effort`: factor on the price of the command, small is fast; `disturbance`: on the
+    process noise, large trusts the sensors, small the model. EstimationError where the equations have no good solution.
     """
     sampled = SampledPlant.of(plant)
     scale = scales_of(sampled, weights)
@@ -397,9 +393,8 @@ def hinf(
 
 
 def tracked(law: StateLaw, driven: Array, command: float) -> StateLaw:
-    """Return a law with G, which tracks its states back where the command is limited, from a dual Riccati equation.
-
-    `driven`: what moves its states in a sample, (n, ...); `command`: the largest that it gives.
+    """Return a law whose G, from a dual Riccati equation, tracks its states back where `command`, the largest, limits
+    it; `driven` (n, ...): what moves its states in a sample.
     """
     from scipy.linalg import solve_discrete_are
 
@@ -431,9 +426,8 @@ _STABLE = 1e-6  # distance from the unit circle of a mode that is balanced
 
 
 def reduced(law: StateLaw, order: int, largest: Array, command: float = 1.0) -> tuple[StateLaw, float]:
-    """Return a law of lower order, and the largest change of its response, from `largest` to `command`.
-
-    `largest`: of each signal it sees, in whose sizes errors count; ModelError where the kept modes alone are more.
+    """Return a law of lower order, and its response's largest change, from `largest` of each signal, in whose sizes
+    errors count, to `command`; ModelError where the kept modes alone are more.
     """
     from scipy.linalg import schur, solve_discrete_lyapunov, solve_sylvester, svd
 

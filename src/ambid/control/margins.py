@@ -71,9 +71,7 @@ class Vibration:
 def room_by_axis(
     loop: ClosedLoop, noise: Mapping[str, float] | None, room: Mapping[str, float | None], machine: Machine | None
 ) -> dict[str, Room]:
-    """Return what each axis bears.
-
-    `noise`: standard deviation of the model's disturbances, held over a sample, and of its outputs' noise, by name;
+    """Return what each axis bears; `noise`: sd of disturbances, held over a sample, and of outputs' noise, by name;
     `room`: by role; `machine`: the rotor, where unbalance can be said of it.
     """
     rooms = {}
@@ -194,10 +192,8 @@ def speeds_of(loop: ClosedLoop) -> Array:
 def synchronous(
     loop: ClosedLoop, machine: Machine, frequency_hz: Array, unbalance: Array, runout: Complex | None
 ) -> Complex:
-    """Return inputs, and motion at the outputs, of a rotor over its speed, (n, n_u + n_y, columns).
-
-    `unbalance`: what it does to the coordinates of a plane of motion by column, kg m times shape; `runout`: (n_y,
-    columns), m.
+    """Return inputs and outputs' motion of a rotor over its speed, (n, n_u + n_y, columns), by `unbalance` in a plane
+    of motion's coordinates, kg m times shape, and `runout` (n_y, columns), m.
     """
     K, rate = loop.at(frequency_hz).K, loop.plant.rate_hz
     motions = []

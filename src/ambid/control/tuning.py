@@ -1,15 +1,13 @@
 """The PID of `ambid.physics.loop.Loop` tuned over many plants at once; of rotors also one a bearing or by motion.
 
-Of one axis its five numbers kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) +
-q (1 - 1/z)/(1 - p/z) and, each alone, in the matrix of the closed loop: the responses H of the plants are computed
-once, and slopes are exact. With x, i by a voltage (H) and by a force (G), D = 1 + kc H_i + K H_x:
+Of one axis kp, ki T, q = kd/(tau + T), kc and p = tau/(tau + T) stand in K = kp + ki T/(z - 1) + q (1 - 1/z)/(1 - p/z):
+responses H (by a voltage) and G (by a force) are computed once, slopes are exact. With D = 1 + kc H_i + K H_x:
 
-    S = (1 + kc H_i)/D,   x/f = (G_x + kc (G_x H_i - H_x G_i))/D,   u/n = (K, kc)/D.
+S = (1 + kc H_i)/D, x/f = (G_x + kc (G_x H_i - H_x G_i))/D, u/n = (K, kc)/D.
 
-The largest over the plants of each figure's logarithm is minimised as an epigraph, with the limits as further
-constraints and a common excess of all of them that is penalised exactly (Nocedal and Wright 2006, sec. 17.2 and 18.5):
-where it stays, no design meets them. The decay of the slowest pole stands for settling, and is corrected by what the
-force steps show.
+The largest logarithm of each figure is minimised as an epigraph, limits' common excess penalised exactly (Nocedal and
+Wright 2006, sec. 17.2 and 18.5): where it stays, no design meets them. The slowest pole stands for settling, corrected
+by what the force steps show.
 """
 
 from __future__ import annotations
@@ -196,9 +194,8 @@ class _Search:
         bounds: Array,
         tick: Callable[[], None],
     ) -> tuple[Array, float, float]:
-        """Return the best point from a start, the largest logarithm of the goals there, and the excess over limits.
-
-        `limits`: largest ln(figure/reference); a pole that hardly decays is always beyond one.
+        """Return the best point from a start, the goals' largest logarithm, and the excess over `limits`, largest
+        ln(figure/reference); a pole that hardly decays is always beyond one.
         """
         from scipy.optimize import minimize
 
@@ -240,11 +237,9 @@ class _Search:
 def tune_pid(
     plants: Sequence[Plant], rig: Rig, goals: Goals, tick: Tick, *, form: str = "axes", filters: int = 0
 ) -> Loop:
-    """Return the PID with current feedback that does best on the worst of some plants.
-
-    Gains that the present loop has not stay absent. `form`: of a rotor which axes share gains, of
-    `ambid.control.gain_sets.FORMS`; `filters`: around so many of its lowest bending modes. EstimationError where no
-    loop meets the limits.
+    """Return the PID with current feedback that does best on the worst of some plants; gains the present loop has not
+    stay absent. `form`: which of a rotor's axes share gains, of `ambid.control.gain_sets.FORMS`; `filters`: around so
+    many of its lowest bending modes. EstimationError where no loop meets the limits.
     """
     assert rig.loop is not None
     if rig.loop.law is not None:
@@ -410,9 +405,8 @@ def _between(
     figures_of: Callable[[Loop], Sequence[Figures]],
     goals: Goals,
 ) -> Loop:
-    """Return the loop farthest from the present one towards the best that meets the limits on all plants.
-
-    The slowest pole says little of force steps where it takes no part.
+    """Return the loop farthest towards the best that meets the limits on all plants: the slowest pole says little of
+    force steps where it takes no part.
     """
     worst = UNSTABLE
     for share in np.linspace(1.0, 0.0, _WAYS + 1):

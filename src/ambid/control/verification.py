@@ -1,7 +1,6 @@
-"""A loop tried on the nonlinear simulator: lift-off, a force step, an impact, unbalance, and noise alone.
-
-Limits of the command, quantisation and delay act as on the bench; all but the case of noise are free of noise, so that
-two loops can be compared number by number. Orbits are judged by ISO 14839-2, whose zone B ends at 0.4 of the clearance.
+"""A loop tried on the nonlinear simulator: lift-off, force step, impact, unbalance, and noise, in that case alone, so
+that loops can be compared number by number. Limits of the command, quantisation and delay act as on the bench. Orbits
+are judged by ISO 14839-2, whose zone B ends at 0.4 of the clearance.
 """
 
 from __future__ import annotations
@@ -123,9 +122,8 @@ def verify(
     plant: Plant, rig: Rig, loop: Loop, *, name: str = "the estimate", trials: Trials | None = None,
     nonlinear: bool = True, seed: int = 0,
 ) -> Verification:  # fmt: skip
-    """Try a loop on a plant, the nonlinear one that linearises to it unless told otherwise.
-
-    `rig`: limits, noise, resolutions, point of rest and magnet; the plant's delay takes the place of the loop's.
+    """Try a loop on a plant, the nonlinear one that linearises to it unless told otherwise, its delay in place of the
+    loop's; `rig`: limits, noise, resolutions, point of rest and magnet.
     """
     bench, todo = workbench(plant, rig, loop, nonlinear=nonlinear), trials or Trials()
     trying = _Trying(bench=bench, trials=todo, seed=seed)
