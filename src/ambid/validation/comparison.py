@@ -67,10 +67,9 @@ class Comparison(Result):
         return tuple(reasons)
 
     def as_dict(self) -> dict[str, object]:
-        """Return the table, ready for JSON.
-
-        Returns ``entries`` with structure, orders, n_estimated, criteria, one_step, simulation, failed_checks, seconds,
-        refusal and the fit; ``judged_on``, ``fitted_samples``, ``judged_samples``, ``summary``.
+        """Return the table, ready for JSON: ``entries`` (structure, orders, n_estimated, criteria, one_step,
+        simulation, failed_checks, seconds, refusal, fit), ``judged_on``, ``fitted_samples``, ``judged_samples``,
+        ``summary``.
         """
         entries = [
             {
@@ -111,12 +110,9 @@ def compare(
     criterion: str = "bic",
     tick: Callable[[str], None] | None = None,
 ) -> Comparison:
-    """Fit structures to the same samples and judge them on others.
-
-    `candidates`: structures with their orders; None chooses them by `criterion`; `second`: other data to judge on; then
-    all of `data` is fitted; `criterion`: for orders that are not given, see `ambid.validation.orders.select`; `tick`:
-    called with the structure before each fit; may raise to interrupt. Returns a structure that cannot be fitted is in
-    it, with the reason.
+    """Fit `candidates`, structures with orders (None: by `criterion`, see `ambid.validation.orders.select`), to the
+    same samples and judge them on others: `second`, which lets all of `data` be fitted. One that cannot be fitted is in
+    the result with the reason. `tick`: called with the structure before each fit; may raise to interrupt.
     """
     if not candidates:
         raise EstimationError("nothing to compare; name at least one structure")

@@ -38,16 +38,12 @@ class Covered:
     ----------
     name : str
     truth : float, SI
-    runs : int
-        With a value that may be used.
-    unknown : int
-        In which it was not identifiable.
+    runs, unknown : int
+        Runs with a value that may be used, and in which it was not identifiable.
     bias, bias_sd : float, SI
         Mean of the errors and its standard deviation.
-    spread : float, SI
-        Standard deviation of the estimates.
-    said : float, SI
-        Root mean square of the standard deviations that the estimates have.
+    spread, said : float, SI
+        Standard deviation of the estimates, and root mean square of those that the estimates have.
     ratio : tuple of float
         95 % interval of said / spread; 1 is honest.
     inside : int
@@ -79,10 +75,8 @@ class Coverage(Result):
 
     Attributes
     ----------
-    rig, job : str
-        Names.
-    settings : str
-        What was asked for, JSON.
+    rig, job, settings : str
+        Names, and what was asked for, JSON.
     truth, units : Mapping
         By parameter, SI.
     trials : tuple of Trial
@@ -109,17 +103,7 @@ class Coverage(Result):
         return {word: counter[word] for word in ("usable", "caution", "unusable", "failed")}
 
     def z(self, name: str) -> Array:
-        """Return error / standard deviation of each run that may be used.
-
-        Parameters
-        ----------
-        name : str
-            Of a parameter.
-
-        Returns
-        -------
-        ndarray, shape (runs,)
-        """
+        """Return error / standard deviation of the parameter `name` in each run that may be used, shape (runs,)."""
         value, sd = self._of(name)
         return np.asarray((value - self.truth[name]) / sd, dtype=float)
 

@@ -1,8 +1,8 @@
 """Fits judged: how well they explain their records, criteria, checks, and their errors on a second record.
 
-Residuals of an output-error model may be coloured; its covariance is then (J'J)^-1 J' R J (J'J)^-1 with R the
-covariance of the noise (Soederstrom and Stoica 1989, sec. 7.5; Ljung 1999, sec. 9.4), not the (J'J)^-1 var(v) of white
-noise, which may be many times too small for slow noise, or too large.
+With coloured residuals an output-error model's covariance is (J'J)^-1 J' R J (J'J)^-1, R that of the noise (Soederstrom
+and Stoica 1989, sec. 7.5; Ljung 1999, sec. 9.4), not white noise's (J'J)^-1 var(v), which may be far too small or
+large.
 """
 
 from __future__ import annotations
@@ -56,12 +56,9 @@ _OUTSIDE = 0.1  # part of a second record that may lie outside the training data
 
 
 def judge(fit: AnyFit, records: IOData | Sequence[IOData], *, second: IOData | None = None) -> AnyFit:
-    """Judge a fit on its own records and, where given, on another.
-
-    `records`: what it was estimated from; `second`: data that were not used; same channels, same rate. Returns it with
-    `fit`, `criteria`, `checks` and, for a second record, `validation` (see `validation`). A failed fit comes back as it
-    is. An output-error model whose residuals are coloured gets the covariance that holds for coloured noise, and says
-    so in its warnings.
+    """Judge a fit on its own `records` and on `second`, unused data of the same channels and rate: `fit`, `criteria`,
+    `checks` and `validation`. A failed fit comes back as it is; an output-error model of coloured residuals gets the
+    covariance that holds for them, and a warning.
     """
     own = [records] if isinstance(records, IOData) else list(records)
     if not own:
@@ -144,12 +141,10 @@ def _conclude(
 
 
 def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dict[str, Any]]:
-    """Judge a fit on data that were not used in the estimation.
-
-    Returns by output: ``one_step`` and ``simulation`` (None where unstable or not finite, or without inputs), each with
-    ``fit`` (1 - |e|/|y - mean|) and ``rmse`` (SI). The model is kept. Of a linear one initial state and a constant
-    error are fitted, because a record's operating point is not a property of the model; of a nonlinear one nothing is,
-    over all samples but the first `lag`, and ``extrapolated`` is the part of them outside the training data.
+    """Judge a fit on data not used in the estimation, by output: ``one_step`` and ``simulation`` (None if unstable, not
+    finite or without inputs) with ``fit`` (1 - |e|/|y - mean|) and ``rmse`` (SI). Of a linear model initial state and a
+    constant error are fitted, as the operating point is the record's; of a nonlinear one nothing is, from sample `lag`
+    on, and ``extrapolated`` is the part outside the training data.
     """
     more = dict[str, float]()
     if isinstance(fit, BlackBoxFit):
@@ -167,10 +162,8 @@ def validation(fit: BlackBoxFit | NonlinearFit, second: IOData) -> dict[str, dic
 
 
 def second_check(fit: BlackBoxFit | NonlinearFit, result: Mapping[str, Any]) -> Check:
-    """Check that a fit holds on a second record; `result`: by output, as `validation` gives it.
-
-    It does where its one-step errors are at most 1.5 times those at identification, and at most a tenth of the record
-    lies outside the training data (which a linear fit does not know).
+    """Check that a fit holds on a second record by `result` of `validation`: one-step errors at most 1.5 times those at
+    identification, and at most a tenth outside the training data (which a linear fit does not know).
     """
     sentences = []
     for name, sizes in result.items():
@@ -202,9 +195,8 @@ def _sizes(records: Sequence[IOData], runs: Sequence[Run], *, free: bool) -> Siz
 
 
 def _criteria(n_estimated: int, records: Sequence[IOData], runs: Sequence[Run]) -> dict[str, float]:
-    """Criteria of the one-step errors, over the samples that a linear fit to the same record would be judged on.
-
-    Of a single record the first hundred samples are left out anyway, so that the lag does not matter.
+    """Criteria of the one-step errors, over the samples that a linear fit would be judged on: of a single record not
+    the first hundred, so that the lag does not matter.
     """
     e = []
     for k, (x, r) in enumerate(zip(records, runs, strict=True)):
@@ -245,10 +237,7 @@ def _run_of(residuals: Errors) -> Run:
 
 
 def run(fit: NonlinearFit, data: IOData) -> Run:
-    """Run a record through the model of a fit.
-
-    `fit`: with a model.
-    """
+    """Run a record through the model that a fit has."""
     model = model_of(fit, data)
     with np.errstate(over="ignore", invalid="ignore"):
         one_step = data.y - model.predict(data.u, data.y)
@@ -278,18 +267,14 @@ def model_of(fit: NonlinearFit, data: IOData) -> NonlinearModel:
 
 
 def beyond(novelty: Array) -> NDArray[np.bool_]:
-    """Return where a model extrapolates.
-
-    `novelty`: (n_samples,). Returns (n_samples,), true outside the training data, and where novelty is not a number.
-    """
+    """Return where a model extrapolates by `novelty` (n_samples,): outside the training data, or where it is NaN."""
     out: NDArray[np.bool_] = ~(novelty <= 1.0 + _ROUNDING)
     return out
 
 
 def looks_back(data: IOData, run: Run) -> bool:
-    """Return whether predictions use measured outputs: if not, the model leaves the colour of the noise open.
-
-    Returns false where the one-step prediction is the free run, as for an output-error model.
+    """Return whether predictions use measured outputs; not where they are the free run, as of an output-error model,
+    which leaves the colour of the noise open.
     """
     if run.simulation is None or run.diverges_at is not None or not run.finite:
         return True
@@ -301,10 +286,8 @@ def looks_back(data: IOData, run: Run) -> bool:
 def nonlinear_residuals(
     fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run], *, coloured: bool
 ) -> Residuals | None:
-    """Prepare what the residual tests look at: errors and inputs over their size, derivatives of the predictions.
-
-    `runs`: of these records, all finite; `coloured`: whether the model leaves the colour of the noise open. None where
-    no record has samples enough.
+    """Prepare scaled errors and inputs, and prediction slopes, of finite `runs` for the residual tests, None without
+    samples enough; `coloured`: the model leaves the colour of the noise open.
     """
     pairs = [(x, r) for x, r in zip(records, runs, strict=True) if x.n_samples - r.lag >= LEAST]
     if not pairs:
@@ -367,10 +350,8 @@ def _check_finite(runs: Sequence[Run]) -> Check:
 
 
 def _check_simulation(records: Sequence[IOData], runs: Sequence[Run], tests: ResidualTests | None) -> Check | None:
-    """Check that the free run stays finite, and within ten times the span of what was measured; None without inputs.
-
-    An unstable plant under feedback cannot be simulated from its input: where the data show feedback, a free run that
-    runs away is reported and not held against the model.
+    """Check that the free run stays finite, and within ten times the span measured; None without inputs. Where the data
+    show feedback it is reported, not held against the model: an unstable plant cannot be simulated from its input.
     """
     if any(r.simulation is None for r in runs):
         return None
@@ -419,9 +400,8 @@ def _unconverged_warnings(fit: NonlinearFit) -> list[str]:
 
 
 def leaves_colour_open(fit: NonlinearFit, records: Sequence[IOData], runs: Sequence[Run]) -> bool:
-    """Return whether a fit says nothing of the colour of its noise, so that coloured residuals are no fault of it.
-
-    Returns true for a model that was fitted to its free run, and for one that predicts without measured outputs.
+    """Return whether coloured residuals are no fault of a fit: it was fitted to its free run, or predicts without
+    measured outputs.
     """
     if fit.settings.get("focus") == "simulation":
         return True
@@ -439,9 +419,8 @@ def _last(data: IOData, residuals: Errors) -> tuple[IOData, Errors]:
 
 
 def linear_residuals(fit: BlackBoxFit, data: IOData, residuals: Errors, slopes: Gradient) -> Residuals:
-    """Prepare what the residual tests look at: the data run through the fit, and derivatives of its predictions.
-
-    In a loop, a model without noise is tested against the reference, where there is one: inputs hold the noise.
+    """Prepare a fit's residuals and prediction slopes for the tests; a model without noise is tested in a loop against
+    the reference, where there is one, as inputs hold the noise.
     """
     first = skipped(data.n_samples)
     loop = not residuals.claims_noise and structure(fit.structure).feedback == "consistent" and bool(data.references)
@@ -503,11 +482,9 @@ def _coloured_warning(fit: BlackBoxFit, *, adjusted: bool) -> list[str]:
 
 
 def coloured_covariance(fit: BlackBoxFit, e: Array, slopes: Gradient, colours: Sequence[Array]) -> Array | None:
-    """Return the covariance (n_theta, n_theta) of an output-error model's coefficients under coloured noise.
-
-    `e`: (n_samples, n_outputs), simulation errors; `slopes`: derivatives of the simulation; `colours`: autoregression
-    of the errors of each output, which are taken to be independent of each other. None where directions are not
-    coefficients, or not independent.
+    """Return the covariance (n_theta, n_theta) of an output-error model under coloured noise; `e`: simulation errors,
+    `slopes`: their derivatives, `colours`: autoregressions of each output's errors, taken as independent of each other.
+    None where directions are not coefficients, or not independent.
     """
     if slopes.theta is None or fit.covariance is None:
         return None

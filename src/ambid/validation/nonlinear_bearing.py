@@ -40,10 +40,8 @@ class WhitenessTest:
 
 
 def whiteness(fit: BearingFit, r: int) -> WhitenessTest:
-    """Test the innovations of one record against their own past, and against past voltages.
-
-    A lag between current and force (an eddy pole) leaves the innovations white, as the levels of the noise grow over
-    it, but not independent of past voltages.
+    """Test the innovations of one record against their own past and past voltages: an eddy pole between current and
+    force leaves them white, as noise levels grow over it, but not independent of these.
     """
     residuals = run(fit.problem, fit.vector, r) if fit.at is None else fit.at.innovations[r]
     assert residuals is not None
@@ -95,10 +93,7 @@ class BearingReplay:
 
 
 def replay(estimate: NonlinearBearingEstimate, record: BearingRecord, *, noise_of: str | None = None) -> BearingReplay:
-    """Run a record through the predictor of an estimate.
-
-    `record`: of the same bench, at a rate of the records that it came from.
-    """
+    """Run a record of the same bench, at a rate of the estimate's own records, through its predictor."""
     delay = estimate.delay_samples(record.rate_hz)
     kind = [
         name
@@ -180,13 +175,11 @@ def _replayed(fit: BearingFit, name: str) -> BearingReplay:
 
 
 def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dict[str, object]:
-    """Judge an estimate on a further record: nothing is fitted but the state at its beginning.
-
-    `record`: of a rotor that moves. Returns ``fit``: by output one_step, simulation (None: one magnet falls or clings),
-    innovation_rms in SI and ratio to that at identification; ``checks``: residuals_white, residuals_uncorrelated,
-    innovations_consistent, inside_range (how much of the record lies beyond the positions and currents that the
-    estimate has seen) and, for one magnet, carries_its_weight, each with ``passed`` and ``detail``; ``passed``;
-    ``samples``; ``outside``, share of the record.
+    """Judge an estimate on a further record of a moving rotor; only the first state is fitted. ``fit`` by output:
+    one_step, simulation (None: one magnet falls or clings), innovation_rms in SI and ratio to that at identification;
+    ``checks``: residuals_white, residuals_uncorrelated, innovations_consistent, inside_range (positions and currents
+    that the estimate has seen) and, for one magnet, carries_its_weight; ``passed``; ``samples``; ``outside``, share of
+    the record.
     """
     replayed = replay(estimate, record)
     sound = np.all(np.isfinite(replayed.innovations), axis=1)
@@ -220,10 +213,7 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
 
 
 def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) -> dict[str, Check]:
-    """Check residuals against their own past and against past voltages; each passes where every record does.
-
-    `names`: of the records, where there are several.
-    """
+    """Check residuals against their own past and past voltages; each passes where every record (by `names`) does."""
     checks = {}
     for check, what, p in (
         ("residuals_white", ("not white", "white"), [t.p_own for t in tests]),

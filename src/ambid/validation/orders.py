@@ -1,9 +1,8 @@
 """Choice of orders: a few good fits instead of hundreds.
 
-Delays and a first size come from all ARX models at once (one triangular factor), subspace models of all orders from
-one factorisation. Other structures are then fitted along one line of sizes, and from its best point orders move by one
-as long as a criterion falls: some tens of fits, whatever the structure. Sources: Ljung 1999, sec. 16.4; Soederstrom and
-Stoica 1989, ch. 11.
+Delays and a first size come from all ARX models at once (one triangular factor), subspace models from one
+factorisation; others are fitted along one line of sizes, then orders move by one while a criterion falls (Ljung 1999,
+sec. 16.4; Soederstrom and Stoica 1989, ch. 11).
 """
 
 from __future__ import annotations
@@ -56,10 +55,7 @@ class Selection:
     samples: int  # how many samples were looked at
 
     def summary(self) -> dict[str, object]:
-        """Return what was chosen and the best candidates, ready for JSON.
-
-        Returns ``criterion``, ``why``, ``tried``, ``samples`` and ``best``: up to ten candidates.
-        """
+        """Return ``criterion``, ``why``, ``tried``, ``samples`` and ``best``, up to ten candidates, ready for JSON."""
         return {
             "criterion": self.criterion,
             "why": self.why,
@@ -79,10 +75,8 @@ def select(
     ranges: Mapping[str, tuple[int, int]] | None = None,
     tick: Callable[[str], None] | None = None,
 ) -> Selection:
-    """Choose the orders of a structure.
-
-    `structure_name`: as in `ambid.blackbox.fit`; `ranges`: least and largest value of an order; `tick`: called
-    with the orders before each fit; may raise to interrupt.
+    """Choose the orders of a structure of `ambid.blackbox.fit` within `ranges`, least and largest; `tick`: called with
+    the orders before each fit; may raise to interrupt.
     """
     chosen = structure(structure_name)
     rule = _criterion(criterion)
@@ -181,13 +175,9 @@ class _Trial:
 
 
 def whiten(e: Array) -> tuple[Array, int]:
-    """Filter the residuals of a model without noise model by an autoregression each, chosen by BIC.
-
-    The likelihood of coloured residuals as if they were white falls for every extra pole that follows the noise: orders
-    chosen by it are too high.
-
-    `e`: (n_samples, n_outputs). Returns `e`: (n_samples, n_outputs), white; `n_estimated`: coefficients of the
-    autoregressions.
+    """Return residuals (n_samples, n_outputs) of a model without noise model, each whitened by an autoregression of
+    BIC's order, and its coefficients' number: as if white, their likelihood falls for every pole that follows the
+    noise, and orders come out too high.
     """
     from scipy.signal import lfilter
 
@@ -235,10 +225,7 @@ class Start:
 
 
 def first_size(chosen: Structure, data: IOData, ranges: Mapping[str, tuple[int, int]]) -> Start:
-    """Compare ARX models of all sizes and delays, as far as the record is long enough for them.
-
-    `ranges`: the user's.
-    """
+    """Compare ARX models of all sizes and delays within the user's `ranges`, as far as the record is long enough."""
     n_u = max(data.n_inputs, 1)
     room = max(data.n_samples // 10, 4)  # coefficients that a record of this length can tell
     slow = chosen.instrumental
@@ -383,10 +370,8 @@ class ArxCandidate:
 
 
 def arx_candidates(data: IOData, bounds: Bounds) -> tuple[ArxCandidate, ...]:
-    """Compare ARX models of all orders within bounds.
-
-    `bounds`: least and largest na, nb and nk. Returns for one input all combinations; for several, delays one input
-    after the other, twice.
+    """Compare ARX models of all orders within `bounds`, least and largest na, nb, nk: all combinations for one input;
+    for several, delays one input after the other, twice.
     """
     (na0, na1), (nb0, nb1), (nk0, nk1) = (bounds[k] for k in ("na", "nb", "nk"))
     first = max(na1, nk1 + nb1 - 1 if data.n_inputs else 0)
@@ -461,10 +446,7 @@ class Fold:
 
 
 def hold_out(data: IOData, part: float = HELD_OUT) -> Fold:
-    """Hold the last part of a record out.
-
-    `part`: 0 to 1.
-    """
+    """Hold the last `part` (0 to 1) of a record out."""
     if not 0 < part < 1:
         raise EstimationError(f"a hold-out of {part:g} of the record; it must be between 0 and 1. Give 0.3, say")
     cut = round(data.n_samples * (1 - part))
@@ -477,11 +459,8 @@ def hold_out(data: IOData, part: float = HELD_OUT) -> Fold:
 
 
 def folds(data: IOData, count: int = FOLDS) -> tuple[Fold, ...]:
-    """Cut a record into blocks; each is judged once, by a fit to the longer part beside it.
-
-    A fit needs samples without a break, so that it cannot use both sides of a block.
-
-    `count`: number of blocks, at least 2.
+    """Cut a record into `count` blocks, at least 2; each is judged once, by a fit to the longer part beside it, as a
+    fit needs samples without a break.
     """
     if count < 2 or data.n_samples // count < _LEAST:
         raise EstimationError(
@@ -498,11 +477,8 @@ def folds(data: IOData, count: int = FOLDS) -> tuple[Fold, ...]:
 
 
 def held_out_error(parts: Sequence[Fold], fitted: Callable[[IOData], BlackBoxFit]) -> float:
-    """Return the root mean squared error on parts that a fit has not seen, relative to the outputs.
-
-    `fitted`: makes a fit from data. Returns 1 is as bad as the mean; over all outputs,
-    each relative to its own variance. One-step errors; for an output-error model simulation errors. Infinite where a
-    model cannot be run.
+    """Return the rms error on unseen parts of fits by `fitted`, over outputs relative to their variances (1: as bad as
+    the mean): one-step errors, of an output-error model simulation errors; infinite where a model cannot be run.
     """
     total, weight = 0.0, 0
     for fold in parts:
@@ -545,9 +521,8 @@ def stabilisation(
     *,
     tick: Callable[[], None] | None = None,
 ) -> Stabilisation:
-    """Identify models of all orders up to `n_max` and follow their poles.
-
-    `method`: all but pbsid are biased under feedback; `tick`: called between steps; may raise to interrupt.
+    """Identify models of all orders up to `n_max` and follow their poles; all methods but pbsid are biased under
+    feedback.
     """
     methods = get_args(Method)
     if method not in methods:

@@ -1,19 +1,11 @@
 """All checks of a physical estimate on its own record, in the order of the report.
 
-The residual tests are score tests (`ambid.validation.residuals`): lagged signals beside the weighted Jacobian as
-further regressors of all innovations together, from the scalar products of one pass of sensitivities.
-
-Under the right model the estimate does not depend on how far ahead the predictor has to look. So the same record is
-fitted again with every second, and every fourth, output only (all inputs act; nothing is resampled), with the predictor
-gain that follows from the fit, and the parameters are compared: the specification test of Hausman (1978). Where they
-move by more than chance allows, the model is wrong in a way that the residuals of one step may hide, and the difference
-says how much.
-
-Two facts have no fit in them: the balance of gravity, and the loop that held the rotor. The force of one magnet grows
-with the square of its current, f = i^2 h(x), and at rest it carries the weight, f = -m g (x grows away from the
-magnet). So k_i = 2 f/i0 and k_i/m = -2 g/i0 (theory.md sec. 1; thesis eq. 1.9), and the motion alone gives k_i/m: the
-balance tests position, rate and the current's zero. With a position that is reversed k_i has the other sign and every
-other parameter its own: a convention, until gravity or a controller says which it is.
+Residual tests are score tests (`ambid.validation.residuals`): lagged signals beside the weighted Jacobian, from one
+pass of sensitivities. The record is fitted again with every second, and fourth, output only: under the right model
+parameters do not move by more than chance allows (Hausman 1978), however far ahead the predictor looks. Without a fit:
+one magnet's f = i^2 h(x) carries f = -m g at rest (x grows away from it), so that k_i = 2 f/i0 and k_i/m = -2 g/i0
+(theory.md sec. 1; thesis eq. 1.9), while motion alone gives k_i/m: that tests position, rate and the current's zero. A
+reversed position gives k_i the other sign and all else its own: a convention, until gravity or a controller decides.
 """
 
 from __future__ import annotations
@@ -91,19 +83,15 @@ class Agreement:
         return bool(self.strides) and self.largest < _MOST
 
     def disagreement(self) -> Array:
-        """Return how far the parameters move in the refit in which they move most.
-
-        Returns (n,), SI, zeros where no refit converged.
-        """
+        """Return how far parameters (n,), SI, move in the refit in which they move most; zeros where none converged."""
         if not self.strides:
             return np.zeros(len(self.names))
         return np.asarray(self.shift[np.argmax(np.max(np.abs(self.shift / self.sd), axis=1))])
 
 
 def innovation_products(fit: Fit, e: Array) -> Products:
-    """Return all scalar products that tests of the innovations and robust covariances want, in one pass.
-
-    `e`: (n_used, n_outputs), innovations at the fit, scaled.
+    """Return the scalar products that tests of scaled innovations `e` (n_used, n_outputs) at the fit and robust
+    covariances want, in one pass.
     """
     problem, weight = fit.problem, weight_of(fit.covariance)
     u = problem.u[problem.skip :: problem.stride] / problem.scales.input
@@ -123,11 +111,9 @@ def _lags(n: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
 
 
 def innovation_checks(fit: Fit, sums: Products, spread: Uncertainty, moved: Agreement) -> dict[str, Check]:
-    """Check what the innovations say of the model, and with that of its standard deviations.
-
-    `sums`: of `innovation_products`; `moved`: estimates from the record used in other ways. Returns
-    ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``. Where one fails,
-    the robust standard deviations are to be used.
+    """Check ``residuals_white``, ``residuals_uncorrelated``, ``uncertainty_consistent``, ``estimates_agree``: where one
+    fails, robust standard deviations are to be used. `sums`: of `innovation_products`; `moved`: estimates from the
+    record used in other ways.
     """
     own, inputs = innovation_tests(fit, sums)
     return {
@@ -170,11 +156,9 @@ def _test_columns(fit: Fit, sums: Products, lags: tuple[int, ...], which: slice)
 
 
 def _explain_columns(fit: Fit, sums: Products, cross: Array, inner: Array) -> tuple[float, int]:
-    """Sum of squares that columns for every output explain beyond the Jacobian, and their rank beyond it.
-
-    `cross`: (n_outputs, size + 1, n_columns), their products with [J, e]; `inner`: (n_columns, n_columns).
-    What the Jacobian and the priors explain is taken off by the Schur complement of their products, which lose no
-    digits because the Jacobian is nearly orthonormal there.
+    """Sum of squares that columns for every output explain beyond Jacobian and priors, and their rank: Schur complement
+    of products `cross` (n_outputs, size + 1, n_columns) with [J, e] and `inner`, which lose no digits as J is nearly
+    orthonormal there.
     """
     p, n_y = fit.problem.size, cross.shape[0]
     prior = fit.J_prior @ sums.turn
@@ -213,9 +197,8 @@ def _estimates_agree(moved: Agreement) -> Check:
 
 
 def agreement(fit: Fit) -> Agreement:
-    """Refit a record with every second and every fourth output.
-
-    `fit`: not failed. Returns refits that do not converge are left out.
+    """Refit a record, by a fit that has not failed, with every second and fourth output; those that do not converge are
+    left out.
     """
     problem = fit.problem
     size, n = problem.magnitude, problem.n_physical
@@ -244,9 +227,8 @@ def agreement(fit: Fit) -> Agreement:
 
 
 def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimated", "given"]) -> dict[str, Check]:
-    """Check what was taken for known.
-
-    Returns ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``delay_shown``, ``long_enough``.
+    """Check what was taken for known: ``fixed_agree``, ``priors_agree``, ``delay_in_range``, ``delay_shown``,
+    ``long_enough``.
     """
     return {
         "fixed_agree": _fixed_agree(fit),
@@ -307,11 +289,9 @@ def _delay_in_range(fit: Fit, how: Literal["estimated", "given"]) -> Check:
 
 
 def _delay_shown(fit: Fit, how: Literal["estimated", "given"]) -> Check:
-    """Could a fraction of a sample of delay that the search takes for none move a parameter out of its interval?
-
-    Freed at the fit, the delay has the standard deviation s, and each s moves a parameter by t of its own (those at a
-    held delay). The search frees it where the criterion falls by log n, which is beyond s sqrt(log n) on average:
-    fractions from 1.96 s / t to there go unseen, and the interval misses.
+    """Could a fraction of a sample of delay, taken for none, move a parameter out of its interval? Freed, the delay has
+    deviation s, each s moving a parameter by t of its own (at a held delay); it is freed where the criterion falls by
+    log n, beyond s sqrt(log n) on average: fractions from 1.96 s / t to there go unseen.
     """
     problem, n = fit.problem, fit.problem.n_physical
     if how == "given":
@@ -355,10 +335,8 @@ def _long_enough(spread: Uncertainty) -> Check:
 
 
 def physical_checks(fit: Fit, spread: Uncertainty, record: Record, *, robust: bool) -> dict[str, Check]:
-    """Check that the parameters are identifiable and possible, and come from signals within their limits.
-
-    `record`: channels named by role; `robust`: which standard deviations count. Returns ``identifiable``,
-    ``plausible``, ``within_limits``, ``signals_sound``.
+    """Check ``identifiable``, ``plausible``, ``within_limits``, ``signals_sound``; `record`: channels named by role;
+    `robust`: which standard deviations count.
     """
     theta = fit.problem.parameters(fit.vector)
     sd = dict(zip(spread.names, spread.standard_deviations(robust=robust).tolist(), strict=True))
@@ -393,23 +371,16 @@ def _identifiable(fit: Fit, spread: Uncertainty, theta: Mapping[str, float], *, 
 
 
 def lowest_power_hz(u: Array, rate_hz: float) -> float:
-    """Return the frequency below which the inputs have 0.1 % of their power.
-
-    `u`: (n_samples, n_inputs). Returns hz.
-    """
+    """Return the frequency in Hz below which inputs `u` (n_samples, n_inputs) have 0.1 % of their power."""
     power = np.sum(np.abs(np.fft.rfft(u - u.mean(axis=0), axis=0)) ** 2, axis=1)
     total = np.cumsum(power)
     return float(np.searchsorted(total, 1e-3 * total[-1]) * rate_hz / u.shape[0])
 
 
 def implausible(model: LinearModel, values: Mapping[str, float], sd: Mapping[str, float]) -> list[str]:
-    """List what physics forbids in an estimate.
-
-    Mass, resistance and inductance have to be positive: a coil with R > 0 and L > 0 is passive, it never gives out more
-    energy than was put in; damping may not be negative beyond its uncertainty. Sizes outside what is built, from
-    micro-bearings to turbines, are a slip of units.
-
-    `values`, `sd`: parameters and their standard deviations, SI. Returns one line each; empty where all is well.
+    """List what physics forbids in `values` with `sd`, SI, one line each: mass, resistance and inductance not positive
+    (a coil with R > 0 and L > 0 is passive), damping negative beyond its uncertainty, sizes outside what is built, from
+    micro-bearings to turbines (a slip of units).
     """
     texts = []
     for spec in model.parameters:
@@ -473,11 +444,9 @@ def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:
 def gravity_balance(
     magnet: RigMagnet, record: Record, theta: Mapping[str, float], names: tuple[str, ...], covariance: Array
 ) -> Check:
-    """Check k_i/m against -2 g/i0.
-
-    `record`: channels named by role; `theta`: parameters; `names`, `covariance`: the estimated ones, under the model.
-    The limit is what is not known: of the estimate, of gravity and of the current's zero (both from the rig; else the
-    current's resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
+    """Check k_i/m against -2 g/i0, within what is not known: of the estimate, of gravity and the current's zero (of the
+    rig, else its resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
+    `record`: channels named by role; `names`, `covariance`: of estimated numbers, under the model.
     """
     x, i = record["position"].values, record["current"].values
     numbers = {name: magnet.known(name) for name in ("g", "i_offset")}
@@ -521,10 +490,8 @@ def _value(p: object, value: float, sd: float) -> tuple[float, float]:
 
 
 def loop_agrees(rig: Rig, theta: Mapping[str, float], rate_hz: float) -> Check | None:
-    """Check that the rig's controller holds what was identified, and not its mirror image.
-
-    `theta`: parameters of model one-axis, SI. Returns None where the rig tells of no loop, or the record was taken
-    without it.
+    """Check that the rig's controller holds what was identified (`theta` of model one-axis, SI), and not its mirror
+    image; None without a loop in the rig or the record.
     """
     if rig.loop is None or not rig.loop.closed or rig.open_loop:
         return None

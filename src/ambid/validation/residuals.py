@@ -1,17 +1,11 @@
 """How large residuals are, and whether anything is left in them that the past explains: tests, and their words.
 
-Every test is a score test. The residuals of a consistent estimate are e0 - J (theta - theta0): with J projected out of
-the regressors, what is left does not see the error of the estimate, whichever estimator made it (Neyman's C(alpha)
-test; for innovations Ljung 1999, sec. 16.6, Soederstrom and Stoica 1989, sec. 11.2). If the model is right, the part of
-the residual that the regressors explain is chi-squared, and each correlation is normal with the variance computed here.
-Regressors are the past alone, so that feedback does not disturb the test: future inputs do depend on present residuals
-when a controller is at work.
-
-The suite for black-box and nonlinear fits tests the residual e against its own past and against past inputs. Linear
-correlations miss what a nonlinear model leaves over, as a residual that holds u^2 is uncorrelated with u: so its e is
-tested against past u^2 and past e u as well, and e^2 against past u^2 (Billings and Voon 1986). Whether inputs depend
-on past residuals is a question of its own, about the loop. Outputs are tested one by one, over all records together,
-and their p-values joined by Bonferroni's rule.
+All are score tests: a consistent estimate's residuals are e0 - J (theta - theta0); with J projected out of regressors
+they do not see the estimate's error (Neyman's C(alpha) test; Ljung 1999, sec. 16.6, Soederstrom and Stoica 1989, sec.
+11.2), and the part explained is chi-squared, each correlation normal. Regressors are the past alone: under feedback
+future inputs depend on present residuals. A nonlinear model's e is tested against past u^2 and e u too, and e^2 against
+past u^2 (Billings and Voon 1986), as u^2 is uncorrelated with u. Outputs are tested one by one, all records together,
+their p-values joined by Bonferroni's rule.
 """
 
 from __future__ import annotations
@@ -47,19 +41,14 @@ Sizes = list[dict[str, float]]
 
 
 def fit_of(error: Array, y: Array) -> Array:
-    """Return ``1 - |e| / |y - mean|`` of each column: 1 is perfect, 0 as good as the mean.
-
-    `error`, `y`: (n_samples, n_outputs). Returns (n_outputs,).
-    """
+    """Return ``1 - |e| / |y - mean|`` of each column, (n_outputs,): 1 is perfect, 0 as good as the mean."""
     spread = np.linalg.norm(y - y.mean(axis=0), axis=0)
     return np.asarray(1 - np.linalg.norm(error, axis=0) / np.where(spread > 0, spread, np.nan))
 
 
 def error_sizes(errors: Sequence[Array], outputs: Sequence[Array]) -> Sizes:
-    """Return fit and root mean square error of each output over several records.
-
-    `errors`, `outputs`: (n_samples, n_outputs), SI, one for each record. The fit takes the mean of each record: a level
-    that differs from record to record does not help.
+    """Return fit and rms error (SI) of each output over several records, the fit by each record's own mean: different
+    levels do not help.
     """
     e, y = np.concatenate(errors), np.concatenate([x - x.mean(axis=0) for x in outputs])
     fits, rmse = fit_of(e, y), np.sqrt(np.mean(e**2, axis=0))
@@ -121,11 +110,9 @@ class Score:
 
 
 def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None) -> Score:
-    """Test whether regressors explain a residual of unknown variance and any mean.
-
-    `e`: (n_used,); `J`: (n_used, n_directions), derivative of the prediction by what was estimated; `regressors`:
-    (n_used, n_regressors), known before each residual, or, where the residuals have a `colour` (see `autoregression`),
-    independent of all of them.
+    """Test whether `regressors` explain a residual `e` (n_used,) of unknown variance and any mean; `J` (n_used,
+    n_directions): derivative of the prediction by what was estimated. Regressors are known before each residual or,
+    where these have a `colour` (see `autoregression`), independent of all.
     """
     n, rows = e.size, np.hstack([J, np.ones((e.size, 1)), regressors, e[:, None]])
     colour = None if colour is None or colour.size == 1 else colour
@@ -158,10 +145,8 @@ def score(e: Array, J: Array, regressors: Array, *, colour: Array | None = None)
 
 
 def joint_triangle(slopes: Array, residuals: Array, regressors: Array) -> Array:
-    """Return the triangle of a test whether regressors explain any of several residuals of unit variance.
-
-    `slopes`: (n_rows, n_outputs, n_directions); `residuals`: (n_rows, n_outputs); `regressors`: (n_rows, n_outputs,
-    n_regressors). Rows are samples, or those of each output's triangle of [slopes, regressors, residual].
+    """Return the triangle of a test whether `regressors` (n_rows, n_outputs, n_regressors) explain any of several
+    residuals of unit variance. Rows are samples, or those of each output's triangle of [slopes, regressors, residual].
     """
     (n, n_y), p, width = residuals.shape, slopes.shape[2], regressors.shape[2]
     rows = np.zeros((n, n_y, p + n_y * width + 1))
@@ -179,11 +164,9 @@ def score_of(triangle: Array, n_directions: int) -> float:
 
 
 def instrumental_score(e: Array, J: Array, instruments: Array, *, colour: Array | None) -> Score:
-    """Test whether instruments explain a residual that feedback makes depend on `J`.
-
-    There J cannot be projected out, because the noise is part of it. Instead only those combinations of the instruments
-    count that are orthogonal to J, so that the error of the estimate does not reach them (the overidentification
-    test of Sargan 1958). Correlations are those with the instruments (n_used, n_regressors), independent of all noise.
+    """Test whether instruments, independent of all noise, explain a residual that feedback makes depend on `J`, which
+    cannot be projected out: only combinations orthogonal to J count, which the estimate's error does not reach (the
+    overidentification test of Sargan 1958). Correlations are those with the instruments (n_used, n_regressors).
     """
     centred, rest = instruments - instruments.mean(axis=0), e - e.mean()
     L = centred / column_sizes(centred)
@@ -221,10 +204,7 @@ def _explain(L: Array, inner: Array, least: float) -> tuple[Array, Array]:
 
 
 def autoregression(e: Array) -> Array:
-    """Describe the colour of a residual: an autoregression by Yule-Walker, its order by BIC.
-
-    `e`: (n_used,). Returns (n + 1,), [1, a1, ..., an], stable; [1] for a white residual.
-    """
+    """Describe a residual's colour by Yule-Walker, order by BIC: stable [1, a1, ..., an]; [1] for a white one."""
     n = e.size
     longest = max(1, min(int(10 * np.log10(n)), n // 10))
     v = e - e.mean()
@@ -246,10 +226,7 @@ def autoregression(e: Array) -> Array:
 
 
 def filter_backwards(L: Array, a: Array) -> Array:
-    """Return H' L for residuals H w of white w: L filtered by 1/A backwards in time.
-
-    `L`: (n_used, n_columns); `a`: (n + 1,).
-    """
+    """Return H' L for residuals H w of white w: `L` (n_used, n_columns) filtered by 1/A backwards in time."""
     from scipy.signal import lfilter
 
     return np.asarray(lfilter([1.0], a, L[::-1], axis=0)[::-1])
@@ -365,9 +342,8 @@ def residual_tests(residuals: Residuals, *, open_loop: bool) -> ResidualTests:
 
 
 def input_lags(n_samples: int, *, with_now: bool) -> tuple[int, ...]:
-    """Return the lags at which inputs are tested.
-
-    Every one up to 16, then in even ratios up to a twentieth of the record, at most 400.
+    """Return the lags at which inputs are tested: up to 16, then in even ratios to a twentieth of the record, at most
+    400.
     """
     longest = max(3, min(n_samples // 20, _LONGEST))
     near = range(0 if with_now else 1, min(_INPUT_LAGS, longest) + 1)
@@ -378,10 +354,8 @@ def input_lags(n_samples: int, *, with_now: bool) -> tuple[int, ...]:
 def correlations(
     residuals: Residuals, inputs: Sequence[str], outputs: Sequence[str], *, n_lags: int = 20
 ) -> list[Correlation]:
-    """Correlate the errors of each output with what the tests look at, lag by lag.
-
-    Output by output: with its own past, then with each input; for a nonlinear model also with u^2 and e u, and e^2 with
-    u^2.
+    """Correlate each output's errors, lag by lag, with their past, then each input; for a nonlinear model also with u^2
+    and e u, and e^2 with u^2.
     """
     lags = tuple(range(1, min(n_lags, residuals.shortest // 4) + 1))
     results, squares = list[Correlation](), residuals.squares
@@ -514,10 +488,8 @@ def _residual_check(test: ResidualTest, against: str = "", *, subject: str = "re
 
 
 def residual_checks(tests: ResidualTests, subject: Subject) -> dict[str, Check]:
-    """Return residual tests as checks.
-
-    Returns ``residuals_white``, with inputs ``residuals_uncorrelated`` and ``feedback``, and of a nonlinear model
-    ``residuals_nonlinear`` and ``residual_variance``.
+    """Return the checks ``residuals_white``, with inputs ``residuals_uncorrelated`` and ``feedback``, and of a
+    nonlinear model ``residuals_nonlinear`` and ``residual_variance``.
     """
     white = white_check(tests.white)
     if not white.passed and subject.coloured:

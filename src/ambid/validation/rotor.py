@@ -1,8 +1,7 @@
 """What speaks for and against an estimate of a rotor: the innovations of its predictor, and its numbers.
 
-A record fits fully with a sign that both sensors of a plane share, or with a wrong unit of one kind of column: only
-the numbers tell. A force factor is positive where sensor, current and voltage count in one direction, and the sizes of
-each axis are those of a bench.
+A sign that both sensors of a plane share, or a wrong unit, fits fully: only numbers tell. A force factor is positive
+where sensor, current and voltage count in one direction; each axis has a bench's sizes.
 """
 
 from __future__ import annotations

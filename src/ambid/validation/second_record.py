@@ -50,10 +50,7 @@ class Replay:
 
 
 def replay(estimate: Estimate, signals: Signals) -> Replay:
-    """Run a record through the predictor of an estimate.
-
-    `signals`: of the same bench, at the same rate.
-    """
+    """Run a record's `signals`, of the same bench and rate, through the predictor of an estimate."""
     with one_thread():
         fit = _fit(estimate, signals)
     problem = fit.problem
@@ -141,11 +138,9 @@ def _with_covariance(fit: Fit, estimate: Estimate) -> Fit:
 
 
 def validation(estimate: Estimate, signals: Signals) -> dict[str, object]:
-    """Judge an estimate on a second record.
-
-    Returns ``fit``: by output one_step, simulation, rms of the innovation in SI, k_step fits, and by k_step_ratio how
-    many times as large as expected the errors are that many steps ahead; ``checks``: residuals_white,
-    residuals_uncorrelated and innovations_consistent (sizes as at identification), each with ``passed`` and ``detail``;
+    """Judge an estimate on a second record. ``fit`` by output: one_step, simulation, rms of the innovation in SI,
+    k_step fits, and k_step_ratio, errors so many steps ahead over the expected; ``checks``: residuals_white,
+    residuals_uncorrelated, innovations_consistent (sizes as at identification), each with ``passed`` and ``detail``;
     ``passed``.
     """
     with one_thread():

@@ -1,10 +1,8 @@
 """Sensitivity analysis: how much each estimated number matters to the fit, the poles and the frequency response.
 
-The information matrix I = covariance^-1 is half the curvature of -2 log L: a step d costs d' I d. So what a number does
-to the fit by itself is I_jj, and with all others free to follow 1/covariance_jj; the ratio of the two is how well the
-others can stand in for it (variance inflation). The collinearity index 1/smallest singular value of the scaled
-sensitivities (Brun, Reichert and Kuensch 2001) says how well all of them can: 10 means that a change of one number can
-be undone by the others to a tenth.
+A step d costs d' I d of -2 log L, I = covariance^-1. I_jj is what a number does by itself, 1/covariance_jj with all
+others free; their ratio is how well others stand in for it (variance inflation). The collinearity index 1/smallest
+singular value of the scaled sensitivities (Brun, Reichert and Kuensch 2001): at 10 others undo a change to a tenth.
 """
 
 from __future__ import annotations
@@ -59,10 +57,7 @@ class SensitivityAnalysis:
 
 
 def sensitivity_analysis(fit: BlackBoxFit, data: IOData) -> SensitivityAnalysis:
-    """Analyse a black-box fit.
-
-    `fit`: with a covariance; `data`: what it was estimated from; its length sets the lowest frequency looked at.
-    """
+    """Analyse a black-box fit with a covariance; the length of its `data` sets the lowest frequency looked at."""
     if fit.covariance is None or not np.any(np.diag(fit.covariance) > 0):
         raise EstimationError(
             f"{fit.structure} gave no covariance for these data, and sensitivities need one. Lower the orders"
