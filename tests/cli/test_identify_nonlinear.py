@@ -91,11 +91,12 @@ def test_the_rig_says_what_is_known_and_the_options_change_it(at, ambid) -> None
     [
         (("r1.csv", "r2.csv"), "2 records are given; the linear model takes one"),
         (("r1.csv", "--held", "r2.csv"), "--held is for the nonlinear magnet"),
-        (("r1.csv", "--magnet", "pair"), "--magnet is for the nonlinear magnet"),
-        (("r1.csv", "--off-below", "0.1"), "--off-below is for the nonlinear magnet"),
-        (("r1.csv", "--nonlinear", "--magnet", "triple"), "'triple' is not one of"),
-        (("r1.csv", "--nonlinear", "--magnet", "pair", "--rig", "exponential.toml"), "a pair has the hyperbolic law"),
-        (("r1.csv", "--nonlinear", "--off-below", "inf"), "--off-below is inf"),
+        (("r1.csv", "--eddy"), "--eddy is for the nonlinear magnet"),
+        (("r1.csv", "--magnet", "pair"), "--magnet of 'ambid identify' is now magnet.kind of the rig. Give that"),
+        (("r1.csv", "--nonlinear", "--off-below=0.1"), "is now magnet.off_below of the rig. Give that"),
+        (("r1.csv", "--nonlinear", "--rig", "triple.toml"), "magnet.kind is 'triple'"),
+        (("r1.csv", "--nonlinear", "--rig", "exponential.toml"), "a pair has the hyperbolic law"),
+        (("r1.csv", "--nonlinear", "--rig", "off.toml"), "magnet.off_below is inf"),
         (("r1.csv", "./r1.csv", "--nonlinear"), "given twice"),
         (("r1.csv", "--nonlinear", "--held", "r1.csv"), "given twice"),
         (("r1.csv", "--nonlinear", "--validate", "fast.csv"), "fast.csv, for validation, is sampled at 4000 Hz"),
@@ -110,7 +111,9 @@ def test_what_makes_no_sense_is_refused_in_one_line_and_nothing_is_written(at, a
     rigs = {
         "coil": 'model = "coil"',
         "wrong": 'model = "one-axis"\n[magnet.parameters]\nL_leek = { unit = "H" }',
-        "exponential": 'model = "one-axis"\n[magnet]\ngap = "exponential"',
+        "exponential": 'model = "one-axis"\n[magnet]\nkind = "pair"\ngap = "exponential"',
+        "triple": 'model = "one-axis"\n[magnet]\nkind = "triple"',
+        "off": 'model = "one-axis"\n[magnet]\noff_below = inf',
     }
     for name, text in rigs.items():
         (at / f"{name}.toml").write_text(f'schema = "ambid.rig/1"\n{text}\n', encoding="utf-8")
@@ -162,12 +165,14 @@ def test_ctrl_c_keeps_the_best_so_far(at, ambid, monkeypatch) -> None:
 def test_data_do_not_count_twice_nor_judge_themselves(at, ambid) -> None:
     copy = at / "copy.csv"
     copy.write_bytes(Path("r1.csv").read_bytes())
+    off = at / "off.toml"
+    off.write_text(RIG.replace("[magnet]\n", "[magnet]\noff_below = 1e300\n"), encoding="utf-8")
     words = ("identify", "r1.csv", "--rig", "ball.toml", "--nonlinear")
     for more, said in (
         ((copy,), "r1.csv and copy.csv hold the same samples and would count twice. Omit one"),
         (("--held", copy), "r1.csv and copy.csv hold the same samples"),
         (("--validate", copy), "copy.csv, for validation, holds samples that the estimate is fitted to"),
-        (("--off-below", "1e300"), "every voltage is at or below off_below"),
+        (("--rig", off), "every voltage is at or below off_below"),
     ):
         found = ambid(*words, *more)
         assert found.code == 2, found.out + found.err

@@ -114,7 +114,7 @@ def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
         if stage == "identify" and stages.count(stage) == 4:
             raise KeyboardInterrupt
 
-    found = identify_nonlinear(balls[:1], rig, magnet="single", tick=tick)
+    found = identify_nonlinear(balls[:1], rig, tick=tick)
     assert found.status == "stalled"
     assert stages.count("identify") == 4
     assert any("did not converge" in w for w in found.warnings)
@@ -122,7 +122,7 @@ def test_an_interruption_ends_all_stages_and_keeps_the_best(balls, rig):
 
 def test_what_is_asked_wrongly_is_refused(balls, rig):
     with pytest.raises(EstimationError, match="no record with a moving rotor"):
-        identify_nonlinear([], rig, held=balls, magnet="single")
+        identify_nonlinear([], rig, held=balls)
 
 
 def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, rig):

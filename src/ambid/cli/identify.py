@@ -36,7 +36,7 @@ def command(v: Values) -> None:
     from ambid.job.files import EXPORT_ENDINGS
 
     stop, kept = Stop(), tuple(v.held or ())
-    own, how = v.only("magnet eddy drift off_below"), v.only("from_s to_s rate_hz gaps validate")
+    own, how = v.only("eddy drift"), v.only("from_s to_s rate_hz gaps validate")
     how |= {"layout": v.layout} if v.layout else {}
     asked = {**how, **own, "held": len(kept), **v.only("nonlinear speed_rpm experiment")}
     with keeping(v, "identify", [*v.records, *kept], **asked) as store:

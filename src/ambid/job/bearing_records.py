@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, TypedDict, Unpack
+from typing import Literal, Unpack
 
 import numpy as np
 
@@ -40,22 +40,16 @@ class TakenRecord:
     start_s: float  # time of its first sample in s
 
 
-class MagnetWords(TypedDict, total=False):
-    """What a caller says of a nonlinear bearing beside its rig."""
+class BearingWords(Reading, total=False):
+    """What a caller says of a nonlinear bearing beside its rig, and how records are read."""
 
-    magnet: Literal["auto", "single", "pair"] | None  # None: as the rig says
-    eddy: bool  # beside what the rig says
+    eddy: bool
     drift: bool
-    off_below: float | None  # in V; None: as the rig says
-
-
-class BearingWords(MagnetWords, Reading, total=False):
-    """That, and how records are read."""
 
 
 def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> Rig:
     """Return a rig whose `magnet` is known as it says, but for what is given here."""
-    bench, off_below = known_rig(rig), words.get("off_below")
+    bench = known_rig(rig)
     if bench.model != "one-axis":
         raise EstimationError(
             f"the rig's model is {bench.model!r}; a nonlinear bearing needs 'one-axis'. Correct model, or use "
@@ -63,9 +57,8 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> 
         )
     magnet = bench.magnet or RigMagnet()
     magnet = replace(
-        magnet, kind=words.get("magnet") or magnet.kind, eddy=magnet.eddy or words.get("eddy", False),
-        drift=magnet.drift or words.get("drift", False), off_below=magnet.off_below if off_below is None else off_below,
-    )  # fmt: skip
+        magnet, eddy=magnet.eddy or words.get("eddy", False), drift=magnet.drift or words.get("drift", False)
+    )
     return replace(bench, magnet=magnet)
 
 
@@ -226,7 +219,7 @@ def _refuse_senseless(record: BearingRecord) -> None:
     if np.all(record.loose > 0.0):
         raise EstimationError(
             f"{record.name}: every voltage is at or below off_below, where the stage is off, so none would be "
-            f"known. Correct {setting('off_below')} or magnet.off_below (in V)"
+            "known. Correct magnet.off_below of the rig (in V)"
         )
     channels = {"voltage": record.u, "position": record.y[:, 0], "current": record.y[:, 1]}
     if record.held:

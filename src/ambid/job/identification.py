@@ -268,10 +268,8 @@ def identify_nonlinear(
     *,
     held: Source | Sequence[Source] = (),
     validate: Source | None = None,
-    magnet: Literal["auto", "single", "pair"] | None = None,
     eddy: bool = False,
     drift: bool = False,
-    off_below: float | None = None,
     from_s: float | None = None,
     to_s: float | None = None,
     rate_hz: float | None = None,
@@ -294,12 +292,8 @@ def identify_nonlinear(
         With the rotor held at rest at different distances: they show the coil.
     validate : as one of the `records`, optional
         A further record, of a rotor that moves, to validate the estimate on.
-    magnet : {"auto", "single", "pair"}, optional
-        One magnet or two; default: as the rig says.
     eddy, drift : bool, optional
         Estimate an eddy pole, or a resistance that drifts, where the rig does not say so.
-    off_below : float, optional
-        Voltage at or below which the power stage is off, V; default: as the rig says.
     from_s, to_s, rate_hz, gaps, units, layout : optional
         As `identify`; the part of every record in which the rotor moves.
     tick : callable, optional
@@ -323,8 +317,7 @@ def identify_nonlinear(
     from ambid.validation.nonlinear_bearing import validation
 
     words = BearingWords(
-        magnet=magnet, eddy=eddy, drift=drift, off_below=off_below, from_s=from_s, to_s=to_s, rate_hz=rate_hz,
-        gaps=gaps, units=units, layout=layout,
+        eddy=eddy, drift=drift, from_s=from_s, to_s=to_s, rate_hz=rate_hz, gaps=gaps, units=units, layout=layout,
     )  # fmt: skip
     say, clock, bench = tick or silent, Clock(), bearing_rig(rig, **words)
     readings, second = take_all(sources_of(records), sources_of(held), validate, bench, words, say)

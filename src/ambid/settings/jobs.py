@@ -20,7 +20,7 @@ def declare(name: str, settings: str, **differences: Mapping[str, Any]) -> Job:
 _JOBS = (
     declare(
         "identify",
-        "records rig nonlinear held magnet eddy drift off_below speed_rpm experiment validate from_s to_s rate_hz "
+        "records rig nonlinear held eddy drift speed_rpm experiment validate from_s to_s rate_hz "
         "gaps layout json plot report export ledger bearing taken_at strict",
         validate={"help": "Validate the estimate on this second record."},
         plot={
@@ -281,6 +281,7 @@ _PART = "'ambid validate RESULT RECORD' with --from and --to"
 # Words of the releases before, by job: what each is now.
 FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
+    "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
     "history": {"export": "--tables"}, "export": {"to": "--library"},
     "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
     "fleet simulate": {"limit": "--time-limit"},

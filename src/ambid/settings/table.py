@@ -212,14 +212,6 @@ SETTINGS = (
     ),
     Setting("log_excitation", "switch", "", "Add a column 'excitation': the reference for 'ambid frf'."),
     Setting(
-        "magnet",
-        "text",
-        "",
-        "With @identify_nonlinear: one magnet, or two opposing ones; auto looks at the sign of the current.",
-        choices=("auto", "single", "pair"),
-        shown="as the rig says, or auto",
-    ),
-    Setting(
         "memory",
         "text",
         "auto|all|S",
@@ -261,13 +253,6 @@ SETTINGS = (
     Setting("no_live", "switch", "", "No live view of the track.", short="quiet"),
     Setting(
         "nonlinear", "switch", "", "Identify the nonlinear magnet: k_i, k_x and L as curves over position and current."
-    ),
-    Setting(
-        "off_below",
-        "number",
-        "V",
-        "With @identify_nonlinear: at or below this voltage the power stage is off, and the coil voltage unknown.",
-        shown="as the rig says",
     ),
     Setting("open_loop", "switch", "", "The record was taken without feedback."),
     Setting(
