@@ -1,6 +1,5 @@
-"""Calibration: from what a column holds (duty, sensor volts, counts) to what the rig needs of it.
-
-Either a straight line, out = gain · raw + offset, or a two-column table with linear interpolation between its points.
+"""Calibration from what a column holds (duty, sensor volts, counts) to what the rig needs of it: a straight line, out =
+gain · raw + offset, or a two-column table with linear interpolation between its points.
 """
 
 from __future__ import annotations
@@ -37,10 +36,7 @@ class Calibration:
     sha256: str = ""  # of the table's file
 
     def apply(self, channel: Channel) -> Channel:
-        """Calibrate a channel.
-
-        `channel`: raw values, shape (n_samples,), in `unit_in`. Returns of the same name and length, in `unit_out`.
-        """
+        """Return a channel of raw values calibrated, of the same name and length, in `unit_out`."""
         if channel.unit != self.unit_in:
             where = f"the table {self.source} begins with" if self.raw is not None else "its calibration is for"
             raise UnitError(
@@ -51,10 +47,7 @@ class Calibration:
         return Channel(name=channel.name, unit=self.unit_out, values=values, source_unit=channel.source_unit)
 
     def step(self, channel: str) -> Step:
-        """Describe the calibration of one channel for a record's history.
-
-        `channel`: name of the calibrated channel. Returns with everything that is needed to repeat it.
-        """
+        """Describe the calibration of one channel for a record's history, with everything to repeat it."""
         settings: dict[str, object] = {"channel": channel, "from": self.unit_in, "to": self.unit_out}
         if self.raw is None or self.out is None:
             settings |= {"gain": self.gain, "offset": self.offset}
@@ -82,10 +75,8 @@ class Calibration:
 
 
 def read_calibration_table(path: str | Path, *, extrapolate: bool = False) -> Calibration:
-    """Read a calibration table: a CSV file with two columns of ``name [unit]``, raw and physical.
-
-    `path`: the table; its first column increases or decreases throughout; `extrapolate`: continue the table's first and
-    last piece outside it. Returns with `raw` increasing.
+    """Read a CSV file with two columns of ``name [unit]``, raw (rising or falling throughout) and physical, into rising
+    `raw`; `extrapolate`: continue its first and last piece outside it.
     """
     path = Path(path)
     if INSIDE and not any(path.resolve().is_relative_to(folder.resolve()) for folder in INSIDE):

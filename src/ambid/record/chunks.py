@@ -1,6 +1,5 @@
-"""Records written and read back in pieces, for those that are longer than memory: the files that `write_record` makes.
-
-Beside it two things that a recording needs: rows of NaN, where samples were lost, and further texts in HDF5.
+"""Records longer than memory, written and read back in pieces: the files that `write_record` makes, rows of NaN where
+samples were lost, and further texts in HDF5.
 """
 
 from __future__ import annotations
@@ -27,12 +26,9 @@ _PIECE = 1 << 17  # bytes, or values, that are read back at once
 def write_chunks(
     record: Record, n_samples: int, chunks: Iterable[Array], path: str | Path, texts: Mapping[str, str]
 ) -> Callable[[], None]:
-    """Write a record whose values come in pieces.
-
-    `record`: names, units, rate, start, history and provenance; without samples; `n_samples`: samples that will come;
-    `chunks`: (n, n_channels); `path`: ``.csv``, ``.csv.gz``, ``.h5`` or ``.hdf5``; overwritten if it exists; `texts`:
-    for HDF5: further datasets, by name. CSV has no place for them. Returns reads the file back, and raises RecordError
-    if a value is not what was written.
+    """Write a record, its head alone, whose `n_samples` values come in pieces (n, n_channels), over a file that exists.
+    What is returned reads it back, and raises RecordError if a value differs. `texts`: further datasets by name, HDF5
+    only.
     """
     path = Path(path)
     write = _write_csv if path.name.lower().endswith((".csv", ".csv.gz")) else _write_hdf5
@@ -46,10 +42,8 @@ def write_chunks(
 def check_chunks(
     record: Record, n_samples: int, chunks: Iterable[Array], path: str | Path, texts: Mapping[str, str]
 ) -> None:
-    """Hold a file against a record whose values come in pieces: whether it is what `write_chunks` would write.
-
-    `record`, `n_samples`, `path`, `texts`: as `write_chunks` takes them. History and provenance are not looked at;
-    `chunks`: (n, n_channels), as `write_chunks` takes them.
+    """Hold a file against a record whose values come in pieces: whether `write_chunks` would write it, history and
+    provenance aside.
     """
     path = Path(path)
     pieces = _counted(chunks, n_samples)

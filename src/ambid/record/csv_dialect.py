@@ -1,7 +1,5 @@
-"""Dialects of CSV: preambles of instruments, units below or behind the names, decimal commas, thousands separators.
-
-A dialect is taken where the file leaves no other; where it does, the reader asks for the word of the layout that
-decides. What was understood goes into the record's history.
+"""Dialects of CSV: preambles, units below or behind names, decimal commas, thousands separators; taken where the file
+leaves no other, else the layout's word is asked for. What was understood goes into the record's history.
 """
 
 from __future__ import annotations
@@ -71,10 +69,7 @@ def words_of(layout: Mapping[str, str], path: Path) -> dict[str, str]:
 
 
 def recognised(lines: list[str], path: Path, layout: Mapping[str, str]) -> Dialect | None:
-    """Recognise a dialect; None where the text is in the usual one, or is no table at all.
-
-    `lines`: of the file. Raises where it could be read in two ways.
-    """
+    """Recognise a dialect; None where the text is usual, or no table. Raises where it could be read in two ways."""
     words = words_of(layout, path)
     begin = next((k for k, line in enumerate(lines) if line.strip() and not line.startswith("#")), None)
     table = None if begin is None else _table(lines, begin, words.get("separator"))

@@ -1,7 +1,5 @@
-"""Records as CSV (contracts.md): ``#`` comments, one header row of ``name [unit]``, then numbers.
-
-The columns are separated by commas; semicolons or tabs are read too where the header row holds no comma, and the
-history then says so. `csv_dialect` reads other forms. Rows in messages are lines of the file, counted from 1.
+"""Records as CSV (contracts.md): ``#`` comments, one header row of ``name [unit]``, then numbers, separated by commas;
+by semicolons or tabs where the header has no comma (told in the history). Rows in messages are lines, from 1.
 """
 
 from __future__ import annotations
@@ -43,10 +41,8 @@ def read_csv(
     gaps: GapPolicy = "error",
     layout: Mapping[str, str] = MappingProxyType({}),
 ) -> Record:
-    """Read a record from a CSV file, gzipped or not.
-
-    `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
-    Returns all columns but time, in SI units. A column whose unit is missing or unknown has the unit ``"?"``.
+    """Read a record, all columns but time in SI, from a CSV file, gzipped if it ends in ``.gz``; a missing or unknown
+    unit is ``"?"``. `rate_hz`: for a file without a column ``time [s]``.
     """
     check_gap_policy(gaps)
     return uniform_record(_table(Path(path), gaps, layout), rate_hz, gaps)
@@ -55,9 +51,8 @@ def read_csv(
 def read_csv_rows(
     path: str | Path, *, rate_hz: float | None = None, layout: Mapping[str, str] = MappingProxyType({})
 ) -> Rows:
-    """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.sampling.Rows`).
-
-    `path`: ends in ``.gz`` if it is gzipped; `rate_hz`: sampling rate in Hz, for a file without a column ``time [s]``.
+    """Read the rows as they stand, whatever is missing and however time runs (`ambid.record.sampling.Rows`); as
+    `read_csv`.
     """
     return record_of_rows(_table(Path(path), "cut", layout), rate_hz)
 
@@ -108,10 +103,8 @@ def _table(path: Path, gaps: GapPolicy, layout: Mapping[str, str]) -> Table:
 
 
 def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ()) -> None:
-    """Write a record as CSV in SI units; every value is read back to the last bit.
-
-    `record`: what to write; its history and provenance are not kept (HDF5 keeps them); `path`: ends in ``.gz`` to be
-    gzipped; `comments`: lines that go before the header row, each after ``#``.
+    """Write a record as CSV in SI, every value read back to the last bit, gzipped if it ends in ``.gz``. History and
+    provenance are not kept (HDF5 keeps them); `comments` go before the header row, each after ``#``.
     """
     path = Path(path)
     lines = head_lines(record, comments)
@@ -131,11 +124,7 @@ def write_csv(record: Record, path: str | Path, *, comments: Sequence[str] = ())
 
 
 def head_lines(record: Record, comments: Sequence[str] = ()) -> list[str]:
-    """Return what stands above the numbers.
-
-    `record`: its values are not looked at; `comments`: lines that go before the header row, each after ``#``. Returns
-    the last one is the header row.
-    """
+    """Return what stands above the numbers: `comments`, each after ``#``, then the header row."""
     for c in record.channels:
         if _REFUSED_IN_NAMES & set(c.name) or c.name.lower() in TIME_NAMES:
             raise RecordError(f"channel {c.name!r} cannot be a CSV column: its name would be misread. Rename it")

@@ -1,7 +1,5 @@
-"""Records from tables in memory and back: pandas, polars, xarray, dicts of arrays.
-
-None of those packages is imported unless a record is to become such a table: what is handed in is known by the module
-that its class comes from. The rules are those of files.
+"""Records from tables in memory and back: pandas, polars, xarray, dicts of arrays, none imported unless a record
+becomes one: what comes in is known by the module of its class. The rules are those of files.
 """
 
 from __future__ import annotations
@@ -66,10 +64,8 @@ def read_table(
     units: Mapping[str, str] | None = None,
     gaps: GapPolicy = "error",
 ) -> Record:
-    """Take a record from a table in memory.
-
-    `table`: a DataFrame of pandas or polars, a Dataset of xarray or a mapping; `rate_hz`: sampling rate in Hz, where it
-    holds no time; `units`: by column, beside or instead of ``name [unit]``. Returns SI units.
+    """Take a record in SI from a DataFrame of pandas or polars, a Dataset of xarray or a mapping; `rate_hz`: where it
+    holds no time; `units`: by column, beside or instead of ``name [unit]``.
     """
     rows = _table(_parts(table), units)
     if gaps == "error":
@@ -165,9 +161,8 @@ def _of_pandas(table: Any) -> _Parts:
 
 
 def _plain(values: Any) -> np.ndarray:
-    """Return an array; missing values as NaN, dates without a time zone.
-
-    NumPy alone would take what lies under a mask, and make objects of the columns that only pandas knows.
+    """Return an array; missing values as NaN, dates without a time zone. NumPy alone would take what lies under a mask,
+    and make objects of columns that only pandas knows.
     """
     dtype: Any = getattr(values, "dtype", None)
     if np.ma.isMaskedArray(values):

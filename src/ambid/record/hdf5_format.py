@@ -27,9 +27,8 @@ from ambid.record.streams import refuse_claim
 
 @contextmanager
 def new_hdf5(path: Path) -> Iterator[tuple[Any, Callable[[], None]]]:
-    """Make an HDF5 file, and close it; what the disk said is raised as OSError then, or by ``check`` in between.
-
-    Yields the h5py.File, and that check.
+    """Make an HDF5 file, yield it (h5py) with a check, and close it; what the disk said is raised as OSError then, or
+    by that.
     """
     import h5py
 
@@ -143,10 +142,7 @@ SCHEMA = "ambid.record/1"
 
 
 def write_hdf5(record: Record, path: str | Path) -> None:
-    """Write a record with its history, provenance and units.
-
-    `record`: what to write; its history's settings must be JSON-able, as `Step` says; `path`: overwritten if it exists.
-    """
+    """Write a record with history (JSON-able settings, as `Step`), provenance and units, over a file that exists."""
     path = Path(path)
     history = _history_text(record)
     try:
@@ -160,10 +156,7 @@ def write_hdf5(record: Record, path: str | Path) -> None:
 
 
 def write_head(file: Any, record: Record, history: str | None = None) -> None:
-    """Write everything but the channels.
-
-    `file`: empty; `record`: its values are not looked at; `history`: its history as JSON, if that is there already.
-    """
+    """Write everything but the channels into an empty file; `history`: as JSON, if that is there already."""
     file.attrs["schema"] = SCHEMA
     file.attrs["rate_hz"] = record.rate_hz
     file.attrs["start_s"] = record.start_s
@@ -174,11 +167,7 @@ def write_head(file: Any, record: Record, history: str | None = None) -> None:
 
 
 def add_channel(file: Any, k: int, channel: Channel, **options: object) -> Any:
-    """Make the dataset of a channel.
-
-    `file`: with its head; `k`: place of the channel; `channel`: its name and units; `**of`: ``data``, or ``shape`` and
-    ``dtype`` where the values are still to come.
-    """
+    """Make the dataset of channel `k`; `**options`: ``data``, or ``shape`` and ``dtype`` of values still to come."""
     dataset = file["channels"].create_dataset(str(k), compression="gzip", compression_opts=1, shuffle=True, **options)
     dataset.attrs["name"] = channel.name
     dataset.attrs["unit"] = channel.unit
@@ -196,10 +185,8 @@ def _history_text(record: Record) -> str:
 
 
 def read_hdf5(path: str | Path) -> Record:
-    """Read a record that :func:`write_hdf5` wrote.
-
-    `path`: HDF5 file of layout ``ambid.record/1``. Returns equal to the one written, bit for bit; ``file`` and
-    ``sha256`` in the provenance are of this file where the record had none.
+    """Read a record of layout ``ambid.record/1``, bit for bit as written; ``file`` and ``sha256`` in the provenance are
+    of this file where the record had none.
     """
     import h5py
 

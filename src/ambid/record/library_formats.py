@@ -1,6 +1,5 @@
-"""Records that libraries read: TDMS of LabVIEW, DAQmx and DIAdem, MDF 3 and 4 of vehicles, Parquet, Arrow and Feather.
-
-npTDMS, asammdf and pyarrow convert to physical values; units are in the files' properties, metadata or names.
+"""Records that npTDMS, asammdf and pyarrow read in physical values: TDMS of LabVIEW, DAQmx and DIAdem, MDF 3 and 4 of
+vehicles, Parquet, Arrow and Feather. Units are in the files' properties, metadata or names.
 """
 
 from __future__ import annotations

@@ -1,8 +1,5 @@
-"""Records from MATLAB: ``.mat`` of version 5 (SciPy) and 7.3 (which is HDF5).
-
-A mapping says which variable is which channel, and in what unit: ``{"current": ("data.i", "mA")}``. A variable is named
-as in MATLAB: ``i``, ``data.i`` for a field of a struct, ``y(:,2)`` for a column of a matrix. Structures that hold
-signals with names and units (`mat_structures`) need none. Files of version 5 are checked element by element first.
+"""Records from MATLAB: ``.mat`` of version 5 (SciPy), checked element by element first, and 7.3 (HDF5). A mapping names
+variables as MATLAB does, ``i``, ``data.i``, ``y(:,2)``, and their units; `mat_structures` need none.
 """
 
 from __future__ import annotations
@@ -122,10 +119,8 @@ def read_mat(
     gaps: GapPolicy = "error",
     layout: Mapping[str, str] | None = None,
 ) -> Record:
-    """Read a record from a MATLAB file.
-
-    `path`: a ``.mat`` file of version 5 or 7.3; `rate_hz`: sampling rate in Hz, for a file without a time variable;
-    `gaps`: what to do about values that are not finite. Returns in SI units where the units are known.
+    """Read a record, SI where units are known, from a ``.mat`` file of version 5 or 7.3; `rate_hz`: for one without
+    time.
     """
     path = Path(path)
     check_gap_policy(gaps)

@@ -1,6 +1,5 @@
-"""The record: uniformly sampled channels in SI units, with the history of what was done to them.
-
-Beside it the bytes and text of the file that it comes from, with every way in which a file can fail in one line.
+"""The record: uniformly sampled channels in SI units, with the history of what was done to them; and the bytes and text
+of its file, with every way in which a file can fail in one line.
 """
 
 from __future__ import annotations
@@ -334,14 +333,13 @@ def cut(record: Record, from_s: float | None = None, to_s: float | None = None) 
     Parameters
     ----------
     record : Record
-        The record to cut.
     from_s, to_s : float, optional
         Ends in s; the record's own by default.
 
     Returns
     -------
-    Record
-        A new record, whose `start_s` is the time of its first sample, with the step in its history.
+    Record, a new one with the step in its history
+        Its `start_s` is the time of its first sample.
 
     Raises
     ------
@@ -381,10 +379,7 @@ def check_rate(rate_hz: object) -> float:
 
 
 def file_bytes(path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> bytes:
-    """Return the bytes of a file that exists, is a file, can be read and is not empty.
-
-    `path`: the file; `error`: what to raise; `what`: what the file is, for messages. Returns at least one.
-    """
+    """Return the bytes, at least one, of a file that exists, is a file and can be read, or raise `error` of it."""
     with readable(path, error, what) as file:
         data = file.read()
     if not data:
@@ -421,18 +416,12 @@ def _similar(path: Path) -> str:
 
 
 def sha256_of(data: bytes) -> str:
-    """Return the SHA-256 of the bytes.
-
-    `data`: of a whole file. Returns 64 hexadecimal digits.
-    """
+    """Return the SHA-256 of the bytes in 64 hexadecimal digits."""
     return hashlib.sha256(data).hexdigest()
 
 
 def gunzipped(data: bytes, path: Path) -> bytes:
-    """Return what a gzip file holds.
-
-    `data`: of the gzip file; `path`: its name, for messages. Returns unpacked.
-    """
+    """Return what the bytes of a gzip file hold; `path` is for messages."""
     most = max(_MOST_UNPACKED, 200 * len(data))
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as file:
@@ -450,10 +439,8 @@ def gunzipped(data: bytes, path: Path) -> bytes:
 
 
 def utf8_text(data: bytes, path: Path, error: type[AmbidError] = RecordError, what: str = "record") -> str:
-    """Decode UTF-8; a byte order mark at the beginning is dropped, as it is no character.
-
-    `data`: of a text file; `path`: its name, for messages; `error`: what to raise; `what`: what the file is, for
-    messages. Returns with lines ending in a line feed, whatever they ended in.
+    """Decode UTF-8 into lines that end in a line feed; a byte order mark at the beginning is dropped. `path`, `error`
+    and `what` are for messages.
     """
     if data[:2] in (b"\xff\xfe", b"\xfe\xff"):
         raise error(f"{what} {path} is UTF-16; text must be UTF-8. Save it as UTF-8")

@@ -1,7 +1,5 @@
-"""From columns and time stamps to a record: units, the rate, and what is done about gaps.
-
-A time column is uniform if every interval is within 1 % of the sampling period, or lies between two stamps that are
-within 1 % of a period of a uniform grid (jitter of a stamp shows twice in the intervals beside it).
+"""From columns and time stamps to a record: units, rate, gaps. Time is uniform if every interval is within 1 % of the
+period, or lies between stamps that near a uniform grid (jitter of a stamp shows twice beside it).
 """
 
 from __future__ import annotations
@@ -75,9 +73,8 @@ def uniform_record(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Reco
 
 
 def checked(record: Record, where: str, rate_hz: float | None, gaps: GapPolicy) -> Record:
-    """Return a record under the rules that hold for every source: one rate, and finite values unless gaps are treated.
-
-    `rate_hz`: has to agree with the record's, in Hz.
+    """Return a record under the rules of every source: one rate (`rate_hz` agrees), and finite values unless gaps are
+    treated.
     """
     check_gap_policy(gaps)
     agreed_rate(where, record.rate_hz, rate_hz)
@@ -128,10 +125,8 @@ def _record(table: Table, values: Array, rate_hz: float, start_s: float, steps: 
 
 
 def column_channel(name: str, unit_text: str | None, raw: Array) -> Channel:
-    """Make a channel in SI units from a column in file units.
-
-    `unit_text`: unit as the file gives it; missing or unknown units give the unit ``"?"``; `raw`: (n_samples,), values
-    in that unit, which stay as they are where it is not known.
+    """Make a channel in SI from raw values (n_samples,) in the file's unit; of a missing or unknown one they stay, in
+    ``"?"``.
     """
     try:
         unit = parse_unit(unit_text or "")
@@ -171,10 +166,7 @@ def refuse_gaps(table: Table) -> None:
 
 
 def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sampled:
-    """Find the rate and treat the gaps.
-
-    `table`: columns of a file; all values finite if `gaps` is ``"error"``. Returns at least 8 samples.
-    """
+    """Find the rate and treat the gaps (none if `gaps` is ``"error"``) of at least 8 samples."""
     check_gap_policy(gaps)
     _check_rate(table, rate_hz)
     _enough(table.values.shape[0], table.where, "row")
@@ -195,10 +187,8 @@ def sample_uniformly(table: Table, rate_hz: float | None, gaps: GapPolicy) -> Sa
 
 
 def usual_rate(table: Table, rate_hz: float | None) -> tuple[float, float]:
-    """Find the rate of rows that need not be uniform: that of their usual interval.
-
-    `table`: columns of a file; NaN where a value is missing. Returns `rate_hz`: in Hz; `start_s`: first stamp, s; 0
-    without time.
+    """Return the rate in Hz of rows that need not be uniform, of their usual interval, and the first stamp in s, 0
+    without.
     """
     _check_rate(table, rate_hz)
     if table.time is None:
@@ -231,10 +221,7 @@ def _agreed(table: Table, found_hz: float, rate_hz: float | None) -> float:
 
 
 def check_gap_policy(gaps: str) -> None:
-    """Refuse a gap policy that does not exist.
-
-    `gaps`: what was asked for.
-    """
+    """Refuse a gap policy that does not exist."""
     if gaps not in GAP_POLICIES:
         raise RecordError(f"gaps = {gaps!r} is not known. Choose one of {', '.join(GAP_POLICIES)}")
 

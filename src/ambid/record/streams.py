@@ -1,7 +1,5 @@
-"""Columns of long files, read piece by piece into a record, so that memory holds their values once.
-
-What the readers of TDMS, MDF and Arrow share: the choice of a group and of channels, one length and one rate for all,
-and one line for whatever a library raises about a damaged file.
+"""Columns of long files, read piece by piece, so that memory holds their values once: what readers of TDMS, MDF and
+Arrow share, with one line for whatever a library raises about a damaged file.
 """
 
 from __future__ import annotations
@@ -46,9 +44,8 @@ class Stream:
 
 @contextmanager
 def library(path: Path, what: str, magic: Sequence[bytes]) -> Iterator[str]:
-    """Open a file that begins with one of `magic`; what a library raises about its content becomes one line.
-
-    Yields the SHA-256 of the file.
+    """Open a file that begins with one of `magic` and yield its SHA-256; what a library raises about it becomes one
+    line.
     """
     with readable(path) as file:
         head = file.read(max(map(len, magic)))
@@ -72,10 +69,7 @@ def library(path: Path, what: str, magic: Sequence[bytes]) -> Iterator[str]:
 
 
 def chosen_group(path: Path, groups: Mapping[str, Sequence[str]], wanted: str | None) -> str:
-    """Return the group that is wanted, or the only one; several are asked back by the names of their channels.
-
-    `groups`: names of the channels by group, of those that hold any.
-    """
+    """Return the group that is wanted, or the only one; several are asked back by the names of their channels."""
     if not groups:
         raise RecordError(f"record {path} holds no samples. Record again")
     if wanted is None and len(groups) > 1:

@@ -1,7 +1,5 @@
-"""From a rig file to a rig, and a record through its eyes.
-
-Units become SI, the entries are checked against the model and each other. Columns of a record become roles, calibrated,
-in the units that the model needs.
+"""From a rig file to a rig, checked against the model and itself, in SI, and a record through its eyes: columns become
+roles, calibrated, in the units of the model.
 """
 
 from __future__ import annotations
@@ -362,11 +360,8 @@ def daq_of(
     record_rate_hz: float | None,
     where: str,
 ) -> Daq:
-    """Check the entries of ``[daq]`` against each other and the rest of the rig.
-
-    `entry`: as written; `channels`: of the rig; `plant`: its model; `limits`: its limits, SI; `record_rate_hz`:
-    ``record.rate_hz``, the default of the rate, Hz; `where`: the file, for messages. Returns all numbers SI, counts or
-    ms.
+    """Return ``[daq]`` in SI, counts or ms, checked against itself and the rest of the rig; `record_rate_hz` is the
+    default of its rate.
     """
     place = f"{where}: daq"
     if entry.duty is not None and not entry.duty[0] < entry.duty[1]:
@@ -429,10 +424,7 @@ _EXPONENTIAL, _HYPERBOLIC = ("L_g", "zeta"), ("k", "s")
 
 
 def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Parameter:
-    """Convert one parameter to SI and check it against what it is.
-
-    `spec`: what it is; `entry`: as written; `place`: where it stands, for messages. Returns SI.
-    """
+    """Return one parameter in SI, checked against what it is; `place` is for messages."""
     unit = None
     if entry.unit is not None:
         unit = unit_of(entry.unit, place)
@@ -457,10 +449,7 @@ def parameter_of(spec: ParameterSpec, entry: ParameterEntry, place: str) -> Para
 
 
 def magnet_of(entry: MagnetEntry, plant: LinearModel, where: str) -> RigMagnet:
-    """Check ``[magnet]`` against the model and itself.
-
-    `entry`: as written; `plant`: the rig's model; `where`: the file, for messages. Returns SI.
-    """
+    """Return ``[magnet]`` in SI, checked against the model and itself."""
     if plant.name != "one-axis" and not isinstance(plant, RotorModel):
         raise RigError(
             f"{where}: [magnet] is given; model {plant.name!r} has no nonlinear magnet. Remove it, or take 'one-axis'"

@@ -373,10 +373,7 @@ class Rig:
 
 
 def role_units(plant: LinearModel) -> dict[str, str]:
-    """Return the roles that a rig of this model may name, with their SI units.
-
-    `plant`: a model. Returns its inputs, its outputs, and the roles that are `optional_roles`.
-    """
+    """Return the roles that a rig of this model may name (inputs, outputs, `optional_roles`) with their SI units."""
     return {**{role: plant.units[role] for role in (*plant.inputs, *plant.outputs)}, **optional_roles(plant)}
 
 

@@ -75,9 +75,8 @@ class Machine:
 
     @property
     def steps(self) -> Array:
-        """One standard deviation along each direction of the covariance, (n, n).
-
-        From the correlations: in SI the variance of a stiffness drowns that of an inductance in rounding.
+        """One standard deviation along each direction of the covariance, (n, n), from the correlations: in SI the
+        variance of a stiffness drowns that of an inductance in rounding.
         """
         sd = np.sqrt(np.diag(self.covariance))
         size = np.where(sd > 0.0, sd, 1.0)
@@ -168,10 +167,8 @@ def estimate_unbalance(
     *,
     runout: Mapping[str, complex] | None = None,
 ) -> Unbalance:
-    """Estimate unbalance in planes, what bending modes see beyond it, and runout of the sensors.
-
-    `runout`: of sensor planes where it is known, m; the others' is estimated. What modes see beyond the planes has a
-    wide prior, by the mass times the largest motion.
+    """Estimate unbalance in planes, what bending modes see beyond it (a wide prior, by the mass times the largest
+    motion), and runout of the sensors; `runout`: by sensor plane where known, m.
     """
     offsets = dict(runout or {})
     free = [place for place in read_by(machine.model) if place not in offsets]
@@ -303,9 +300,8 @@ def _spread(half: Array) -> float:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Turned:
-    """A record in which the rotor turned: its number and response, its spectra where its excitation is periodic.
-
-    `controller`: K of u = F r - K y at the speed, (n_u, n_y), where it is known.
+    """A record in which the rotor turned: its number and response, its spectra where periodic, and the `controller` K
+    of u = F r - K y at the speed, (n_u, n_y), where known.
     """
 
     record: int
@@ -359,8 +355,7 @@ def balance_rotor(
     runout: Mapping[str, complex] | None = None,
     clearance: float | None = None,
 ) -> dict[str, Any]:
-    """Return unbalance, runout, influence and a proposal for balancing as `RotorEstimate.synchronous` keeps them.
-
+    """Return unbalance, runout, influence and a proposal for balancing as `RotorEstimate.synchronous` keeps them;
     `clearance`: radius in m within which the rotor may move.
     """
     marked = [t for t in turned if t.response.rotation.marked]

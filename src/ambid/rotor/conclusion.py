@@ -205,11 +205,9 @@ def _residual_checks(fit: RotorFit) -> dict[str, Check]:
 def line_checks(
     outputs: Sequence[str], parts: Sequence[tuple[Experiment, Complex, Array]], *, n_free: int = 0
 ) -> dict[str, Check]:
-    """Judge what a model leaves at the lines of records: of all lines, and band by band for each output.
-
-    `parts`: of each record its whitened mean residuals, and the squares that errors of the model's numbers are expected
-    to add to them, (n_lines, n_y); `n_free`: numbers that were fitted to these lines. 2|r|² of a whitened residual has
-    two degrees of freedom; the noise's own levels come from P - 1 periods.
+    """Judge what a model leaves at the lines of records, of all and band by band for each output. `parts`: whitened
+    mean residuals, and the squares that errors of its numbers add, (n_lines, n_y); `n_free`: numbers fitted to these
+    lines. 2|r|² has two degrees of freedom; the noise's own levels come from P - 1 periods.
     """
     worst: dict[str, Any] = {"z": 0.0, "where": ""}
     total, count, spread = 0.0, 0, 0.0

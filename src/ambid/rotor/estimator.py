@@ -95,9 +95,7 @@ def estimate_rotor(
     tick: Tick = silent,
 ) -> RotorFit:
     """Estimate a rotor from records with periodic excitation, the slowest first: their lines together give the start.
-
-    `parameters`: what the rig knows; `delays`: of each input in samples, None where it is searched; `modes`: how many
-    within the excited band, and where they may be; left open, the likelihood decides.
+    `delays`: of inputs in samples, None: searched; `modes`: how many and where; left open, the likelihood decides.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
     work = _Work(

@@ -79,9 +79,8 @@ def residuals(spectra: PeriodSpectra, H: Complex) -> Complex:
 
 
 def fit_noise(between: Between, response_between: Sampled, sampled: Sampled, before: Noise | None = None) -> Noise:
-    """Return the noise at a model: levels by maximum likelihood between the lines, covariance at each line.
-
-    `response_between`, `sampled`: the model between the lines and at them; `before`: at a model nearby.
+    """Return the noise at a model: levels by maximum likelihood between the lines (`response_between`), covariance at
+    each line (`sampled`); `before`: at a model nearby.
     """
     e = between.Y - (response_between.transfer() @ between.U[:, :, None])[:, :, 0]
     g = _sources(response_between)  # (n_between, n_y, n_sources)
@@ -154,9 +153,8 @@ def closed(K: Complex, H: Complex) -> Complex:
 
 
 def rough_covariance(spectra: PeriodSpectra, H: Complex, relative: float) -> Complex:
-    """Return variances of the mean residual without a noise model, (n_lines, n_y, n_y).
-
-    Scatter between periods, and a relative error of the model, which makes the criterion smooth far from its minimum.
+    """Return variances of the mean residual without a noise model, (n_lines, n_y, n_y): scatter between periods, and a
+    relative error of the model, which makes the criterion smooth far from its minimum.
     """
     e = residuals(spectra, H)
     level = np.sqrt(smoothed(np.abs(spectra.mean_y) ** 2, 2))
@@ -273,9 +271,8 @@ class Likelihood:
         return np.column_stack([slopes, left])
 
     def corrected(self, v: Array) -> tuple[Array, Array, float]:
-        """Return the vector where the likelihood's slope vanishes, the triangle of [J | r] there, and its last step.
-
-        Full Gauss-Newton steps from the least squares; the last step's squared length is in standard deviations.
+        """Return the vector where the likelihood's slope vanishes, the triangle of [J | r] there, and the squared
+        length of the last full Gauss-Newton step, in standard deviations.
         """
         length = np.inf
         for k in range(_CORRECTIONS):

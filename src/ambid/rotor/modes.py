@@ -148,10 +148,8 @@ def _motions(
 
 
 def _sums(m: _Motion, line: Array, omega: Array, zeta: float) -> tuple[Array, Array]:
-    """Return the normal equations of a mode at each frequency and of a static compliance beside it.
-
-    (n_omega, n_sensors, 2 n_bearings, 2 n_bearings) and (n_omega, n_sensors, 2 n_bearings). With D = 1/(a + jb) the
-    real part of D* q is |D|² (a Re q - b Im q), so that one real matrix |D|² serves all.
+    """Return the normal equations (n_omega, n_sensors, 2 n_bearings, 2 n_bearings) and (..., 2 n_bearings) of a mode
+    and a static compliance. With D = 1/(a + jb), Re(D* q) = |D|² (a Re q - b Im q): one real matrix serves all.
     """
     n_b, n_s = m.force.shape[1], m.left.shape[1]
     reach = omega[:, None] ** 2 - line**2

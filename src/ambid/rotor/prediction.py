@@ -1,8 +1,5 @@
-"""The innovations-form predictor of a rotor: maximum likelihood from any record, periodic or not.
-
-The plant of `RotorModel` is sampled exactly, its noise is a level of every disturbance and sensor, and the predictor's
-gain follows from them by the Riccati equation (Ljung 1999, sec. 4.3 and 7.4; `ambid.estimation.predictor`). Unstable
-plants and feedback need no care: the innovations do not depend on inputs to come.
+"""The innovations-form predictor of a rotor: maximum likelihood from any record, by `ambid.estimation.predictor` (Ljung
+1999, sec. 4.3, 7.4). Unstable plants and feedback need no care: innovations do not depend on inputs to come.
 """
 
 from __future__ import annotations
@@ -118,9 +115,8 @@ def predict_rotor(
     modes: RigModes = RigModes(),  # noqa: B008 - a frozen value
     tick: Tick = silent,
 ) -> PredictorFit:
-    """Estimate a rotor from one record by its innovations, with start values from windowed spectra.
-
-    `record`: channels by role; `speed`: rad/s; `parameters`, `delays`, `modes`: as for `estimate_rotor`.
+    """Estimate a rotor from one record (channels by role) at a speed in rad/s by its innovations, start values from
+    windowed spectra; the rest as `estimate_rotor`.
     """
     tick("start", 0.0)
     spectra = windowed_spectra(record, model, speed)
@@ -160,9 +156,8 @@ def predictor_problem(
     free: Sequence[int] = (),
     skip: int = 0,
 ) -> tuple[PredictorProblem, Array]:
-    """Return the core's problem at a point, and its vector there.
-
-    `free`: inputs whose delay is searched; `skip`: samples that are left out at the start, at least.
+    """Return the core's problem at a point, and its vector there; `free`: inputs whose delay is searched; `skip`:
+    samples left out at the start, at least.
     """
     unknowns = unknowns_at(model, parameters, at, free)
     searched = Searched(unknowns=unknowns, base=at)
@@ -231,10 +226,8 @@ _ProblemAt = Callable[[RotorModel, Point, Sequence[int], Fit], tuple[PredictorPr
 
 
 def _with_delays(fit: Fit, free: tuple[int, ...], problem_at: _ProblemAt, tick: Callable[[], None]) -> Fit:
-    """Estimate delays as real numbers where the score test says that they are not those whole samples.
-
-    Those that come to rest at whole samples, where the criterion has an edge, are held there, and the others searched
-    once more.
+    """Estimate delays as real numbers where the score test asks for it. Those that rest at whole samples, where the
+    criterion has an edge, are held there, and the others searched once more.
     """
     rotor = _rotor_of(fit)
     loose, vector = problem_at(rotor, _point_of(fit), free, fit)

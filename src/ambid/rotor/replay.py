@@ -1,6 +1,5 @@
-"""A rotor's estimate on a record, the one it came from or another: what the model leaves, beside what noise would.
-
-Nothing is fitted but the levels of the noise, from the scatter between periods.
+"""A rotor's estimate on a record, its own or another: what the model leaves, beside what noise would. Nothing is fitted
+but the levels of the noise, from the scatter between periods.
 """
 
 from __future__ import annotations
@@ -67,9 +66,8 @@ class RotorReplay:
 
 
 def validation(runs: Sequence[RotorReplay]) -> tuple[dict[str, dict[str, Any]], dict[str, Check]]:
-    """Return how much of the excited lines an estimate explains by output, and the tests of what it leaves.
-
-    The tests allow for the estimate's own error: C_e + J P Jᴴ, with P its covariance.
+    """Return how much of the excited lines an estimate explains by output, and tests of what it leaves, which allow for
+    its own error: C_e + J P Jᴴ, with P its covariance.
     """
     outcomes: dict[str, dict[str, Any]] = {}
     for k, role in enumerate(runs[0].model.outputs):

@@ -99,8 +99,7 @@ class Sampled:
         return np.asarray((h[:, None, :] * (self.space.C @ V)) @ (inverse @ self.space.E))
 
     def transients(self) -> Complex:
-        """Return what a difference of states, and of held inputs, between the ends of a period adds: (n_lines, n_y, n).
-
+        """Return what a difference of states, and of held inputs, between the ends of a period adds, (n_lines, n_y, n):
         z C (z - A_d)⁻¹ and C (z - A_d)⁻¹ B (Pintelon and Schoukens 2012, sec. 6.3.2).
         """
         s, V, inverse = self.eigen
@@ -120,9 +119,8 @@ class Sampled:
         return np.asarray(np.sum(parts, axis=0))
 
     def slopes(self, U: Complex, directions: Sequence[StateSpace], n_delays: int = 0) -> Complex:
-        """Return the derivative of H U along directions (dA, dB, dC), then by the first `n_delays` delays.
-
-        `U`: (n_lines, n_u). Returns (n_lines, n_y, n_directions + n_delays).
+        """Return the derivative of H U along directions (dA, dB, dC), then by the first `n_delays` delays, (n_lines,
+        n_y, n_directions + n_delays).
         """
         if self.omega.size > _BLOCK:  # a block's arrays stay in the cache
             blocks = [slice(k, k + _BLOCK) for k in range(0, self.omega.size, _BLOCK)]

@@ -1,7 +1,5 @@
-"""Period spectra of a record: what the frequency-domain estimator of a rotor sees of it.
-
-The record is cut into whole periods of its excitation; each period's discrete Fourier transform, over the number of
-samples, holds the amplitude of every line (Pintelon and Schoukens 2012, ch. 2).
+"""Period spectra of a record, as the estimator of a rotor sees them: whole periods of its excitation, whose discrete
+Fourier transform, over the samples, holds each line's amplitude (Pintelon and Schoukens 2012, ch. 2).
 """
 
 from __future__ import annotations
@@ -49,9 +47,8 @@ class Excitation:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Between:
-    """Spectra of the whole record between the excited lines, where noise stands alone; scaled as those of one period.
-
-    Over all periods at once less leaks from line to line than in single periods.
+    """Spectra of the whole record between the excited lines, noise alone, scaled as those of one period: over all
+    periods at once less leaks from line to line.
     """
 
     frequency_hz: Array  # (n_between,)
@@ -164,9 +161,8 @@ def references_of(model: LinearModel) -> list[str]:
 
 
 def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
-    """Return the periodic excitation of a record, None where it is not periodic or has less than two whole periods.
-
-    Leading periods with a transient are left out.
+    """Return the periodic excitation of a record, without leading periods of a transient; None if less than two are
+    whole.
     """
     signals = _excitations(record, model)
     if not signals:
@@ -190,9 +186,8 @@ def find_excitation(record: Record, model: LinearModel) -> Excitation | None:
 
 
 def experiments_of(record: Record, model: LinearModel) -> tuple[Record, ...]:
-    """Return the experiments of a record one after the other: it is cut where its periodic excitation changes for good.
-
-    So are the experiments of an orthogonal excitation. A record of which a part would be too short stays whole.
+    """Return the experiments of a record, cut where its periodic excitation changes for good, as an orthogonal one
+    does; whole where a part would be too short.
     """
     signals = _excitations(record, model)
     try:
@@ -218,9 +213,8 @@ def _excitations(record: Record, model: LinearModel) -> list[Array]:
 
 
 def period_spectra(record: Record, model: LinearModel, run: Excitation, speed: float = 0.0) -> PeriodSpectra:
-    """Return the spectra of a record's periods at its excited lines, those beside harmonics of the speed left out.
-
-    `speed`: rad/s.
+    """Return the spectra of a record's periods at its excited lines, those beside harmonics of the speed (rad/s) left
+    out.
     """
     n, rate = run.period, record.rate_hz
 
@@ -254,9 +248,8 @@ def period_spectra(record: Record, model: LinearModel, run: Excitation, speed: f
 
 
 def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> PeriodSpectra:
-    """Return the spectra of a whole record under a Hann window, at lines where it moves: rough, for start values.
-
-    `speed`: rad/s.
+    """Return the spectra of a record under a Hann window, at lines where it moves: rough, for start values; speed in
+    rad/s.
     """
     n, rate = record.n_samples, record.rate_hz
     window: Array = 0.5 - 0.5 * np.cos(2.0 * np.pi * (np.arange(n) + 0.5) / n)
@@ -295,9 +288,8 @@ def windowed_spectra(record: Record, model: RotorModel, speed: float = 0.0) -> P
 
 
 def _scatter(U: Complex, Y: Complex) -> Array:
-    """Return the variance of what the inputs do not explain of the outputs, (n_lines, n_y).
-
-    By the local polynomial method, of first order (Pintelon and Schoukens 2012, sec. 7.2), in bands of equal width.
+    """Return the variance of what inputs do not explain of outputs, (n_lines, n_y), by first-order local polynomials
+    (Pintelon and Schoukens 2012, sec. 7.2) in bands of equal width.
     """
     n, n_u = U.shape
     width = min(_LINES_PER_UNKNOWN * 2 * (n_u + 1), n)

@@ -101,10 +101,8 @@ class SynchronousResponse:
 
 
 def rotation_of(record: Record, model: RotorModel, excitation: Excitation | None = None) -> Rotation | None:
-    """Return how the rotor turned in a record, None where it stood still.
-
-    Its angle if logged, pulses once a revolution, else the synchronous line near the logged or given speed; without any
-    of them the line is searched everywhere if the model has a polar moment of inertia.
+    """Return how the rotor turned in a record, None where it stood still: its angle if logged, pulses once a
+    revolution, else the line near the logged or given speed, or anywhere if the model has a polar moment of inertia.
     """
     n, rate = record.n_samples, record.rate_hz
     if "angle" in record:
@@ -218,9 +216,8 @@ def _by_lines(
 def _line_beside(
     y: Array, model: RotorModel, first: Array, rate: float, periods: int, near: float | None
 ) -> float | None:
-    """Return the speed, less that of a first angle, of the line that stands out, rad/s; None without one.
-
-    Off the excitation's lines what differs between periods shows it, on them the one that is larger than the others.
+    """Return the speed, less a first angle's, of the line that stands out, rad/s; None without. Off the excitation's
+    lines what differs between periods shows it, on them the one larger than the others.
     """
     n = y.shape[0]
     hint = float(first[-1] - first[0]) * rate / (n - 1)
@@ -297,9 +294,8 @@ class Separated:
 
 
 def separate(record: Record, model: RotorModel, speed: float | None = None) -> Separated:
-    """Find how the rotor turned in a record, and take the synchronous part out of all its channels.
-
-    `speed`: roughly, rad/s, where it is known of this record; 0: at rest.
+    """Find how the rotor turned in a record, roughly at a speed (rad/s; 0: at rest) if known, and take the synchronous
+    part out of all its channels.
     """
     excitation = find_excitation(record, model)
     turning = model if speed is None else replace(model, speed=speed)
@@ -368,9 +364,8 @@ def _coincident(angle: Array, orders: Sequence[int], periods: int) -> NDArray[np
 def _amplitudes(
     y: Array, waves: Sequence[Complex], samples: NDArray[np.intp], periods: int
 ) -> tuple[Complex, Array, Array]:
-    """Fit Re Σ a_k wave_k in least squares beside all periodic signals but the `samples` lines.
-
-    Returns amplitudes (n_waves, n_channels), of each wave the share of its power that is its own, what is left.
+    """Fit Re Σ a_k wave_k in least squares beside all periodic signals but the `samples` lines; return amplitudes
+    (n_waves, n_channels), of each wave the share of its power that is its own, what is left.
     """
     n = y.shape[0]
     columns = np.column_stack([part for w in waves for part in (w.real, -w.imag)])

@@ -158,8 +158,7 @@ class Unknowns:
 
 
 def split_rows(model: RotorModel, theta: Mapping[str, float], names: Sequence[str]) -> Array:
-    """Return the priors of the shapes' parts over numbers by `names`, as rows over their sd, (n_modes, n_names).
-
+    """Return the priors of the shapes' parts over numbers by `names`, as rows over their sd, (n_modes, n_names):
     ln(|bearings' part| / |sensors' part|) is 2 l with the convention's scatter.
     """
     n, rows = sum(not b.axial for b in model.bearings), np.zeros((model.n_modes, len(names)))

@@ -1,11 +1,5 @@
-"""Simulation of a bench: plant, controller, delay, limits and noise, sampled as a data logger would.
-
-y[k] is sampled at t_k before u[k] acts; u[k] is computed from y[k] (with noise and quantisation), logged, and acts from
-t_k plus the delay on, held for a sample. Disturbances are held over a sample.
-
-Parameters of a linear plant may change on the way. While they drift, each stretch of a millisecond has the matrices of
-its middle; jumps happen at their exact sample. States stay continuous where parameters change: a mass is added at the
-rotor's speed, an inductance changes at equal current, and the term i dL/dt of a drifting inductance is left out.
+"""Simulation of a bench, sampled as a data logger would: y[k] at t_k before u[k] acts; u[k], from y[k] (with noise and
+quantisation), acts from t_k plus the delay on, held for a sample, as disturbances are.
 """
 
 from __future__ import annotations
@@ -115,24 +109,24 @@ def simulate(
     """Simulate a plant in open or closed loop.
 
     The linear plant is stepped with its exact zero-order-hold matrices, the nonlinear one by the classical Runge-Kutta
-    method.
+    method. While parameters drift, each stretch of a millisecond has the matrices of its middle; jumps happen at their
+    exact sample. States stay continuous: a mass is added at the rotor's speed, an inductance changes at equal current,
+    and the term i dL/dt of a drifting inductance is left out.
 
     Parameters
     ----------
     plant : LinearPlant or NonlinearPlant
-        The plant; a linear one moves about the operating point.
+        A linear one moves about the operating point.
     excitation : array_like, shape (n_samples,), in the unit of the input (V)
         Added at the controller's output, before its limits.
     rate_hz : float
         Sampling rate in Hz.
     seed : int or numpy.random.Generator
-        Seed of the noise; equal seeds give equal records.
+        Of the noise; equal seeds give equal records.
     loop : Loop, optional
         Controller and delay; open loop without delay if not given.
     limits : Limits, optional
-        None by default.
     noise : Noise, optional
-        None by default.
     operating_point : OperatingPoint, optional
         Where the controller holds the plant, and start; default zero (linear), the rest point at zero (nonlinear).
     setpoint : array_like, shape () or (n_samples,), in m, optional
@@ -150,7 +144,6 @@ def simulate(
     Returns
     -------
     Simulation
-        The record and what happened.
 
     Raises
     ------
@@ -181,9 +174,8 @@ class Stretch:
 
 
 class VaryingLoop:
-    """A bench that runs on from call to call; how the samples are cut into calls changes no number.
-
-    Arguments are those of `simulate`; while parameters drift, stretches of `grid_s` s have equal ones.
+    """A bench that runs on from call to call; how the samples are cut into calls changes no number. Arguments as
+    `simulate`; while parameters drift, stretches of `grid_s` s have equal ones.
     """
 
     def __init__(
@@ -260,9 +252,8 @@ class VaryingLoop:
         return int(self.counts[0])
 
     def advance(self, excitation: Array, setpoint: ArrayLike | None = None, load: Array | None = None) -> Stretch:
-        """Run on for as many samples as there are of the excitation, new arrays each time.
-
-        `load` (n_samples,): force over each sample in N, beside what varies.
+        """Run on for the samples of the excitation, new arrays each time; `load` (n_samples,): further force over each
+        in N.
         """
         model, n, first, standing = self.standing.model, excitation.size, self.n_done, self.standing
         wanted = _vector("setpoint", standing.point.position if setpoint is None else setpoint, n)
@@ -469,14 +460,13 @@ def largest_amplitude(
     operating_point : OperatingPoint, optional
         Rest point in m, A, V; default zero.
     fraction : float
-        Part of the limits that may be used, 0 < fraction <= 1.
+        0 < fraction <= 1.
     accuracy : float
         Relative accuracy of the result; the result itself is within the limits.
 
     Returns
     -------
-    float
-        The factor, in the unit of the excitation for a `shape` of amplitude one.
+    float, in the unit of the excitation
 
     Raises
     ------

@@ -1,6 +1,5 @@
 """The sequential loops of the simulator: controller, delay line, plant and stops of one axis, and of a rotor's axes.
-
-Import it only from a module that is itself imported inside a function: it loads the compiler.
+Import it only from a module imported inside a function: it loads the compiler.
 """
 
 from __future__ import annotations
@@ -119,9 +118,8 @@ def order(
     limits: tuple[float, float, float],
 ) -> tuple[float, float, float, bool]:
     """Return command, next integral and derivative of the law of `Loop` on one axis, and whether it was limited.
-
-    `feed`: what is ordered without feedback; `error`: of the position; `moved`: since the last sample; `carried`:
-    current beyond that at rest; `gains`: kp, ki T, kd, kc, tau, T; `limits`: low, high and resolution of the command.
+    `feed`: ordered without feedback; `carried`: current beyond that at rest; `gains`: kp, ki T, kd, kc, tau, T;
+    `limits`: low, high and resolution of the command.
     """
     derivative = (gains[4] * derivative - gains[2] * moved) / (gains[4] + gains[5])
     wanted = feed + (gains[0] * error + integral + derivative) - gains[3] * carried
@@ -213,10 +211,7 @@ def advance_linear(
     e: Array,
     deviation: Array,
 ) -> None:
-    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations.
-
-    `deviation` (n_states,) is room to work in.
-    """
+    """Carry the state over one sample in place with exact zero-order-hold matrices; voltages are deviations."""
     n = x.size
     for row in range(n):
         deviation[row] = x[row] - centre[row]
@@ -239,11 +234,9 @@ def advance_plant(
     stops: tuple[float, float],
     room: Array,
 ) -> bool:
-    """Carry the state of a plant over one sample in place; tell whether the rotor touched a stop.
-
-    `voltages`: before and after the delay's fraction has passed, and that at `centre`. `disturbance`: held over the
-    sample; of the nonlinear plant force, then voltage. Position and velocity come first in `x` where there are any;
-    `room` (n_states,) is to work in.
+    """Carry the state (position, velocity first if any) over one sample in place; tell whether the rotor touched a
+    stop. `voltages`: before and after the delay's fraction, and at `centre`; `disturbance`: held, of the nonlinear
+    plant force, then voltage.
     """
     late, now, rest = voltages
     if len(equations) == 3:  # known while compiling: each plant compiles its own equations alone
@@ -287,19 +280,15 @@ def run(
     command: Array,
     states: Array,
 ) -> int:
-    """Run the loop over some samples and keep what the next call needs.
+    """Run the loop over some samples into measured, command, states; return the first that is not finite or outside the
+    `gap` in which the equations hold, -1 for none.
 
-    `noise` (n, n_outputs + n_disturbances); `force` (n,) adds to the disturbance `force_column`, or is empty. `edges`
-    (n_pieces + 1) bound the stretches of `sensor_gain` (n_pieces, n_outputs) and of a linear plant's matrices, each
-    with one axis more in front. `outputs` are the states that are measured, `roles` the columns among them of position
-    and current (-1: none), `gains` kp, ki T, kd, kc, tau, T, `offset` what the current's sensor shows without current,
-    `limits` low, high and resolution of the command, and `gap` the positions between which the equations hold.
-
-    Kept between calls: x (n_states,), memory = integral, derivative, last position, law; line = the
-    newest commands, newest first (whole delay + 2); counts = samples done, first contact, first limited command (-1:
-    none), limited commands.
-    Filled: measured, command, states. Returns the first sample of these that is not finite or outside the gap, -1 for
-    none.
+    `noise` (n, n_outputs + n_disturbances); `force` (n,) adds to disturbance `force_column`, or is empty. `edges`
+    (n_pieces + 1) bound stretches of `sensor_gain` (n_pieces, n_outputs) and, one axis more in front, of a linear
+    plant's matrices. `outputs`: measured states; `roles`: columns of position and current (-1: none); `gains`: kp, ki
+    T, kd, kc, tau, T; `offset`: the current's sensor without current; `limits`: low, high, resolution. Kept between
+    calls: x; memory = integral, derivative, last position, law; line = newest commands, newest first (whole delay + 2);
+    counts = samples done, first contact, first limited command (-1: none), limited commands.
     """
     at, current_at = roles
     integral, derivative, last = memory[0], memory[1], memory[2]
@@ -380,10 +369,9 @@ def rate(
     into: Array,
     room: Array,
 ) -> bool:
-    """Write the derivative of the states; tell whether all gaps are open.
-
-    `motion`, `moving` (n_axes,): what each axis sees of the rotor and of its speed; `voltage`, `force` (n_axes,): with
-    disturbances; `room` (n_axes, n_axes + 2) is to work in: inductances, what drives the currents, force.
+    """Write the derivative of the states; tell whether all gaps are open. `motion`, `moving`, `voltage`, `force`
+    (n_axes,): what each axis sees of the rotor and of its speed, with disturbances; `room` (n_axes, n_axes + 2):
+    inductances, what drives currents, force.
     """
     values, places, pushes, poles, axes, resistance, leakage, (flows, acts), _ = plant
     n = voltage.size
@@ -482,10 +470,9 @@ def advance_poles(
 
 @compiled(error_model="numpy")
 def touch(x: Array, magnets: Array, pushes: Array, stops: tuple[float, float]) -> bool:
-    """Stop the rotor at the magnets' planes without rebound, in place; tell whether it touched.
-
-    `magnets` (n_axes, n): what each axis sees of the n coordinates that come first in `x`, their rates after them;
-    `pushes` (n_axes, n): what moves an axis by one and is done by a force on it.
+    """Stop the rotor at the magnets' planes without rebound, in place; tell whether it touched. `magnets` (n_axes, n):
+    what each axis sees of the first n states, their rates behind; `pushes` (n_axes, n): what moves an axis by one, by
+    its force.
     """
     touched = False
     n = magnets.shape[1]
@@ -530,15 +517,14 @@ def run_rotor(
     command: Array,
     truth: Array,
 ) -> int:
-    """Run the loop of all axes from where it stands.
+    """Run the loop of all axes into measured, command, truth (what each axis sees of the rotor, then currents); return
+    the first sample that is not finite or in which a gap closes, -1 for none.
 
-    `excitation` (n, n_inputs); `noise` (n, n_outputs + n_disturbances); `offsets` (n, n_outputs) run-out, or (0, ...).
-    `read` (n_outputs, n_states); `roles` (n_inputs, 2): outputs of position and current that each axis feeds back, -1:
-    none; `gains` kp, ki T, kd, kc, tau, T; `limits` low, high and resolution of the commands; `line` (whole delay +
-    2, n_inputs); `carried`: states that are currents; states `x` of the plant, `z` of the law; `memory` (n_inputs, 3)
-    of gains: integral, derivative, last position, NaN at first. All four go on. Filled: measured, command, truth =
-    what each axis sees of the rotor, then the currents; counts = first contact, first limited sample (-1: none),
-    limited samples. Returns the first sample that is not finite or in which a gap closes, -1 for none.
+    `excitation` (n, n_inputs); `noise` (n, n_outputs + n_disturbances); `offsets` (n, n_outputs) run-out, or (0, ...);
+    `read` (n_outputs, n_states); `roles` (n_inputs, 2): outputs of position and current fed back, -1: none; `gains`:
+    kp, ki T, kd, kc, tau, T; `limits`: low, high, resolution; `carried`: states that are currents. Going on: states
+    `x`, `z` of the law, `line` (whole delay + 2, n_inputs), `memory` (n_inputs, 3): integral, derivative, last
+    position, NaN at first; counts = first contact, first limited sample (-1: none), limited samples.
     """
     n, n_inputs, n_outputs = command.shape[0], command.shape[1], measured.shape[1]
     n_axes = magnets.shape[0]

@@ -1,7 +1,5 @@
-"""Margins of a position loop as its plant and controller predict it: poles, gain, phase, sensitivity; and a refusal.
-
-The loop is opened at the controller's output, where everything that it orders passes: L = 1/S - 1, with the sensitivity
-S = 1/(1 + L) from an excitation to the command (ISO 14839-3). Limits and quantisation are left out.
+"""Margins of a position loop as predicted: poles, gain, phase, sensitivity; and a refusal. Opened at the controller's
+output: L = 1/S - 1, S from an excitation to the command (ISO 14839-3). Limits and quantisation are left out.
 """
 
 from __future__ import annotations
@@ -137,9 +135,8 @@ class LoopMargins(OpenLoop):
         )
 
     def refuse(self, where: str, *, remedy: str) -> None:
-        """Raise `ModelError` for an unstable loop: its largest pole, how far the gains are off, and what to do.
-
-        `where`: which plant, rate and delay; `remedy`: what to do unless a sign is reversed.
+        """Raise `ModelError` for an unstable loop at `where` (plant, rate, delay): its largest pole, how far the gains
+        are off, and the remedy, unless a sign is reversed.
         """
         if self.stable:
             return
@@ -157,10 +154,7 @@ class LoopMargins(OpenLoop):
 
 
 def loop_margins(parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str = "one-axis") -> LoopMargins:
-    """Predict a loop's poles and margins.
-
-    `parameters`: of the model called `of`, SI; `loop`: controller and delay.
-    """
+    """Predict poles and margins of controller and delay on the model called `of`, its parameters in SI."""
 
     def largest(tried: Loop) -> float:
         try:

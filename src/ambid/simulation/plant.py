@@ -95,10 +95,9 @@ class Standing:
         return (-math.inf, math.inf) if isinstance(self.plant, LinearPlant) else self.plant.magnet.range
 
     def equations(self, period: float, fraction: float, substeps: int) -> Equations:
-        """Return what a compiled loop steps the plant with: A, B, B_late and E, or magnet, body and timing.
-
-        The input is late by `fraction` of `period`. The magnet is k_a, s_a, k_b, s_b, i0, leakage and i0_asym of a
-        `CoEnergy`, or `LawMagnet.vector`; the body m, c, R, gravity, eddy pole, v_drop, i_drop, limits and offset.
+        """Return what a compiled loop steps the plant with, the input late by `fraction` of `period`: A, B, B_late and
+        E, or magnet (k_a, s_a, k_b, s_b, i0, leakage, i0_asym of a `CoEnergy`, or `LawMagnet.vector`), body (m, c, R,
+        gravity, eddy pole, v_drop, i_drop, limits, offset) and timing.
         """
         if isinstance(self.plant, LinearPlant):
             d, _ = discretise(self.model.matrices(self.plant.parameters), period, fraction=fraction)
@@ -117,9 +116,8 @@ class Standing:
 
 
 def nonlinear_truth(plant: NonlinearPlant) -> Mapping[str, float]:
-    """Return the numbers of a nonlinear plant by the names of ``[magnet.parameters]``.
-
-    Returns SI: those of the law and g, of the others those that are not zero; and R, without what a drop adds to it.
+    """Return, SI, the law's numbers and g of a nonlinear plant by the names of ``[magnet.parameters]``, of the others
+    those that are not zero; and R, without what a drop adds to it.
     """
     magnet, stage, w = plant.magnet, plant.stage, plant.magnet.coenergy
     if isinstance(magnet, LawMagnet):
@@ -145,27 +143,25 @@ def closed_loop_matrix(
     Parameters
     ----------
     parameters : Mapping[str, float]
-        Parameters of the model in SI units.
+        Of the model, in SI units.
     loop : Loop
         Controller and delay, the same on every axis.
     rate_hz : float
         Sampling rate in Hz.
     of : str or LinearModel
-        The linear model, or its name; commands u and a PID's states I, D, x[k-1] are one for each of its inputs, those
-        of a `StateLaw` are its own.
+        Commands u and a PID's states I, D, x[k-1] are one for each of its inputs, those of a `StateLaw` are its own.
 
     Returns
     -------
     ndarray, shape (n_states + n_delayed n_inputs + n_controller, ...)
-        The loop's matrix; limits and quantisation are left out.
+        Limits and quantisation are left out.
     """
     return excited_loop(parameters, loop, rate_hz, of=of)[0]
 
 
 def fed_back(of: LinearModel) -> NDArray[np.int64]:
-    """Return the outputs of position and current that the controller of each input feeds back, -1: none.
-
-    ``ax_voltage`` is that of ``ax_position`` (its first sensor) and ``ax_current``. Shape (n_inputs, 2).
+    """Return the outputs of position (first sensor) and current, ``ax_position`` and ``ax_current``, that the
+    controller of each input such as ``ax_voltage`` feeds back, -1: none; (n_inputs, 2).
     """
 
     def place(name: str) -> int:
@@ -201,10 +197,8 @@ def matrices_of(law: StateLaw | None) -> tuple[Array, Array, Array, Array, Array
 def excited_loop(
     parameters: Mapping[str, float], loop: Loop, rate_hz: float, *, of: str | LinearModel = "one-axis"
 ) -> tuple[Array, Array, Array]:
-    """Return the matrix of `closed_loop_matrix`, the rows that give the commands, and what an excitation of them does.
-
-    The excitation is added to the command: the states become z x + excited e, what is ordered is command x + e. Of a
-    model with one input, rows and columns are vectors.
+    """Return the matrix z of `closed_loop_matrix`, the rows that give the commands, and what an excitation e added to
+    them does: states become z x + excited e, ordered is command x + e; vectors of a model with one input.
     """
     plant, period = model(of) if isinstance(of, str) else of, 1.0 / rate_hz
     whole = math.floor(loop.delay)
@@ -253,13 +247,11 @@ def closed_loop_poles(
     Parameters
     ----------
     parameters : Mapping[str, float]
-        Parameters of the model in SI units.
+        Of the model, in SI units.
     loop : Loop
-        Controller and delay.
     rate_hz : float
         Sampling rate in Hz.
     of : str or LinearModel
-        The linear model, or its name.
 
     Returns
     -------

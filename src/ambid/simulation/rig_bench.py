@@ -1,6 +1,5 @@
-"""Simulation of a rig: its linear model about the operating point, or the nonlinear plant of its ``[magnet]``.
-
-Magnet, gravity, eddy pole, stage and offsets are those that `ambid.identify_nonlinear` finds, under the same names.
+"""Simulation of a rig: its linear model, or the nonlinear plant of its ``[magnet]``, whose numbers are those that
+`ambid.identify_nonlinear` finds, under the same names.
 """
 
 from __future__ import annotations
@@ -37,9 +36,8 @@ FINE = 0.25  # largest rate of the plant at rest times a Runge-Kutta step
 
 
 def law_of_rig(rig: Rig) -> tuple[MagnetLaw, dict[str, float]]:
-    """Return the law that a rig's ``[magnet]`` names, and the numbers of it that have a value.
-
-    Returns `values`: all numbers of ``[magnet.parameters]`` with a value, whatever their role, and m, R and c; SI.
+    """Return the law that a rig's ``[magnet]`` names, and all numbers of ``[magnet.parameters]`` with a value, whatever
+    their role, with m, R and c; SI.
     """
     magnet = rig.magnet
     if magnet is None:
@@ -140,28 +138,20 @@ def plant_of_law(law: MagnetLaw, values: Mapping[str, float], *, eddy: bool) -> 
 
 
 def current_offset(rig: Rig) -> float:
-    """Return what the rig's current sensor shows without current.
-
-    Returns in A.
-    """
+    """Return in A what the rig's current sensor shows without current."""
     offset = None if rig.magnet is None else rig.magnet.known("i_offset")
     return 0.0 if offset is None or offset.value is None else offset.value
 
 
 def rest_of_rig(rig: Rig, plant: NonlinearPlant) -> OperatingPoint:
-    """Return where the loop holds the plant: the declared position, and what current and voltage the law needs
+    """Return where the loop holds the plant: the declared position, 0 without one, and the law's current and voltage
     there.
-
-    `rig`: the position of its operating point is used, 0 where it gives none.
     """
     return plant.equilibrium(rig.operating_point.get("position", 0.0))
 
 
 def enough_steps(plant: NonlinearPlant, point: OperatingPoint, rate_hz: float) -> int:
-    """Return how many Runge-Kutta steps a sample needs, by the fastest rate of the plant at rest.
-
-    Returns at least 1.
-    """
+    """Return how many Runge-Kutta steps, at least 1, a sample needs by the fastest rate of the plant at rest."""
     p = plant.linearise(point.position)
     resistance = p["R"] + abs(plant.stage.slope(0.0))  # the drop is steepest where the current passes zero
     rates = [resistance / p["L"], abs(p["k_i"]) / math.sqrt(p["L"] * p["m"]), math.sqrt(abs(p["k_x"]) / p["m"])]
@@ -200,13 +190,13 @@ def simulate_rig(
     rate_hz : float
         Sampling rate in Hz.
     seed : int or numpy.random.Generator
-        Seed of the noise.
+        Of the noise.
     closed : bool, optional
-        Closed or open loop; default closed where the rig has a loop and does not say ``open_loop``.
+        Default closed where the rig has a loop and does not say ``open_loop``.
     setpoint : array_like, shape () or (n_samples,), in m, optional
         Wanted position; default the operating point's.
     nonlinear : bool
-        Simulate the nonlinear plant instead of the linear one.
+        Simulate the nonlinear plant.
     substeps : int, optional
         Runge-Kutta steps in each sample (nonlinear only); default what the plant's rates ask for.
     columns : bool
@@ -217,7 +207,6 @@ def simulate_rig(
     Returns
     -------
     Simulation
-        The record and what happened.
 
     Raises
     ------
@@ -253,13 +242,13 @@ def simulate_preset(
     excitation : array_like, shape (n_samples,), in V
         Added at the controller's output.
     seed : int or numpy.random.Generator
-        Seed of the noise.
+        Of the noise.
     rate_hz : float, optional
         Sampling rate in Hz; default the preset's, for which its loop is designed.
     closed : bool, optional
-        Closed or open loop; default the preset's usual way.
+        Default the preset's usual way.
     nonlinear : bool
-        Simulate the nonlinear plant instead of the linear one.
+        Simulate the nonlinear plant.
     noise : Noise, optional
         Default the preset's.
     setpoint : array_like, shape () or (n_samples,), in m, optional
@@ -270,7 +259,6 @@ def simulate_preset(
     Returns
     -------
     Simulation
-        The record and what happened.
 
     Raises
     ------
@@ -380,11 +368,9 @@ class Bench:
 def parts_of_rig(
     rig: Rig, closed: bool | None, *, nonlinear: bool = False
 ) -> tuple[LinearPlant | NonlinearPlant, Loop | None, OperatingPoint]:
-    """Return what a rig gives a simulation.
-
-    `rig`: every parameter needs a value, whatever its role; `nonlinear`: the nonlinear plant and its rest point, as
-    `simulate_rig`. Returns `plant`: with the rig's parameters; `loop`: the controller, or its delay alone; `point`: a
-    value that the rig does not give is zero; a voltage that it does not give is R times the current.
+    """Return plant, controller (or its delay alone) and operating point that a rig gives a simulation; every parameter
+    needs a value. A value that the rig does not give is zero, a voltage R times the current; a nonlinear plant has its
+    rest point.
     """
     loop = loop_of_rig(rig, closed)
     if nonlinear:
@@ -418,10 +404,8 @@ def loop_of_rig(rig: Rig, closed: bool | None) -> Loop | None:
 
 
 def as_columns(record: Record, rig: Rig, setpoint: Array | None = None) -> Record:
-    """Name the roles by the rig's columns and undo their calibrations.
-
-    `setpoint`: (n_samples,), in m, the role ``reference`` of one axis. Returns the rig's columns, then what has no
-    role.
+    """Name the roles by the rig's columns and undo their calibrations, those first, then what has no role. `setpoint`
+    (n_samples,), in m: the role ``reference`` of one axis.
     """
     roles = {c.name: c for c in record.channels}
     if setpoint is not None:

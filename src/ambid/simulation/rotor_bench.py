@@ -1,18 +1,5 @@
-"""Simulation of a rotor in its bearings: all axes in one loop, each with the rig's controller.
-
-The linear plant is stepped with its exact zero-order-hold matrices, the one with nonlinear magnets by the classical
-Runge-Kutta method. Unbalance is exact: two states turn with the rotor.
-
-A pole pair with gap d and coil current j has W' = k h(j)/d, h = j^2/(1 + sqrt(1 + sigma j^2)) (thesis eq. 1.9 for
-sigma = 0; `physics.coenergy_law`). The sum of all is one co-energy of the positions and currents of all axes, so that
-force and back-EMF agree. Two opposed pairs on an axis have, at the centre and with gap s, bias i0 and pole faces that
-the axis meets at an angle with the cosine c,
-
-    k_i = 2 c k h'(i0)/s^2,   k_x = -4 c^2 k h(i0)/s^3,   L = 2 k h''(i0)/s + leakage,
-
-so k, i0 and leakage follow from k_i, k_x, L and s. Conical pole faces at an angle to the shaft have c = cos(cone), and
-act with sin(cone) along it: a current of the axial axis adds half of itself to every coil of the bearing that pulls to
-+z and takes as much from those of the other.
+"""Simulation of a rotor in its bearings: all axes in one loop, each with the rig's controller. Linear plants have exact
+zero-order-hold matrices, nonlinear magnets classical Runge-Kutta; unbalance is exact: two states turn with the rotor.
 """
 
 from __future__ import annotations
@@ -67,9 +54,15 @@ class Poles(NamedTuple):
 
 
 def poles_of(rig: Rig, rotor: RotorModel, theta: Mapping[str, float]) -> Poles:
-    """Return the pole pairs that have the linear numbers of a rig at its centre.
+    """Return the pole pairs that have the linear numbers of a rig at its centre, or raise `RigError` where there is no
+    gap, or no magnet can have these.
 
-    Raises `RigError` where there is no gap, or no magnet can have these numbers.
+    A pair with gap d and coil current j has W' = k h(j)/d, h = j^2/(1 + sqrt(1 + sigma j^2)) (thesis eq. 1.9 for sigma
+    = 0; `physics.coenergy_law`); the sum of all is one co-energy. Two opposed pairs at gap s, bias i0, that the axis
+    meets at an angle with the cosine c have k_i = 2 c k h'(i0)/s^2, k_x = -4 c^2 k h(i0)/s^3, L = 2 k h''(i0)/s +
+    leakage, from which k, i0 and leakage follow. Conical faces have c = cos(cone) and act with sin(cone) along the
+    shaft: the axial current adds half of itself to every coil of the bearing that pulls to +z and takes as much from
+    those of the other.
     """
     magnet, where = rig.magnet, f"rig {rig.name!r}"
     gap = None if magnet is None else magnet.known("s")
@@ -167,9 +160,8 @@ class Running:
     law: StateLaw | None
 
     def hand_over(self, law: StateLaw, y: Array) -> None:
-        """Go on with another law, whose states order of themselves what those of the last one would.
-
-        By least squares over samples; then z+ = z + C⁺ (w - C z - D y), w what the last law would order.
+        """Go on with another law, whose states order of themselves what those of the last one would: by least squares
+        over samples; then z+ = z + C⁺ (w - C z - D y), w what the last law would order.
         """
         assert self.law is not None
         wanted, n = self.law.C @ self.z + self.law.D @ y, 2 * max(self.law.order, law.order)
@@ -271,11 +263,12 @@ class RotorBench:
         self, excitation: ArrayLike, *, seed: int, columns: bool = True, settle: int = 0, load: Array | None = None,
         start: Array | Running | None = None,
     ) -> Simulation:  # fmt: skip
-        """Simulate the bench, excited at the controllers' outputs, (n_samples, n_axes).
+        """Simulate the bench, excited at the controllers' outputs, (n_samples, n_axes); `load` (n_samples, n_axes):
+        force in N.
 
-        `load` (n_samples, n_axes): force over each sample in N; `start` (n_states,): default at rest; or a loop that
-        runs and goes on. Of `settle` samples at the beginning nothing is logged but that limits were met. The record
-        holds voltage, current, position and reference of each axis and, of a rotor that turns, its angle.
+        `start` (n_states,): default at rest; or a loop that runs and goes on. Of `settle` samples only that limits were
+        met is logged. The record holds voltage, current, position and reference of each axis and, of a rotor that
+        turns, its angle.
         """
         rotor, u = self.model, np.ascontiguousarray(excitation, dtype=np.float64)
         if u.ndim != 2 or u.shape[1] != len(rotor.inputs) or u.shape[0] <= settle:
@@ -352,9 +345,8 @@ class RotorBench:
         )
 
     def largest(self, shape: Array, seed: int, fraction: float) -> float:
-        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits.
-
-        It is that of the linear plant, which is near the nonlinear one in that part of the gap, and fast.
+        """Return the amplitude of an excitation of peak one that uses a fraction of the limits, to three digits: the
+        linear plant's, which is near the nonlinear one there, and fast.
         """
         linear = replace(self, poles=None)
         amplitude = largest_amplitude(
@@ -473,10 +465,8 @@ class RotorBench:
 def _drawn(
     rig: Rig, rotor: RotorModel, shaft: Shaft, values: Mapping[str, float], rate_hz: float, numbers: int
 ) -> tuple[int, Mapping[str, float]]:
-    """Return how many bending modes a simulation keeps, and what follows from the drawing.
-
-    As many modes as ``modes.count`` says; else those below a quarter of the rate. `numbers`: modes whose numbers the
-    rig gives; then none come from the drawing.
+    """Return how many bending modes a simulation keeps, ``modes.count`` or those below a quarter of the rate, and what
+    follows from the drawing: no modes where the rig gives `numbers` of them.
     """
     missing = [place for place in rotor.places if place not in values]
     if missing:

@@ -1,10 +1,5 @@
-"""Scenarios: named courses of a bench whose truth is known, to try on-line identification on.
-
-Each says what changes, from when, and by how much; the bench is any preset or rig of a linear model with a loop, and
-chooses the excitation that suits it.
-
-A position sensor of gain g hides behind the parameters: z = g x obeys the same equations with m/g^2, k_x/g^2, c/g^2 and
-k_i/g. Who does not know the mass cannot tell the two apart.
+"""Scenarios, to try on-line identification on: what changes on a linear bench, when, by how much. A position sensor of
+gain g, z = g x, has the same equations with m/g^2, k_x/g^2, c/g^2, k_i/g: without the mass, none can tell.
 """
 
 from __future__ import annotations
@@ -34,9 +29,8 @@ _MEAN_BURST = 8  # samples
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Loss:
-    """One burst of lost samples, `first` to `stop` - 1.
-
-    One channel's cells are empty; all cells but the time are; or the rows are missing, so that time jumps.
+    """One burst of lost samples, `first` to `stop` - 1: one channel's cells are empty; all but the time are; or the
+    rows are missing, so that time jumps.
     """
 
     first: int
@@ -49,9 +43,8 @@ _KINDS = ("cells", "rows", "skipped")
 
 
 def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[Loss, ...]:
-    """Return which samples are lost: bursts of some samples each, of all kinds in turn, apart from each other.
-
-    `share` of the samples from `first` on, above 0 and at most 0.5; not of the record's first and last eight.
+    """Return which samples are lost, `share` (over 0, to 0.5) of those from `first` on but the record's first and last
+    eight: bursts of all kinds in turn, apart from each other.
     """
     begin, end = max(first, 8), n_samples - 8
     if not 0.0 < share <= 0.5:
@@ -75,9 +68,8 @@ def losses(n_samples: int, share: float, seed: int, *, first: int = 0) -> tuple[
 def damage(
     record: Record, path: str | Path, *, share: float, seed: int, first: int = 0, comments: Sequence[str] = ()
 ) -> tuple[Loss, ...]:
-    """Write a record as a CSV file in which samples are lost (see `losses`), and return which.
-
-    Channels whose names begin with ``true_`` lose no cells.
+    """Write a record as a CSV file in which samples are lost, and return which (`losses`); ``true_`` channels lose no
+    cells.
     """
     path = Path(path)
     if not path.name.lower().endswith((".csv", ".csv.gz")):
@@ -115,10 +107,8 @@ def input_room(bench: Bench) -> float:
 
 
 def one_period(bench: Bench, seed: int, *, fast: bool = False) -> Array:
-    """Return one period of a multisine of peak one from 1/4000 to 1/20 of the rate, shape (n_samples,).
-
-    There the rotor and the coil both answer: 5 Hz to 1 kHz at 20 kHz. A `fast` one, from 1/40 to 1/5 of the rate, the
-    rotor hardly follows.
+    """Return one period (n_samples,) of a multisine of peak one from 1/4000 to 1/20 of the rate, where rotor and coil
+    both answer; a `fast` one, from 1/40 to 1/5, the rotor hardly follows.
     """
     rate = bench.rate_hz
     band = (rate / 40.0, rate / 5.0) if fast else (rate / 4000.0, rate / 20.0)

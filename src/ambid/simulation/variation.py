@@ -1,7 +1,5 @@
-"""What changes while a bench runs: parameters, sensors and loads by schedule, and the matrices that follow from them.
-
-All times are seconds of the record; a jump or a corner happens at the sample nearest to its time. Stretches of equal
-parameters lie on a grid of the record, not of the call, so that the numbers do not depend on how a record is cut up.
+"""What changes while a bench runs: parameters, sensors and loads by schedule, in s of the record, at the nearest
+sample, and the matrices that follow, on a grid of the record, so that no number depends on how it is cut up.
 """
 
 from __future__ import annotations
@@ -62,13 +60,11 @@ class Schedule:
         ----------
         before, after : float
             Values before and from `at_s` on.
-        at_s : float
-            In s.
+        at_s : float, s
 
         Returns
         -------
-        Schedule
-            With two knots.
+        Schedule, with two knots
         """
         return cls(times_s=(at_s, at_s), values=(before, after))
 
@@ -80,13 +76,11 @@ class Schedule:
         ----------
         before, after : float
             Values until `from_s` and after `to_s`.
-        from_s, to_s : float
-            In s.
+        from_s, to_s : float, s
 
         Returns
         -------
-        Schedule
-            With two knots.
+        Schedule, with two knots
         """
         return cls(times_s=(from_s, to_s), values=(before, after))
 
@@ -136,7 +130,6 @@ class Schedule:
         Returns
         -------
         ndarray, shape (n,), in the unit of the schedule
-            The values.
         """
         knots, values = self.knots(rate_hz), np.asarray(self.values)
         if values.size == 1:
@@ -232,10 +225,7 @@ class Variation:
 
 
 def check_variation(variation: Variation, model: LinearModel) -> None:
-    """Refuse what a model does not have.
-
-    `variation`: what is to change; `model`: the model that is simulated.
-    """
+    """Refuse a variation of what a model does not have."""
     specs = {s.name: s for s in model.parameters}
     for name, schedule in variation.parameters.items():
         if name not in specs:
@@ -347,10 +337,9 @@ class Tables:
         return self._known[key]
 
     def _drifting(self, begin: int, end: int, first: int, stop: int) -> tuple[Array, Matrices, list[int]]:
-        """Return the cells of an interval in which something moves: middles, matrices, and where each ends.
-
-        Matrices are exact at nodes, every `_NODE` cells, and linear between them: right to second order in the change
-        from node to node, where held ones are right to first order in the change over a cell.
+        """Return middles, matrices and ends of the cells of an interval in which something moves. Matrices are exact
+        every `_NODE` cells and linear between: right to second order from node to node, held ones to first order over a
+        cell.
         """
         cells = np.arange((first - begin) // self._grid, -((begin - stop) // self._grid))
         starts = begin + cells * self._grid
@@ -389,10 +378,8 @@ class Tables:
 
 
 def exponentials(stack: Array, halvings: int) -> Array:
-    """Return exp of each matrix by a Taylor polynomial of 2^-halvings times it, squared as often.
-
-    `stack` is (n_matrices, n, n). SciPy's expm solves equations on the threads of the linear algebra library, which on
-    a busy machine takes a hundred times as long for matrices as small as these; products stay on this thread.
+    """Return exp of each matrix of (n_matrices, n, n) by a Taylor polynomial of 2^-halvings times it, squared as often:
+    SciPy's expm waits for linear algebra threads, on a busy machine a hundred times as long; products stay on this one.
     """
     x = stack * 0.5**halvings
     unit = np.eye(x.shape[1])
