@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from importlib import import_module
 from typing import Annotated, Any
@@ -14,7 +14,6 @@ import typer
 from ambid import compiled
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
-from ambid.settings.jobs import FORMER
 
 VERBS = {
     "demo": "identify the embedded record, and compare with the true parameters",
@@ -40,6 +39,15 @@ VERBS = {
 }
 """What each verb does, in the order of the help."""
 _BESIDE = {"compare": "fit", "models": "info", "validate": "identify"}  # verbs in the file of another
+_PART = "'ambid validate RESULT RECORD' with --from and --to"
+# Words of the releases before, by job: what each is now.
+_FORMER: Mapping[str, Mapping[str, str]] = {
+    "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
+    "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
+    "history": {"export": "--tables"}, "export": {"to": "--library"},
+    "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
+    "fleet simulate": {"limit": "--time-limit"},
+}  # fmt: skip
 
 
 def _global(
@@ -107,9 +115,9 @@ def run_verb(words: Sequence[str]) -> int:
 
 def _refuse_former(words: Sequence[str]) -> None:
     """Refuse an option of a release before, and say what it is now."""
-    job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in FORMER), "")
+    job = next((name for name in (" ".join(words[:2]), *words[:1]) if name in _FORMER), "")
     for word in words if job else ():
-        new = FORMER[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
+        new = _FORMER[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
         if new is not None:
             raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is now {new}. Give that")
 

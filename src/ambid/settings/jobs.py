@@ -277,15 +277,6 @@ _JOBS = (
     ),
 )
 JOBS = {job.name: job for job in _JOBS}
-_PART = "'ambid validate RESULT RECORD' with --from and --to"
-# Words of the releases before, by job: what each is now.
-FORMER: Mapping[str, Mapping[str, str]] = {
-    "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
-    "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
-    "history": {"export": "--tables"}, "export": {"to": "--library"},
-    "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
-    "fleet simulate": {"limit": "--time-limit"},
-}  # fmt: skip
 
 
 def check(job: str, **values: Any) -> None:
