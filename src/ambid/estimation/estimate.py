@@ -96,6 +96,10 @@ class Check:
     detail: str  # one line for people: what was looked at, what was found, what to do
     p: float | None = None  # probability of a result at least as extreme if the model is right
     values: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))  # further numbers
+    grave: bool = False  # where it failed: no number is to be used
+    cause: str = ""  # what explains a failure best, its size, and causes that explain it about as well
+    size: float | None = None
+    alternatives: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,9 +112,14 @@ class OutputFit:
 
 
 _GRAVE = frozenset(
-    {"units", "plausible", "delay_in_range", "in_time", "finite_prediction", "stable_predictor", "response_fit"}
-)
+    {
+        "units", "plausible", "delay_in_range", "in_time", "finite_prediction", "stable_predictor", "response_fit",
+        "belonging", "position_size",
+    }
+)  # fmt: skip
 """Checks after whose failure no number is to be used."""
+_EVIDENCE = frozenset({"ohm", "gravity_balance", "fixed_agree", "loop_agrees", "sampling"})
+"""Checks of a fact each: two that contradict the estimate are as grave as one above."""
 
 _UNFINISHED = {
     "stalled": "the search did not converge: its numbers are a first guess. Excite more, or give start values",
@@ -131,7 +140,15 @@ class Judged(Result):
         failed = (
             [] if self.status == "converged" else [Reason(check="status", text=_UNFINISHED[self.status], grave=True)]
         )
-        failed += [Reason(check=k, text=c.detail, grave=k in _GRAVE) for k, c in self.checks.items() if not c.passed]
+        against = {k: c for k, c in self.checks.items() if not c.passed}
+        contradicted = len(_EVIDENCE & against.keys()) > 1
+        failed += [
+            Reason(
+                check=k, text=c.detail, grave=c.grave or k in _GRAVE or (contradicted and k in _EVIDENCE),
+                cause=c.cause, size=c.size, alternatives=c.alternatives,
+            )
+            for k, c in against.items()
+        ]  # fmt: skip
         second = (getattr(self, "validation", None) or {}).get("checks", {})
         failed += [Reason(check=f"validation.{k}", text=c["detail"]) for k, c in second.items() if not c["passed"]]
         return tuple(failed)
@@ -437,8 +454,7 @@ def _exactly(kind: type, what: str) -> Callable[[Any, str], Any]:
 
 
 def _check(value: Any, at: str) -> Check:
-    own_fields = ("passed", "detail", "p")
-    numbers = {name: x for name, x in value.items() if name not in own_fields}
+    numbers = {name: x for name, x in value.items() if name not in _OF_CHECKS}
     return cast("Check", _dataclass(Check, {**value, "values": numbers}, at))
 
 
@@ -453,9 +469,14 @@ def _refuse(value: Any, at: str, wanted: str) -> Any:
     raise ValueError(f"{at or 'it'} is {text if len(text) <= 40 else text[:37] + '...'} instead of {wanted}")
 
 
+_OF_CHECKS = tuple(f.name for f in fields(Check) if f.name != "values")
+
+
 def _write_check(check: Check) -> dict[str, Any]:
     p = {} if check.p is None else {"p": plain_json(check.p)}
-    return {"passed": bool(check.passed), **p, **plain_json(check.values), "detail": check.detail}
+    named = {"cause": check.cause, "size": check.size, "alternatives": check.alternatives, "grave": check.grave}
+    given = {name: plain_json(x) for name, x in named.items() if x not in ("", None, (), False)}
+    return {"passed": bool(check.passed), **p, **plain_json(check.values), **given, "detail": check.detail}
 
 
 def _write_delay(delay: Delay) -> dict[str, Any]:

@@ -37,6 +37,9 @@ class Reason:
     check: str  # its name; ``"status"`` for the search itself
     text: str  # what was found, and what to do
     grave: bool = False  # whether nothing of the result is to be used
+    cause: str = ""  # what explains it best, where that is known: its size, and what explains it about as well
+    size: float | None = None
+    alternatives: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

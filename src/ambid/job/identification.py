@@ -217,14 +217,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
         checks["in_time"] = check_lag(signals)
-        if rig.loop is not None or rig.magnet is not None:
-            from ambid.validation.physical import carries_weight, gravity_balance, loop_agrees
-
-            theta = problem.parameters(fit.vector)
-            loop = loop_agrees(rig, theta, bench.rate_hz)
-            checks |= {} if loop is None else {"loop_agrees": loop}
-            if rig.magnet is not None and carries_weight(rig.magnet, bench["current"].values):
-                checks["gravity_balance"] = gravity_balance(rig.magnet, bench, theta, spread.names, spread.information)
+        theta = problem.parameters(fit.vector)
+        checks |= physical.fact_checks(rig, bench, theta, spread, robust=robust)
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import curvature_check
 

@@ -40,6 +40,7 @@ from ambid.record import Record
 from ambid.rig.rig import Rig, RigMagnet
 from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation, resolution
 from ambid.simulation.plant import closed_loop_poles
+from ambid.validation.facts import agreements, one_sided
 from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -56,6 +57,7 @@ _BLIND = 1e-12  # eigenvalue, over the largest, of directions that neither recor
 _SAME = 1e-6  # length left of a column below which it counts as held by the others: lags of a slow input nearly are
 _STRIDES = (2, 4)
 _MOST = 4.0  # shift in its standard deviations that chance allows
+_BEYOND = 10.0  # from which no number is to be used
 _FAR = 3.3  # standard deviations between a prior and the record
 _MISSED = 0.05  # part of a sample in which a delay may go unseen and move a parameter out of its interval
 _SIZES = {"m": (1e-5, 1e5), "k_x": (0.0, 1e11), "k_i": (0.0, 1e6), "R": (1e-4, 1e5), "L": (1e-7, 1e3), "c": (0.0, 1e8)}
@@ -190,10 +192,9 @@ def _estimates_agree(moved: Agreement) -> Check:
             "SI): the model does not fit this record. Excite more, reduce the range of motion, or extend the model"
         )
     return Check(
-        passed=moved.passed,
-        values={"largest_shift_sd": moved.largest, "refits": float(len(moved.strides))},
-        detail=detail,
-    )
+        passed=moved.passed, grave=moved.largest > _BEYOND,
+        values={"largest_shift_sd": moved.largest, "refits": float(len(moved.strides))}, detail=detail,
+    )  # fmt: skip
 
 
 def agreement(fit: Fit) -> Agreement:
@@ -428,17 +429,47 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
 
 GRAVITY = 9.81
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
-_REVERSED = 0.02  # of a current's largest value that an offset may put on the other side of zero
+_NEAR = 0.3  # relative, up to which a calibration may explain it
+_OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
+
+
+def fact_checks(
+    rig: Rig, bench: Record, theta: Mapping[str, float], spread: Uncertainty, *, robust: bool
+) -> dict[str, Check]:
+    """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
+
+    `theta`: parameters, SI; `robust`: which standard deviations count. The balance of gravity is asked for by default
+    where the current keeps its sign, as that of one magnet that carries a weight does, and its mean is that of the
+    voltage, so that it is no offset.
+    """
+    sd, alone = (
+        dict(zip(spread.names, spread.standard_deviations(robust=which).tolist(), strict=True))
+        for which in (robust, False)
+    )
+    checks = agreements(bench, theta, sd, alone)
+    loop = loop_agrees(rig, theta, bench.rate_hz)
+    checks |= {} if loop is None else {"loop_agrees": loop}
+    magnet, means = rig.magnet, checks["ohm"].values
+    if magnet is None and "value" in means and abs(means["value"] / theta["R"] - 1.0) < _OWN_CURRENT:
+        magnet = RigMagnet()
+    if carries_weight(magnet, bench["current"].values):
+        assert magnet is not None
+        checks["gravity_balance"] = gravity_balance(magnet, bench, theta, spread.names, spread.information)
+        if theta["k_x"] > _FAR * sd.get("k_x", np.inf):
+            checks["sign_of_k_x"] = Check(
+                passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},
+                detail=f"k_x = {theta['k_x']:.3g} N/m is that of a spring, and no magnet that carries a weight has "
+                "k_x > 0. Check that all columns are of one run, and their signs",
+            )  # fmt: skip
+    return checks
 
 
 def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:
     """Whether a rig says that one magnet carries the weight, with a force that grows as the square of `current`."""
     if magnet is None or magnet.kind == "pair" or magnet.saturation:
         return False
-    low, high = sorted((float(current.min()), float(current.max())), key=abs)
-    one_sided = low * high > 0 or abs(low) <= _REVERSED * abs(high)
     gravity = magnet.known("g")
-    return (magnet.kind == "single" or one_sided) and (gravity is None or gravity.value != 0.0)
+    return (magnet.kind == "single" or one_sided(current)) and (gravity is None or gravity.value != 0.0)
 
 
 def gravity_balance(
@@ -472,15 +503,19 @@ def gravity_balance(
         )
     else:
         detail += f": {100.0 * abs(off):.3g} % {'more' if off > 0 else 'less'}"
-    if not passed and abs(off) < 1.0:
+    if not passed and abs(off) < _NEAR:
         detail += (
             f". A position that reads as much too {'large' if off > 0 else 'small'}, or a current that reads "
             f"{zero + i0 * off / (1.0 + off):.3g} A at zero would explain it (a factor on current, voltage or mass "
             "would not). Check these two, and that one magnet alone carries the rotor; else record away from limits, "
             "with more excitation"
         )
+    if not passed and magnet == RigMagnet():
+        detail += ". If a pair of magnets carries the rotor, or none of its weight, give magnet.kind = 'pair'"
     values = {"k_i_over_m": ratio, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
-    return Check(passed=passed, values=values, detail=detail)
+    return Check(
+        passed=passed, values=values, detail=detail, cause="" if passed else "weight", size=None if passed else off
+    )
 
 
 def _value(p: object, value: float, sd: float) -> tuple[float, float]:

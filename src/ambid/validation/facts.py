@@ -1,0 +1,198 @@
+"""What a record says of a bench by itself, without any fit: means, weight, belonging, sampling, the log.
+
+Each fact is compared with the estimate in standard deviations of both; a contradiction is a check with its cause.
+
+- Means: at rest on average V = R i, so that R = mean V / mean i where the current keeps its sign (theory.md sec. 1).
+- Belonging: position and current of one run are related beyond chance. Slow signals always look alike, so that each is
+  whitened by its own past first; n times the sum of squared cross-correlations at 2M + 1 lags is then chi-squared if
+  they have nothing to do with each other (Haugh 1976).
+- Sampling: a coil whose time constant L/R is shorter than a sample shows its resistance and no inductance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from ambid.arrays import Array
+from ambid.estimation.estimate import Check
+from ambid.estimation.uncertainty import chi_squared_tail
+from ambid.record import Record
+
+_FAR = 2.5  # standard deviations between R and the means, whose offsets are allowed for generously
+_OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
+_ONE_SIDED = 0.02  # part of a current's largest value that may lie beyond zero
+_BLOCKS = 30  # stretches whose means show the scatter of a mean
+_PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are compared
+_LONGEST = 40_000  # samples that are compared
+_CHANCE = 1e-3  # probability above which a relation may be chance
+_SHOWN = 3.0  # standard deviations of k_i above which current and position belong together
+_STILL = 4  # samples in which no channel changes: the log stood still
+_FURTHEST = 1.0  # m, from zero that a position sensor can be
+_PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
+
+
+def one_sided(current: Array) -> bool:
+    """Return whether a current keeps its sign, but for what an offset may do."""
+    low, high = sorted((float(current.min()), float(current.max())), key=abs)
+    return low * high > 0 or abs(low) <= _ONE_SIDED * abs(high)
+
+
+def mean_resistance(record: Record) -> tuple[float, float] | None:
+    """Return mean voltage over mean current with its standard deviation, ohm; None where the current has both signs.
+
+    The deviation holds the scatter of means of stretches, and offsets of both channels, sd 0.5 % of each
+    channel's largest value.
+    """
+    v, i = record["voltage"].values, record["current"].values
+    if not one_sided(i) or abs(i.mean()) < float(i.std()):
+        return None
+    ratio = float(v.mean() / i.mean())
+    length = max(1, len(v) // _BLOCKS)
+    rest = (v - ratio * i)[: len(v) // length * length].reshape(-1, length).mean(axis=1)
+    scatter = float(rest.std(ddof=1)) / np.sqrt(rest.size) if rest.size > 1 else float(np.abs(v).max())
+    volts, amperes = _offset(v), _offset(i)
+    return ratio, float(np.sqrt(scatter**2 + volts**2 + (ratio * amperes) ** 2) / abs(i.mean()))
+
+
+def _offset(x: Array) -> float:
+    return _OFFSET * float(np.abs(x).max())
+
+
+def facts(record: Record) -> dict[str, Check]:
+    """Return what the record says by itself, channels named by role; a check that fails names a cause."""
+    roles = set(record.names)
+    checks: dict[str, Check] = {}
+    if {"voltage", "current"} <= roles:
+        known = mean_resistance(record)
+        text = "voltage and current have no mean that shows R" if known is None else _ohms(*known)
+        checks["ohm"] = Check(passed=True, detail=text, values=_level(known))
+    if {"position", "current"} <= roles:
+        checks["belonging"] = belonging(record)
+    if "position" in roles:
+        checks["position_size"] = _position_size(record["position"].values)
+    checks["log_runs"] = _log_runs(record)
+    return checks
+
+
+def _ohms(value: float, sd: float) -> str:
+    return f"mean voltage over mean current is {value:.4g} ± {sd:.2g} ohm, if neither has a larger offset"
+
+
+def _level(known: tuple[float, float] | None) -> dict[str, float]:
+    return {} if known is None else {"value": known[0], "sd": known[1]}
+
+
+def belonging(record: Record) -> Check:
+    """Check that position and current, or position and voltage, are related beyond chance."""
+    names = [name for name in ("current", "voltage") if name in record.names]
+    chance = {name: _chance(record["position"].values, record[name].values) for name in names}
+    passed = min(chance.values()) <= _CHANCE
+    return Check(
+        passed=passed, p=min(chance.values()), cause="" if passed else "belonging",
+        detail="position and current are of one run: they are related beyond chance" if passed
+        else f"nothing relates the position to {' or '.join(names)}, at any lag up to {_LAGS} samples: channels of "
+        "different runs, or shifted against each other. Take all columns from one run",
+    )  # fmt: skip
+
+
+def _chance(a: Array, b: Array) -> float:
+    """Probability that two signals are related as much by chance."""
+    n = min(a.size, _LONGEST)
+    if n < 4 * (_PAST + _LAGS):
+        return 0.0
+    x, y = _whitened(a[:n]), _whitened(b[:n])
+    size = float(np.sqrt((x @ x) * (y @ y)))
+    if not size > 0.0:
+        return 1.0
+    both = np.fft.irfft(np.fft.rfft(x, 2 * x.size) * np.conj(np.fft.rfft(y, 2 * x.size))) / size
+    r = np.concatenate([both[-_LAGS:], both[: _LAGS + 1]])
+    return chi_squared_tail(r.size, x.size * float(r @ r))
+
+
+def _whitened(x: Array) -> Array:
+    """Return what a signal's own past does not say of it, in units of its spread, without glitches."""
+    x = (x - x.mean()) / max(float(x.std()), 1e-300)
+    rows = np.column_stack([x[_PAST - k : x.size - k] for k in range(_PAST + 1)])
+    gram = rows.T @ rows
+    past = np.linalg.lstsq(gram[1:, 1:], gram[1:, 0], rcond=1e-10)[0]
+    rest = rows[:, 0] - rows[:, 1:] @ past
+    reach = 12.0 * float(np.median(np.abs(rest)))
+    return np.asarray(np.clip(rest, -reach, reach) if reach > 0.0 else rest)
+
+
+def _position_size(x: Array) -> Check:
+    far = float(np.abs(x).max())
+    return Check(
+        passed=far <= _FURTHEST, values={"largest": far}, cause="" if far <= _FURTHEST else "unit",
+        detail=f"the position reaches {far:.3g} m" if far <= _FURTHEST
+        else f"the position reaches {far:.3g} m, which no bearing has. Correct the unit of its column",
+    )  # fmt: skip
+
+
+def _log_runs(record: Record) -> Check:
+    """Check that there are no stretches in which no channel changes: the log stood still, and time went on."""
+    still = np.ones(record.n_samples - 1, dtype=bool)
+    for channel in record.channels:
+        if np.ptp(channel.values) > 0:
+            still &= np.diff(channel.values) == 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], still.view(np.int8), [0]])))
+    runs = [(a, b - a) for a, b in zip(edges[::2].tolist(), edges[1::2].tolist(), strict=True) if b - a >= _STILL]
+    moving = 1.0 - float(still.mean())
+    if not runs or moving < 0.5:  # slow signals of coarse steps stand still together
+        return Check(passed=True, detail="no stretch in which the log stood still")
+    first, longest = runs[0][0], max(length for _, length in runs) + 1
+    at = record.start_s + first / record.rate_hz
+    return Check(
+        passed=False, cause="stuck", values={"stretches": float(len(runs)), "longest": float(longest)},
+        detail=f"all channels stand still for up to {longest} samples, first at {at:.4g} s: the log stopped while the "
+        "rotor went on. Cut the record there",
+    )  # fmt: skip
+
+
+def agreements(
+    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
+) -> dict[str, Check]:
+    """Compare the facts of a record with an estimate from it, model one-axis.
+
+    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: of those standard deviations, under the model.
+    """
+    checks = facts(record)
+    if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
+        checks["belonging"] = Check(passed=True, p=checks["belonging"].p, detail="position and current are of one run")
+    known = mean_resistance(record)
+    if known is not None:
+        checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
+    checks["sampling"] = _sampling(theta, sd, record.rate_hz)
+    return checks
+
+
+def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:
+    far = (R - mean) / float(np.hypot(sd, mean_sd))
+    passed = abs(far) <= _FAR
+    i0 = float(record["current"].values.mean())
+    detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
+    if not passed:
+        detail += (
+            f": {abs(far):.2g} sd apart. An offset of {(mean - R) * i0:+.2g} V or {i0 * (1.0 - mean / R):+.2g} A, or a "
+            "coil that warms up, would explain it; else the model does not hold. Measure R, and both channels at rest"
+        )
+    return Check(
+        passed=passed, values={"value": mean, "sd": mean_sd, "apart_sd": far}, detail=detail,
+        cause="" if passed else "ohm", size=None if passed else mean - R,
+    )  # fmt: skip
+
+
+def _sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float) -> Check:
+    """Check that the coil is slower than the sampling, in samples of L/R at the upper end of L's interval."""
+    R, L = theta["R"], theta["L"]
+    samples = (L + 2.0 * sd.get("L", 0.0)) / R * rate_hz if R > 0 else np.inf
+    passed = samples >= _PER_COIL
+    return Check(
+        passed=passed, values={"samples": L / R * rate_hz if R > 0 else np.nan}, grave=samples < 1.0,
+        cause="" if passed else "sampling",
+        detail=f"the coil's time constant is {L / R * rate_hz:.3g} samples long" if passed
+        else f"sampled too slowly for the coil: L/R is {max(L / R * rate_hz, 0.0):.2g} samples, so that L is not seen. "
+        f"Sample at {rate_hz * 5.0 / max(samples, 0.1):.2g} Hz or more, or fix L",
+    )  # fmt: skip
