@@ -1,6 +1,5 @@
 """Global search by SciPy's differential evolution (Storn and Price 1997; best1bin, dithered mutation, Sobol start)
-between bounds, scaled to 0 .. 1, and the rescue of fits whose ordinary starts fail. The result depends on the seed
-alone.
+between bounds, scaled to 0 .. 1, and the rescue of fits whose ordinary starts fail. Equal seeds give equal results.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""Bearings watched over time: what drifts, what stepped and when, which alarms stand, and what the cause may be.
-
-Only usable estimates and identifiable values count: no other one raises or clears an alarm. A rule compares the median
-of the latest estimates with that of the first; both spreads, enlarged by the scatter from one estimate to the next,
-decide with the rule's confidence, twice in succession. The date of a step has the interval of Bai (1997), Review of
-Economics and Statistics 79(4), 551-563; that of a drift is where a line through its surroundings crosses the limit.
+"""Bearings watched over time: what drifts, what stepped and when (interval of Bai 1997, Review of Economics and
+Statistics 79(4), 551-563), which alarms stand, and their cause. Only usable estimates and identifiable values count.
 """
 
 from __future__ import annotations

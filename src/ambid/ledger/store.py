@@ -1,7 +1,6 @@
-"""The ledger itself: opened, written in whole batches, asked, and written to Parquet; SQLite or PostgreSQL.
-
-One batch is one transaction: a writer that is killed, a full disk or a lost server leaves nothing of it. Two writers
-may write at once; an estimate that both have counts once.
+"""The ledger itself, SQLite or PostgreSQL: opened, written, asked, and written to Parquet. One batch is one
+transaction, of which a kill or a full disk leaves nothing; two may write at once, and an estimate that both have counts
+once.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""Errors of sensors: what each adds to the signals, how far it moves the parameters J⁺c (least squares with Jacobian
-J), and the residuals c - J J⁺c along which alone a score test sees it (Rao 1948); c is what e adds to y = G(jw; theta)
-u.
+"""Errors of sensors: what each adds to the signals, how far J⁺c it moves the parameters (least squares with Jacobian
+J), and the residuals c - J J⁺c, along which alone a score test sees it (Rao 1948); c: what e adds to G(jw; theta) u.
 """
 
 from __future__ import annotations

@@ -1,10 +1,4 @@
-"""Records as HDF5, layout ``ambid.record/1``: nothing of a record is lost. Files are opened and written without damage.
-
-    /                 attributes: schema, rate_hz, start_s, history (JSON), provenance (JSON)
-    /channels/<k>     float64 dataset, k = 0, 1, …; attributes: name, unit, source_unit
-
-Calibrations are part of the history. The values are stored bit for bit, compressed without loss.
-"""
+"""Records as HDF5, layout ``ambid.record/1``: nothing of a record is lost, nor any file damaged by opening."""
 
 from __future__ import annotations
 
@@ -142,7 +136,11 @@ SCHEMA = "ambid.record/1"
 
 
 def write_hdf5(record: Record, path: str | Path) -> None:
-    """Write a record with history (JSON-able settings, as `Step`), provenance and units, over a file that exists."""
+    """Write a record with history (JSON-able settings, as `Step`), provenance and units, over a file that exists.
+
+    /                 attributes: schema, rate_hz, start_s, history (JSON, with calibrations), provenance (JSON)
+    /channels/<k>     float64 dataset, k = 0, 1, …, compressed without loss; attributes: name, unit, source_unit
+    """
     path = Path(path)
     history = _history_text(record)
     try:

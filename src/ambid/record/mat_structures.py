@@ -1,10 +1,4 @@
-"""Signals in MATLAB's structures, with their names and units: Simulink, timeseries, Simcenter Testlab, plain structs.
-
-time, signals(k).values, .label          Simulink, "Structure with time"
-Time, Data, Name, units                  a timeseries as struct, alone, in an array, in fields, in Elements{k}.Values
-x_values, y_values, function_record      Simcenter (LMS) Testlab
-time, u, i, …, units.u                   a struct of columns
-"""
+"""Signals in MATLAB's structures, with names and units: Simulink, timeseries, Simcenter Testlab, plain structs."""
 
 from __future__ import annotations
 
@@ -154,7 +148,13 @@ def _stream(signal: _Signal, path: Path, layout: Mapping[str, str]) -> Stream:
 
 
 def _signals(node: Any, name: str, path: Path) -> Iterator[_Signal]:
-    """Yield all signals of a variable."""
+    """Yield all signals of a variable:
+
+    time, signals(k).values, .label          Simulink, "Structure with time"
+    Time, Data, Name, units                  a timeseries as struct, alone, in arrays, fields or Elements{k}.Values
+    x_values, y_values, function_record      Simcenter (LMS) Testlab
+    time, u, i, …, units.u                   a struct of columns
+    """
     if isinstance(node, list):
         for k, x in enumerate(node, 1):
             yield from _signals(x, f"{name}({k})", path)

@@ -1,6 +1,5 @@
-"""What every recursive estimator promises: the same numbers from single samples and from blocks, and a way back.
-Signals and settings are float64, C order, writable; covariances go to and from the U-D factors of
-`square_root_kernels`.
+"""What every recursive estimator promises: the same numbers from single samples and blocks, and a way back; and float64
+signals in C order, writable, and U-D factors (`square_root_kernels`) of covariances.
 """
 
 from __future__ import annotations

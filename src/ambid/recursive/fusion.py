@@ -1,6 +1,5 @@
-"""One position from two or more sensors of one displacement, by a Kalman filter of motion, each sensor's walking
-offset, perhaps a shared temperature, that tests each sensor against the others at every sample and leaves faulty ones
-out.
+"""One position from several sensors of one displacement, by a Kalman filter of motion, walking offsets, perhaps a
+shared temperature, which tests each sensor against the others at every sample and leaves out faulty ones.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Recursive prediction error method for A y = (B/F) u + (C/D) e + constant (Ljung & Söderström 1983, ch. 3): each
-sample a Gauss-Newton step theta += P psi e in U-D form, psi exact (thesis eq. 3.12 ff.), begun by a first window fitted
+"""Recursive prediction error method for A y = (B/F) u + (C/D) e + constant (Ljung & Söderström 1983, ch. 3):
+Gauss-Newton steps theta += P psi e in U-D form, psi exact (thesis eq. 3.12 ff.), begun by a window that is fitted
 off-line.
 """
 

@@ -1,8 +1,6 @@
-"""Which column is which role: by unit and name, by whether it holds a signal, and by what a bearing does to it.
-
-Voltage and current are those of a coil. Over windows of some samples, int V = R int i + L [i] + k [x] (the weak form of
-thesis eq. 4.4, Shinbrot 1957): no measured signal is differentiated, and no controller biases it much. The position is
-a second-order response to the force: coherent with current and voltage where it has its power, and smoother than they.
+"""Which column is which role: by unit and name, whether it holds a signal, and what a bearing does to it: int V = R int
+i + L [i] + k [x] (weak form of thesis eq. 4.4, Shinbrot 1957) over windows; the position follows the force, and is
+smoother.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
-"""From the tables of a rig file to a rotor on many axes: its bearings, planes and speed, what drives it, its drawing.
-
-Numbers with a unit are read in SI; ``[shaft]`` is written too.
+"""From the tables of a rig file to a rotor on many axes: bearings, planes and speed, what drives it, its drawing, in
+SI.
 """
 
 from __future__ import annotations

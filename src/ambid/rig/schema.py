@@ -1,7 +1,5 @@
-"""What a rig file (TOML, schema ``ambid.rig/1``) may hold, and one line for everything that it may not.
-
-Only the shape is checked here: known keys, types, finite numbers. What the entries mean together is checked where the
-rig is built.
+"""What a rig file (TOML, schema ``ambid.rig/1``) may hold, and one line for everything that it may not. Only the shape
+is checked here: known keys, types, finite numbers; what entries mean together is checked where the rig is built.
 """
 
 from __future__ import annotations

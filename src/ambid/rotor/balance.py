@@ -1,10 +1,5 @@
-"""Unbalance, runout and balancing of a rotor from synchronous responses and its identified model.
-
-At the speed W the outputs obey y = H(jW) v + X u + r whatever controller holds the rotor: H the plant from its inputs,
-X its response to unbalances u = U exp(j phase), whose force is U W² (cos, sin)(angle + phase) in the planes x and y, so
-that they turn with the rotor from x to y, and r the runout of the sensors. Both u and r are found by generalised least
-squares over all records; weights count the noise between lines and the covariance of the plant, which is common to all.
-Currents see the rotor through the voltage that its motion induces, and no runout; two speeds separate the two by W².
+"""Unbalance, runout and balancing of a rotor: at the speed W y = H(jW) v + X u + r, u = U exp(j phase) of forces U W²
+(cos, sin)(angle + phase) in planes x and y, r the sensors' runout, whatever controller holds it.
 """
 
 from __future__ import annotations
@@ -168,7 +163,9 @@ def estimate_unbalance(
     runout: Mapping[str, complex] | None = None,
 ) -> Unbalance:
     """Estimate unbalance in planes, what bending modes see beyond it (a wide prior, by the mass times the largest
-    motion), and runout of the sensors; `runout`: by sensor plane where known, m.
+    motion), and runout of the sensors, given by plane in m where known: generalised least squares over all records,
+    whose weights count the noise and the plant's common covariance. Currents see motion by its voltage, no runout; two
+    speeds part both by W².
     """
     offsets = dict(runout or {})
     free = [place for place in read_by(machine.model) if place not in offsets]

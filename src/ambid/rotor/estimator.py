@@ -1,10 +1,5 @@
-"""The estimator of a rotor from periodic excitation: rigid start, modes one after the other, noise, feedback.
-
-1. A rigid rotor is fitted below the first mode: linear least squares in several bands, the widest that fits.
-2. The band grows; where the fit breaks, a scan of the residuals says which mode is missing (`modes.scan`).
-3. On all lines the noise model takes over from the relative error, the likelihood decides on further modes, and the
-   feedback is corrected for (`likelihood.Likelihood.corrected`).
-4. Delays that agree with whole samples are held there, and the last search is repeated.
+"""The estimator of a rotor from periodic excitation: rigid start, modes one after the other, noise, feedback (theory.md
+sec. 10).
 """
 
 from __future__ import annotations
@@ -96,6 +91,11 @@ def estimate_rotor(
 ) -> RotorFit:
     """Estimate a rotor from records with periodic excitation, the slowest first: their lines together give the start.
     `delays`: of inputs in samples, None: searched; `modes`: how many and where; left open, the likelihood decides.
+
+    A rigid rotor is fitted below the first mode, by linear least squares in the widest band that fits; the band grows,
+    and where the fit breaks a scan says which mode is missing (`modes.scan`). On all lines the noise model takes over,
+    the likelihood decides on further modes, the feedback is corrected for (`Likelihood.corrected`). Delays that agree
+    with whole samples are held there, and the last search is repeated.
     """
     ordered = sorted(experiments, key=lambda e: abs(e.speed))
     work = _Work(

@@ -1,18 +1,5 @@
-"""Frequency-domain maximum likelihood of a rotor on period spectra: its criterion, search and information.
-
-e(k) = Y(k) - H(k; theta) U(k) at the excited lines, mean over the periods; no frequency response is formed (Pintelon
-and Schoukens 2012, sec. 9.11). Under feedback the inputs hold a part Q e of the residuals; the likelihood's slope is
-that of H (U - Q e), and without it weak excitation is biased.
-
-Between the lines of a periodic excitation e = Y - H U is noise alone. Its covariance is that of white sources seen
-through the model,
-
-    C(k) = Σ_j s_j g_j(k) g_j(k)ᴴ,   g_j: a sensor's unit vector, or the response to a held force or voltage,
-
-whose levels s_j maximise the likelihood (Fisher scoring; Pintelon and Schoukens 2012, ch. 10 and 12). Feedback carries
-that noise back into the inputs: with U = R - K Y they hold -(I + K H)⁻¹ K e; K follows from U and Y between the lines,
-which a controller binds. Inputs that are measured themselves, such as currents without voltages, hold noise of their
-own: there Q follows from U and e.
+"""Frequency-domain maximum likelihood of a rotor on period spectra, its noise and feedback: e(k) = Y(k) - H(k; theta)
+U(k) at the excited lines; no frequency response is formed (Pintelon and Schoukens 2012, sec. 9.11; theory.md sec. 10).
 """
 
 from __future__ import annotations
@@ -63,7 +50,10 @@ class Point:
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Noise:
-    """Noise of one period's residuals."""
+    """Noise of one period's residuals, from between the excited lines: C(k) = Σ_j s_j g_j(k) g_j(k)ᴴ, g_j a sensor's
+    unit vector or the response to a held force or voltage, s_j by Fisher scoring (Pintelon and Schoukens 2012, ch. 10,
+    12).
+    """
 
     levels: Array  # (n_sources,): variance of one period's spectrum, sensors first, then disturbances
     covariance: Complex  # (n_lines, n_y, n_y) at the excited lines, of one period
@@ -118,9 +108,8 @@ def _covariance(g: Complex, levels: Array) -> Complex:
 def feedback(spectra: PeriodSpectra, H: Complex, H_between: Complex, *, measured: bool) -> Complex | None:
     """Return Q(k), what goes with the residuals in the inputs, (n_lines, n_u, n_y); None: too few lines.
 
-    K (or Q) is constant with a slope over as many neighbouring lines as its rows have unknowns, three equations for
-    each. `H`, `H_between`: the model at the lines and between them; `measured`: some inputs are no commands of a
-    controller.
+    With U = R - K Y the inputs hold Q e = -(I + K H)⁻¹ K e; K, or for inputs `measured` themselves (no commands) Q,
+    follows between the lines, constant with a slope over as many as its rows have unknowns, three equations for each.
     """
     spectrum_between = spectra.between
     at, n_u, n_y = spectrum_between.frequency_hz, spectrum_between.U.shape[1], spectrum_between.Y.shape[1]
@@ -204,7 +193,9 @@ def noise_weight(experiment: Experiment, model: RotorModel, at: Point, before: W
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Likelihood:
-    """The criterion over several experiments, as `ambid.estimation.search.Problem`."""
+    """The criterion over several experiments, as `ambid.estimation.search.Problem`. Under feedback the likelihood's
+    slope is that of H (U - Q e): without it weak excitation is biased.
+    """
 
     unknowns: Unknowns
     base: Point  # what does not move

@@ -1,16 +1,4 @@
-"""Where a bending mode is missing: a scan of the residuals for one more pole pair, all at once by linear least squares.
-
-A mode (w, zeta) with shape b at the bearings and s at the sensors adds x_s = s D(jw) Σ b f to the positions, f the
-force of each magnet. At speed W a gyroscopic term g splits it: for the circular motions x ± jy
-
-    D± = 1/(w² - W_l² ± g W W_l + 2 j zeta w W_l),   W_l: frequency of the line,
-
-whose resonances stand at w exp(±d), 2 sinh d = g W/w: they are tried as pairs of modes at rest, with g > 0.
-
-The products s bᵀ are linear in the residuals; the best rank-one part is the start of a search. Beside it stands a
-static compliance, so that modes above the band do not look like one within. The magnets' stiffness moves the pole that
-is seen: w² = seen² - Σ k_x b².
-"""
+"""Where a bending mode is missing: a scan of the residuals for one more pole pair by linear least squares."""
 
 from __future__ import annotations
 
@@ -59,7 +47,13 @@ class _Motion:
 def scan(
     experiment: Experiment, model: RotorModel, at: Point, weight: Weight, band: tuple[float, float]
 ) -> Candidate | None:
-    """Return the mode within a band in Hz that explains most of what the model leaves over; None without one."""
+    """Return the mode within a band in Hz that explains most of what the model leaves over; None without one.
+
+    With shape b at bearings and s at sensors it adds x_s = s D(jw) Σ b f, f the magnets' forces, beside a static
+    compliance for modes above the band. At speed W circular motions x ± jy have D± = 1/(w² - W_l² ± g W W_l + 2 j zeta
+    w W_l), W_l the line, resonances at w exp(±d), 2 sinh d = g W/w, tried as pairs at rest with g > 0. The rank-one
+    part of s bᵀ starts a search; magnets move the pole: w² = seen² - Σ k_x b².
+    """
     motions, places = _motions(experiment, model, at, weight)
     omega = 2.0 * np.pi * np.exp(np.arange(np.log(band[0]), np.log(band[1]), _STEP))
     turning = motions[0].direction != 0

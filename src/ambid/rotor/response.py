@@ -1,14 +1,4 @@
-"""The exact sampled response of a linear model at many lines, and its derivatives, through one eigendecomposition.
-
-With x' = A x + B u, u held over a sample and f samples late, every line z has H = C h_z(A) B, where
-
-    h_z(s) = (exp(s (1-f) T) - 1 + (exp(s T) - exp(s (1-f) T))/z) / (s (z - exp(s T)))
-
-(Astrom and Wittenmark 1997, sec. 2.3). A measured current is the integral of a held voltage, and linear between the
-samples: h_z(s) = (g0 - g1 + g1 z)/(z - exp(s T)), g0 = (exp(s T) - 1)/s, g1 = (exp(s T) - 1 - s T)/(s² T). In the
-eigenvectors A = V diag(s) V⁻¹ the derivative of h_z(A) along dA is V [(V⁻¹ dA V) ∘ D] V⁻¹ with the divided differences
-D_ij = (h_z(s_i) - h_z(s_j))/(s_i - s_j) (Daleckii and Krein 1965; Higham 2008, th. 3.11).
-"""
+"""The exact sampled response of a linear model at many lines, and its derivatives, through one eigendecomposition."""
 
 from __future__ import annotations
 
@@ -29,7 +19,14 @@ _REST = 1e-9  # an eigenvalue at 0 stands here, 1/s
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Sampled:
-    """A model at lines: `delays` (n_u,) in samples, `held` (n_u,) whether an input is held over a sample, or linear."""
+    """A model at lines: `delays` (n_u,) in samples, `held` (n_u,) whether an input is held over a sample, or linear.
+
+    Held and f samples late, H = C h_z(A) B with h_z(s) = (exp(s (1-f) T) - 1 + (exp(s T) - exp(s (1-f) T))/z) / (s (z -
+    exp(s T))) (Astrom and Wittenmark 1997, sec. 2.3); a measured current, linear, has h_z(s) = (g0 - g1 + g1 z)/(z -
+    exp(s T)), g0 = (exp(s T) - 1)/s, g1 = (exp(s T) - 1 - s T)/(s² T). With A = V diag(s) V⁻¹ the derivative along dA
+    is V [(V⁻¹ dA V) ∘ D] V⁻¹, D_ij = (h_z(s_i) - h_z(s_j))/(s_i - s_j) (Daleckii and Krein 1965; Higham 2008, th.
+    3.11).
+    """
 
     space: StateSpace
     omega: Array  # (n_lines,), rad/s

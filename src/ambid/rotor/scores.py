@@ -1,11 +1,5 @@
-"""What the model of a rotor leaves out, or holds at a wrong value: score tests of the residuals, by cause.
-
-Each cause is one more column c beside the Jacobian J of the whitened residuals r: a fixed number that would move, or a
-sensor's gain, lag or cross-talk, or an eddy pole. With c⊥ its part outside J's space,
-
-    z = c⊥ᵀ r / |c⊥|,   size = c⊥ᵀ r / |c⊥|²
-
-are standard normal for a right model, and what the cause would have to be (Rao 1948; Breusch and Pagan 1980).
+"""What the model of a rotor leaves out, or holds at a wrong value: score tests of the residuals, by cause: z = c⊥ᵀ
+r/|c⊥|, size = c⊥ᵀ r/|c⊥|², c⊥ a cause's column outside the Jacobian's space (Rao 1948; Breusch and Pagan 1980).
 """
 
 from __future__ import annotations

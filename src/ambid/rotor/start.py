@@ -1,12 +1,5 @@
-"""Start values of a rigid rotor without help: coils and mechanics by weighted linear least squares on period spectra.
-
-Below the first bending mode all equations are linear in the numbers. With x(z) = x0 + z alpha between the sensors:
-
-    V = R i + L jw i + k_i jw x_b                                              (coil of each axis: R, L, k_i)
-    m a0 + S a1 + Σ k_x x_b = Σ k_i i,   S a0 + J a1 ± Ip W jw b + Σ z k_x x_b = Σ z k_i i      (each plane)
-
-with a0 = -w² x0, a1 = -w² alpha, S = m z_cg, J = Id + m z_cg², b the slope of the other plane. Rows are weighted by
-what the noise does to them, and every voltage counts from the middle of the sample over which it is held.
+"""Start values of a rigid rotor without help: coils and mechanics by weighted linear least squares on period spectra
+below the first mode. Rows count by their noise; a voltage counts from the middle of the sample over which it is held.
 """
 
 from __future__ import annotations
@@ -123,7 +116,9 @@ def _sensor_place(model: RotorModel, row: int) -> str:
 def _coils(
     spectra: PeriodSpectra, model: RotorModel, motion: _Seen, values_of_rig: Mapping[str, float]
 ) -> tuple[Array, dict[str, float]]:
-    """Return the delays in samples, and R, L, k_i of each coil; where there is none, k_i alone as a first guess."""
+    """Return the delays in samples, and R, L, k_i of each coil, V = R i + L jw i + k_i jw x_b; without a coil, k_i
+    alone as a first guess.
+    """
     delays, coils = np.zeros(len(model.axes)), dict[str, float]()
     jw = 1j * motion.omega
     x = motion.omega / spectra.rate_hz
@@ -164,7 +159,12 @@ def _mechanics(
     speed: float,
     eddy: float | None,
 ) -> dict[str, float]:
-    """Return m, Id, Ip, z_cg and k_x from currents, motion and force factors."""
+    """Return m, Id, Ip, z_cg and k_x from currents, motion x(z) = x0 + z alpha and force factors, of each plane:
+
+        m a0 + S a1 + Σ k_x x_b = Σ k_i i,   S a0 + J a1 ± Ip W jw b + Σ z k_x x_b = Σ z k_i i
+
+    with a0 = -w² x0, a1 = -w² alpha, S = m z_cg, J = Id + m z_cg², b the slope of the other plane.
+    """
     jw = 1j * motion.omega
     pull = motion.current * (eddy / (jw + eddy))[:, None] if eddy else motion.current
     k_i = np.array([theta[f"{axis}.k_i"] for axis in model.axes])

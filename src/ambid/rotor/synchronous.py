@@ -1,9 +1,5 @@
-"""Synchronous analysis: how a rotor turned in a record, and the response at harmonics of its speed.
-
-The angle runs from plane x to plane y; a response is x(t) = Re Σ_k a_k exp(j k angle(t)). The amplitudes a_k are found
-by least squares on the whole used record together with every line of a periodic excitation, so that nothing leaks from
-one into the other whatever the speed. A harmonic that falls on such a line (less than half a line of the whole record
-away) cannot be told from it by time alone; the line is then left to the harmonic and `together` says so.
+"""Synchronous analysis: how a rotor turned in a record (angle from x to y), and the response x(t) = Re Σ_k a_k exp(j k
+angle(t)), by least squares on the whole used record with every line of a periodic excitation: nothing leaks between.
 """
 
 from __future__ import annotations
@@ -52,7 +48,10 @@ class Rotation:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class SynchronousResponse:
-    """Amplitudes at harmonics of the speed, and what else is in the record."""
+    """Amplitudes at harmonics of the speed, and what else is in the record. A harmonic less than half a line of the
+    whole record away from one of the excitation cannot be told from it: the line is left to the harmonic and `together`
+    says so.
+    """
 
     roles: tuple[str, ...]
     rotation: Rotation  # of the whole record

@@ -1,8 +1,5 @@
-"""The vector that a search for a rotor's parameters moves, and what it means under the names of the model.
-
-Positive numbers go as logarithms, others over their size. A bending mode's shape at the bearings is exp(l) b, at the
-sensors exp(-l) s: positions see the product of both alone, so that b and s are kept equally long and l has a weak
-prior N(0, 1); shapes without it run off where no voltage shows the bearings' part.
+"""The vector that a search for a rotor's parameters moves, and what it means under the names of the model. Positive
+numbers go as logarithms, others over their size.
 """
 
 from __future__ import annotations
@@ -24,7 +21,10 @@ _LEAST_LENGTH = 1e-12
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Unknowns:
-    """What is searched: `known` are the rig's parameters, `scales` the sizes of numbers that may change their sign."""
+    """What is searched: `known` are the rig's parameters, `scales` the sizes of numbers that may change their sign. A
+    mode has shape exp(l) b at bearings, exp(-l) s at sensors, prior N(0, 1) on l: positions see the product alone, so b
+    and s are kept equally long, and run off without it where no voltage shows the bearings' part.
+    """
 
     model: RotorModel
     known: tuple[Parameter, ...]

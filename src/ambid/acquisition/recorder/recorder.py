@@ -1,6 +1,5 @@
 """The recorder: blocks go through a bounded queue to a journal beside the wanted file, at the end a record; nobody
-waits. A block is acknowledged once on the disk, safe from kill and power cut; one without room is counted, told and
-marked.
+waits. A block on the disk is acknowledged, safe from kill and power cut; one without room is counted, told and marked.
 """
 
 from __future__ import annotations
