@@ -1,15 +1,11 @@
 """Nonlinear models, fits, their files (schema ``ambid.fit/1``), their settings, and the register of structures.
 
-An estimator is a function ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit``: `records` a sequence
-of `IOData` of one bench (same channels, same rate), `tick` (`ambid.estimation.estimate.Tick`) called now and
-then with the name of the stage and the share of the whole search that is over; it may raise KeyboardInterrupt, upon
-which the estimator gives the best model so far with status ``stalled``. Divergence, or numbers that are not finite, end
-in status ``failed`` with the reason, never in an exception; an exception is a request that makes no sense. The
-estimator leaves `fit`, `criteria` and `checks` to `ambid.validation.fits`. It is imported only when it is asked for.
-`tests/nonlinear/test_conformance.py` runs on every entry.
-
-Settings are one frozen dataclass a family, whose fields, made by `whole`, `number`, `choice` or `text`, say what they
-are and what they may be. What is left out, or ``auto`` where a field has no default of its own, the method chooses.
+An ``estimator(records, settings, *, seed=0, tick=None) -> NonlinearFit`` takes `IOData` of one bench (same channels and
+rate) and calls `tick` (`ambid.estimation.estimate.Tick`), whose KeyboardInterrupt ends in the best model so far, status
+``stalled``. Divergence ends in ``failed`` with a reason; an exception is a request that makes no sense.
+`ambid.validation.fits` adds `fit`, `criteria`, `checks`; `tests/nonlinear/test_conformance.py` runs on every entry.
+Settings are a frozen dataclass of `whole`, `number`, `choice` or `text`; what is left out, or ``auto`` without a
+default of its own, the method chooses.
 """
 
 from __future__ import annotations
@@ -186,40 +182,32 @@ class NonlinearFit(FittedModel):
     covariance : ndarray, shape (n_theta, n_theta) or None
         Of ``model.theta``; zeros where a parameter was not estimated. None where the method has none to give.
     covariance_from : str
-        How it came about: ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white),
-        ``"bootstrap"``; empty without.
+        ``"information"``, ``"laplace"``, ``"sandwich"`` (errors not taken as white), ``"bootstrap"``; empty without.
     n_estimated : int
         Numbers that were estimated.
     noise_covariance : ndarray, shape (n_outputs, n_outputs), SI
         Of the one-step errors (of the simulation errors for a model that was fitted to those).
-    inputs, outputs : tuple of str
-        Channels.
+    inputs, outputs, warnings : tuple of str
     units : Mapping[str, str]
         SI unit by channel.
-    dt : float
-        s.
+    dt : float, s
     records : tuple of Mapping
         ``samples``, ``rate_hz``, ``sha256``, ``file`` of each record that it was estimated from.
     seed : int
         Of everything random: equal seeds give equal results.
     status : {"converged", "stalled", "failed"}
-        ``failed`` has its reason in `reason`, and no model.
     reason : str
-        One line; empty unless failed.
+        Of a failed fit, one line; else empty.
     curves : tuple of LearningCurve
         Of each training that was done.
     fit : Mapping[str, OutputFit]
         By output, over all records.
-    criteria : Mapping[str, float]
-        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``.
+    criteria, timing_s : Mapping[str, float]
+        ``aic``, ``aicc``, ``bic``, ``mdl``, ``fpe``; seconds by stage.
     checks : Mapping[str, Check]
         Made by `ambid.validation.fits`.
     validation : Mapping[str, object] or None
         By output, on a second record.
-    warnings : tuple of str
-        One line each.
-    timing_s : Mapping[str, float]
-        By stage.
     details : Mapping[str, object]
         Further results of the method as JSON-able values (terms with their error reduction ratios, chosen lags).
     """
@@ -493,10 +481,9 @@ def nonlinear_fit_text(fit: NonlinearFit) -> str:
 
 
 def nonlinear_fit_to_json(fit: NonlinearFit) -> dict[str, Any]:
-    """Return a nonlinear fit in the form of schema ``ambid.fit/1``.
-
-    ``orders`` and ``settings`` are the same: readers of linear fits look for the former. ``parameters`` lists the
-    numbers of ``model`` by name, and ``sd`` has one entry for each of them; all three are null for a failed fit.
+    """Return a nonlinear fit in the form of schema ``ambid.fit/1``. ``orders`` and ``settings`` are the same, for
+    readers of linear fits; ``parameters`` names the numbers of ``model``, ``sd`` has one for each; all three null for a
+    failed fit.
     """
     model, noise = fit.model, fit.noise_covariance
     more = {
@@ -549,19 +536,13 @@ MODEL_KINDS: Mapping[str, str] = MappingProxyType(
 
 
 def model_to_json(model: NonlinearModel) -> dict[str, Any]:
-    """Return a model as JSON-able values, its kind beside what the model itself writes.
-
-    Returns ``kind`` and what `NonlinearModel.as_json` returns.
-    """
+    """Return a model as JSON-able values: its ``kind``, and what `NonlinearModel.as_json` returns."""
     _home(model.kind)
     return {"kind": model.kind, **model.as_json()}
 
 
 def model_from_json(document: Mapping[str, Any]) -> NonlinearModel:
-    """Read a model back.
-
-    `document`: that `model_to_json` made.
-    """
+    """Read back a model that `model_to_json` wrote."""
     if not isinstance(document, Mapping) or not isinstance(document.get("kind"), str):
         raise EstimationError("the model has no kind; a file of a nonlinear fit names it. Write the file again")
     module, name = _home(document["kind"]).split(":")

@@ -152,9 +152,8 @@ class HammersteinFunction(LaggedFunction):
 def hammerstein(
     records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None
 ) -> NonlinearFit:
-    """Identify a Hammerstein model of one output; biased under feedback unless its errors are white.
-
-    Nothing is random; `tick` is called with the stage and may raise KeyboardInterrupt.
+    """Identify a Hammerstein model of one output, without randomness; biased under feedback unless its errors are
+    white. `tick` is called with the stage and may raise KeyboardInterrupt.
     """
     s = read_settings(HammersteinSettings, "hammerstein", settings)
     data = scaled_records("hammerstein", records, lag=max(s.ny, s.nk + s.nu - 1, 1))

@@ -1,16 +1,10 @@
 """Hybrid NARMAX and network from records, by prediction errors (thesis eqs 3.23, 3.24).
 
-yhat(t) = P(y, u) theta + W2 tanh(W1 z + b1) + (C(q^-1) - 1) e(t), z = [y(t-1).., u(t-nk)..], with C the polynomial
-1 + C1 q^-1 + .. of `ne` matrices.
-
-Polynomial and noise terms by orthogonal least squares (`narmax`) -> number of neurons by held-out errors -> network on
-what they leave, from several starts -> all numbers together by Levenberg-Marquardt with exact slopes through the
-innovations -> terms that no longer pay, order of C -> covariance by Laplace's approximation.
-
-The hidden layer's weights are N(0, prior^2) before the data (scaled signals), coefficients of the polynomial and of C
-have no prior: what the polynomial can do costs nothing, so that it is not left to the network. C keeps its roots inside
-the unit circle because a vector with a root outside has an infinite cost: such a step is refused, and a shorter one
-tried.
+yhat(t) = P(y, u) theta + W2 tanh(W1 z + b1) + (C(q^-1) - 1) e(t), z = [y(t-1).., u(t-nk)..], C = 1 + C1 q^-1 + .. of
+`ne` matrices. Terms by orthogonal least squares (`narmax`) -> neurons by held-out errors -> network on what they leave,
+from several starts -> all by Levenberg-Marquardt -> terms that no longer pay, order of C -> Laplace's covariance.
+Scaled hidden weights are N(0, prior^2), polynomial and C have no prior: what the polynomial can do costs nothing. A
+root of C outside the unit circle has an infinite cost: a shorter step is tried.
 """
 
 from __future__ import annotations
@@ -250,10 +244,9 @@ class _Hybrid(Draft[HybridFunction]):
 
 
 def hybrid(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify polynomial, network and noise model together, yhat = g(y, u) + (C(q^-1) - 1) e.
-
-    Consistent under feedback as long as polynomial, network and C hold the truth. `seed` is that of the network's
-    starts; `tick` is called with the stage and the share that is over and may raise KeyboardInterrupt.
+    """Identify polynomial, network and noise model together, yhat = g(y, u) + (C(q^-1) - 1) e, consistent under
+    feedback as long as they hold the truth. `seed`: of the network's starts; `tick`: called with stage and share that
+    is over; may raise KeyboardInterrupt.
     """
     if not records:
         raise EstimationError("hybrid: no record was given. Pass at least one")
@@ -358,10 +351,7 @@ def hybrid_problem(function: HybridFunction, parts: Parts, theta: Array, prior: 
 
 
 def transfer(old: HybridFunction, theta: Array, new: HybridFunction) -> Array:
-    """Return the numbers of another function: those with the same names are taken over, new ones are zero.
-
-    C is drawn towards zero where it would not be invertible.
-    """
+    """Return another function's numbers, those of the same name taken over, new ones zero, C made invertible."""
     values = dict(zip(old.names, theta, strict=True))
     return new.make_invertible(np.array([values.get(name, 0.0) for name in new.names], dtype=np.float64))
 
@@ -395,10 +385,9 @@ def train(
     s: HybridSettings, function: HybridFunction, linear: Array, parts: Parts, seed: int, starts: int,
     tick: Tick | None, draft: _Hybrid | None = None,
 ) -> Array:  # fmt: skip
-    """Train a network on what polynomial and C (`linear`) leave, then all numbers for a while; the best of the starts.
-
-    Only the beginning of a long record is looked at. Every other start takes C as 1: what the polynomial could not do
-    alone has coloured the errors, and gone into the first C. The training of the network alone is noted in `draft`.
+    """Train a network on what polynomial and C (`linear`) leave, noted in `draft`, then all numbers a while, on the
+    beginning of a long record; the best of the starts. Every other takes C as 1, as what the polynomial could not do
+    alone has coloured the first C.
     """
     most = max(_STARTED_ON // len(parts), 10 * function.lag + 60)
     level = np.concatenate([linear, np.zeros(function.n_theta - linear.size)])
@@ -425,9 +414,8 @@ def train(
 def _choose_neurons(
     s: HybridSettings, function: HybridFunction, linear: Array, draft: _Hybrid, tick: Tick | None
 ) -> int:
-    """Choose the number of hidden units by one-step errors behind the parts of the records that are trained on.
-
-    A short record has several ends that are held out, one before the other.
+    """Choose the number of hidden units by one-step errors behind the trained parts of records, of a short one at
+    several ends.
     """
     most = max(_MOST_ROWS // len(draft.data.parts), 10 * function.lag + 60)
     parts, share = tuple((y[:most], u[:most]) for y, u in draft.data.parts), s.held_out
@@ -456,10 +444,8 @@ def _choose_neurons(
 
 
 def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick | None) -> tuple[HybridFunction, Array]:
-    """Choose the order of C by an information criterion of the one-step errors, all numbers searched again for each.
-
-    `theta` is the optimum for the order there is. Orders are nested, not chosen out of many; all outputs' errors count,
-    as all their numbers do.
+    """Choose the order of C by an information criterion of one-step errors of all outputs, all numbers searched again,
+    from `theta`, the optimum for the order there is. Orders are nested, not chosen out of many.
     """
     old = problem.function
     assert isinstance(old, HybridFunction)
@@ -479,10 +465,8 @@ def choose_noise(problem: LaggedProblem, theta: Array, prior: float, tick: Tick 
 
 
 def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tick | None) -> None:
-    """Leave out terms of the polynomial, one at a time, as long as the criterion gains; all numbers are searched again.
-
-    Terms were chosen before there was a network, so that some only imitate it. One that the network could take over
-    stays: otherwise units that are to spare would swallow it, and what can be read would become what cannot.
+    """Leave out terms one at a time, all numbers searched again, while the criterion gains: some only imitate the
+    network. One that the network could take over stays, or spare units would swallow what can be read.
     """
     n = max(problem.n_errors // draft.function.p, 2)
     for k in range(draft.function.n_terms):
@@ -516,9 +500,8 @@ def _revise(s: HybridSettings, problem: LaggedProblem, draft: _Hybrid, tick: Tic
 
 
 def _inflation(R: Array, P: Array, n_linear: int) -> Array:
-    """By what the network multiplies the standard deviations of polynomial and C, the first `n_linear` numbers.
-
-    `R` is the triangle of the slopes, `P` the inverse of R'R. Ones where they are not determined at all.
+    """By what the network multiplies deviations of polynomial and C, the first `n_linear`; ones where not determined.
+    `R`: triangle of the slopes; `P`: inverse of R'R.
     """
     alone, _ = information_inverse(R[:, :n_linear])
     return np.ones(n_linear) if alone is None else np.sqrt(np.diag(P)[:n_linear] / np.diag(alone))
@@ -566,10 +549,8 @@ def _finish(s: HybridSettings, draft: _Hybrid) -> NonlinearFit:
 
 
 def _spare_units(function: HybridFunction, theta: Array, problem: LaggedProblem, posterior: Laplace) -> int:
-    """Units whose output weights' Wald statistic is below Bayes' price of the unit's numbers.
-
-    Beside them coefficients of the polynomial are off by 1.5 to 2 times their deviations: the likelihood is far from
-    quadratic in what a unit does that is hardly there.
+    """Units whose output weights' Wald statistic is below Bayes' price of their numbers: beside them the polynomial is
+    off by 1.5 to 2 deviations, the likelihood being far from quadratic.
     """
     if posterior.covariance is None:
         return 0

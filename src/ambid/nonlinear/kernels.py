@@ -1,11 +1,10 @@
 """Compiled loops of lagged models and of state-space networks, on scaled signals.
 
-Lagged models: a run sample by sample; what earlier samples pass on to later ones; descent of the weights of radial
-units; the free run whose own set point schedules its coefficients. State-space networks: predictor and free run with
-exact sensitivities, e = y - x[heads], x+ = M [x; u; f; e], f = W2 phi(W1 [x; u] + b1); the last column of u is 1 and
-does not enter the hidden layer. Units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no value
-and no slope at the operating point. A sensor without sign adds a last state, z+ = rho z + (1 - rho) m, with m the mean
-of |x1| over the sampling interval, x1 being straight in it; units behind it are plain ones.
+Lagged models: a run, what earlier samples pass on, descent of radial units' weights, a free run whose own set point
+schedules it. Networks, with exact sensitivities: e = y - x[heads], x+ = M [x; u; f; e], f = W2 phi(W1 [x; u] + b1), u's
+last column 1 outside the hidden layer; units are anchored, phi(a + b) = tanh(a + b) - tanh(b) - (1 - tanh(b)^2) a: no
+value or slope at the operating point. A sensor without sign adds z+ = rho z + (1 - rho) m, m the mean of |x1| over the
+sampling interval, x1 straight in it; units behind it are plain.
 """
 
 from __future__ import annotations
@@ -23,10 +22,8 @@ _FAR = 1e6  # times the typical size of a signal: a recursion that is beyond has
 
 @compiled(error_model="numpy")
 def propagate(out: Array, gain: Array, source: Table, back: Table, first: int) -> None:
-    """Add to each row of `out` (first + n, p, k) from `first` on what earlier rows pass on to it.
-
-    out[t, o] += sum over d of gain[t - first, o, d] out[t - back[d], source[d]]; rows before the array are zero. One
-    row of `gain` stands for all.
+    """Add to each row of `out` (first + n, p, k) from `first` on: out[t, o] += sum over d of gain[t - first, o, d]
+    out[t - back[d], source[d]]; rows before the array are zero, one row of `gain` stands for all.
     """
     last, p, k = gain.shape[0] - 1, out.shape[1], out.shape[2]
     for t in range(first, out.shape[0]):
@@ -48,13 +45,11 @@ def run(
     terms: Table, place: Table, theta: Array, W2: Array, W1: Array, b1: Array,
     W: Array, M: Array, C: Array, s: Array,
 ) -> None:  # fmt: skip
-    """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on.
-
-    `shape` = (lag, n_outputs, first column of the innovations, free, folded). A block that is not there has arrays of
-    length zero. A row of `terms` names regressors, -1 behind the last; `place` its output, and 1 for a denominator.
-    Predicts from measured outputs and writes innovations into z, or with `free` its own outputs. `out` (n, n_outputs)
-    is NaN where nothing is computed, and from a divergence on. With `folded` the sign of the output is not measured: it
-    gets that of the prediction, and `out` is its magnitude.
+    """Run a sum of blocks over z (n, outputs + inputs + innovations) from sample `lag` on: predict and write
+    innovations into z, or if `free` own outputs; `out` (n, n_outputs) is NaN elsewhere, and from a divergence on.
+    `shape` = (lag, n_outputs, first innovations column, free, folded); absent blocks have length zero. `terms`:
+    regressors, -1 behind the last; `place`: output, and 1 for a denominator. With `folded`, `out` is a magnitude, and z
+    gets the prediction's sign.
     """
     lag, p, n_e, free, folded = shape[0], shape[1], shape[2], shape[3], shape[4]
     n, D, h, Q = z.shape[0], column.size, b1.size, M.shape[0]
@@ -122,9 +117,8 @@ def run(
 
 @compiled(error_model="numpy")
 def descent_pass(F: Array, Y: Array, rate: float, W: Array) -> None:
-    """Take one step W <- W + eta e f' for each row f of F (n, d); W (p, d) changes.
-
-    eta is `rate`, or one over the squared slope of all errors where that is less, with which none of them grows.
+    """Take W <- W + eta e f' in place for each row f of F (n, d), eta `rate`, or one over the squared slope if less,
+    with which no error grows.
     """
     (n, d), p = F.shape, Y.shape[1]
     e = np.zeros(p)
@@ -146,10 +140,9 @@ def descent_pass(F: Array, Y: Array, rate: float, W: Array) -> None:
 def scheduled_run(
     y: Array, W: Array, s: Array, first: int, a: Array, b: Array, share: float, middle: float, half: float,
 ) -> None:  # fmt: skip
-    """Write the free run into y from sample `first` on; NaN from a divergence on.
-
-    y(t) = -a(p(t)) y(t-k) + b(p(t)) W(t), with a (na, K) and b (n_w, K) by Legendre polynomial of p, which
-    is s or, with `share` > 0, the set point of the run itself: (level - middle) / half.
+    """Write the free run y(t) = -a(p(t)) y(t-k) + b(p(t)) W(t) into y from `first` on, NaN from a divergence on; a (na,
+    K) and b (n_w, K) by Legendre polynomial of p: s, or with `share` > 0 the run's own set point, (level - middle) /
+    half.
     """
     level = 0.0
     for t in range(y.size):
@@ -241,11 +234,9 @@ def slope_states(
     M: Array, heads: Table, W1: Array, b1: Array, W2: Array, rho: float, D: Array, changed: Table, u: Array, X: Array,
     E: Array, s: Array, out: Array,
 ) -> None:  # fmt: skip
-    """Write the slopes of the predictions, out (n_samples, p, P); s (n or n + 1, P): of the state, first to last.
-
-    Columns: directions D (n, n + m + q + p, P1) of M, the last of them that of rho where there is a sensor, W1 row by
-    row, b1 (not with a sensor), W2 row by row; any more are passed on with s. `changed` (n, n + m + q + p) is 0 where
-    no direction changes an entry.
+    """Write the predictions' slopes, out (n_samples, p, P); s (n or n + 1, P): the state's, first to last. Columns:
+    directions D (n, n + m + q + p, P1) of M, rho's last behind a sensor, W1 row by row, b1 (not with a sensor), W2,
+    others passed on with s; `changed` (n, n + m + q + p) is 0 where no direction changes an entry.
     """
     N, m, n, p, (q, h) = u.shape[0], u.shape[1], M.shape[0], heads.size, W2.shape
     P1, P, nz, sensor = D.shape[2], s.shape[1], n + m - 1, X.shape[1] > n

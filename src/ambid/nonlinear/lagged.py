@@ -1,14 +1,10 @@
 """One model for every difference equation whose right side is a function of past signals.
 
-yhat(t) = f(x(t), theta): x(t) are regressors, outputs, inputs and innovations some samples ago (`Regressors`), and f is
-a sum of blocks with parameters of their own: `Linear`, `Terms` (a polynomial or rational function), `Tanh` (one hidden
-layer), `Radial` (units about centres). The rest is written once: one-step predictions, free runs, and the exact
-derivatives of both. These are slopes of the function plus what own outputs (free run) or innovations (prediction) pass
-on, D(t) = df/dtheta + sum of (df/dx_k) D(t - k), a loop that all families share (`kernels.propagate`).
-
-A family is a subclass of `LaggedFunction`: sizes, regressors, blocks, names, document. `LaggedModel` gives it scaling,
-units and the cloud of its training; `lagged_problem` searches for its parameters. Coefficients that follow a schedule
-are `Terms` with basis functions as further inputs. All signals in here are scaled; time is axis 0.
+yhat(t) = f(x(t), theta), x past outputs, inputs and innovations (`Regressors`), f a sum of blocks: `Linear`, `Terms`
+(polynomial or rational), `Tanh` (a hidden layer), `Radial` (units about centres). Predictions, free runs and exact
+derivatives D(t) = df/dtheta + sum of (df/dx_k) D(t - k) (`kernels.propagate`) are written once. A family is a subclass
+of `LaggedFunction`; `LaggedModel` adds scaling, units and cloud; `lagged_problem` searches. Scheduled coefficients are
+`Terms` with basis functions as inputs. Signals here are scaled; time is axis 0.
 """
 
 from __future__ import annotations
@@ -53,9 +49,8 @@ class Block(Protocol):
         ...
 
     def derivatives(self, theta: Array, rows: tuple[Array, ...], live: Mask, at: Table) -> tuple[Array, Array]:
-        """Return slopes by the parameters where `live` and by the regressors at some places.
-
-        Of shapes (n, n_outputs, n_live) and (n or 1, n_outputs, at.size); one row stands for all.
+        """Return slopes by `live` parameters, (n, n_outputs, n_live), and by regressors at places, (n or 1, n_outputs,
+        at.size); one row stands for all.
         """
         ...
 
@@ -66,9 +61,8 @@ class Block(Protocol):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Terms:
-    """Sums of coefficient times product of regressors: numerators, over 1 + denominators where there are any.
-
-    Where there are, it is the only block of its kind.
+    """Sums of coefficient times product of regressors: numerators, over 1 + denominators if any, and then the only such
+    block.
     """
 
     n_outputs: int
@@ -267,9 +261,8 @@ class Tanh:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Radial:
-    """W phi, phi_k = exp(-|M x - C_k|^2 / (2 width_k^2)): W (p, h), C (h, n_seen), logarithms of the widths (h,).
-
-    M, no parameter, says which regressors the units see, and in which metric.
+    """W phi, phi_k = exp(-|M x - C_k|^2 / (2 width_k^2)): W (p, h), C (h, n_seen), log widths (h,); M, no parameter,
+    says which regressors the units see, in which metric.
     """
 
     n_outputs: int
@@ -551,9 +544,8 @@ class LaggedFunction(ABC):
         return not self.folded and not any(b.bends(self.regressors.noisy) for b in self.blocks)
 
     def predict(self, theta: Array, rows: Rows) -> tuple[Array, Rows]:
-        """Return one-step predictions, shape (n, n_outputs), and the rows with the innovations that they go with.
-
-        NaN from where innovations diverge on.
+        """Return one-step predictions (n, n_outputs), NaN from where innovations diverge on, and the rows with their
+        innovations.
         """
         predictions, z = self._predicted(theta, rows)
         if z is None:
@@ -588,9 +580,8 @@ class LaggedFunction(ABC):
         return rows.y - E, z
 
     def free_run(self, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
-        """Return a run on own outputs from sample `lag` on, shape (n_samples, n_outputs), and all signals behind it.
-
-        NaN where it has diverged. Outputs among the signals have their signs also where the run has magnitudes.
+        """Return a run on own outputs from `lag` on, (n_samples, n_outputs), NaN where diverged, and all signals behind
+        it, outputs with their signs also where the run has magnitudes.
         """
         z = self.regressors.signals(y, u)
         out = self._run(theta, z, free=True)
@@ -629,10 +620,8 @@ class LaggedFunction(ABC):
     def slopes(
         self, theta: Array, rows: Rows, *, free: bool, live: Mask | None = None, before: Array | None = None
     ) -> Array:
-        """Return the exact derivative of predictions, or of a free run, by the live parameters; see `fold`.
-
-        `rows` are those of the prediction or of the run; `before` the derivative at rows right before, none where
-        `rows` begin with the first. Returns (n, n_outputs, n_live).
+        """Return the exact derivative (n, n_outputs, n_live) of predictions, or of a free run, whose `rows` these are;
+        see `fold`. `before`: that at rows right before, none where `rows` begin with the first.
         """
         x = self.regressors
         at = x.own if free else x.noisy
@@ -656,10 +645,8 @@ class LaggedFunction(ABC):
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LaggedModel(ScaledModel):
-    """A lagged function with its parameters, scaling and training cloud.
-
-    The predictor takes innovations before its first prediction as zero. Implements
-    `ambid.nonlinear.fit.NonlinearModel`.
+    """A lagged function with parameters, scaling and training cloud (an `ambid.nonlinear.fit.NonlinearModel`);
+    innovations before its first prediction are zero.
     """
 
     dt: float  # s

@@ -1,7 +1,6 @@
 """Least squares for every lagged model: one-step or simulation errors over records, priors, and what a fit ends with.
 
-Errors are weighted to unit variance; the rows of a normal prior stand beside them. Triangles of [J | r] are made block
-by block, slopes going on from block to block, so that a long record needs no more memory than a short one.
+Errors have unit variance, normal priors' rows beside them; triangles of [J | r] come block by block: constant memory.
 """
 
 from __future__ import annotations
@@ -133,9 +132,8 @@ class LaggedProblem:
         return np.asarray(self.precision * (self.mean - theta))
 
     def across(self, v: Array, noise: Array) -> Array:
-        """Return the information that scores have beyond that of the slopes where outputs' errors are correlated.
-
-        `noise` (n_outputs, n_outputs) is their covariance, scaled. Returns (n_live, n_live).
+        """Return the information (n_live, n_live) of scores beyond the slopes' where outputs' errors are correlated, of
+        scaled covariance `noise`.
         """
         extra = self.weight @ noise @ self.weight.T
         np.fill_diagonal(extra, 0.0)
@@ -175,10 +173,7 @@ def problem_at(
     free: bool = False,
     joint: bool = False,
 ) -> LaggedProblem:
-    """Return the problem around given parameters, of which the live ones are searched.
-
-    Errors have unit variance there, or a `weight`.
-    """
+    """Return the problem around parameters, the live ones searched, errors of unit variance there, or a `weight`."""
     none = np.zeros(function.n_theta)
     problem = LaggedProblem(
         function=function, parts=parts, weight=np.eye(function.n_outputs) if weight is None else weight, base=theta,
@@ -198,9 +193,8 @@ def whitening(noise: Array) -> Array:
 
 
 def column_gains(R: Array, inside: Mask) -> Array:
-    """Return what each column outside explains of the last one, made orthogonal to those inside first.
-
-    `R` is the triangle of columns and errors; 0 where nothing is left of a column.
+    """Return what each outside column explains of the last, orthogonal to those inside, by the triangle `R`; 0 where
+    nothing is left of it.
     """
     Q, left = np.linalg.qr(R[:, :-1][:, inside])[0], R[:, :-1][:, ~inside]
     size, rest = np.sum(left**2, axis=0), R[:, -1] - Q @ (Q.T @ R[:, -1])
@@ -236,9 +230,8 @@ def choose_smallest(
     sizes: Sequence[Size], score: Callable[[Size, Tick | None], float], tried: list[Size], near: float,
     tick: Tick | None,
 ) -> Size:  # fmt: skip
-    """Return the first of some sizes, the smallest first, that does about as well as the best: within `near` times.
-
-    `score` is its error on data held out; it is added to `tried` for the report. One size alone is not scored.
+    """Return the first size, smallest first, within `near` times the best's `score`, its error on held-out data, added
+    to `tried`; one size alone is not scored.
     """
     if len(sizes) == 1:
         return sizes[0]
@@ -260,10 +253,7 @@ def lag_sizes(ny: int | None, nu: int | None, nk: int, parts: Parts, share: floa
 
 
 def solve_linear(problem: LaggedProblem, n: int, v: Array) -> Array:
-    """Return what is searched with its first `n` numbers, in which errors are linear, at their best for the others.
-
-    As given where errors are not finite.
-    """
+    """Return what is searched with its first `n` numbers, linear in the errors, at their best, if finite."""
     place = np.flatnonzero(problem.live)[:n]
     part = replace(problem, base=problem.whole(v), live=np.isin(np.arange(problem.base.size), place))
     R, out = part.triangle(v[:n]), v.copy()
@@ -281,9 +271,8 @@ def linear_start(function: LaggedFunction, parts: Parts, n: int) -> Array:
 def draw_start(
     problem: LaggedProblem, n: int, v: Array, neurons: int, width: int, rng: np.random.Generator, draws: int
 ) -> Array:
-    """Return what is searched with a random hidden layer, its last numbers, whose units bend inside the data.
-
-    Of some draws the one is taken with the least errors over the beginning of the records, `solve_linear` for each.
+    """Return what is searched with the best of some random hidden layers, its last numbers, whose units bend inside the
+    data, by errors over the records' beginning after `solve_linear`.
     """
     most = problem.function.lag + _DRAWN_ON // len(problem.parts)
     few = replace(problem, parts=tuple((y[:most], u[:most]) for y, u in problem.parts), _rows=[])
@@ -386,9 +375,8 @@ def train_watched(
     n_linear: int,
     **options: Any,
 ) -> Found:
-    """Train a draft watched on the `share` of each record that is held out; all data teach where nothing is overfitted.
-
-    `problem_of` gives the problem of some records about parameters, `n_linear` see `solve_linear`.
+    """Train a draft watched on the held-out `share` of each record, on all data where nothing overfits; `problem_of`:
+    the problem of records about parameters; `n_linear`: see `solve_linear`.
     """
     training, validation = split(draft.data.parts, share, draft.function.lag)
     first, second = portions(tick, (1.0, 1.0 * bool(validation)))
@@ -451,10 +439,9 @@ def finish(
     noise: bool = False,
     instead: str = "Use narmax or nn",
 ) -> NonlinearFit:
-    """Return the fit of a draft in SI with the covariance that was asked for, and what a reader must be told.
-
-    `units` are what a model has too many of, `how` is the setting ``uncertainty``; `why_not` says why there are no
-    standard deviations. Without a `noise` model feedback does harm; `instead` says what to do then.
+    """Return a draft's fit in SI, its covariance, and what a reader must be told. `units`: of which a model has too
+    many; `how`: setting ``uncertainty``; `why_not`: no standard deviations; `instead`: without a `noise` model feedback
+    does harm.
     """
     records, data, share = draft.records, draft.data, posterior.effective / problem.n_errors
     if share > _CROWDED:

@@ -1,9 +1,8 @@
 """LPV models scheduled by set point: system model and error model by prediction error, coefficients functions of p.
 
-Scale -> set point (its low-pass, where left open) -> degree in p, form and error model, each by a criterion of
-the one-step errors -> Levenberg-Marquardt, the time constant of the low-pass included where it was left open. Starts
-come from least squares without an error model, and from the pseudo-linear regression of extended least squares (Ljung
-1999, sec. 10.1): with v and e of an earlier fit in place of the true ones, the predictor is linear in all coefficients.
+Set point (its low-pass, where open) -> degree in p, form and error model by a criterion of one-step errors ->
+Levenberg-Marquardt, an open time constant included. Starts: least squares without an error model, and extended least
+squares (Ljung 1999, sec. 10.1), linear with v and e of an earlier fit.
 """
 
 from __future__ import annotations
@@ -128,11 +127,10 @@ def _schedule_column(name: str, first: IOData) -> int:
 
 
 def lpv(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify a linear model whose coefficients follow a scheduling signal, with an error model (thesis sec. 1.6).
-
-    Consistent under feedback as long as the error model holds the true one. Standard deviations take the form for
-    given, and count degree and time constant of the set point where these were chosen: 95 % intervals hold the truth
-    about 92 times in 100 on a few hundred samples. Nothing here is random: `seed` is there for the contract's sake.
+    """Identify a linear model whose coefficients follow a scheduling signal, with an error model (thesis sec. 1.6),
+    consistent under feedback as long as that is true. Deviations take the form for given, and count a chosen degree and
+    time constant: 95 % intervals hold the truth about 92 times in 100 on a few hundred samples. Nothing is random,
+    whatever `seed`.
     """
     if not records:
         raise EstimationError("lpv: no record was given. Pass at least one")
@@ -267,11 +265,9 @@ def from_earlier(
     theta: Array,
     earlier: Sequence[Part] | None = None,
 ) -> tuple[Array, float] | None:
-    """Fit all coefficients with errors and innovations of an earlier model in place of the true ones.
-
-    `earlier` are the records made for that model, where its functions of p are others. Returns parameters, zeros of C
-    outside the unit circle reflected, and the sum of squared errors of this regression; None where the earlier model
-    diverges.
+    """Fit all coefficients with errors and innovations of an earlier model, whose functions of p (`earlier`: records
+    for it) may differ: parameters, zeros of C reflected into the unit circle, and the sum of squared errors; None where
+    it diverges.
     """
     rows, targets = [], []
     for part, before in zip(parts, earlier or parts, strict=True):
@@ -291,10 +287,8 @@ def from_earlier(
 
 
 def carry_over(shape: LpvShape, old: LpvShape, theta: Array, at: Array = _EVEN, earlier: Array = _EVEN) -> Array:
-    """Carry a model over to one with other functions of p, or with another error model.
-
-    Coefficients are as near as can be over the range of p; zeros where the old model has none. `at` are scaled values
-    of p, and `earlier` those that the old model has for them.
+    """Carry a model over to other functions of p or another error model, coefficients as near as can be, zeros for new
+    ones; `at`: scaled p, `earlier`: the old model's values there.
     """
 
     def carried(values: Array, n: int) -> Array:
@@ -404,9 +398,8 @@ class Fitting(Attempt):
     def search(
         self, shape: LpvShape, starts: Sequence[Array | None], tick: Tick | None, stage: str, *, last: bool = False
     ) -> Candidate:
-        """Search from the start with the least cost, which is infinite where the predictor is unstable there.
-
-        The `last` search goes on to the end, and what it finds is held on to.
+        """Search from the start of least cost (infinite if unstable); the `last` search goes on to the end and is held
+        on to.
         """
         problem = self.problem(shape)
         costs = [(problem.cost(x), k) for k, x in enumerate(starts) if x is not None]
@@ -444,9 +437,8 @@ class Fitting(Attempt):
 
 
 def time_constants(slowest: float, shortest: int, dt: float) -> list[float]:
-    """Return low-passes of the set point to try, in s: so slow that it stands still beside the plant's movements.
-
-    `slowest`, the largest time constant of the linear model, and `shortest`, of the records, are in samples.
+    """Return set-point low-passes to try, in s, slow beside the plant; `slowest` of the linear model and `shortest` of
+    the records, in samples.
     """
     top = max(_MOST * shortest, _LEAST)
     low = min(max(_SLOWER * slowest, _LEAST), top)
@@ -467,10 +459,8 @@ def slowest_mode(a: Array) -> float:
 
 
 def choose_level(fitting: Fitting, order: int, degree: int | None, tick: Tick | None) -> Schedule:
-    """Choose the low-pass of the set point.
-
-    A linear model with autoregressive errors of some `order` says how slow the plant is; pseudo-linear regressions with
-    its errors compare what coefficients that follow each set point explain.
+    """Choose the set point's low-pass: a linear model with autoregressive errors of some `order` says how slow the
+    plant is; pseudo-linear regressions with its errors compare set points.
     """
     white = replace(fitting.shape, degree=0)
     shape = replace(white, ar=order)
@@ -598,10 +588,8 @@ def _finish(fitting: Fitting) -> NonlinearFit:
 
 
 def _frozen_table(model: LpvModel, covariance: Array | None, inputs: Sequence[str]) -> list[dict[str, object]]:
-    """Return poles and gains over the range of the scheduling signal, by value of p.
-
-    ``poles_rad_s`` has real and imaginary part and their standard deviations, ``dc_gain`` value and standard deviation
-    by input; None where there is none.
+    """Return ``poles_rad_s`` (real, imaginary part, deviations) and ``dc_gain`` (value, deviation by input; None where
+    there is none), by value of p over its range.
     """
     out = list[dict[str, object]]()
     for p in np.linspace(model.schedule.low, model.schedule.high, _POINTS):
@@ -657,10 +645,8 @@ def _other_degrees(fitting: Fitting) -> list[tuple[Candidate, float]]:
 
 
 def _disagreement(fitting: Fitting) -> Array:
-    """Covariance of the coefficients, scaled, by which degree the model might have had (Burnham and Anderson 2002).
-
-    Each other degree counts by its Akaike weight with the square of what its coefficients differ by over the range of
-    p: unconditional variance, sec. 4.3.
+    """Scaled covariance by which degree the model might have had (Burnham and Anderson 2002, sec. 4.3, unconditional):
+    each other degree by its Akaike weight with the squared difference over the range of p.
     """
     shape, theta = fitting.shape, fitting.theta
     others = [

@@ -1,18 +1,13 @@
 """The equations of an LPV model on scaled signals, its predictor, the model, and what it is where p stands still.
 
-p is a column among the inputs (its value now), the output (its last value), or ``level``: the set point, as a causal
-first-order low-pass of the output before the present sample. It is scaled to -1 ... 1 over the training data; a
-coefficient is a sum of Legendre polynomials of it.
-
-Equation form: A(q, p) y = B(q, p) u + c(p) + v; output form: A(q, p) x = B(q, p) u + c(p), y = x + v; both with the
-error model D(q) v = C(q) e. Coefficients at time t are functions of p(t), and stand before the shifted signals:
-(A y)(t) = y(t) + a_1(p(t)) y(t - 1) + ... (Toth 2010, sec. 3.1: static dependence, shifted form). Operators do not
-commute with p, so that this is another model than one with p(t - k).
-
-States of the output form and first innovations, w, are those that make the innovations of the first samples small:
-min |e(theta, w)|^2 + w' Lambda w, with Lambda from their own size beside the innovations'. e is linear in w. Without
-it, a zero of C near the unit circle keeps an error of these alive for its time constant. In a fit these numbers are
-solved for at each theta, and their columns projected out (Golub and Pereyra 1973; Jacobian as in Kaufman 1975).
+p is an input column (now), the output (last), or ``level``: the set point, a causal first-order low-pass of the output
+before the sample; scaled to -1 ... 1, coefficients are sums of its Legendre polynomials. Equation form: A(q, p) y =
+B(q, p) u + c(p) + v; output form: A(q, p) x = B(q, p) u + c(p), y = x + v; both D(q) v = C(q) e. Coefficients at t
+stand before shifted signals, (A y)(t) = y(t) + a_1(p(t)) y(t - 1) + ... (Toth 2010, sec. 3.1: static dependence,
+shifted form); operators do not commute with p: with p(t - k) it is another model. Output-form states and first
+innovations, w, minimise |e(theta, w)|^2 + w' Lambda w, e linear in w, Lambda from their size beside the innovations':
+else a zero of C near the unit circle keeps their error alive. Fits project them out (Golub and Pereyra 1973; Jacobian
+as in Kaufman 1975).
 """
 
 from __future__ import annotations
@@ -73,10 +68,7 @@ class Schedule:
         return 1.0 if self.time_constant <= 0 else -math.expm1(-dt / self.time_constant)
 
     def signal(self, u: Array, y: Array, dt: float) -> Array:
-        """Return the scheduling signal, (n_samples,), of inputs and outputs; all in SI.
-
-        The low-pass begins as the mean of all samples so far.
-        """
+        """Return the scheduling signal (n_samples,) in SI; its low-pass begins as the mean of all samples so far."""
         from scipy.signal import lfilter
 
         if self.column >= 0:
@@ -223,10 +215,8 @@ class LpvShape:
         return all(stable(np.concatenate([[1.0], row])) for row in rows)
 
     def is_sound(self, theta: Array) -> bool:
-        """Whether the predictor is stable: C, and in the output form A over the range of p.
-
-        That a run stays finite does not say so: what was before the record is fitted as well, and can balance a mode
-        that grows.
+        """Whether C, and in the output form A over the range of p, is stable. A finite run does not say so: the fitted
+        past can balance a mode that grows.
         """
         if self.ma and not stable(np.concatenate([[1.0], self.split(theta)[3]])):
             return False
@@ -265,9 +255,8 @@ class Errors:
 
 
 def errors(shape: LpvShape, part: Part, theta: Array, start: Array | None = None, *, slopes: int = 0) -> Errors:
-    """Run a record through the predictor, from `start`, what was before it (zeros if left out).
-
-    `slopes`: derivatives: 0 for none, 1 for those by `start` alone, 2 for all.
+    """Run a record through the predictor from `start`, what was before (default zeros); `slopes`: 0 for none, 1 by
+    `start`, 2 for all.
     """
     y, m, lag, P = part.y, shape.first, shape.lag, shape.n_theta
     n, n_x, n_p, ma = y.size, shape.n_states, shape.n_process_theta, shape.ma
@@ -405,10 +394,7 @@ def looks_back(shape: LpvShape) -> int:
 
 
 def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False) -> tuple[Array, Array] | None:
-    """Estimate what was before a record, and its derivative by theta (zeros unless asked for).
-
-    None where the predictor diverges.
-    """
+    """Estimate what was before a record, and its derivative by theta (zeros unless asked); None where it diverges."""
     k, P = shape.n_start, shape.n_theta
     last = looks_back(shape)
     if not k or part.y.size < last:
@@ -440,9 +426,8 @@ def beginning(shape: LpvShape, part: Part, theta: Array, *, slopes: bool = False
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Frozen:
-    """The linear model y = (B/A) u + offset/A(1) + v that stands still at one p.
-
-    With p made of the output it describes movements about the set point that are fast beside its low-pass.
+    """The linear model y = (B/A) u + offset/A(1) + v at one p; for a p of the output, of movements fast beside its
+    low-pass.
     """
 
     a: Array  # (order + 1,), of q^0, q^-1, ...; the first is 1
@@ -466,11 +451,9 @@ class Frozen:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class LpvModel(ScaledModel):
-    """A linear model of one output whose coefficients follow a scheduling signal.
-
-    What was before a record the predictor estimates from the first `lag` samples, see `beginning`. `theta` are each
-    coefficient's weights of the functions of p; the cloud is that of the training regressors and the scheduling signal.
-    Implements `ambid.nonlinear.fit.NonlinearModel`.
+    """A linear model of one output with scheduled coefficients (an `ambid.nonlinear.fit.NonlinearModel`): `theta`
+    weighs the functions of p, the past comes from the first `lag` samples (`beginning`), the cloud is of regressors and
+    schedule.
     """
 
     dt: float  # s
@@ -504,9 +487,8 @@ class LpvModel(ScaledModel):
         return out
 
     def at(self, p: float, covariance: Array | None = None) -> Frozen:
-        """Return the linear model at one value of p, with standard deviations by the fit's `covariance`.
-
-        Outside ``schedule.low`` to ``schedule.high`` the functions of p are continued, which nothing backs.
+        """Return the linear model at one p, with deviations by `covariance`; outside ``schedule.low`` to
+        ``schedule.high`` the functions of p are continued, which nothing backs.
         """
         shape, s = self.shape, self.schedule.scaled(float(p)).reshape(1)
         na, nb, m = shape.order, shape.nb, len(shape.columns)
@@ -575,9 +557,8 @@ class LpvModel(ScaledModel):
         return out
 
     def novelty(self, u: Array, y: Array) -> Array:
-        """As `NonlinearModel.novelty`: the largest of p's, over half its range, and of ellipsoid and hull of the cloud.
-
-        Holes of the cloud do not count: between set points an LPV model interpolates.
+        """As `NonlinearModel.novelty`: the largest of p's, over half its range, and of ellipsoid and hull of the cloud,
+        without its holes: between set points an LPV model interpolates.
         """
         ys, us = scaled(self, u, y)
         s = self.scheduling(u, y)

@@ -1,8 +1,7 @@
 """NARMAX from records: terms by orthogonal least squares, coefficients by prediction (or simulation) errors.
 
-Linear start -> process terms -> denominators -> noise terms -> pruning -> Levenberg-Marquardt with exact derivatives.
-Standard deviations are those of the coefficients of the terms chosen; that the terms were chosen from the same data
-makes them too small where a term was a close call (Leeb and Poetscher 2005).
+Deviations are those of the chosen terms; where a term was a close call they are too small, as it was chosen from the
+same data (Leeb and Poetscher 2005).
 """
 
 from __future__ import annotations
@@ -56,9 +55,8 @@ class _Fitting(Draft[PolynomialFunction]):
 
 
 def narmax(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4).
-
-    Consistent under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``; not random.
+    """Identify a polynomial or rational NARMAX model, y(t) = b/a + e(t) (thesis eqs 3.1-3.4), not random; consistent
+    under feedback as long as the terms hold the true ones and ``focus`` is ``prediction``.
     """
     if not records:
         raise EstimationError("narmax: no record was given. Pass at least one")

@@ -1,22 +1,13 @@
 """Which terms a NARMAX model has: process terms, denominators, noise terms, and which of them can go again.
 
-Process terms are chosen from measured signals alone, by orthogonal least squares. Denominators are chosen together with
-numerators from the equation multiplied out (thesis eq. 3.3); there y(t) stands on the right side too, and its noise
-would bias the result (Billings and Zhu 1991): a prediction takes its place, which makes the equation error the
-innovation itself. Terms with innovations follow by extended least squares: those of the model before stand for the
-unknown ones, process terms stay as they are (Billings 2013, sec. 3.5).
-
-By simulation, from a linear model on, each candidate not in the model is looked at as a coefficient that is still zero:
-the slope of the free run by it, an exact sensitivity, is its column, and the simulation error what the columns have to
-explain. The one with the largest error reduction ratio enters, all coefficients are searched again, terms that have
-become useless go. The aim is that of Piroddi and Spinelli (2003), who try every candidate in a run of its own. Where
-only the magnitude of the output is measured, such as the speed of a pulse counter, the sign is not in the data, and a
-search from a wrong one ends in a wrong minimum. So linear models of order three (a real pole, a pair, a delay) are laid
-on a grid, the gain of each fitted to the magnitude, and the best of them refined.
-
-A term is taken out with the others readjusted along the linearised least-squares problem, exact for NARX: by
-predictions if an information criterion gains by it, by simulation if the free run does not pay for it, for terms that
-predict well for one step may spoil a run of many.
+Process terms come by orthogonal least squares; denominators with numerators from the equation multiplied out (thesis
+eq. 3.3), a prediction in place of y(t), whose noise would bias it (Billings and Zhu 1991); noise terms by extended
+least squares, process terms held (Billings 2013, sec. 3.5). By simulation, from a linear model, the candidate whose
+free-run slope explains most of the simulation error enters, all are searched again, useless terms go: the aim of
+Piroddi and Spinelli (2003), who run every candidate. Of a magnitude alone, such as a pulse counter's speed, the sign is
+not in the data, and a search from a wrong one ends in a wrong minimum: linear models of order three (a real pole, a
+pair, a delay) on a grid, gains fitted, the best refined. A term goes, others readjusted along the linearised problem
+(exact for NARX), if a criterion gains by predictions, or the free run does not pay: what predicts well may spoil a run.
 """
 
 from __future__ import annotations
@@ -315,10 +306,8 @@ def add_noise_terms(s: NarmaxSettings, process: Choice, parts: Parts, tick: Tick
 
 
 def _innovations_of_long_model(process: Choice, parts: Parts, errors: list[Array]) -> list[Array]:
-    """First innovations from many linear lags beside the process terms (Hannan and Rissanen 1982), if they are less.
-
-    Where noise on the output is sampled fast, least squares without noise terms is so biased that its errors are nearly
-    white, and no noise term pays beside them.
+    """First innovations, if less, from many linear lags beside the process terms (Hannan and Rissanen 1982): with
+    fast-sampled output noise the errors of least squares are nearly white, and biased so that no noise term pays.
     """
     n, function = min(int(y.shape[0]) for y, _ in parts), process.function
     most = min(_LONG, n // (10 * (function.n_outputs + function.m)))
@@ -382,9 +371,8 @@ def prune_by_prediction(model: Choice, parts: Parts, weight: Array, criterion: s
 def prune_by_simulation(
     model: Choice, parts: Parts, value: Callable[[Choice], float], tick: Tick | None = None, *, anew: bool = False
 ) -> Choice:
-    """Leave out process terms as long as `value` falls, an information criterion of the simulation errors.
-
-    With `again` only the least significant term is tried at a time, and coefficients are searched again without it.
+    """Leave out process terms while `value`, an information criterion of simulation errors, falls; with `again` only
+    the least significant at a time, the rest searched again.
     """
     now, before = value(model), model.theta.size
     while model.theta.size > max(model.function.n_outputs, 2 * anew) and np.isfinite(now):
@@ -434,9 +422,8 @@ def _may_go(model: Choice, *, noise: bool) -> np.ndarray:
 
 
 def choose_by_simulation(s: NarmaxSettings, parts: Parts, tick: Tick | None, keep: Callable[[Choice], None]) -> Choice:
-    """Choose process terms by the error of the free run; `keep` is given each better model.
-
-    Coefficients are those of a one-step fit where no free run stays finite.
+    """Choose process terms by the free run's error (`keep` gets each better model), one-step coefficients where none is
+    finite.
     """
     if parts[0][0].shape[1] > 1:
         raise EstimationError("narmax: selection = simulation is for one output. Use frols, and pruning = simulation")

@@ -1,10 +1,8 @@
 """Neural NARX: a linear part and one hidden layer of tanh units on lagged outputs and inputs (Billings 2013, sec. 8.2).
 
-Scale -> lags and neurons (where left open) -> training from several random starts, each watched on held-out data -> the
-best, once more on all data -> simulation errors (option) -> covariance by Laplace's approximation, sandwich, bootstrap.
-
-Weights of the hidden layer are N(0, prior^2) for scaled signals: where the data speak it does not count; where they do
-not (units that do the same thing), it makes the information matrix regular.
+Lags and neurons (where open) -> several random starts watched on held-out data -> the best on all -> simulation errors
+(option) -> covariance (Laplace, sandwich, bootstrap). Scaled hidden weights are N(0, prior^2): it counts only where the
+data do not speak (units alike), and makes the information matrix regular.
 """
 
 from __future__ import annotations
@@ -132,10 +130,9 @@ class NarxFunction(LaggedFunction):
 
 
 def narx(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify a neural NARX model, y(t) = L z + c + W2 tanh(W1 z + b1) + e(t).
-
-    Its errors are taken as white: under feedback, or with coloured noise, it is biased. `seed` is that of the starts
-    and of the bootstrap; `tick` is called with the stage and may raise KeyboardInterrupt.
+    """Identify a neural NARX model, y(t) = L z + c + W2 tanh(W1 z + b1) + e(t), biased under feedback or with coloured
+    noise, as errors are taken as white. `seed`: of starts and bootstrap; `tick`: called with the stage, may raise
+    KeyboardInterrupt.
     """
     s = read_settings(NarxSettings, "narx", settings)
     if s.ny == 0 and s.nu == 0:

@@ -1,11 +1,9 @@
 """State-space network from records (thesis eqs 5.1-5.2, fig. 5.9): its weights are A and B, beside a network G(x, u).
 
-Delay -> subspace start -> the thesis's training beside Gauss-Newton (for the learning curves) -> Levenberg-Marquardt on
-simulation errors -> hidden layer (option) -> predictor gain, where errors are not white -> global search, where all
-that failed, and training again -> covariance.
-
-Behind a sensor that sees no sign, such as a pulse counter (output=magnitude): starts from a grid of poles -> number of
-states by Bayes' criterion -> number of odd hidden units by how the free run goes on behind parts of the records.
+Delay -> subspace start -> the thesis's training and Gauss-Newton (learning curves) -> Levenberg-Marquardt on simulation
+errors -> hidden layer (option) -> predictor gain for coloured errors -> global search if all failed -> covariance.
+Behind a sensor without sign (output=magnitude), such as a pulse counter: a grid of poles -> states by Bayes' criterion
+-> odd hidden units by how the free run goes on behind parts of the records.
 """
 
 from __future__ import annotations
@@ -107,12 +105,11 @@ class NnSettings:
 
 
 def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9).
-
-    In the form ``one-axis`` (position, current and perhaps velocity from a voltage) the weights are entries of thesis
-    eq. 4.8. Consistent under feedback as far as the predictor gain holds the noise. Where all starts of that form fail,
-    there is a global search. The form ``free`` has none: its states have no fixed meaning, so that nothing bounds the
-    entries; its starts come from subspace models of several horizons.
+    """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9),
+    consistent under feedback as far as the predictor gain holds the noise. In the form ``one-axis`` (position, current
+    and perhaps velocity from a voltage) they are entries of thesis eq. 4.8, with a global search where all starts fail;
+    states of ``free``, started from subspace models of several horizons, have no fixed meaning, and nothing bounds the
+    entries.
     """
     chosen = {k: v for k, v in asdict(read_settings(NnSettings, "nn", settings)).items() if v is not None}
     unsigned = chosen["output"] == "magnitude"
@@ -277,9 +274,8 @@ def _choose_states(
     clear: float = 0.0,
     **how: Any,
 ) -> Training | None:
-    """The network with the number of states that Bayes' criterion likes best; a larger one has to be `clear` of it.
-
-    `starts` are the first networks by number of states.
+    """The network of the number of states best by Bayes' criterion, a larger one if `clear` of it; `starts`: by that
+    number.
     """
     best: Training | None = None
     values: list[dict[str, Any]] = []
@@ -384,9 +380,8 @@ def _error_ahead(at: State, data: Scaled, cut: list[int]) -> float:
 
 
 def _rescue(fitting: Fitting, tick: Tick | None, reason: str, *, requested: bool) -> str:
-    """Search globally where ordinary starts failed, and train what was found; return what is left of the reason.
-
-    Where the search was `requested` for, errors that are suspect are enough.
+    """Search globally where ordinary starts failed (if `requested`, suspect errors are enough), train, return what is
+    left of the reason.
     """
     s, before, why = fitting.settings, fitting.state, reason
     if before is not None:

@@ -1,12 +1,8 @@
 """Terms, products of lagged outputs, inputs and innovations; their function; their choice by orthogonal least squares.
 
-A factor is one lagged signal, a term the product of its factors (repeated ones are powers; none makes the constant).
-
-Forward regression (FROLS): step by step that candidate is taken which, orthogonalised against those chosen before, has
-the largest error reduction ratio (Chen, Billings, Luo 1989; Billings 2013, sec. 3.2). One pass over the data makes the
-Gram matrix of candidates of unit length; steps then cost nothing beside. Where digits run short the candidates are made
-orthogonal to the chosen ones explicitly, by QR, and the Gram matrix again. Candidates are made block by block from
-lagged signals: a long record needs no matrix of all of them.
+A term is a product of lagged signals (repeated: powers; none: the constant). FROLS takes the candidate that,
+orthogonalised, has the largest error reduction ratio (Chen, Billings, Luo 1989; Billings 2013, sec. 3.2), on the Gram
+matrix of unit-length candidates from one pass, made again by QR where digits run short; candidates come block by block.
 """
 
 from __future__ import annotations
@@ -131,9 +127,8 @@ def unit_of(owned: Sequence[tuple[int, int, Term]], y_scale: Array, u_scale: Arr
 
 @dataclass(frozen=True, kw_only=True)
 class PolynomialFunction(LaggedFunction):
-    """yhat(t) = b / (1 + a), b and a sums of coefficient times term (thesis eqs 3.1-3.4).
-
-    Coefficients stand output by output, numerator before denominator; denominators are empty for a polynomial.
+    """yhat(t) = b / (1 + a), sums of coefficient times term (thesis eqs 3.1-3.4), by output, numerator first;
+    denominators empty for a polynomial.
     """
 
     kind: ClassVar[str] = "narmax"
@@ -255,10 +250,7 @@ class Candidates:
         return sum(self.rows)
 
     def blocks(self, which: Sequence[int] | None = None) -> Iterator[tuple[slice, Array]]:
-        """Yield rows in order, a block at a time, and values of some candidates, or of all, there.
-
-        Values are of shape (n_which, n_rows of the block), contiguous.
-        """
+        """Yield rows block by block, and the values there, contiguous (n_which, n_rows), of some candidates, or all."""
         terms = self.terms if which is None else [self.terms[k] for k in which]
         size, start = max(_BLOCK, 1), 0
         for r, (n, signals) in enumerate(zip(self.rows, self.parts, strict=True)):

@@ -1,15 +1,11 @@
 """Networks of radial basis functions: a linear part beside units about centres (thesis eqs 1.13, 1.14; Billings 2013).
 
-Scale -> lags, what the units see, their number and width (where left open) -> centres -> output weights by regularised
-least squares -> all numbers by Levenberg-Marquardt, or weights recursively, or by steepest descent (options) ->
-simulation errors. What is left open is compared by errors on held-out data, of the free run where the model is to
-simulate.
-
-Recursive Gauss-Newton is R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e (thesis eq. 1.14), with R kept as its
-triangle, to which blocks of rows are joined by orthogonal rotations; with mu = 1/(t + 1) and R_0 the prior's it is
-recursive least squares, and ends at the solution of all samples. Steepest descent is w <- w + rate phi e (thesis
-eq. 3.22, printed as W <- W eta e Phi', its plus sign lost). One sample's error after a step is (1 - rate |phi|^2) e, so
-that it grows where the rate is over 2/|phi|^2; the rate is kept at 1/|phi|^2 at most, as in NLMS.
+Lags, what units see, number and width (where open, by held-out errors, of the free run for simulation) -> centres ->
+regularised least squares -> Levenberg-Marquardt, or weights recursively or by steepest descent -> simulation errors.
+Recursive Gauss-Newton: R <- R + mu (phi phi' - R), w <- w + mu R^-1 phi e (thesis eq. 1.14), R as its triangle; with mu
+= 1/(t + 1) and the prior's R_0 it is recursive least squares. Steepest descent: w <- w + rate phi e (thesis eq. 3.22,
+printed as W <- W eta e Phi', its plus sign lost), rate at most 1/|phi|^2, as in NLMS: a sample's error becomes (1 -
+rate |phi|^2) e, which grows over 2/|phi|^2.
 """
 
 from __future__ import annotations
@@ -238,12 +234,10 @@ class _Work(Draft[RbfFunction]):
 
 
 def rbf(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
-    """Identify a network of radial basis functions, y(t) = L z + c + W phi(z) + e(t).
-
-    Its errors are taken as white: under feedback, or with coloured noise, it is biased. There are standard deviations
-    where centres and widths are trained too, or there are no units: what the choice of units adds cannot be told, and
-    intervals without it hold in as few as half of the places. `seed` is that of the candidates among the data, and of
-    k-means; `tick` is called with the stage and may raise KeyboardInterrupt.
+    """Identify y(t) = L z + c + W phi(z) + e(t), biased under feedback or with coloured noise, as errors are taken as
+    white. Standard deviations exist only without units, or with trained centres and widths: what the choice adds cannot
+    be told, and intervals without it hold in as few as half of the places. `seed`: of candidates and k-means; `tick`:
+    called with the stage, may raise KeyboardInterrupt.
     """
     s = read_settings(RbfSettings, "rbf", settings)
     if s.ny == 0 and s.nu == 0:
@@ -368,10 +362,7 @@ def _choose(s: RbfSettings, work: _Work, tick: Tick | None) -> tuple[RbfFunction
 
 
 class Placing:
-    """Units on some training rows: where they stand and how wide they are; centres are found once for each question.
-
-    `x` and `y` are the rows looked at: all, or some spread evenly over the records where they are many.
-    """
+    """Units' places and widths, centres found once a question, on rows `x`, `y`: all, or some spread evenly."""
 
     def __init__(self, s: RbfSettings, function: RbfFunction, parts: Parts, seed: int, *, most: int) -> None:
         self.s, self.function, self.seed, self.most = s, function, seed, most
@@ -422,11 +413,8 @@ def k_means(x: Array, k: int, rng: np.random.Generator) -> Array:
 
 
 def ols_order(candidates: Array, basis: Array, y: Array, most: int) -> list[int]:
-    """Choose regressors by orthogonal least squares, beside some that are in the model in any case.
-
-    It takes, again and again, that candidate which explains most of what is left of all outputs (Chen, Cowan and Grant
-    1991), by Gram-Schmidt on the candidates themselves: units that overlap are nearly dependent, and their Gram matrix
-    has too few digits to tell them apart. Returns their order.
+    """Return the order of regressors by orthogonal least squares over all outputs, beside some in any case (Chen, Cowan
+    and Grant 1991), by Gram-Schmidt on the candidates: units overlap, and their Gram matrix has too few digits.
     """
     free = y.shape[0] - basis.shape[1] - 1
     m, d = candidates.shape[1], basis.shape[1]
@@ -474,11 +462,9 @@ class Weights(NamedTuple):
 
 
 def solve_weights(function: RbfFunction, theta: Array, x: Array, y: Array, prior: float | None) -> Weights:
-    """Solve for the output weights of units that stand, min |y - F l - Phi w|^2 / sigma^2 + |w|^2 / alpha^2.
-
-    The linear part l has no prior. One QR of [F | Phi | y], then singular values of what F leaves of Phi: every prior
-    costs a line. Left open, sigma and alpha are those of the restricted likelihood, output by output (Patterson and
-    Thompson 1971; MacKay's evidence 1992), so that Laplace's covariance is honest.
+    """Solve min |y - F l - Phi w|^2 / sigma^2 + |w|^2 / alpha^2 for standing units, l without prior, by one QR of [F |
+    Phi | y] and singular values. Open sigma, alpha: restricted likelihood, output by output (Patterson and Thompson
+    1971; MacKay's evidence 1992), so that Laplace's covariance is honest.
     """
     n, p, h = y.shape[0], function.p, function.neurons
     d = 1 + function.line.width
@@ -566,9 +552,8 @@ def _train_by_sample(s: RbfSettings, work: _Work, noise: Array, tick: Tick | Non
 def train_by_sample(
     network: RbfFunction, theta: Array, x: Array, y: Array, pull: Array, rate: float | None, tick: Tick | None
 ) -> tuple[Array, LearningCurve]:
-    """Train the weights on regressors and outputs, from zero: by steepest descent with a rate, or by Gauss-Newton.
-
-    `pull` (n_outputs, n_features) is the errors' standard deviation over that of the prior.
+    """Train the weights from zero by steepest descent with a rate, or Gauss-Newton; `pull` (n_outputs, n_features): the
+    errors' standard deviation over the prior's.
     """
     from ambid.nonlinear.kernels import descent_pass
 

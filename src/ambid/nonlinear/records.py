@@ -1,12 +1,9 @@
 """Records of one bench in scaled deviations from common levels, models on them, and where a model was trained.
 
-Three distances from the training regressors, each 1 at the edge. Mahalanobis, from the middle, in that of the farthest
-training regressor. The gauge of the convex hull: in two and three dimensions of the hull itself; in more, where hulls
-have too many faces, of the polytope whose faces touch the hull across some hundred directions (towards its corners,
-along every regressor, along the principal axes), so that whatever counts as outside is outside the hull. And, because a
-cloud may have holes, the distance to the nearest of some hundred training regressors that were spread over the cloud
-(farthest first), in the farthest that any training regressor has. The first two count inside; the third where it says
-"outside".
+Distances from training regressors, each 1 at the edge: Mahalanobis, over the farthest's; the gauge of the convex hull,
+beyond three dimensions of a polytope that touches it across some hundred directions (corners, regressors, principal
+axes), so that what counts as outside is; and, for holes, to the nearest of some hundred spread over the cloud, over the
+farthest's. The first two count inside; the third where it says "outside".
 """
 
 from __future__ import annotations
@@ -189,11 +186,9 @@ class Scaled:
 def scaled_records(
     structure: str, records: Sequence[IOData], *, lag: int, levels: str = "mean", fewest: int = _FEWEST
 ) -> Scaled:
-    """Check that records belong together and scale them.
-
-    `structure` is for messages; `lag` samples of each record are only past, and `fewest` more are needed. `levels` are
-    what signals are deviations from: their means, zero, or (auto) means where signals stand far from zero; levels
-    change what the terms of a polynomial mean.
+    """Check that records belong together, for `structure` with `lag` past samples and `fewest` more, and scale
+    deviations from `levels`: means, zero, or (auto) means where signals stand far from zero. Levels change what
+    polynomial terms mean.
     """
     if not records:
         raise EstimationError(f"{structure}: no record was given. Pass at least one")

@@ -1,11 +1,10 @@
 """A state-space network whose weights are A and B: layout of its weights, errors over records, model.
 
-x+ = A x + B u + c + K e + G f(x, u), y = x[heads] + e (thesis eq. 5.1, fig. 5.9). In the form ``one-axis`` the weights
-are entries of the continuous A and B of thesis eq. 4.8 (position, velocity, current); A, B, G of a sample follow by the
-matrix exponential. In the form ``free`` they are those of the sampled A and B; a state that is not measured is the
-scaled difference of the state before it, x_j+ = x_j + step x_(j+1) + .., which makes the weights unique. Where a sensor
-sees no sign, the output is |x1| behind a low pass, and the network is odd: a sign that is not measured leaves nothing
-to tell the directions apart by.
+x+ = A x + B u + c + K e + G f(x, u), y = x[heads] + e (thesis eq. 5.1, fig. 5.9). ``one-axis``: weights are entries of
+the continuous A and B of thesis eq. 4.8 (position, velocity, current), sampled by the matrix exponential. ``free``:
+those sampled; an unmeasured state is the scaled difference before it, x_j+ = x_j + step x_(j+1) + .., which makes them
+unique. Behind a sensor without sign the output is |x1| behind a low pass, and the network odd: nothing tells directions
+apart.
 """
 
 from __future__ import annotations
@@ -71,9 +70,8 @@ class Matrices:
         return replace(self, M=M, D=D)
 
     def run(self, y: Array, u: Array, x0: Array) -> tuple[Array, Array]:
-        """Return states (n_samples + 1, width) and innovations (n_samples, p), NaN from a divergence on.
-
-        `u` has a last column of ones, `x0` is the first state.
+        """Return states (n_samples + 1, width) from `x0` and innovations (n_samples, p), NaN from a divergence on;
+        `u`'s last column is ones.
         """
         from ambid.nonlinear.kernels import run_states
 
@@ -83,9 +81,8 @@ class Matrices:
         return X, E
 
     def slopes(self, u: Array, X: Array, E: Array, s: Array) -> Array:
-        """Return the slopes of the predictions (n_samples, p, n_columns) along what `run` returned.
-
-        `s` (width, n_columns) is changed from the first state's slopes to the last's.
+        """Return the predictions' slopes (n_samples, p, n_columns) along `run`; `s` (width, n_columns) goes from the
+        first state's to the last's.
         """
         from ambid.nonlinear.kernels import slope_states
 
@@ -227,10 +224,7 @@ class Layout:
         )  # fmt: skip
 
     def weights(self, theta: Array) -> Array:
-        """Return [A | B | c] with all weights in, continuous in the form ``one-axis``.
-
-        `theta`: (n_theta,), scaled. Returns (n, n + n_inputs + 1), scaled.
-        """
+        """Return [A | B | c], scaled, (n, n + n_inputs + 1), all weights in, continuous for ``one-axis``."""
         n = self.n
         M = np.zeros((n, n + self.n_inputs + 1))
         if self.form == "one-axis":
@@ -354,12 +348,10 @@ class StateProblem:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class StateNetwork(ScaledModel):
-    """A trained network with its scaling and the cloud of its training (implements `NonlinearModel`).
-
-    The state at the beginning is that which fits the first `lag` samples best, without G and K. Behind a sensor without
-    sign there is no one-step predictor: what is measured does not correct the state, and a prediction is the free run
-    from the state that fits best, of searches from rest and from both signs. In `theta` entries of A and B are in SI,
-    gains and hidden layer for scaled signals; the cloud is that of states and inputs in training.
+    """A trained network (implements `NonlinearModel`), entries of A and B in SI, else scaled; cloud of states and
+    inputs. The first state fits the first `lag` samples best, without G and K. Behind a sensor without sign a
+    prediction is the free run from the best first state, searched from rest and both signs: what is measured does not
+    correct it.
     """
 
     layout: Layout
@@ -421,10 +413,7 @@ class StateNetwork(ScaledModel):
         return out
 
     def states(self, u: Array, y: Array) -> Array:
-        """Return the predicted states, scaled: (n_samples, width).
-
-        The first `delay` rows are NaN, and all from where the predictor diverges on.
-        """
+        """Return predicted scaled states (n_samples, width): NaN in the first `delay` rows, from a divergence on."""
         ys, us = self._late(u, y)
         x0, _ = self._first_state(ys, us, derive=False)
         out = np.full((np.asarray(u).shape[0], self.layout.width), np.nan)
@@ -499,9 +488,8 @@ class StateNetwork(ScaledModel):
 
 
 def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool) -> tuple[Array, Array]:
-    """Least squares without hidden layer and gain, O x0 = y - (forced response), and its slopes by the `P` weights.
-
-    With r what is left: dx0 = (O'O)^-1 (dO' r - O' d(O x0 + forced)).
+    """Least squares without hidden layer and gain, O x0 = y - (forced response), and its slopes by `P` weights: dx0 =
+    (O'O)^-1 (dO' r - O' d(O x0 + forced)), r what is left.
     """
     n, linear = m.M.shape[0], m.without_gain(hidden=False)
     still = np.zeros_like(y), np.zeros_like(u)
@@ -520,9 +508,8 @@ def _solve_first_state(m: Matrices, P: int, y: Array, u: Array, *, derive: bool)
 
 
 def _search_first_state(layout: Layout, theta: Array, y: Array, u: Array) -> tuple[Array, Array]:
-    """Best of searches from rest and from both signs; slopes as least squares has them (Gauss-Newton).
-
-    They are exact where the first samples are fitted exactly, else to first order in what is left over.
+    """Best of searches from rest and both signs; Gauss-Newton slopes, exact for exactly fitted first samples, else to
+    first order.
     """
     P, first = layout.n_theta, float(y[0, 0]) if y.size else 0.0
     problem = StateProblem(layout=layout, parts=((y, u),), weight=np.eye(1), held=slice(0, P))

@@ -1,10 +1,8 @@
 """First weights of a state-space network: delay, subspace model, the thesis's training, and global search.
 
-A predictor-based subspace estimate (PBSID-opt) stands for any stability and under feedback. Its states are turned into
-those of the network: measured outputs, and rates (``one-axis``; after the matrix logarithm) or differences (``free``).
-Where it leads nowhere, differential evolution looks for the free entries of A, in the logarithm of their size with
-sign: over short shots the first state, B and the constants enter linearly and are solved for (variable projection,
-Golub and Pereyra 1973). Nothing runs away over a short shot, so that unstable plants have a finite cost everywhere.
+PBSID-opt, for any stability and feedback, is turned into the network's states: outputs, and rates (``one-axis``, matrix
+logarithm) or differences (``free``). Else differential evolution searches free entries of A (log size, sign): over
+short shots, where unstable plants' costs are finite, first state, B and constants are linear (Golub and Pereyra 1973).
 """
 
 from __future__ import annotations
@@ -55,10 +53,8 @@ _PROCESS = (1e-8, 1e-5, 1e-2)  # variance of process noise over that of the stat
 
 
 def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), past: int = SHORT) -> State | str:
-    """Return a first network of `n` states, or the reason why there is none.
-
-    With `heads`, the states (position, velocity, current) that outputs are, in the form ``one-axis``, else ``free``;
-    `past` samples the first model looks back.
+    """Return a first network of `n` states from a model `past` samples back, or why there is none; with `heads`, the
+    states (position, velocity, current) that outputs are, in the form ``one-axis``, else ``free``.
     """
     p = data.n_outputs
     if n < p:
@@ -104,10 +100,7 @@ def first_network(data: Scaled, dt: float, n: int, heads: tuple[int, ...] = (), 
 
 
 def one_axis_layout(data: Scaled, dt: float, heads: tuple[int, ...], unit: float, M: Array) -> Layout:
-    """Return the layout of the form ``one-axis``.
-
-    A velocity that is not measured is scaled so that x1' = x2 in SI, `unit` being its size; `M` is [A | B | c].
-    """
+    """Return the layout ``one-axis`` of `M` = [A | B | c]; an unmeasured velocity has size `unit`, x1' = x2 in SI."""
     scale = np.empty(3)
     for o, s in enumerate(heads):
         scale[s] = data.y_scale[o]
@@ -171,10 +164,8 @@ def matrices_json(layout: Layout, A: Array, B: Array, *, sampled: bool) -> dict[
 
 
 def rank_grid(parts: Parts, n: int, delays: Sequence[int] = (1,)) -> list[tuple[Array, int, int, float]]:
-    """Return linear models gain q^-d / A(q^-1) of `n` poles behind a sensor without sign, the best first.
-
-    The sign is not in the data, and a search from a wrong one ends in a wrong minimum. By model A, the input, its delay
-    d and the gain that fits the magnitude best.
+    """Return models gain q^-d / A(q^-1) of `n` poles behind a sensor without sign, best first, by A, input, its delay d
+    and the best-fitting gain: the sign is not in the data, and a search from a wrong one ends in a wrong minimum.
     """
     from scipy.signal import lfilter
 
@@ -230,10 +221,8 @@ def pole_grid(n: int) -> list[Array]:
 
 
 def guess_delay(data: Scaled) -> int:
-    """Return the least delay at which a long linear fit of an output on the past sees an input; 0 where it sees none.
-
-    Where inputs act weakly within a sample (fast sampling, much noise) this cannot tell neighbours apart, and the
-    network itself is trained a little way beside them (`find_delay`).
+    """Return the least delay at which a long linear fit sees an input, 0 if none. Where inputs act weakly within a
+    sample it cannot tell neighbours apart: see `find_delay`.
     """
     y, u = (x[-_MOST:] for x in max(data.parts, key=lambda part: part[0].shape[0]))
     largest = min(LARGEST, y.shape[0] // 8 - 2 * _HISTORY)
@@ -246,9 +235,8 @@ def guess_delay(data: Scaled) -> int:
 
 
 def find_delay(state: State, whole: Scaled, delay: int, tick: Tick | None, *, rather_late: bool = False) -> int:
-    """Go from a guess to a neighbour as long as a short training ends with smaller errors there.
-
-    `state` is a first network at `delay`, `whole` not yet shifted.
+    """Go to neighbours of a guess while a short training has smaller errors; `state`: a first network at `delay`,
+    `whole` unshifted.
     """
     share = _TRAINED // len(whole.parts)
     cut = replace(whole, parts=tuple((y[:share], u[:share]) for y, u in whole.parts))
@@ -282,11 +270,9 @@ def find_delay(state: State, whole: Scaled, delay: int, tick: Tick | None, *, ra
 def train_one_step(
     state: State, data: Scaled, iterations: int
 ) -> tuple[tuple[LearningCurve, LearningCurve], dict[str, object]]:
-    """Train one-step errors of the network's states as the thesis does, and by Gauss-Newton, from weights of zero.
-
-    J = sum |x(k+1) - A x(k) - B u(k) - c|^2 with measured states where all are, else predicted ones; v <- v - eta dJ/dv
-    (thesis eqs 5.1, 5.2). Noise on the states biases what both converge to. A and B, in SI and continuous in the form
-    ``one-axis``, are given by training.
+    """Train from zero weights as the thesis does, and by Gauss-Newton: J = sum |x(k+1) - A x(k) - B u(k) - c|^2, states
+    measured where all are, else predicted; v <- v - eta dJ/dv (thesis eqs 5.1, 5.2). State noise biases both. A and B
+    are by training, in SI and continuous in the form ``one-axis``.
     """
     problem, layout = state.problem(data), state.layout
     X = [x[:-1] for x in problem.errors(state.vector)[0]]
@@ -427,9 +413,8 @@ def shot_cost(data: Scaled, dt: float, heads: tuple[int, ...]) -> ShotCost:
 def search_start(
     data: Scaled, dt: float, heads: tuple[int, ...], *, seed: int, evaluations: int, tick: Tick = silent
 ) -> tuple[State | None, GlobalFound]:
-    """Search globally for a network of form ``one-axis`` that runs on the records, a predictor gain with it.
-
-    There is no state where no gain keeps the predictor finite.
+    """Search globally for a ``one-axis`` network with gain that runs on the records; no state where no gain keeps it
+    finite.
     """
     cost = shot_cost(data, dt, heads)
     n = len(cost.searched)

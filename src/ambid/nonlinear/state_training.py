@@ -1,7 +1,7 @@
 """Training of a state-space network: weights and first states by Levenberg-Marquardt, gain, hidden layer, covariance.
 
-The hidden layer's weights are N(0, prior^2), its output 1 being the size of the linear part of its row. Units are
-anchored, without value and slope at the operating point, so that A and B are the linearisation there (thesis eq. 4.9).
+Hidden weights are N(0, prior^2), output 1 the size of their row's linear part. Units are anchored, without value and
+slope at the operating point: A and B are the linearisation there (thesis eq. 4.9).
 """
 
 from __future__ import annotations
@@ -182,9 +182,8 @@ def train(
     rounds: int = _ROUNDS,
     damping: float | None = None,
 ) -> Training | None:
-    """Search for weights and first states over whole records; None where the start diverges.
-
-    `fitting` takes over what was found, also by a search that is interrupted.
+    """Search weights and first states over whole records, None where the start diverges; `fitting` keeps what was
+    found, also of an interrupted search.
     """
     if damping is None:  # physics alone begins near: Gauss-Newton at once
         damping = 1e-2 if state.layout.sensor else 1e-3 if state.layout.neurons else 1e-9
@@ -221,10 +220,8 @@ def train(
 
 
 def _wake_units(start: State, data: Scaled, iterations: int, damping: float, tick: Tick | None) -> State:
-    """Begin units that put out nothing yet against the errors of the linear part, their prior being strong.
-
-    As long as they put out nothing the data say nothing of what they see, and the prior would take it away: what they
-    see is held for the first iterations.
+    """Begin silent units against the linear part's errors under a strong prior; what they see is held for the first
+    iterations, or the prior would take it away.
     """
     k, (n_W1, _, _) = start.layout.n_directions, start.layout.hidden_sizes
     if np.any(start.theta[k + n_W1 :]):
@@ -307,9 +304,8 @@ class Misfit:
 
 
 def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
-    """Regress errors on past inputs, and on past errors with a gain, without which errors may be coloured.
-
-    A linear model of high order predicts no better than a network that is at its best, unless the plant has more to it.
+    """Regress errors on past inputs, and with a gain on past errors (else perhaps coloured): a linear model of high
+    order predicts no better than the best network, unless the plant has more to it.
     """
     from scipy.stats import chi2
 
@@ -330,9 +326,8 @@ def misfit(state: State, data: Scaled, *, inputs: bool = True) -> Misfit:
 
 
 def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple[Array | None, str]:
-    """Covariance of trained weights in the units of the model's, the first states counted, and where it is from.
-
-    What a reader must be told of it goes to the warnings.
+    """Covariance of trained weights in the model's units, first states counted, and its source; warnings say what to
+    mind.
     """
     data, how = fitting.data, fitting.settings["uncertainty"]
     problem, v = state.problem(data), state.vector
@@ -375,10 +370,9 @@ def _estimate_spread(fitting: Fitting, state: State, tick: Tick | None) -> tuple
 
 
 def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tuple[Array, tuple[str, ...]]:
-    """Return what starts that fit about as well disagree by, to be added to the covariance, and what to say of it.
-
-    A hidden layer of few units only comes near to what the plant does: where other starts end with errors as small but
-    other A and B, the likelihood alone is too sure of them. `covariance` is in the units of the model's weights.
+    """Return what starts that fit about as well disagree by, to be added to `covariance` (in the units of the model's
+    weights), and what to say of it: few hidden units only come near the plant, and the likelihood is too sure of A and
+    B.
     """
     k = len(state.layout.entries)
     unit, extra = state.layout.unit[:k], np.zeros_like(covariance)
@@ -402,10 +396,7 @@ def disagreement(state: State, rivals: Sequence[State], covariance: Array) -> tu
 
 
 def finish(fitting: Fitting, reason: str, tick: Tick | None) -> NonlinearFit:
-    """Return the fit of a trained network; failed where there is none, or none that runs on its own records.
-
-    `reason` says why there is no network.
-    """
+    """Return a trained network's fit, failed where there is none (`reason`), or none that runs on its own records."""
     state, data, records = fitting.state, fitting.data, fitting.records
     fitting.settings = {"states": 0, "neurons": 0, **fitting.settings, "delay": fitting.delay}
     if state is None:
