@@ -262,10 +262,8 @@ def opened(
     closes: bool,
     note: Note,
 ) -> Iterator[Device]:
-    """Open a device and close it.
-
-    `bench`: plant behind a controller that is no hardware; `pace`: of such a device; `seed`: of simulated noise;
-    `closes`: whether a loop is to be closed that has to be stable. Returns idle.
+    """Open a device, idle, and close it. `bench`, `pace`, `seed`: plant, pace and noise of one that is no hardware;
+    `closes`: a loop is to be closed that has to be stable.
     """
     from ambid.acquisition.devices import open_device
 

@@ -27,10 +27,8 @@ _ROLES = ("position", "current")
 def judge_bearing(
     fit: BearingFit, spread: BearingUncertainty, readings: Sequence[TakenRecord], *, delay_given: bool
 ) -> NonlinearBearingEstimate:
-    """Check a fit on its own records and put the estimate together.
-
-    `fit`: not failed; `spread`: of that fit; `readings`: the records that it came from; `delay_given`: whether the rig
-    gives the delay. Returns without validation, timings and rig.
+    """Check a fit that has not failed, with its `spread`, on its own `readings`; estimate without validation, timings
+    and rig. `delay_given`: the rig gives the delay.
     """
     problem, names = fit.problem, _names(fit)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:

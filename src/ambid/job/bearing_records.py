@@ -1,6 +1,5 @@
-"""Records of a nonlinear bearing as its predictor sees them, through a rig that says what is known of the magnet.
-
-What they must not be: the same data twice, one channel twice, the stage off, a held rotor that moves.
+"""Records of a nonlinear bearing as its predictor sees them, through a rig that says what is known of the magnet; not
+the same data or channel twice, the stage off, a held rotor that moves.
 """
 
 from __future__ import annotations
@@ -63,19 +62,14 @@ def bearing_rig(rig: Rig | str | Path | None, **words: Unpack[BearingWords]) -> 
 
 
 def numbers_of(rig: Rig) -> dict[str, Parameter]:
-    """Return what a rig knows of the numbers of a nonlinear bearing.
-
-    `rig`: with a `magnet`. Returns its m, R and c, and those of the magnet.
-    """
+    """Return what a rig with a `magnet` knows of a nonlinear bearing: m, R and c, and the magnet's numbers."""
     assert rig.magnet is not None
     return {**{n: rig.parameter(n) for n in _LINEAR}, **{p.name: p for p in rig.magnet.parameters}}
 
 
 def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[MagnetLaw], bool]:
-    """Return the laws between which the likelihood is to decide.
-
-    `records`: in which the rotor moves. Returns `extend`: whether a rising leakage, and unequal magnets of a pair, are
-    to be tried beyond them.
+    """Return the laws between which the likelihood of moving rotors' `records` decides, and `extend`: whether to try a
+    rising leakage, and unequal magnets of a pair.
     """
     kind = magnet.kind
     if kind == "auto" and magnet.gap == "exponential":
@@ -95,10 +89,7 @@ def laws_of(magnet: RigMagnet, records: Sequence[BearingRecord]) -> tuple[list[M
 
 
 def take_record(record: Source, rig: Rig, how: Reading, *, held: bool = False) -> TakenRecord:
-    """Read a record as the predictor sees it.
-
-    `rig`: with a `magnet`; `held`: the rotor is held at rest: all of the record is taken.
-    """
+    """Read a record as the predictor sees it, by a rig with a `magnet`; all of it where the rotor is `held` at rest."""
     if held:
         rig = replace(rig, record=replace(rig.record, from_s=None, to_s=None))
         how = {**how, "from_s": None, "to_s": None}
@@ -194,10 +185,7 @@ def take_all(
 
 
 def check_together(readings: Sequence[TakenRecord], second: TakenRecord | None) -> tuple[TakenRecord, ...]:
-    """Check what shows only in values or between records.
-
-    `readings`: to identify from; `second`: to judge on. Returns `readings`, with a warning where a held rotor moves.
-    """
+    """Check what only values show, or `readings` and `second` (to judge on) together; warn of a moving held rotor."""
     for j, one in enumerate(readings):
         _refuse_senseless(one.record)
         for other in readings[:j]:

@@ -32,9 +32,8 @@ Numbers = Estimate | RotorEstimate
 def loop_of(
     estimate: Numbers, rig: Rig, rate_hz: float, spectra: PeriodSpectra | None, speed: float = 0.0
 ) -> ClosedLoop:
-    """Return the closed loop of an estimate, of a rotor at a speed in rad/s.
-
-    `spectra`: of the record whose controller is looked for. EstimationError where nothing says what that is.
+    """Return an estimate's closed loop, at a rotor's speed in rad/s, its controller by the record's `spectra`;
+    EstimationError where nothing says what that is.
     """
     plant = plant_of(estimate, rate_hz, speed)
     return ClosedLoop.of(plant, controller_of(plant, rig, spectra))
@@ -43,9 +42,8 @@ def loop_of(
 def loop_and_peaks(
     estimate: Numbers, rig: Rig, bench: Record, spectra: PeriodSpectra | None, speed: float = 0.0
 ) -> tuple[ClosedLoop | None, Mapping[str, Any], tuple[str, ...]]:
-    """Return the closed loop of a record, the peaks of its sensitivity, warnings; None: its controller is not known.
-
-    `spectra`: of the record, where they are there already.
+    """Return a record's closed loop, sensitivity peaks, warnings; None: controller unknown. `spectra`: if there
+    already.
     """
     of = estimate.plant if isinstance(estimate, RotorEstimate) else model(estimate.model)
     if not any(role in bench for role in references_of(of)) and (rig.loop is None or rig.open_loop):
@@ -95,10 +93,8 @@ def plant_of(estimate: Numbers, rate_hz: float, speed: float = 0.0) -> Plant:
 
 
 def controller_of(plant: Plant, rig: Rig, spectra: PeriodSpectra | None) -> Controller:
-    """Return the controller: of the record, else of the rig; EstimationError where neither says what it is.
-
-    With noise between what is logged and what the controller computes with, the coil's own equation fits as well as the
-    controller's: one that misses more than `MISFIT` of the inputs is not taken.
+    """Return the controller: of the record, else of the rig; EstimationError without either. One that misses more than
+    `MISFIT` of the inputs is not taken: with noise in between, the coil's own equation fits as well.
     """
     missed: float | None = None
     if spectra is not None and spectra.R is not None:
@@ -135,9 +131,8 @@ def controller_of(plant: Plant, rig: Rig, spectra: PeriodSpectra | None) -> Cont
 
 
 def spectra_of(bench: Record, of: LinearModel, speed: float = 0.0) -> PeriodSpectra | None:
-    """Return the spectra of a record at its excited lines; None where nothing says which these are.
-
-    Of a record that is not periodic all of it counts as one period: the law of the controller holds for any stretch.
+    """Return spectra at the excited lines, None where these are unknown; a record that is not periodic is one period,
+    as the controller's law holds for any stretch.
     """
     found = find_excitation(bench, of)
     if found is not None:
@@ -169,9 +164,8 @@ def spectra_of(bench: Record, of: LinearModel, speed: float = 0.0) -> PeriodSpec
 def measure(
     loop: ClosedLoop, bench: Record | None, spectra: PeriodSpectra | None
 ) -> tuple[MeasuredSensitivity | None, ...]:
-    """Return the sensitivity as the record shows it, by axis.
-
-    Where the controller is the rig's, the excitation is what the inputs hold beside the controller's own answer.
+    """Return the measured sensitivity by axis; for a rig's controller, excitation is what inputs hold beside its
+    answer.
     """
     none = (None,) * len(loop.plant.axes)
     if spectra is None:

@@ -1,7 +1,5 @@
 """Guided commissioning: self-test, rest, polarity, levitate, excite, record, identify, validate, track; and its report.
-
-Each step is judged before the next begins; one that is not good enough ends it, with the reasons. All that was found up
-to there stays in the folder.
+A step not good enough ends it, with the reasons; all that was found stays in the folder.
 """
 
 from __future__ import annotations
@@ -478,20 +476,14 @@ def check_folder(folder: str | Path) -> None:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file that is there whole or not at all.
-
-    `path`: written over if it exists; `text`: in UTF-8.
-    """
+    """Write a UTF-8 file, over an existing one, whole or not at all."""
     with whole_file(path) as beside:
         beside.write_text(text, encoding="utf-8")
 
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
-    """Let a file be written under another name, and put it in place whole.
-
-    `path`: where it goes. Returns where it is to be written.
-    """
+    """Let a file be written under the returned name, and put it in place whole."""
     beside = path.with_name(f".{os.getpid()}-{path.name}")
     try:
         yield beside

@@ -1,7 +1,4 @@
-"""The steps of a guided commissioning: looks at the bench itself, and judgements of the outcome of it.
-
-Each has findings and, where it is not good enough, the reasons.
-"""
+"""The steps of a guided commissioning, with findings and, where it is not good enough, the reasons."""
 
 from __future__ import annotations
 
@@ -107,17 +104,11 @@ class Plan:
         return get_args(StepName) if self.redesign else STEPS
 
     def band(self, rate_hz: float) -> tuple[float, float]:
-        """Return the band of the excitation in Hz.
-
-        `rate_hz`: of the device, Hz. Returns as requested, or from the rate.
-        """
+        """Return the band of the excitation in Hz, as requested or from the rate in Hz."""
         return self.band_hz or moving_band(rate_hz)
 
     def longest_trial_s(self, rate_hz: float) -> float:
-        """Return the length of a trial in s: as requested, or longer where the band is slow.
-
-        `rate_hz`: of the device, Hz. Returns four periods of the lowest line at least.
-        """
+        """Return a trial's length in s: as requested, or longer, at least four periods of the lowest line."""
         low = self.band(rate_hz)[0]
         return max(self.trial_s, _PERIODS / low * (1 + 1e-9)) if low > 0.0 else self.trial_s
 
@@ -130,10 +121,7 @@ class Plan:
 
 
 def self_test(device: Device) -> Step:
-    """Let the device look at itself.
-
-    `device`: opened, idle. Returns passed if nothing failed.
-    """
+    """Let an opened, idle device look at itself; passed if nothing failed."""
     found = device.self_test()
     who = ", ".join(f"{k} {v}" for k, v in device.info.identity.items() if k in ("protocol", "major", "minor", "board"))
     where = f"{device.info.kind} device at {device.info.port}" + (f": {who}" if who else "")
@@ -142,10 +130,8 @@ def self_test(device: Device) -> Step:
 
 
 def rest(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
-    """Look at the sensors with the output off.
-
-    `look`: see `make_look`; `room`: limits; `plan`: lengths; `rate_hz`: of the device, Hz. Returns not
-    passed where a sensor is noisy, or a current is shown that cannot be.
+    """Look (see `make_look`) at the sensors with the output off; not passed where one is noisy, or a current is shown
+    that cannot be. `room`: limits; `plan`: lengths; rate in Hz.
     """
     report, seen = look(Course(mode="sample", seconds=plan.rest_s))
     reasons = list(why_incomplete(report, "the look at rest"))
@@ -178,10 +164,8 @@ def rest(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
 
 
 def polarity(look: Look, room: Room, rig: Rig, device: Device) -> Step:
-    """Find by pulses which way the bench answers, and compare it with what the rig says and the controller assumes.
-
-    `look`: see `make_look`; `room`: limits; `rig`: of the device. Returns not passed where a sign is reversed, no
-    current flows, or the controller tripped; a rotor that did not move is a caution.
+    """Find by pulses which way the bench answers, compared with rig and controller; `look`: see `make_look`; `room`:
+    limits. Not passed where a sign is reversed, no current flows, or the controller tripped; no motion is a caution.
     """
     found = find_polarity(look, room, rig, device.info.rate_hz, clear=device.clear)
     largest = max(found.pulses, key=lambda p: abs(p.volts) * p.hold_s)
@@ -258,10 +242,8 @@ def _reversed(found: Polarity, rig: Rig) -> list[str]:
 
 
 def levitate(look: Look, room: Room, plan: Plan, rate_hz: float) -> Step:
-    """Lift the rotor and let it hover without excitation.
-
-    `look`: see `make_look`; `room`: limits; `plan`: lengths; `rate_hz`: of the device, Hz. Returns not
-    passed where the controller tripped, the rotor strays, or no room is left.
+    """Lift the rotor and let it hover without excitation; not passed where the controller tripped, the rotor strays, or
+    no room is left. `look`: see `make_look`; `room`: limits; `plan`: lengths; rate in Hz.
     """
     course = Course(mode="levitate", seconds=plan.hover_s, settle_s=plan.settle_s, transient=True)
     report, whole = look(course)
@@ -305,11 +287,9 @@ def resting_at(room: Room, hover: Step) -> dict[str, float]:
 
 
 def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> tuple[Step, Size]:
-    """Find the largest excitation that keeps to its part of the room.
-
-    `look`: see `make_look`; `room`: limits; `plan`: band, part of the room, perhaps the amplitude
-    itself; `rate_hz`: of the device, Hz; `hover`: levitation without excitation: where the bench rests. Returns
-    `numbers` hold ``amplitude_v``; not passed where a trial tripped, or too much of the room was used.
+    """Find the largest excitation, ``amplitude_v``, that keeps to its part of the room; not passed where a trial
+    tripped, or too much was used. `look`: see `make_look`; `plan`: band, part, perhaps the amplitude; rate in Hz;
+    `hover`: where it rests.
     """
     resting = resting_at(room, hover)
     trial = plan.trial(rate_hz, plan.longest_trial_s(rate_hz))
@@ -322,10 +302,8 @@ def excite(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step) -> t
 
 
 def designed(look: Look, room: Room, plan: Plan, rate_hz: float, hover: Step, made: Experiment) -> tuple[Step, Program]:
-    """Play a designed excitation as long as a trial, once again with less where it moves more than it should.
-
-    `made`: on what a small excitation showed. Returns the excitation as it is to be played; not passed where the
-    controller tripped, or both used too much.
+    """Play what was `made` on a small excitation for a trial, again with less if it moves too much: the excitation to
+    play; not passed where the controller tripped, or both used too much.
     """
     program, resting = made.program, resting_at(room, hover)
     findings: list[str] = []
@@ -375,11 +353,8 @@ def _numbers(shown: Mapping[str, tuple[float, float]]) -> dict[str, float]:
 
 
 def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Step:
-    """Judge a record as it was taken.
-
-    `name`: what it is for; `done`: from `acquire`; `pictures`: of it.
-    Returns not passed where samples were lost or not stored, or a sensor saturates or stands still. Little signal over
-    noise is a caution: whether it is enough is decided by the intervals of what is identified.
+    """Judge a record as it was taken: not passed where samples were lost or not stored, or a sensor saturates or stands
+    still; little signal over noise is a caution, decided by intervals of what is identified.
     """
     reasons = list(why_incomplete(done.run, f"the {name}"))
     if done.not_stored:
@@ -409,12 +384,9 @@ def record(name: str, done: Acquired, pictures: tuple[Picture, ...] = ()) -> Ste
 def identification(
     estimate: Estimate, plan: Plan, loops: Mapping[str, LoopMargins], experiment: Experiment | None = None
 ) -> Step:
-    """Judge an estimate: found at all, each parameter identifiable and known well enough, nothing implausible.
-
-    `estimate`: of the record; `plan`: how wide an interval may be; `loops`: margins of the controller on the plant
-    that was identified, and that was expected, by name, the first one first; `experiment`: that was played, with what
-    it promised. Returns tests of residuals that fail are cautions, because the standard deviations allow for them; all
-    else stops.
+    """Judge an estimate: found at all, parameters identifiable and known as well as `plan` says, nothing implausible.
+    `loops`: controller's margins by name, first on the identified plant, then the expected; `experiment`: played, with
+    its promise. Failed residual tests are cautions, as standard deviations allow for them.
     """
     findings: list[str] = []
     reasons: list[str] = []
@@ -452,10 +424,8 @@ def identification(
 
 
 def redesign(design: Design, estimate: Estimate) -> Step:
-    """Judge a designed controller by its verification; one that is not better leaves the present one in place.
-
-    `design`: on the `estimate`, whose curvature alone stops nothing: designs are tried on displaced plants, and by the
-    controller on trial. Returns always passed; `numbers` hold ``better``, 1 or 0.
+    """Judge a designed controller by its verification, always passed; ``better`` 0 leaves the present one. Curvature of
+    the `estimate` stops nothing: designs are tried on displaced plants, and on trial.
     """
     curved = all(r.check == "curvature" for r in estimate.verdict.reasons)
     against = [r for r in design.verdict.reasons if not (curved and r.check == "estimate")]
@@ -472,10 +442,8 @@ def redesign(design: Design, estimate: Estimate) -> Step:
 
 
 def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]) -> Step:
-    """Judge the new loop by what was measured with it.
-
-    `done`: the record with it; `hover`, `before`: hovering with it, and with the loop before; `loops`: margins by
-    record, the loop before first. Returns not passed where the controller did not keep it, or it does not levitate.
+    """Judge the new loop by its record, hovering with it and `before`, and margins by record, the loop before first;
+    not passed where the controller did not keep it, or it does not levitate.
     """
     kept = record("record with the new loop", done)
     findings, numbers = list(kept.findings), dict[str, float]()
@@ -498,9 +466,8 @@ def load(done: Acquired, hover: Step, before: Step, loops: Mapping[str, Margins]
 
 
 def validation(estimate: Estimate) -> Step:
-    """Judge how an estimate does on the second record.
-
-    `estimate`: with `validation`. Returns not passed where the second record is predicted worse than the first allows.
+    """Judge an `estimate` by its `validation`: not passed where the second record is predicted worse than the first
+    allows.
     """
     checks: Mapping[str, Any] = (estimate.validation or {}).get("checks", {})  # type: ignore[assignment]
     findings = tuple(f"{name}: {c['detail']}" for name, c in checks.items() if c["passed"])
@@ -513,10 +480,8 @@ def validation(estimate: Estimate) -> Step:
 
 
 def tracking(done: LiveTrack, limit: float) -> Step:
-    """Judge live tracking: the bench that was identified is the bench that runs.
-
-    `done`: from `track_live`, with its lines; `limit`: acceptable model error. Returns not passed where it ended early,
-    the error is beyond the limit, or a change was found.
+    """Judge live tracking (`track_live`, with lines): the identified bench runs. Not passed where it ended early, the
+    error is beyond the `limit`, or a change was found.
     """
     reasons = list(why_incomplete(done.run, "tracking"))
     summary, lines = done.track.totals, done.track.lines

@@ -310,9 +310,8 @@ def _designed(
 
 
 def _refuse_worse(goals: Goals, before: Sequence[Examined], after: Sequence[Examined]) -> None:
-    """Refuse a loop that loses more of the plants that judge than the present one, or whose peak passes its limit.
-
-    The peak counts on plants that the present loop holds: one that is held for the first time is none that got worse.
+    """Refuse a loop that loses more judging plants than the present one, or whose peak passes its limit on those that
+    the present loop holds: one held for the first time is none that got worse.
     """
     from ambid.control.tuning import raised, said
 

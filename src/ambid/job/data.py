@@ -120,11 +120,8 @@ def load_bench(
     record : file, Record, DataFrame, Dataset or dict of arrays
         In the rig's columns, or through a rig already.
     rig : Rig
-    from_s, to_s : float, optional
-        Override the rig's ``record.from`` and ``record.to``; s.
-    rate_hz : float, optional
-    gaps : {"error", "interpolate", "cut"}, optional
-    units, layout : Mapping of str to str, optional
+    from_s, to_s, rate_hz, gaps, units, layout : optional
+        As `ambid.identify`.
     beside : sequence of str, optional
         Columns of the file that are no role of the rig, kept under their own names.
 
@@ -222,10 +219,8 @@ class Channels:
         return cls(**named, **said, rig=None if rig is None else known_rig(rig))
 
     def read(self, record: Source, part: Part = WHOLE) -> IOData:
-        """Read a record, cut it and take the columns out of it.
-
-        With a rig they are named by role or as in the file, and calibrated; where none are named all of its model are
-        taken. A reference may be any column of the file.
+        """Read a record, cut it and take the columns, with a rig by role or as in the file, calibrated, by default all
+        of its model; a reference may be any column of the file.
         """
         from ambid.blackbox.data import io_data
 

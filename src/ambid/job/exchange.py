@@ -1,7 +1,6 @@
 """Results for other programs: ``.mat``, python-control, C source, FMU; a rotor as a script for ROSS.
 
-ROSS reads the stiffness of a bearing at the running speed only. A magnet under control has another one at every
-frequency, so that its bearings stand for the synchronous frequency alone; the whole plant is beside them.
+ROSS reads bearings at the running speed alone: a controlled magnet's stand for the synchronous frequency, plant beside.
 """
 
 from __future__ import annotations
@@ -50,10 +49,8 @@ def export(result: Any, path: str | Path, to: str | None = None, *, anyway: bool
 
 
 def write_plant(result: Any, path: Path, name: str, to: str | None = None, *, anyway: bool = False) -> None:
-    """Write a plant for another program, by the ending of the file.
-
-    `name`: of the plant in C and in an FMU; `to`: of `SCRIPTS`, for which library a script is; `anyway`: also where the
-    result should not be relied on, and then the file says so.
+    """Write a plant called `name` (C, FMU) by the file's ending, a script for `to` of `SCRIPTS`; `anyway`: also where
+    the result should not be relied on, and then the file says so.
     """
     check_switch({"anyway": anyway})
     ending = path.suffix.lower()

@@ -511,10 +511,8 @@ def _lowered(task: Task, wanted: Wanted) -> tuple[str, ...]:
 
 
 def _cautions(rig: Rig, task: Task, lines: Lines, power: Array, known: Information) -> tuple[str, ...]:
-    """Say what is promised of a rotor with modes, but depends on numbers that the record shows too weakly.
-
-    A rotor that turns trades frequencies at rest for gyroscopic terms: at an estimate, which scatters by what is
-    promised, the information is another than at the numbers that are designed for.
+    """Say what is promised of a rotor with modes by weakly shown numbers: a turning one trades frequencies at rest for
+    gyroscopic terms, and the information at the estimate, which scatters, is another.
     """
     plant = task.loops[0].plant
     if not getattr(plant.model, "n_modes", 0):
@@ -561,9 +559,8 @@ def _expected(task: Task, known: Information, power: Array, flat: Array, target:
 
 
 def _seconds(task: Task, known: Information, power: Array, aim: tuple[int, float]) -> float:
-    """Return the length of a record, a period at least, in which a number reaches a relative standard deviation.
-
-    What a prior knows does not grow with the length, so that the root of the length is no rule.
+    """Return the record length, a period at least, for a relative standard deviation; no root rule, as priors do not
+    grow.
     """
     low, high = 0.0, math.log(_EVER)
     for _ in range(_HALVINGS):

@@ -30,12 +30,8 @@ _STREAMED = ("json",)  # settings that take - for standard output
 
 
 class Files:
-    """Files that are going to be written.
-
-    Each is written beside its place under another name; only when everything is there are all of them moved. After an
-    error or Ctrl-C nothing is left behind.
-
-    `inputs`: files that are read; none of them may be written over.
+    """Files that are going to be written, each beside its place, and moved when all are there; after an error or Ctrl-C
+    nothing is left. None of `inputs`, which are read, may be written over.
     """
 
     def __init__(self, *inputs: Path | None) -> None:
@@ -45,11 +41,9 @@ class Files:
         self._staged: dict[Path, Path] = {}
 
     def claim(self, path: Path | None, name: str, suffixes: Sequence[str] = (), *, force: bool | None = None) -> None:
-        """Check that a file can be written, before any work is done.
-
-        `path`: the file; None: none was given; `name`: of the setting that names it, for messages; `suffixes`:
-        endings that it may have; any if empty; `force`: what the setting of that name says, None where there is none.
-        Without it only figures, reports, results and simulated records are written over, and that is told.
+        """Check before any work that a file (None: none) can be written; `name`: of its setting; `suffixes`: its
+        endings, any if empty; `force`: of that name, None: no such setting. Without it only figures, reports, results
+        and simulated records are written over, and that is told.
         """
         if path is None:
             return
@@ -87,10 +81,7 @@ class Files:
                 raise AmbidError(f"{setting(name)} {path} is named by two options. Choose another file for one of them")
 
     def stage(self, path: Path, write: Callable[[Path], object]) -> None:
-        """Write a file under a name beside its own.
-
-        `path`: where the file will be; `write`: takes the present name, which ends like `path`, and writes it.
-        """
+        """Write a file under a name beside `path`, of the same ending, which `write` takes."""
         named, path = path.name, path.resolve()  # through a link, to the file that it stands for
         beside = path.with_name(f".{os.getpid()}-{named}")
         self._staged[path] = beside
@@ -105,10 +96,7 @@ class Files:
             ) from None
 
     def stage_text(self, path: Path, text: str) -> None:
-        """Write a text file under a name beside its own.
-
-        `path`: where the file will be; `text`: what it holds, in UTF-8.
-        """
+        """Write a UTF-8 text file under a name beside `path`."""
         self.stage(path, lambda beside: beside.write_text(text, encoding="utf-8"))
 
     def replaced(self, path: Path) -> None:

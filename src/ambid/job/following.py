@@ -165,11 +165,8 @@ def _short(x: object) -> str:
 def truth_beside(
     record: Record | Path | str, rate: float | None, units: Mapping[str, str]
 ) -> dict[str, tuple[Any, Any]]:
-    """Read the truth that a simulated record holds: columns ``true_NAME``.
-
-    `rate`: sampling rate in Hz, for a record without time; `units`: SI unit of each tracked number; empty where it is
-    not known. Returns ndarrays of shape (n_samples,), s of record and SI; without parameters that have no such column,
-    or one in another unit.
+    """Read the truth in a simulated record's columns ``true_NAME``: (n_samples,), s of record and SI, but those of
+    another unit. `rate`: Hz, for a record without time; `units`: SI unit of each tracked number, empty where not known.
     """
     if not isinstance(record, Record) and not _may_hold_truth(Path(record)):
         return {}

@@ -189,10 +189,7 @@ def identify_axis(
 
 
 def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Check a fit that has not failed on its own record, and put the estimate together, without timings.
-
-    `bench`: the record it came from, channels named by role.
-    """
+    """Check a fit that has not failed on its own record `bench`, by role, and make the estimate, without timings."""
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.likelihood import innovations, simulation_error
@@ -236,10 +233,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:
-    """Check the sizes of an estimate; where the rig's values are in doubt, of one that does without them.
-
-    `doubt`: whether the data contradict a fixed value.
-    """
+    """Check an estimate's sizes; in `doubt` of the rig's values (contradicted by data) of one without them."""
     from ambid.bearing.linear import greybox
     from ambid.bearing.sizes import check_units
 

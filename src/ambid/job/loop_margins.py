@@ -135,9 +135,8 @@ def margins(
 
 
 def margins_beside(estimate: Numbers, used: Any) -> Margins | None:
-    """Return the margins of an estimate's loop for its page; None where they cannot be said.
-
-    `used`: the record it was made from, of a rotor one or several; None: the margins of the model.
+    """Return the margins of an estimate's loop for its page, None where they cannot be said; `used`: its record, of a
+    rotor one or several; None: the margins of the model.
     """
     from ambid.job.results import rig_of
 

@@ -1,9 +1,8 @@
 """An identified plant as C source (C99, math.h alone, no allocation), with the delay of its inputs, and as FMU.
 
-A linear plant is stepped with its exact zero-order-hold matrices, which are computed from the parameters there; a
-nonlinear magnet by the Runge-Kutta steps of the simulator, with its stops. The code stands in ``data/plant_*.c``; an
-estimate adds declarations, numbers and the entries of the matrices. An FMU (FMI 2.0 for co-simulation) holds the source
-and, by a C compiler, the binary for this machine; it is the same, byte by byte, for the same estimate and compiler.
+A linear plant steps by exact zero-order-hold matrices of its parameters, a nonlinear magnet by the simulator's
+Runge-Kutta steps and stops; code in ``data/plant_*.c``. An FMU (FMI 2.0 for co-simulation) holds source and this
+machine's binary, byte by byte the same for the same estimate and compiler.
 """
 
 from __future__ import annotations

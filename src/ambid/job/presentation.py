@@ -1,7 +1,5 @@
-"""How each kind of result is shown: one register of what describes it, what it is drawn beside, and its JSON.
-
-The methods of `ambid.estimation.result.Result` and the verbs come here; nothing else shows a result. What there is to
-see of one is declared in `ambid.report` as a `Document`, of which text, figure, page, table and short forms are made.
+"""How each kind of result is shown: one register of what describes it, what it is drawn beside, and its JSON; nothing
+else shows one. What there is to see is a `Document` of `ambid.report`: text, figure, page, table and short forms.
 """
 
 from __future__ import annotations

@@ -178,11 +178,8 @@ def read_linear_estimate(path: str | Path, otherwise: str) -> Estimate:
 def data_of(
     known: AnyEstimate | AnyFit, record: Any, rig: Rig | None = None, *, where: str, **reading: Unpack[Reading]
 ) -> Any:
-    """Read a further record as a result wants it: a Record, IOData of a fit, a TakenRecord of a nonlinear bearing.
-
-    A rotor has a tuple of records.
-
-    `rig`: through which it is read; default: as the result remembers it; `where`: name of the result, for messages.
+    """Read a further record as a result wants it: a Record, IOData of a fit, a TakenRecord of a nonlinear bearing, a
+    tuple of a rotor. `rig`: default as the result remembers it; `where`: name of the result, for messages.
     """
     if isinstance(known, BlackBoxFit | NonlinearFit):
         if rig is not None:

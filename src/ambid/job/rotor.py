@@ -1,7 +1,5 @@
-"""The job of a rotor on many axes: records and a rig in, one estimate of the machine out.
-
-Read -> periods, or none -> estimate -> judge. Records at several speeds, or with one bearing excited at a time, give
-one machine.
+"""The job of a rotor on many axes: records and a rig in, one estimate of the machine out; several speeds, or one
+bearing excited at a time, give one machine.
 """
 
 from __future__ import annotations
@@ -46,11 +44,8 @@ def identify_rotor(
     tick: Tick | None = None,
     **reading: Unpack[Reading],
 ) -> RotorEstimate:
-    """Identify a rotor from one or several records.
-
-    Records of two or more whole periods go to the estimator on period spectra, another one to the predictor. `rig`:
-    with bearings; `speed_rpm`: of each record; `reading`: how files are read. EstimationError where nothing can be
-    identified.
+    """Identify a rotor by a `rig` with bearings: two or more whole periods by the estimator on period spectra, else by
+    the predictor. `speed_rpm`: of each record; `reading`: of files. EstimationError where nothing can be identified.
     """
     from ambid.job.closed_loop import loop_and_peaks
     from ambid.rotor.conclusion import conclude
@@ -231,9 +226,8 @@ def _synchronous(
 
 
 def balance_planes(estimate: RotorEstimate, rig: Rig) -> dict[str, tuple[float, ...]]:
-    """Return the planes of unbalance that a rig gives: z, and the shape of each mode there.
-
-    Shapes are the rig's, else those of its drawing, each turned to the side of the identified mode.
+    """Return a rig's planes of unbalance: z, and each mode's shape there, the rig's or its drawing's, turned to the
+    side of the identified mode.
     """
     modes, numbers = range(1, estimate.n_modes + 1), rig.modes.numbers
     places = estimate.plant.places
@@ -363,10 +357,8 @@ def read_records(
     say: Tick,
     **reading: Unpack[Reading],
 ) -> list[RotorRecord]:
-    """Read the records of one rotor.
-
-    `speed_rpm`: of each record, or of a single one; None: each says its own, and one without the channel of angle or
-    speed that another has was taken at rest. A record of several experiments becomes several.
+    """Read the records of one rotor; `speed_rpm`: of each, or a single one; None: each says its own, and one without
+    the channel that another has was taken at rest. One of several experiments becomes several.
     """
     from ambid.rotor.spectra import experiments_of
 

@@ -1,8 +1,7 @@
 """Two or more sensors of one position made into one channel, before a record goes through its rig.
 
-Noise and offset of each sensor and the pace of the motion come from the record itself, so that a rig only has to name
-the columns; `ambid.recursive.fusion` follows them and leaves out a sensor that fails. What it decided stands in the
-record's history, from where a track takes it.
+Noise, offsets and pace come from the record; `ambid.recursive.fusion` leaves out a sensor that fails. What it decided
+is in the record's history, from where a track takes it.
 """
 
 from __future__ import annotations
@@ -75,9 +74,8 @@ def _fused(record: Record, c: RigChannel, unit: str) -> Record:
 
 
 def _noise(x: Array) -> float:
-    """Standard deviation of a sensor's noise from third differences, in which motion is small; rounding included.
-
-    Where values are not on a grid, stretches without any difference are of a sensor that stopped, and tell nothing.
+    """Standard deviation of a sensor's noise from third differences (motion is small), rounding included; without a
+    grid, stretches without differences are of a stopped sensor.
     """
     third = np.diff(x, 3)
     third = np.abs(third[np.isfinite(third)])

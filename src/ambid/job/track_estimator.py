@@ -1,7 +1,6 @@
-"""The on-line job with any recursive estimator: a record is fed to it block by block, and reported line by line.
+"""The on-line job with any recursive estimator, block by block, line by line, published as it is, without a supervisor.
 
-There is no supervisor: what the estimator says is published as it is. Regressions and polynomial models follow
-coefficients from named inputs to an output, the joint filters physical parameters of a bench.
+Regressions and polynomial models follow coefficients, the joint filters physical parameters of a bench.
 """
 
 from __future__ import annotations
@@ -140,9 +139,8 @@ def _coefficients(
 
 
 def _scale(method: str, data: IOData) -> tuple[Array, Array, tuple[Array, Array]]:
-    """Return inputs, with instruments behind them, and output brought to mean zero and size one, and those sizes.
-
-    Both are taken from the first samples, as they come on-line.
+    """Return inputs (then instruments) and output at mean zero and size one, and sizes, from the first samples as
+    on-line.
     """
     first = slice(0, max(_FIRST_SAMPLES, round(_FIRST_S / data.dt)))
     external = data.reference if method == "iv" and data.references else np.empty((data.y.shape[0], 0))

@@ -1,7 +1,5 @@
-"""Live tracking: a device runs in a thread of its own and fills a ring; the tracker follows what comes out of it.
-
-Nothing on the way of the data waits for the tracker. The beginning of the stream is what an identification starts from,
-or what a given start is checked with; it is then tracked like the rest.
+"""Live tracking: a device in its own thread fills a ring, the tracker follows; nothing on the data's way waits for it.
+An identification, or a check of the start, takes the stream's beginning, which is then tracked like the rest.
 """
 
 from __future__ import annotations
@@ -70,14 +68,11 @@ def track_live(
     stopped: Callable[[], bool] = lambda: False,
     **following: Unpack[FollowingWords],
 ) -> LiveTrack:
-    """Let a device do a course, and follow the physical parameters of its bench meanwhile.
-
-    `device`: opened, idle; `course`: what the device is to do; tracking begins when it has settled; `start`: where
-    tracking begins; default: an identification of the first `start_s` of the stream; `taps`: others who listen to the
-    run, such as a recorder; `on_event`: told of the device's events, in the thread of the run; `on_run`: given what
-    came of the run, also where tracking was interrupted; `on_lag`: told, after each block, the time from its last
-    sample to the end of its work, s; `following`: see `ambid.job.following.Following`; times count from the first
-    sample that is tracked. Returns the track up to the end of the course, a fault, or an interrupt.
+    """Let an opened, idle `device` do a `course`, and follow its bench once it has settled, to the course's end, a
+    fault, or an interrupt. `start`: default an identification of the first `start_s`; `taps`: other listeners, such as
+    a recorder; `on_event`: of the device, in the run's thread; `on_run`: given its result, also of interrupted
+    tracking; `on_lag`: told a block's time from last sample to done work, s. Times of `Following` count from the first
+    tracked sample.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
@@ -167,15 +162,9 @@ def _too_short(runner: LiveRun, wanted_s: float, rate_hz: float) -> DeviceError:
 
 
 class RingTap:
-    """Puts what a device samples into the ring, seen through the rig, numbered from its first sample.
-
-    A bench of this world waits for nobody: blocks that find the ring full are counted. One that is only played runs
-    ahead of the tracker, and is held up instead. Samples that a calibration does not cover go in as NaN, which the
-    tracker rejects and counts.
-
-    `view`: of device and rig; `waits`: whether the device may be held up.
-
-    `over`: set when nobody reads the ring any more; `fresh`: set when a block was put into it.
+    """Puts what a device samples into the ring, by the rig's `view`, numbered from its first sample, uncovered by
+    calibration as NaN, rejected and counted. A real bench waits for nobody, and blocks lost to a full ring are counted;
+    one that is only played is held up (`waits`). `over`: set when nobody reads; `fresh`: when a block is put in.
     """
 
     def __init__(self, ring: BlockRing, view: BenchView, *, waits: bool) -> None:
@@ -209,10 +198,8 @@ class RingTap:
 
 
 class LiveRun:
-    """The run of the device, in a thread of its own; leaving the context ends it.
-
-    `job`: the run, but for what stops it; `ring`: ended with the run; `recorded`: others listen: where tracking fails,
-    the run goes on for them; `on_run`: given the result of the run.
+    """The run `job` of the device, in a thread of its own, ended with the context, as is the `ring`; `recorded`: it
+    goes on for others where tracking fails; `on_run`: given its result.
     """
 
     def __init__(

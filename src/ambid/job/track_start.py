@@ -61,9 +61,8 @@ class BenchRows:
         return {"file": provenance.get("file"), "sha256": provenance.get("sha256"), **began(self.record)}
 
     def clean_part(self, n: int, *, begin_anywhere: bool) -> tuple[Record, int]:
-        """Return the first clean stretch, and the number of the sample after it.
-
-        `n`: samples wanted; `begin_anywhere`: take a later stretch, or a shorter one, where the beginning is damaged.
+        """Return the first clean stretch of `n` samples, and the next number; `begin_anywhere`: later or shorter for a
+        damaged beginning.
         """
         numbers = self.replay.numbers
         sound = np.asarray(np.isfinite(self.replay.values).all(axis=1))
@@ -93,10 +92,7 @@ class BenchRows:
 
 
 def rows_of(record: Source, stated: Rig | None, **reading: Unpack[Reading]) -> BenchRows:
-    """Read the rows of a record through a rig; without one, columns are named like the roles, also of a turning rotor.
-
-    `record`: a table or file, or a record.
-    """
+    """Read the rows of a table, file or record through a rig, else by roles, also of a turning rotor."""
     rig, rate_hz = known_rig(stated), reading.get("rate_hz")
     if isinstance(record, Record) or (isinstance(record, (str, Path)) and not str(record).lower().endswith(_ROWS)):
         bench, stamps = load_bench(record, rig, **reading), None
@@ -175,11 +171,7 @@ def start_of(
     start_s: float | None,
     rig_speaks: bool,
 ) -> Start:
-    """Take the estimate to begin with, or make one.
-
-    `start`: an estimate or its file; None: identify the beginning of the record; `start_s`: length of that beginning,
-    s.
-    """
+    """Take the estimate or file to begin with, or (None) identify the first `start_s` of the record."""
     warnings: list[str] = []
     if start is None:
         estimate, first = _identify_beginning(source, rig, start_s)
@@ -206,10 +198,8 @@ def start_of(
 
 
 def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:
-    """Refuse a start whose predictor would never say anything of the record.
-
-    `duration_s`: of the whole record, s; infinite for a live stream; `first`: number of the first sample that is
-    tracked.
+    """Refuse a start whose predictor would never say anything of a record of `duration_s` (infinite for a live stream),
+    tracked from number `first` on.
     """
     rate = rpem.numbers.rate_hz
     settling_s, left_s = rpem.stream.settling_samples / rate, duration_s - first / rate
@@ -222,11 +212,8 @@ def check_settling(rpem: PhysicalRpem, duration_s: float, first: int) -> None:
 
 
 def credible_limits(source: BenchRows, estimate: Estimate) -> list[float]:
-    """Say from which magnitude on a value is no measurement any more.
-
-    An output is judged by its spread at identification, an input, of which an estimate keeps no spread, by the record.
-
-    Returns for each input, then each output, SI.
+    """Say for each input, then output, from which magnitude, SI, on a value is no measurement: outputs by their spread
+    at identification, inputs, without one in an estimate, by the record.
     """
     plant, point = model(estimate.model), estimate.operating_point
     limits = []

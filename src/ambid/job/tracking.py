@@ -181,9 +181,8 @@ def track(
 def follow(
     blocks: Iterable[Block | Frame] | BlockRing, source: BenchRows, begin: Start, how: Following, *, live: bool = False
 ) -> Track:
-    """Follow the physical parameters of a bench through blocks, SI, from sample ``begin.first`` on.
-
-    What replayed and live tracking share: guard, supervisor and reporter. `live`: the stream has no known end.
+    """Follow a bench's parameters through SI blocks from ``begin.first`` on, replayed or live: guard, supervisor and
+    reporter; `live`: without a known end.
     """
     numbers, first, forcing = begin.numbers, begin.first, source.forcing
     rpem = PhysicalRpem(numbers, memory=how.memory)
