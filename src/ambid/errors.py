@@ -43,13 +43,17 @@ class DeviceError(AmbidError):
     """A controller, its port or its line: not there, not understood, refusing, or in its safe state."""
 
 
+_ALIKE = 0.4  # ratio of letters in common from which a word may be meant
+
+
 def nearest(word: object, known: Sequence[str]) -> str:
     """Return `` Did you mean 'x'?`` for the known word closest to `word`, or an empty string.
 
     `word`: what was written; `known`: what may be written. Returns a sentence that begins with a space, or ``""``.
     """
     turned = [k for k in known if sorted(k) == sorted(str(word))]  # two letters exchanged come before another word
-    close = turned[:1] or difflib.get_close_matches(str(word), known, n=1, cutoff=0.4)
+    alike = {k: difflib.SequenceMatcher(None, k, str(word)).ratio() for k in known}
+    close = turned[:1] or [k for k in known if alike[k] == max(alike.values()) >= _ALIKE]  # the first of several
     return f" Did you mean {close[0]!r}?" if close else ""
 
 

@@ -41,6 +41,8 @@ class EstimatedParameter:
     # whether the data (with the priors) show it: relative sd under 25 %. True for a fixed parameter.
     identifiable: bool
     data_share: float | None = None  # for a prior: part of the information that comes from the data, 0 to 1
+    sd_calibrated: float | None = None  # with what the rig says of calibration; None where it says nothing
+    ci95_calibrated: tuple[float, float] | None = None
 
     def __repr__(self) -> str:
         unit = "" if self.unit == "1" else f" {self.unit}"
@@ -559,6 +561,11 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     checks : Mapping[str, Check]
     sensitivity : Mapping[str, Any]
         Peak of the sensitivity of axis ``x``, where a loop is known or a reference is logged.
+    calibration : Mapping[str, Mapping[str, float]]
+        By channel, and ``"rate"``, the per cent by which an error of 1 % would move each estimated parameter.
+    calibration_sd : Mapping[str, float]
+        What the rig says of these errors: relative standard deviations of gains and rate, SI ones of offsets
+        (``"current.offset"``), which move the operating point alone.
     validation : Mapping[str, object] or None
         Results on a second record.
     warnings : tuple of str
@@ -587,6 +594,8 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
     sensitivity: Mapping[str, Any] = field(default_factory=lambda: MappingProxyType({}))
+    calibration: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MappingProxyType({}))
+    calibration_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
     validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
     timing_s: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))

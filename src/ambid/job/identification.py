@@ -192,6 +192,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     """Check a fit that has not failed on its own record `bench`, by role, and make the estimate, without timings."""
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
+    from ambid.estimation.calibration import Numbers, calibrated, lines_of
     from ambid.estimation.likelihood import innovations, simulation_error
     from ambid.validation import physical
     from ambid.validation.residuals import fit_of
@@ -229,7 +230,15 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
-    return replace(estimate, global_search=fit.global_search)
+    known = Numbers(
+        plant=problem.model, theta=problem.parameters(fit.vector), names=spread.names, covariance=spread.information,
+        known=rig.parameters,
+    )  # fmt: skip
+    widened = calibrated(estimate.parameters, known, rig, lines_of(fit))
+    return replace(
+        estimate, global_search=fit.global_search, parameters=widened.parameters, calibration=widened.calibration,
+        calibration_sd=widened.calibration_sd,
+    )  # fmt: skip
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

@@ -11,14 +11,14 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Literal
 
-from ambid.errors import AmbidError, ModelError, RecordError, RigError, UnitError, nearest
+from ambid.errors import ModelError, RecordError, RigError, UnitError, nearest
 from ambid.physics.law import StateLaw
 from ambid.physics.law_magnet import BEARING_NUMBERS, NOT_NEGATIVE
 from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, model
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
-from ambid.record.calibration import Calibration, read_calibration_table
+from ambid.rig.calibration import calibration_of, channel_sd_of, plane_sd_of
 from ambid.rig.rig import (
     DAQ_RATE_HZ,
     Daq,
@@ -34,7 +34,17 @@ from ambid.settings.caller import path_of
 from ambid.units import UNKNOWN, parse_unit
 
 if TYPE_CHECKING:
-    from ambid.rig.schema import ChannelEntry, LawEntry, LimitsEntry, LoopEntry, NoiseEntry, ParameterEntry, RigFile
+    from ambid.rig.schema import (
+        ChannelEntry,
+        DaqEntry,
+        LawEntry,
+        LimitsEntry,
+        LoopEntry,
+        MagnetEntry,
+        NoiseEntry,
+        ParameterEntry,
+        RigFile,
+    )
 
 
 SELECTED = Step(name="select")
@@ -142,6 +152,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         channels=channels,
         parameters=parameters,
         rotor=plant if isinstance(plant, RotorModel) else None,
+        plane_sd=plane_sd_of(file, where),
         modes=modes_of(file, plant, where),
         shaft=None if file.shaft is None else shaft_of(file.shaft, parameters, where),
         unbalance=unbalance,
@@ -153,6 +164,7 @@ def _build(file: RigFile, path: Path) -> Rig:
         noise=_noise(file.noise) if file.noise else None,
         record=RecordSettings(
             rate_hz=record.rate_hz,
+            rate_sd=record.rate_sd,
             gaps=record.gaps,
             from_s=record.from_,
             to_s=record.to,
@@ -217,39 +229,13 @@ def _channel(role: str, entry: ChannelEntry, unit: str, plant: LinearModel, path
         role=role,
         column=entry.column or role,
         unit=unit_of(entry.unit, place).symbol if entry.unit else None,
-        calibration=_calibration(entry, unit, place, path.parent),
+        calibration=calibration_of(entry, unit, place, path.parent),
         delay=entry.delay if entry.delay is not None else "auto" if role in plant.inputs and not sensor else 0,
         variable=entry.variable,
         sensors=tuple(
             _channel(role, s, unit, plant, path, f".sensors[{k}]") for k, s in enumerate(entry.sensors or ())
         ),
-    )
-
-
-def _calibration(entry: ChannelEntry, unit: str, place: str, folder: Path) -> Calibration | None:
-    """Build gain and offset, or read the table; `unit` is the role's."""
-    if entry.table is not None:
-        if entry.gain is not None or entry.offset is not None:
-            raise RigError(f"{place} has both a table and a gain or offset; it can have one of them. Remove one")
-        try:
-            table = read_calibration_table(folder / entry.table, extrapolate=entry.extrapolate)
-        except AmbidError as error:
-            raise RigError(f"{place}.table: {error}") from None
-        if table.unit_out != unit:
-            raise RigError(
-                f"{place}.table gives [{table.unit_out}] in its second column; the role is in [{unit}]. Fix it"
-            )
-        return table
-    if entry.extrapolate:
-        raise RigError(f"{place}.extrapolate is set but there is no table. Remove it, or give table")
-    if entry.gain is None and entry.offset is None:
-        return None
-    if entry.gain == 0:
-        raise RigError(f"{place}.gain is 0; every sample would be the same. Give the gain")
-    # Without a gain the column must be in the role's unit already; with one, the bench tells which unit it is in.
-    unit_in = unit if entry.gain is None else ""
-    return Calibration(
-        unit_in=unit_in, unit_out=unit, gain=1.0 if entry.gain is None else entry.gain, offset=entry.offset or 0.0
+        **channel_sd_of(entry, unit, place, known=not sensor and role in (*plant.inputs, *plant.outputs)),
     )
 
 
@@ -343,9 +329,6 @@ def _noise(entry: NoiseEntry) -> Noise:
     return Noise(**entry.model_dump(exclude={"resolutions"}), **steps)
 
 
-if TYPE_CHECKING:
-    from ambid.rig.schema import DaqEntry
-
 _BAUD = (300, 12_000_000)
 _HOST_MS = (20, 2000)
 _LIFT_MS = (0, 2000)
@@ -416,9 +399,6 @@ def _trip(
         )
     return low, high
 
-
-if TYPE_CHECKING:
-    from ambid.rig.schema import MagnetEntry, ParameterEntry
 
 _EXPONENTIAL, _HYPERBOLIC = ("L_g", "zeta"), ("k", "s")
 

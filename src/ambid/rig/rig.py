@@ -58,6 +58,9 @@ class RigChannel:
         Variable of a ``.mat`` file that holds the column; None: it is called like the column.
     sensors : tuple of RigChannel
         Two or more columns that are made into this one, where several sensors look at one position.
+    gain_sd, offset_sd : float or None
+        How well its calibration is known: standard deviations of the gain, relative, and of the offset in the role's
+        SI unit; None: nothing is said of it.
     """
 
     role: str
@@ -67,6 +70,8 @@ class RigChannel:
     delay: int | Literal["auto"] = 0
     variable: str | None = None
     sensors: tuple[RigChannel, ...] = ()
+    gain_sd: float | None = None
+    offset_sd: float | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,6 +82,8 @@ class RecordSettings:
     ----------
     rate_hz : float or None
         Sampling rate in Hz for records without time.
+    rate_sd : float or None
+        Relative standard deviation of the sampling rate, of records with time too; None: nothing is said of it.
     gaps : {"error", "interpolate", "cut"} or None
         What to do about gaps; None: refuse them.
     from_s, to_s : float or None
@@ -88,6 +95,7 @@ class RecordSettings:
     """
 
     rate_hz: float | None = None
+    rate_sd: float | None = None
     gaps: GapPolicy | None = None
     from_s: float | None = None
     to_s: float | None = None
@@ -228,6 +236,9 @@ class Rig:
         What is known of the nonlinear law of its magnet.
     rotor : RotorModel or None
         Bearings, axes, planes and speed of a rotor on many axes (``[bearings.X]``).
+    plane_sd : Mapping[str, float]
+        Standard deviations of where its bearings stand, m: ``A.z_sd`` of both planes of bearing A together,
+        ``A.z_magnet_sd`` and ``A.z_sensor_sd`` of each beside that.
     modes : RigModes
         What is known of its bending modes.
     shaft : Shaft or None
@@ -258,6 +269,7 @@ class Rig:
     parameters: tuple[Parameter, ...]
     magnet: RigMagnet | None = None
     rotor: RotorModel | None = None
+    plane_sd: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     modes: RigModes = field(default_factory=RigModes)
     shaft: Shaft | None = None
     unbalance: tuple[Turning, ...] = ()
@@ -466,6 +478,7 @@ def _channel_lines(c: RigChannel, folder: Path, *, is_input: bool) -> list[str]:
     lines += _calibration_lines(c.calibration, c.role, folder) if c.calibration else []
     if is_input or c.delay:
         lines.append('delay = "auto"' if c.delay == "auto" else f"delay = {c.delay}")
+    lines += [f"{key} = {x!r}" for key in ("gain_sd", "offset_sd") if (x := getattr(c, key)) is not None]
     for sensor in c.sensors:
         _, *entries = _channel_lines(sensor, folder, is_input=False)
         lines += ["", f"[[channels.{c.role}.sensors]]", *entries]
@@ -508,6 +521,8 @@ def _rotor_lines(rig: Rig) -> list[str]:
         lines.append(f"z = {plane(f'{b.name}.z')}")
         read = [plane(b.sensor_parameter(k)) for k in range(len(b.z_sensors))]
         lines.append(f"z_sensor = {read[0]}" if len(read) == 1 else f"z_sensors = [{', '.join(read)}]")
+        own = {key.removeprefix(f"{b.name}."): x for key, x in rig.plane_sd.items() if key.startswith(f"{b.name}.")}
+        lines += [f'{key} = {{ value = {x!r}, unit = "m" }}' for key, x in own.items()]
     if rig.modes != RigModes():
         count = '"auto"' if rig.modes.count is None else rig.modes.count
         lines += ["", "[modes]", f"count = {count}"]
@@ -590,7 +605,7 @@ def layout_line(layout: Mapping[str, str]) -> str:
 
 def _record_lines(record: RecordSettings) -> list[str]:
     lines = ["[record]"]
-    numbers = {"rate_hz": record.rate_hz, "from": record.from_s, "to": record.to_s}
+    numbers = {"rate_hz": record.rate_hz, "rate_sd": record.rate_sd, "from": record.from_s, "to": record.to_s}
     lines += [f"{key} = {value!r}" for key, value in numbers.items() if value is not None]
     lines += [f'gaps = "{record.gaps}"'] if record.gaps else []
     if record.time is not None:

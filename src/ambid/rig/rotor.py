@@ -93,7 +93,7 @@ def planes_of(file: RigFile) -> Mapping[str, ParameterEntry]:
             bearing = Bearing(name=name, axes=tuple(given.axes))
             planes = [
                 (f"{name}.z", given.z),
-                *((bearing.sensor_parameter(k), z) for k, z in enumerate(_read_at(given))),
+                *((bearing.sensor_parameter(k), z) for k, z in enumerate(read_at(given))),
             ]
             entries |= {place: entry(plane) for place, plane in planes if plane is not None}
     return entries
@@ -171,7 +171,7 @@ def _bearing(name: str, entry: BearingEntry, place: str) -> Bearing:
         )
     if entry.z_sensor is not None and entry.z_sensors is not None:
         raise RigError(f"{place} has both z_sensor and z_sensors; it has one of them. Remove one")
-    sensors = _read_at(entry)
+    sensors = read_at(entry)
     if not sensors:
         raise RigError(
             f"{place}.z_sensor is missing; it is the plane of the sensor. Give it, equal to z if they are one"
@@ -199,7 +199,7 @@ def _apart(bearings: tuple[Bearing, ...], where: str) -> None:
             )
 
 
-def _read_at(entry: BearingEntry) -> list[PlaneEntry]:
+def read_at(entry: BearingEntry) -> list[PlaneEntry]:
     """Return the planes of the sensors of a bearing."""
     return entry.z_sensors or ([] if entry.z_sensor is None else [entry.z_sensor])
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Discriminator, Field, Tag, ValidationError
 
 from ambid.errors import RigError, nearest
 from ambid.record.record import file_bytes, utf8_text
@@ -45,6 +45,18 @@ class QuantityEntry(_Entry):
     unit: Text
 
 
+class SpreadEntry(QuantityEntry):
+    """A standard deviation with its unit."""
+
+    value: NotNegative
+
+
+Spread = Annotated[
+    Annotated[NotNegative, Tag("number")] | Annotated[SpreadEntry, Tag("quantity")],
+    Discriminator(lambda x: "quantity" if isinstance(x, dict) else "number"),
+]
+
+
 class ChannelEntry(_Entry):
     """``[channels.<role>]``: which column is this role, and how its values become the role's unit."""
 
@@ -57,6 +69,8 @@ class ChannelEntry(_Entry):
     table: Text | None = None
     extrapolate: Annotated[bool, Field(strict=True)] = False
     delay: Literal["auto"] | Samples | None = None
+    gain_sd: NotNegative | None = None
+    offset_sd: Spread | None = None
 
 
 class ParameterEntry(_Entry):
@@ -139,6 +153,7 @@ class RecordEntry(_Entry):
     """``[record]``: how records of this bench are read."""
 
     rate_hz: Positive | None = None
+    rate_sd: NotNegative | None = None
     gaps: Literal["error", "interpolate", "cut"] | None = None
     from_: NotNegative | None = Field(default=None, alias="from")
     to: Positive | None = None
@@ -214,6 +229,9 @@ class BearingEntry(_Entry):
     axes: Annotated[list[AxisName], Field(min_length=1, max_length=2)]
     axial: Annotated[bool, Field(strict=True)] = False
     runout: TurningEntry | None = None
+    z_sd: SpreadEntry | None = None
+    z_magnet_sd: SpreadEntry | None = None
+    z_sensor_sd: SpreadEntry | None = None
 
 
 class ModesEntry(_Entry):
