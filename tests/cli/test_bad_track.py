@@ -67,7 +67,7 @@ def test_time_printed_too_coarsely_does_not_halve_the_rate(ambid, bench, record_
 
 @pytest.mark.parametrize("name", ["steady", "quiet"])
 def test_a_scenario_in_which_nothing_begins_takes_no_time(ambid, bench, name):
-    refused(ambid("simulate", "rmit-axis", "--scenario", name, "--at", "0.1", "-o", "s.csv"), "has no beginning")
+    refused(ambid("simulate", "rmit-axis", "--scenario", f"{name}@0.1", "-o", "s.csv"), "has no beginning")
     assert not (bench / "s.csv").exists()
 
 

@@ -35,7 +35,7 @@ def test_models_lists_the_scenarios(ambid):
 
 
 def test_a_change_is_written_with_its_truth_and_told(here, ambid):
-    found = simulated(ambid, "change", *SHORT, "--at", "0.04", "--size=-0.3")
+    found = simulated(ambid, "change:-0.3@0.04", *SHORT)
     assert (found.code, found.err) == (0, "")
     assert "r.csv: 2000 samples at 20000 Hz, excitation of 8 V, seed 3" in found.out
     assert "truth: m 4, " in found.out
@@ -72,7 +72,7 @@ def test_a_spin_up_logs_speed_and_angle_and_the_excitation_on_request(here, ambi
 
 @pytest.mark.parametrize("out", ["r.csv", "r.csv.gz"])
 def test_lost_samples_are_counted_and_missing(here, ambid, out):
-    found = simulated(ambid, "dropped", *SHORT, "--size", "0.05", out=out)
+    found = simulated(ambid, "dropped:0.05", *SHORT, out=out)
     assert found.code == 0
     assert "of them lost or without a value" in found.out
     data = (here / out).read_bytes()
@@ -110,9 +110,13 @@ REFUSED = {
     "a band": (("change", "--band", "1:50"), "--band"),
     "periods": (("change", "--periods", "2"), "--periods"),
     "a nonlinear plant": (("change", "--nonlinear"), "--nonlinear"),
-    "a time outside": (("change", "--at", "9"), "from 0 to 4 s"),
-    "a size of nothing": (("steady", "--size", "1"), "no size"),
-    "too much": (("added-mass", "--size=-2"), "must stay positive"),
+    "a time outside": (("change@9",), "from 0 to 4 s"),
+    "a size of nothing": (("steady:1",), "no size"),
+    "too much": (("added-mass:-2",), "must stay positive"),
+    "a size that is no number": (("change:x",), "it must be NAME[:SIZE][@SECONDS]"),
+    "no finite size": (("change:inf",), "must be finite"),
+    "no finite time": (("change@nan",), "from 0 to 4 s"),
+    "the former size": (("change", "--size", "1"), "is now --scenario NAME:SIZE. Give that"),
     "no time at all": (("steady", "--duration", "0"), "must be a positive number"),
 }
 
@@ -127,8 +131,5 @@ def test_what_does_not_fit_is_refused_on_one_line(here, ambid, case):
     assert not list(here.iterdir())
 
 
-def test_lost_samples_want_a_text_file_and_options_of_a_scenario_want_one(here, ambid):
+def test_lost_samples_want_a_text_file(here, ambid):
     assert ".csv.gz" in simulated(ambid, "dropped", out="r.h5").err
-    found = ambid("simulate", "rmit-axis", "-o", "r.csv", "--at", "1")
-    assert (found.code, found.out) == (2, "")
-    assert "--at is for --scenario" in found.err

@@ -32,7 +32,7 @@ def folder(tmp_path_factory):
     from ambid.cli import run
 
     here = tmp_path_factory.mktemp("track")
-    words = ["simulate", "unstable-bearing", "--scenario", "change", "--duration", "2.2", "--at", "1.6", "--seed", "2"]
+    words = ["simulate", "unstable-bearing", "--scenario", "change@1.6", "--duration", "2.2", "--seed", "2"]
     assert run([*words, "-o", str(here / "change.csv")]) == 0
     assert run(["identify", str(here / "change.csv"), "--to", "1.0", "--json", str(here / "e.json")]) == 0
     return here

@@ -47,6 +47,7 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "history": {"export": "--tables"}, "export": {"to": "--library"},
     "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
     "fleet simulate": {"limit": "--time-limit"},
+    "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip
 
 

@@ -170,7 +170,7 @@ _NAMES: dict[str, Callable[[], Iterable[str]]] = {
     "--preset NAME": _presets,
     "--bench PRESET|RIG": lambda: _presets(rotors=False),
     "RIG|PRESET": _presets,
-    "--scenario NAME": _scenarios,
+    "--scenario NAME[:SIZE][@S]": _scenarios,
     "--method NAME": _methods,
     "--port PORT": lambda: ("emulated", "simulated"),
 }

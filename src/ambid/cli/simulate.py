@@ -11,7 +11,7 @@ import typer
 from ambid.cli.options import Values, verb
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import progress
-from ambid.errors import counted
+from ambid.errors import AmbidError, counted
 from ambid.settings.caller import refuse_given
 
 if TYPE_CHECKING:
@@ -37,7 +37,6 @@ def command(v: Values) -> None:
         refuse_given(of_excitation, "--scenario takes no {}. Omit {}")
         _run_scenario(v, preset)
         return
-    refuse_given(v.only("at size"), "{} is for --scenario. Omit {}")
     if not v.nonlinear:
         refuse_given(v.only("position"), "{} is for --nonlinear. Omit {}")
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):
@@ -78,8 +77,10 @@ def _run_scenario(v: Values, preset: Preset | None) -> None:
     from ambid.simulation import simulate_scenario
     from ambid.simulation.scenarios import damage, scenario
 
-    what, record = scenario(v.scenario), v.out
-    how = v.only("rate_hz amplitude size closed log_excitation force") | {"duration_s": v.duration, "at_s": v.at}
+    name, size_asked, at_s = _named(v.scenario)
+    what, record = scenario(name), v.out
+    how = v.only("rate_hz amplitude closed log_excitation force")
+    how |= {"duration_s": v.duration, "at_s": at_s, "size": size_asked}
     with Outputs(None if preset else Path(v.rig)) as outputs, progress("simulate"):
         outputs.claim(record, "out", _ENDINGS[:2] if what.dropped else _ENDINGS, force=v.force)
         done = simulate_scenario(what, preset or load_rig(Path(v.rig)), seed=v.seed, **how)
@@ -108,6 +109,18 @@ def _run_scenario(v: Values, preset: Preset | None) -> None:
     typer.echo(f"{record}: {counted(n, 'sample')} at {rate:g} Hz{short}, {what_moves}")
     for line in lines:
         typer.echo(line)
+
+
+def _named(text: str) -> tuple[str, float | None, float | None]:
+    """Read ``--scenario``: a name, a size after a colon, a start in s after an at sign."""
+    before, at, start = text.partition("@")
+    name, colon, size = before.partition(":")
+    try:
+        return name, float(size) if colon else None, float(start) if at else None
+    except ValueError:
+        raise AmbidError(
+            f"--scenario is {text!r}; it must be NAME[:SIZE][@SECONDS], such as change:-0.15@2. Correct it"
+        ) from None
 
 
 def warn(done: Simulation) -> None:

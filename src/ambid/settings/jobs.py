@@ -234,7 +234,7 @@ _JOBS = (
     ),
     declare(
         "simulate",
-        "rig out duration rate_hz scenario at size excitation amplitude band periods axes settle excitation_only "
+        "rig out duration rate_hz scenario excitation amplitude band periods axes settle excitation_only "
         "log_excitation seed closed nonlinear position force",
         rig={
             "help": "Rig file, or a bench that 'ambid models' lists.",

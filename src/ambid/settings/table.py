@@ -26,7 +26,6 @@ SETTINGS = (
         "Rig file whose [loop] the controller tries once it levitates, and keeps: the record is made with"
         " it. It returns to the loop before where the rotor moves more than half way to a trip.",
     ),
-    Setting("at", "number", "S", "Start of the scenario, in s.", shown="the scenario's"),
     Setting(
         "at_rest",
         "switch",
@@ -347,8 +346,9 @@ SETTINGS = (
     Setting(
         "scenario",
         "text",
-        "NAME",
-        "A change with known truth, as 'ambid models' lists them; the truth goes into columns true_....",
+        "NAME[:SIZE][@S]",
+        "A change with known truth, as 'ambid models' lists them, its size and its start in s; the truth goes into "
+        "columns true_....",
         shown="nothing changes",
     ),
     Setting(
@@ -371,7 +371,6 @@ SETTINGS = (
         many=True,
     ),
     Setting("settle", "from_zero", "S", "Time after the start that is not recorded, in s.", shown="1 when levitating"),
-    Setting("size", "number", "X", "Size of the change, e.g. -0.15.", shown="the scenario's"),
     Setting("slew", "positive", "V/S", "Largest rate of change of the voltage.", shown="any"),
     Setting(
         "source",
