@@ -32,7 +32,7 @@ from ambid.fleet.run import run_fleet
 from bench.fleet import slowly
 if __name__ == "__main__":
     folder, how = sys.argv[1:]
-    workers = {"scheduler": how} if "://" in how else {how: 2}
+    workers = {"workers": 2} if how == "workers" else {"scheduler": how}
     run_fleet([folder + "/*.txt"], ledger=folder + "/f.db", job=slowly, taken_at="file", limit_s=5.0, **workers)
 """
 
@@ -54,7 +54,7 @@ def beside_a_loop(n: int, folder: Path) -> None:
     loop = [ambid.identify(path) for path in paths]
     alone = time.perf_counter() - begin
     print(f"{n} records of 1,000 samples, one after the other: {alone:.1f} s ({1e3 * alone / n:.1f} ms each)")
-    for name, how in (("two processes", {"workers": 2}), ("Dask, local:2", {"dask": 2})):
+    for name, how in (("two processes", {"workers": 2}), ("Dask, local:2", {"scheduler": "local:2"})):
         begin, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
         table = fleet(paths, **how)
         taken = time.perf_counter() - begin
@@ -139,7 +139,7 @@ def _descendants(pid: int) -> list[int]:
 def main(n: int, kills: int) -> None:
     with tempfile.TemporaryDirectory() as folder:
         beside_a_loop(n, Path(folder))
-    for how in ("workers", "dask", "scheduler"):
+    for how in ("workers", "local:2", "scheduler"):
         with tempfile.TemporaryDirectory() as folder:
             under_kills(kills, Path(folder), how)
 

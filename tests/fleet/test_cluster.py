@@ -21,7 +21,7 @@ from tests.fleet.jobs import double
 async def fails():
     raise RuntimeError("killed as it started")
 if __name__ == "__main__":
-    with _client(distributed, None, 1) as client:
+    with _client(distributed, 1) as client:
         if {gone}:
             for nanny in client.cluster.workers.values():
                 nanny.instantiate = fails

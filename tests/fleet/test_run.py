@@ -124,9 +124,15 @@ def test_another_function_of_the_same_name_is_another_job(monkeypatch):
 def test_a_cluster_gives_the_same_to_the_last_digit():
     pytest.importorskip("distributed", reason="Dask's distributed is not installed")
     records = [ambid.simulate("thesis", duration=0.05, seed=k) for k in (1, 2)]
-    table, here = ambid.fleet(records, dask=1), ambid.fleet(records, workers=1)
+    table, here = ambid.fleet(records, scheduler="local:1"), ambid.fleet(records, workers=1)
     assert table["state"].tolist() == ["done", "done"]
     assert table[["k_i", "k_i sd", "R", "verdict"]].equals(here[["k_i", "k_i sd", "R", "verdict"]])
+
+
+@pytest.mark.parametrize("scheduler", ["local", "local:", "local:0", "local:x", "local:1025"])
+def test_a_cluster_of_no_number_is_refused(scheduler):
+    with pytest.raises(AmbidError, match="local:N has a number of workers, 1 to 1024"):
+        ambid.fleet([], scheduler=scheduler)
 
 
 def test_records_in_memory_give_a_table():

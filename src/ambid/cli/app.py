@@ -45,7 +45,8 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
     "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
     "history": {"export": "--tables"}, "export": {"to": "--library"},
-    "design controller": {"method": "--kind", "export": "--law"}, "fleet run": {"limit": "--time-limit"},
+    "design controller": {"method": "--kind", "export": "--law"},
+    "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "fleet simulate": {"limit": "--time-limit"},
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip

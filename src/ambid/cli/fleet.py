@@ -40,8 +40,8 @@ def run(v: Values) -> None:
         with signals(stop.take), progress("fleet") as show:
             how = v.only("job ledger workers limit_s taken_at scheduler")
             found = run_fleet(
-                v.records, v.rig, settings=_settings(v.set), again=v.again is not None, dask=_local(v.dask),
-                stopped=stop.wished, tick=show, **how,
+                v.records, v.rig, settings=_settings(v.set), again=v.again is not None, stopped=stop.wished,
+                tick=show, **how,
             )  # fmt: skip
         outputs.give(found)
     _show(outputs, found, stop, strict=v.strict)
@@ -88,12 +88,3 @@ def _settings(words: list[str] | None) -> dict[str, Any]:
         except tomllib.TOMLDecodeError:
             found[name] = value
     return found
-
-
-def _local(text: str | None) -> int | None:
-    if text is None:
-        return None
-    where, _, number = text.partition(":")
-    if where != "local" or not number.isdigit() or not int(number):
-        raise AmbidError(f"--dask is {text!r}; it must be local:N with a number of workers. Correct it")
-    return int(number)

@@ -26,8 +26,7 @@ def work_on_cluster(
     job: Callable[[Any], Any],
     tasks: Iterable[Any],
     *,
-    scheduler: str | None,
-    local: int | None,
+    scheduler: str | int,
     limit_s: float,
     stopped: Callable[[], bool] = lambda: False,
 ) -> Generator[Done, None, None]:
@@ -36,13 +35,13 @@ def work_on_cluster(
     A task that is held to have killed its workers is run again alone, when all others are done: it may only have waited
     on them beside the one that did.
 
-    `scheduler`: its address; `local`: instead, number of workers of a cluster on this machine.
+    `scheduler`: its address, or the number of workers of a cluster on this machine.
     """
     try:
         distributed: Any = import_module("distributed")
     except ImportError:
         raise AmbidError("Dask distributed is not installed, and a cluster needs it. Install ambid[fleet]") from None
-    with _client(distributed, scheduler, local) as client:
+    with _client(distributed, scheduler) as client:
         try:
             yield from _answers(distributed, client, job, iter(tasks), limit_s, stopped)
         except (asyncio.CancelledError, distributed.client.FutureCancelledError, OSError) as failure:
@@ -111,7 +110,7 @@ def timed(job: Callable[[Any], Any], task: Any, limit_s: float, caller: Language
 
 
 @contextmanager
-def _client(distributed: Any, scheduler: str | None, local: int | None) -> Iterator[Any]:
+def _client(distributed: Any, scheduler: str | int) -> Iterator[Any]:
     """Yield a client of a cluster; one on this machine lives as long as the context, without a dashboard."""
     import dask
 
@@ -124,7 +123,7 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
         "distributed.worker.profile.enabled": False,  # looks at the stack a hundred times a second
     }
     with dask.config.set(quiet):
-        if scheduler is not None:
+        if isinstance(scheduler, str):
             try:
                 client = distributed.Client(scheduler, timeout=10)
             except (OSError, ValueError) as failure:
@@ -138,7 +137,7 @@ def _client(distributed: Any, scheduler: str | None, local: int | None) -> Itera
         with one_thread_each():
             try:
                 cluster = distributed.LocalCluster(
-                    n_workers=local, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
+                    n_workers=scheduler, threads_per_worker=1, processes=True, host="127.0.0.1", dashboard_address=None,
                     worker_dashboard_address=None, silence_logs=logging.CRITICAL,
                     scheduler_kwargs={"dashboard": False, "dashboard_address": "127.0.0.1:0"},  # any port
                 )  # fmt: skip

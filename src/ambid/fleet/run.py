@@ -37,6 +37,7 @@ _OWN = ("record", "records", "rig", "tick", "units")  # arguments that are no se
 _ASKED = 200  # keys that a ledger is asked for at once
 _STORE_S = 0.25  # results of so long are stored together
 _MOST = 500
+_WORKERS = 1024  # at most
 
 Job = str | Callable[..., Any]
 
@@ -282,27 +283,26 @@ def run_fleet(
     again: bool = False,
     taken_at: str | None = None,
     scheduler: str | None = None,
-    dask: int | None = None,
     stopped: Callable[[], bool] = lambda: False,
     tick: Tick | None = None,
 ) -> FleetRun:
     """Do a job on many records, as `fleet` does; `again`: also those that failed before; `stopped`: ends it early."""
     check_positive({"limit_s": limit_s})
-    for name, n in (("workers", workers), ("dask", dask)):
-        if n is not None:
-            check_whole({name: n}, 1, 1024)
+    if workers is not None:
+        check_whole({"workers": workers}, 1, _WORKERS)
+    local = _local(scheduler)
     job_made = job_of(job, settings or {}, stored=ledger is not None)
     fleet, begin, say = items(records, rigs, taken_at), time.monotonic(), tick or silent
     store = None if ledger is None else open_ledger(ledger)
     try:
         run = _Run(job_made, fleet, store, again=again)
-        if scheduler is None and dask is None:
+        if scheduler is None:
             answers = work(job_made, run.tasks(), workers=workers, limit_s=limit_s, stopped=stopped)
         else:
             from ambid.fleet.cluster import work_on_cluster
 
             answers = work_on_cluster(
-                job_made, run.tasks(), scheduler=scheduler, local=dask, limit_s=limit_s, stopped=stopped
+                job_made, run.tasks(), scheduler=local or scheduler, limit_s=limit_s, stopped=stopped
             )
         try:
             for n, done in enumerate(answers, 1):
@@ -316,9 +316,21 @@ def run_fleet(
             store.close()
     return FleetRun(
         job=job_made.name, settings=job_made.said, ledger=None if store is None else store.shown,
-        workers=dask or workers or cores(), seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
+        workers=local or workers or cores(), seconds=time.monotonic() - begin, records=len(fleet), units=run.units,
         rows=tuple(run.rows[at] for at in sorted(run.rows)),
     )  # fmt: skip
+
+
+def _local(scheduler: str | None) -> int | None:
+    """Return the number of workers where a cluster on this machine is named, as ``local:N``."""
+    where, _, number = (scheduler or "").partition(":")
+    if where != "local":
+        return None
+    if not (number.isdecimal() and 1 <= int(number) <= _WORKERS):
+        raise AmbidError(
+            f"{setting('scheduler', scheduler)}: local:N has a number of workers, 1 to {_WORKERS}. Correct it"
+        )
+    return int(number)
 
 
 def fleet(
@@ -331,7 +343,6 @@ def fleet(
     workers: int | None = None,
     limit_s: float = LIMIT_S,
     scheduler: str | None = None,
-    dask: int | None = None,
     tick: Tick | None = None,
     **settings: Any,
 ) -> pandas.DataFrame:
@@ -359,9 +370,7 @@ def fleet(
     limit_s : float, optional
         Longest time for one record, s.
     scheduler : str, optional
-        Address of a Dask scheduler, ``tcp://…``; or
-    dask : int, optional
-        Number of workers of a Dask cluster on this machine.
+        Cluster of Dask: ``local:2`` for one of two workers on this machine, or a scheduler's address, ``tcp://…``.
     tick : callable, optional
         Called with the progress.
     **settings
@@ -387,5 +396,5 @@ def fleet(
     """
     return run_fleet(
         records, rigs, job=job, settings=settings, ledger=ledger, taken_at=taken_at, workers=workers, limit_s=limit_s,
-        scheduler=scheduler, dask=dask, tick=tick,
+        scheduler=scheduler, tick=tick,
     ).to_dataframe()  # fmt: skip

@@ -184,7 +184,7 @@ _JOBS = (
     ),
     declare(
         "fleet run",
-        "records ledger rig taken_at job set again workers limit_s scheduler dask json plot report strict",
+        "records ledger rig taken_at job set again workers limit_s scheduler json plot report strict",
         records={
             "help": "Files, URLs, or patterns in quotes such as 'records/{bearing}/*.h5', where a word in braces "
             "stands for a part of one name.",

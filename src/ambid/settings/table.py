@@ -73,7 +73,6 @@ SETTINGS = (
         "Criterion that chooses orders: bic, aic, aicc, mdl, fpe, holdout or kfold.",
         default="bic",
     ),
-    Setting("dask", "text", "local:N", "Start a Dask cluster of N workers on this machine."),
     Setting(
         "delay", "text", "S|auto", "Delay of the inputs in s, for the models.", shown="0; with @rig as the rig says"
     ),
@@ -359,7 +358,12 @@ SETTINGS = (
         least=1,
         default=1,
     ),
-    Setting("scheduler", "text", "tcp://HOST:PORT", "Dask scheduler, which somebody has started, with its workers."),
+    Setting(
+        "scheduler",
+        "text",
+        "local:N|tcp://HOST:PORT",
+        "Cluster of Dask: N workers on this machine, or a scheduler that somebody has started, with its workers.",
+    ),
     Setting("seconds", "positive", "S", "Length of the record in s.", default=10.0),
     Setting("seed", "whole", "N", "Seed of excitation and simulated noise.", least=0, default=0),
     Setting("sensitivity", "switch", "", "Show how much each coefficient matters, and which are correlated."),
