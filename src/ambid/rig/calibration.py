@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING
 
 from ambid.errors import AmbidError, RigError
 from ambid.record.calibration import Calibration, read_calibration_table
-from ambid.rig.rotor import read_at
-from ambid.rig.shaft import si_of
+from ambid.rig.rotor import read_at, si_of
 
 if TYPE_CHECKING:
     from ambid.rig.schema import ChannelEntry, RigFile
