@@ -9,9 +9,11 @@ import time
 import pytest
 
 from ambid.cli import info
+from ambid.cli.app import _FORMER
 from ambid.cli.output import Outputs
 from ambid.cli.terminal import plain_where_needed
 from ambid.errors import AmbidError
+from ambid.settings.jobs import JOBS
 
 AMBID = [sys.executable, "-c", "from ambid.cli import main; main()"]
 
@@ -33,6 +35,7 @@ USAGE = {
         ["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--nonlinear"],
         "has no [magnet]; a nonlinear simulation needs one",
     ),
+    "metrics without alarms": (["history", "--ledger", "x.db", "--publish", "a.prom"], "--publish needs --alarms"),
     "rig without rate": (["simulate", "rig.toml", "-o", "x.csv"], "Give --rate HZ"),
     "rig without values": (["simulate", "rig.toml", "-o", "x.csv", "--rate", "1e4", "--amplitude", "1"], "no value"),
 }
@@ -69,6 +72,16 @@ def test_outputs_are_refused_before_any_work(bench, ambid, words, said):
     assert said in found.err
     assert len(found.err.splitlines()) == 1
     assert sorted(p.name for p in bench.iterdir()) == before
+
+
+@pytest.mark.parametrize(("job", "word"), [(job, word) for job, words in _FORMER.items() for word in words])
+def test_a_word_of_a_release_before_is_refused_with_what_it_is_now(ambid, job, word):
+    now = _FORMER[job][word]
+    for found in (ambid(*job.split(), f"--{word}", "1"), ambid(*job.split(), f"--{word}=1")):
+        assert found.code == 2
+        assert found.err == f"ambid: --{word} of 'ambid {job}' is now {now}. Give that\n"
+    if now.startswith("--"):
+        assert now.split()[0] in {s.flag for s in JOBS[job].settings}
 
 
 def test_files_are_put_in_place_together_or_not_at_all(tmp_path):

@@ -219,7 +219,7 @@ def test_the_page_on_monitoring_runs(tmp_path, monkeypatch, capsys):
         )
     Path("rules.toml").write_text(blocks(page, "text")[0], encoding="utf-8")
     for line in "".join(blocks(page, "sh")).splitlines():
-        if "--mqtt" not in line:  # tests/ledger/test_monitor.py has a broker
+        if "broker.example" not in line:  # tests/ledger/test_monitor.py has a broker
             assert run_verb(shlex.split(line)[1:]) == (3 if "--strict" in line else 0), line
     capsys.readouterr()
     exec(compile(blocks(page, "python")[0], "monitoring.md", "exec"), {})

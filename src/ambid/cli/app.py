@@ -44,7 +44,8 @@ _PART = "'ambid validate RESULT RECORD' with --from and --to"
 _FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
     "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
-    "history": {"export": "--tables"}, "export": {"to": "--library"},
+    "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
+    "history": {"export": "--tables", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
     "design controller": {"method": "--kind", "export": "--law"},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "fleet simulate": {"limit": "--time-limit"},

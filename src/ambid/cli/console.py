@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+from pathlib import Path
 
 from ambid.cli.options import Values, verb
 from ambid.errors import AmbidError
@@ -24,11 +25,13 @@ def command(v: Values) -> None:
         if (missing.name or "").startswith("ambid"):
             raise
         raise AmbidError(f"the console needs {missing.name}. Install it: pip install 'ambid[console]'") from None
-    if (v.certificate is None) != (v.key is None):
-        raise AmbidError("--certificate and --key belong together, and one is missing. Give both")
-    for path in (v.certificate, v.key):
-        if path is not None and not path.is_file():
-            raise AmbidError(f"{path} is no file. Correct the path")
+    tls = None
+    if v.certificate is not None:
+        certificate, _, key = v.certificate.partition(",")
+        tls = Path(certificate), Path(key or certificate)
+        for path in tls:
+            if not path.is_file():
+                raise AmbidError(f"{path} is no file. Correct the path")
 
     def ready(link: str) -> None:
         print(f"console of {v.folder}: {link}  (Ctrl-C ends it; runs go on)", flush=True)
@@ -38,7 +41,6 @@ def command(v: Values) -> None:
             webbrowser.open(link)
 
     serve(
-        v.folder, port=v.port, read_only=v.read_only, listen=v.listen,
-        tls=None if v.certificate is None or v.key is None else (v.certificate, v.key),
+        v.folder, port=v.port, read_only=v.read_only, listen=v.listen, tls=tls,
         password=os.environ.get(PASSWORD) or None, on_ready=ready,
     )  # fmt: skip

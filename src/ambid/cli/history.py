@@ -32,10 +32,12 @@ def command(v: Values) -> None:
     place = None if "://" in v.ledger else Path(v.ledger)
     file = None if v.alarms in (None, _USUAL) else Path(str(v.alarms))
     with Outputs(place, file, **v.outputs) as outputs:
-        outputs.claim(v.metrics, "metrics", METRICS_ENDINGS)
+        gauges = [Path(x) for x in v.publish or () if x.endswith(METRICS_ENDINGS)]
+        for path in gauges:
+            outputs.claim(path, "publish", METRICS_ENDINGS)
         rules = BUILT_IN if file is None else read_rules(file)
         if v.alarms is None:
-            refuse_given(v.only("metrics mqtt"), "{} needs --alarms. Give it, or omit {}")
+            refuse_given(v.only("publish"), "{} needs --alarms. Give it, or omit {}")
         if v.bearing is None and v.alarms is None:
             refuse_given(v.only("json plot report strict"), "{} is for one bearing. Name it, or omit {}")
         with open_ledger(v.ledger, write=False) as found:
@@ -45,10 +47,10 @@ def command(v: Values) -> None:
             if v.alarms is not None:
                 names = [b.name for b in found.bearings()] if v.bearing is None else [v.bearing]
                 result = watched = watch((found.history(name) for name in names), rules)
-                if v.metrics is not None:
-                    outputs.stage(v.metrics, lambda beside: write_metrics(watched, beside))
-                if v.mqtt is not None:
-                    typer.echo(f"{counted(publish(watched, v.mqtt), 'message')} sent to {v.mqtt}", err=True)
+                for path in gauges:
+                    outputs.stage(path, lambda beside: write_metrics(watched, beside))
+                for broker in (x for x in v.publish or () if not x.endswith(METRICS_ENDINGS)):
+                    typer.echo(f"{counted(publish(watched, broker), 'message')} sent to {broker}", err=True)
             elif v.bearing is None:
                 typer.echo(bearings_text(found.bearings(), found.failures().values(), paint=painter()))
                 return

@@ -417,8 +417,8 @@ def serve(
     local = listen in ("127.0.0.1", "localhost", "::1")
     if not local and (tls is None or not password):
         raise AmbidError(
-            f"{setting('listen', listen)} lets others on the network in; it needs {setting('certificate')}, "
-            f"{setting('key')} and a password. Give them"
+            f"{setting('listen', listen)} lets others on the network in; it needs {setting('certificate')} and a "
+            "password. Give them"
         )
     try:
         family = socket.AF_INET6 if ":" in listen else socket.AF_INET
@@ -446,7 +446,7 @@ def serve(
     except OSError as failure:  # also one of TLS
         listening.close()
         raise AmbidError(
-            f"{setting('certificate')} and {setting('key')} cannot be used: {failure}. Give PEM files of one pair"
+            f"{setting('certificate')} cannot be used: {failure}. Give PEM files of one pair, or one that holds both"
         ) from None
     server = uvicorn.Server(config)
     try:

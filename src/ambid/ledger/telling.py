@@ -38,7 +38,7 @@ def write_metrics(watched: Watched, path: str | Path) -> None:
         from prometheus_client import CollectorRegistry, Gauge, generate_latest
     except ImportError:
         raise AmbidError(
-            f"prometheus-client is not installed, and {setting('metrics')} needs it. Install ambid[metrics]"
+            f"prometheus-client is not installed, and {setting('publish')} needs it. Install ambid[metrics]"
         ) from None
     registry = CollectorRegistry()
 
@@ -88,10 +88,12 @@ def publish(watched: Watched, where: str) -> int:
         from paho.mqtt.client import Client, MQTTv5
         from paho.mqtt.enums import CallbackAPIVersion
     except ImportError:
-        raise AmbidError(f"paho-mqtt is not installed, and {setting('mqtt')} needs it. Install ambid[mqtt]") from None
+        raise AmbidError(
+            f"paho-mqtt is not installed, and {setting('publish')} needs it. Install ambid[mqtt]"
+        ) from None
     if "@" in where:
         raise AmbidError(
-            f"{setting('mqtt')} takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead"
+            f"{setting('publish')} takes no user or password: give AMBID_MQTT_USER and AMBID_MQTT_PASSWORD instead"
         )
     plain = where.removeprefix("mqtts://")
     address, _, topic = plain.removeprefix("mqtt://").partition("/")
@@ -99,7 +101,7 @@ def publish(watched: Watched, where: str) -> int:
     secure = plain != where
     if not host or not topic.strip("/") or set(topic) & set("+#") or not (not port or port.isdigit()):
         raise AmbidError(
-            f"{setting('mqtt')} is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it"
+            f"{setting('publish')} is {where!r}; it must be HOST[:PORT]/TOPIC, such as localhost/works. Correct it"
         )
     replies = Queue[str]()
     client = Client(CallbackAPIVersion.VERSION2, protocol=MQTTv5)
@@ -113,7 +115,7 @@ def publish(watched: Watched, where: str) -> int:
         client.loop_start()
         refused = replies.get(timeout=PATIENCE_S)
         if refused:
-            raise AmbidError(f"{setting('mqtt', where)}: {refused}. Check user and password")
+            raise AmbidError(f"{setting('publish', where)}: {refused}. Check user and password")
         sent = [
             client.publish(f"{topic.strip('/')}/{_plain(h.bearing)}", _message(watched, h), qos=1, retain=True)
             for h in watched.used or ()
@@ -123,12 +125,14 @@ def publish(watched: Watched, where: str) -> int:
         lost = sum(not message.is_published() for message in sent)
         if lost:
             raise AmbidError(
-                f"{setting('mqtt', where)}: the broker did not confirm {counted(lost, 'message')}. Check it"
+                f"{setting('publish', where)}: the broker did not confirm {counted(lost, 'message')}. Check it"
             )
     except Empty:
-        raise AmbidError(f"{setting('mqtt', where)}: the broker was silent for {PATIENCE_S:.0f} s. Check it") from None
+        raise AmbidError(
+            f"{setting('publish', where)}: the broker was silent for {PATIENCE_S:.0f} s. Check it"
+        ) from None
     except (OSError, ValueError, RuntimeError) as failure:
-        raise AmbidError(f"{setting('mqtt', where)}: {failure}. Check broker, user and network") from None
+        raise AmbidError(f"{setting('publish', where)}: {failure}. Check broker, user and network") from None
     finally:
         client.disconnect()
         client.loop_stop()

@@ -79,7 +79,7 @@ _JOBS = (
     ),
     declare(
         "console",
-        "folder port no_browser read_only listen certificate key",
+        "folder port no_browser read_only listen certificate",
         port={
             "help": "Port of the page; 0: any that is free.",
             "default": 0,
@@ -118,7 +118,7 @@ _JOBS = (
     ),
     declare(
         "history",
-        "ledger bearing export alarms metrics mqtt json plot report strict",
+        "ledger bearing export alarms publish json plot report strict",
         ledger={"help": "The ledger: file of SQLite, or URL of PostgreSQL.", "required": True},
         bearing={
             "help": "Name of the bearing; without it all are listed.",

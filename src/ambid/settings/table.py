@@ -57,7 +57,7 @@ SETTINGS = (
         many=True,
         required=True,
     ),
-    Setting("certificate", "path", "FILE", "TLS certificate, PEM."),
+    Setting("certificate", "text", "FILE|CERT,KEY", "TLS certificate with its key, PEM: in one file, or in two."),
     Setting(
         "closed",
         "loop",
@@ -181,7 +181,6 @@ SETTINGS = (
     ),
     Setting("json", "text", "FILE", "Write the result as JSON; - for standard output."),
     Setting("judges", "whole", "N", "Plants that judge the design.", least=1, default=200),
-    Setting("key", "path", "FILE", "TLS key, PEM."),
     Setting(
         "layout",
         "words",
@@ -224,7 +223,6 @@ SETTINGS = (
         choices=("auto", "periodic", "random", "local"),
         default="auto",
     ),
-    Setting("metrics", "path", "FILE.prom", "Write latest values and alarms for Prometheus; needs @alarms."),
     Setting(
         "mode",
         "text",
@@ -239,13 +237,6 @@ SETTINGS = (
         "auto|N",
         "Find modes of vibration by maximum likelihood: frequency, damping, shape over the outputs; N: so"
         " many. Without @input: operational modes.",
-    ),
-    Setting(
-        "mqtt",
-        "text",
-        "HOST[:PORT]/TOPIC",
-        "Send latest values and alarms to a broker of MQTT; needs @alarms. User and password: "
-        "AMBID_MQTT_USER, AMBID_MQTT_PASSWORD.",
     ),
     Setting("no_browser", "switch", "", "Print the link only."),
     Setting("no_live", "switch", "", "No live view of the track.", short="quiet"),
@@ -301,6 +292,14 @@ SETTINGS = (
         "text",
         "NAME",
         "Instead of a record: the rig of a bench that 'ambid models' lists; prototype has a controller.",
+    ),
+    Setting(
+        "publish",
+        "text",
+        "FILE.prom|HOST[:PORT]/TOPIC",
+        "Tell latest values and alarms: to Prometheus by a file, or to a broker of MQTT (user and password: "
+        "AMBID_MQTT_USER, AMBID_MQTT_PASSWORD); repeatable; needs @alarms.",
+        many=True,
     ),
     Setting("rate_hz", "positive", "HZ", "Sampling rate in Hz, for a record without time."),
     Setting("read_only", "switch", "", "Refuse what changes something."),
