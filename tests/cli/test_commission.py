@@ -75,8 +75,9 @@ def test_a_good_bench_ends_with_0_and_a_line_that_runs_next(commission, ambid):
 
 @pytest.mark.usefixtures("bench_program", "firmware_elf")
 def test_the_firmware_on_the_emulated_bench_is_commissioned_and_its_loop_made_better(commission, monkeypatch):
-    few = partial(job.design_controller, plants=12, judges=12)  # what a design is worth its own tests say
+    few = partial(job.design_controller, plants=12)  # what a design is worth its own tests say
     monkeypatch.setattr("ambid.job.commissioning.design_controller", few)
+    monkeypatch.setattr("ambid.job.controller_design._JUDGES", 12)
     done = commission(*QUICK, "--redesign", port="emulated")
     assert done.code == 0, done.out + done.err
     assert set(REDESIGNED) < files()

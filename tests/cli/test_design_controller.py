@@ -8,7 +8,7 @@ import ambid as package
 from ambid.cli import run
 from ambid.rig import load_rig
 
-FEW = ("--plants", "8", "--judges", "12")
+FEW = ("--plants", "8")
 
 
 @pytest.fixture(scope="module")
@@ -29,7 +29,9 @@ def designed(made):
     """The files of a design, and its result."""
     words = ("-o", made / "new.toml", "--json", made / "d.json", "--plot", made / "d.png", "--report", made / "d.html",
              "--law", made / "law.c")  # fmt: skip
-    assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("ambid.job.controller_design._JUDGES", 12)
+        assert run(["design", "controller", str(made / "e.json"), *FEW, *map(str, words)]) == 0
     return package.load(made / "d.json")
 
 

@@ -34,6 +34,7 @@ def test_a_law_is_judged_as_the_words_that_the_controller_gets():
 def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
     rig = rig_of_preset(ambid.preset("rmit-axis"))
     known = ambid.identify(ambid.simulate("rmit-axis", duration=0.3, seed=1), rig)
+    monkeypatch.setattr(room, "_JUDGES", 3)
 
     def given(change):
         monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: change(rig.loop))
@@ -42,22 +43,23 @@ def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
     with pytest.raises(
         EstimationError, match=r"none is offered. Give the goal peak alone, or limits={'peak': "
     ) as told:
-        design_controller(known, rig, plants=3, judges=3)
+        design_controller(known, rig, plants=3)
     least = float(str(told.value).rpartition("'peak': ")[2].removesuffix("}"))
-    found = design_controller(known, rig, plants=3, judges=3, limits={"peak": least})
+    found = design_controller(known, rig, plants=3, limits={"peak": least})
     assert found.after.worst.peak > found.before.worst.peak
     given(lambda loop: replace(loop, kd=0.0))
     with pytest.raises(EstimationError, match=r"does not hold 3 of the 3 plants that judge, the present one loses 0"):
-        design_controller(known, rig, plants=3, judges=3)
+        design_controller(known, rig, plants=3)
 
 
 def test_a_rotors_loop_with_a_higher_peak_is_refused_too(monkeypatch):
     rig = rig_of_preset(ambid.preset("rmit"))
     known = ambid.identify(ambid.simulate("rmit", duration=1.0, seed=1), rig)
     worse = replace(rig.loop, kd=0.7 * rig.loop.kd)
+    monkeypatch.setattr(room, "_JUDGES", 2)
     monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: worse)
     with pytest.raises(EstimationError, match=r"none is offered. Give the goal peak alone, or limits={'peak': "):
-        design_controller(known, rig, plants=2, judges=2)
+        design_controller(known, rig, plants=2)
 
 
 def test_a_loop_that_holds_more_plants_and_is_better_on_the_others_is_not_refused():

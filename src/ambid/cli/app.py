@@ -40,13 +40,13 @@ VERBS = {
 """What each verb does, in the order of the help."""
 _BESIDE = {"compare": "fit", "models": "info", "validate": "identify"}  # verbs in the file of another
 _PART = "'ambid validate RESULT RECORD' with --from and --to"
-# Words of the releases before, by job: what each is now.
+# Words of the releases before, by job: what each is now; nothing where it is gone.
 _FORMER: Mapping[str, Mapping[str, str]] = {
     "fit": {"settings": "--orders", "validate-from": _PART, "validate-to": _PART},
     "identify": {"magnet": "magnet.kind of the rig", "off-below": "magnet.off_below of the rig"},
     "console": {"key": "--certificate CERT,KEY"}, "export": {"to": "--library"},
     "history": {"export": "--tables", "metrics": "--publish FILE.prom", "mqtt": "--publish HOST[:PORT]/TOPIC"},
-    "design controller": {"method": "--kind", "export": "--law"},
+    "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "fleet simulate": {"limit": "--time-limit"},
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
@@ -122,7 +122,8 @@ def _refuse_former(words: Sequence[str]) -> None:
     for word in words if job else ():
         new = _FORMER[job].get(word.partition("=")[0].removeprefix("--")) if word.startswith("--") else None
         if new is not None:
-            raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is now {new}. Give that")
+            now = f"now {new}. Give that" if new else "gone. Omit it"
+            raise AmbidError(f"{word.partition('=')[0]} of 'ambid {job}' is {now}")
 
 
 def refusal(error: Exception) -> str | None:

@@ -32,7 +32,7 @@ def experiment(v: Values) -> None:
     of = None if known is not None else Path(v.source)
     with Outputs(of, v.rig, **v.outputs) as outputs, progress("design") as show:
         outputs.claim(v.out, "out", (".csv", ".csv.gz", ".h5", ".hdf5"), force=v.force)
-        how = v.only("seconds period band lines criterion target use slew spread rate_hz closed seed")
+        how = v.only("seconds period band criterion target use slew spread rate_hz closed seed")
         found = design_experiment(known or v.source, v.rig, **how, tick=show)
         outputs.give(found, show)
         if v.out is not None:
@@ -55,7 +55,7 @@ def controller(v: Values) -> None:
     with Outputs(v.estimate, v.rig, **v.outputs) as outputs, progress("design") as show:
         outputs.claim(v.out, "out", force=v.force)
         outputs.claim(v.export, "export", LAW_ENDINGS)
-        how = v.only("method form filters speeds_rpm schedule plants judges seed")
+        how = v.only("method form filters speeds_rpm schedule plants seed")
         how |= {"limits": _figures(v.limits or ()), "spread": _sources(v.spread or ())}
         found = design_controller(v.estimate, v.rig, goals=v.goals or GOALS, **how, tick=show)
         outputs.give(found, show)

@@ -55,6 +55,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.settings.caller import by_name, check_whole
 from ambid.simulation.margins import zone_of
 
+_JUDGES = 200  # plants that judge a design
 _ROUNDS = 3  # in which the limits are met on the plants that judge too
 _TURNED = 5  # plants that are turned at speeds, for the curve
 _STEP = 1.5  # settling times over which a force step is drawn
@@ -95,7 +96,6 @@ def design_controller(
     speeds_rpm: tuple[float, float] | None = None,
     schedule: int = 1,
     plants: int = 60,
-    judges: int = 200,
     seed: int = 0,
     tick: Tick | None = None,
 ) -> Design:
@@ -130,8 +130,8 @@ def design_controller(
         Of a rotor, between which the plants turn; default: from rest to the speed of rig or estimate.
     schedule : int
         Laws over these speeds, of which the nearest orders; of "lqg" and "hinf".
-    plants, judges : int
-        How many plants the design is tuned over, and how many judge it.
+    plants : int
+        How many the design is tuned over; 200 others judge it.
     seed : int
         Of the plants.
     tick : callable, optional
@@ -156,7 +156,7 @@ def design_controller(
     >>> from ambid.rig.draft import rig_of_preset
     >>> rig = rig_of_preset(ambid.preset("rmit-axis"))
     >>> found = ambid.identify(ambid.simulate("rmit-axis", duration=0.5, seed=1), rig)
-    >>> design = ambid.design_controller(found, plants=8, judges=8)
+    >>> design = ambid.design_controller(found, plants=8)
     >>> design.after.worst.peak < design.before.worst.peak
     True
     """
@@ -170,7 +170,7 @@ def design_controller(
         raise EstimationError(f"method {method!r} of a design is unknown; known: {names} Give one of them")
     if bench.loop is None or not bench.loop.closed:
         raise EstimationError("the rig has no [loop]; a design begins with the present controller. Give [loop]")
-    check_whole({"plants": plants, "judges": judges, "schedule": schedule}, 1)
+    check_whole({"plants": plants, "schedule": schedule}, 1)
     check_whole({"seed": seed, "filters": filters})
     design = _method(method, form, filters)
     speeds = _speeds(known, bench, speeds_rpm)
@@ -179,7 +179,7 @@ def design_controller(
             raise EstimationError("a schedule is of lqg or hinf on a rotor that turns. Omit it, or give both")
         design = _scheduled(design, speeds[1], schedule)
     with one_thread():
-        problem = _problem(known, bench, sources, (plants, judges, seed), speeds)
+        problem = _problem(known, bench, sources, plants, seed, speeds)
         found = _designed(problem, method, design, goals, asked, say, clock)
     return replace(found, timing_s=clock.laps)
 
@@ -251,11 +251,8 @@ def _speeds(known: Numbers, bench: Rig, given: tuple[float, float] | None) -> In
     return (0.0, top) if top else None
 
 
-def _problem(
-    known: Numbers, bench: Rig, spread: Spread, sizes: tuple[int, int, int], speeds: Interval | None
-) -> _Problem:
+def _problem(known: Numbers, bench: Rig, spread: Spread, plants: int, seed: int, speeds: Interval | None) -> _Problem:
     """Return the plants around an estimate, and the present loop on it."""
-    plants, judges, seed = sizes
     sd = known.noise.sensor_sd if isinstance(known, Estimate) else known.noise
     position, current, assumed = noise_of(bench.noise, sd)
     white = replace(bench.noise or Noise(), position=position, current=current, position_resolution=0.0,
@@ -268,7 +265,7 @@ def _problem(
     seeds = 2 * seed, 2 * seed + 1
     tuning, judging = (
         draw_plants(plant, rig, n, seed=k, spread=spread, point=point)
-        for k, n in zip(seeds, (plants, judges), strict=True)
+        for k, n in zip(seeds, (plants, _JUDGES), strict=True)
     )
     if speeds is not None:
         tuning, judging = over_speeds(tuning, speeds), over_speeds(judging, speeds)

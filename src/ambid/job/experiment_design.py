@@ -290,7 +290,7 @@ def _designed(known: Known | None, bench: AnyBench, wanted: Wanted, say: Tick) -
     ):
         raise AmbidError(
             f"{min(wanted.lines, task.candidates().size)} lines in {task.periods} periods; a rotor is identified from "
-            f"{LEAST_LINES} lines and {LEAST_PERIODS} periods at least. Change {setting('lines')}, "
+            f"{LEAST_LINES} lines and {LEAST_PERIODS} periods at least. Change "
             f"{setting('band')}, {setting('period')} or {setting('seconds')}"
         )
     say("design")

@@ -134,7 +134,7 @@ _JOBS = (
     ),
     declare(
         "design experiment",
-        "source out rig seconds period band lines criterion target use slew spread rate_hz closed seed json plot "
+        "source out rig seconds period band criterion target use slew spread rate_hz closed seed json plot "
         "report strict force",
         out={"help": "Write one period of the excitation: .csv, .csv.gz or .h5.", "required": False},
         seconds={"shown": "10", "default": None},
@@ -145,7 +145,7 @@ _JOBS = (
     ),
     declare(
         "design controller",
-        "estimate rig out method goals limits spread form filters speeds_rpm schedule plants judges seed json "
+        "estimate rig out method goals limits spread form filters speeds_rpm schedule plants seed json "
         "plot report export strict force",
         estimate={
             "help": "What 'ambid identify @json' wrote.",

@@ -180,7 +180,6 @@ SETTINGS = (
         required=True,
     ),
     Setting("json", "text", "FILE", "Write the result as JSON; - for standard output."),
-    Setting("judges", "whole", "N", "Plants that judge the design.", least=1, default=200),
     Setting(
         "layout",
         "words",
@@ -199,7 +198,6 @@ SETTINGS = (
         many=True,
         shown="what the present loop has",
     ),
-    Setting("lines", "whole", "N", "How many lines are excited, at most.", least=2, default=100),
     Setting(
         "listen",
         "text",
