@@ -67,7 +67,7 @@ def scores(case: Case, seed: int) -> tuple[Array, Array]:
     done = simulate_scenario(
         case.scenario, preset("unstable-bearing"), duration_s=case.seconds, seed=seed, **case.words
     )
-    followed = track(done.record, start_s=START_S, memory=case.memory)  # type: ignore[arg-type]
+    followed = track(done.record, start=START_S, memory=case.memory)  # type: ignore[arg-type]
     t = np.array([line.t for line in followed.lines])
     columns = truth_columns(done.record)
     found = np.empty((t.size, len(PHYSICAL)))

@@ -43,7 +43,7 @@ def main(seed: int = 1) -> Result:
     simulation = simulate_scenario(
         "change", preset("unstable-bearing"), duration_s=LENGTH_S, at_s=CHANGE_S, size=-0.15, seed=seed
     )
-    followed = track(simulation.record, start_s=START_S)
+    followed = track(simulation.record, start=START_S)
 
     print(f"{simulation.record.n_samples} samples at {simulation.record.rate_hz:g} Hz, closed loop")
     for line in followed.lines:

@@ -26,7 +26,7 @@ record[1.9:2.1].plot()
 # The first second gives the starting estimate; from there on the record is followed block by block, without looking
 # ahead. A new value is published only after later data have confirmed it.
 
-track = ambid.track(record, start_s=1.0)
+track = ambid.track(record, start=1.0)
 track
 
 # %%

@@ -30,7 +30,7 @@ def test_the_same_record_rig_settings_and_version_is_kept_once(demo, ambid, monk
     assert again.out.splitlines()[0] == first.out.splitlines()[0]
     assert again.err == "l.db has this already (same record, rig, settings and version); nothing was added\n"
     assert "stored in" in ambid(*WORDS, "--taken-at", "2026-04-01", "--from", "0.05").err  # other settings
-    tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start-seconds", "0.2", "--quiet")
+    tracked = ambid("track", *WORDS[1:], "--taken-at", "file", "--start", "0.2")
     assert (tracked.code, "stored in" in tracked.err) == (0, True)
     with open_ledger("l.db", write=False) as ledger:
         found = ledger.history("pump 1")

@@ -62,11 +62,11 @@ def test_a_track_is_printed_written_and_drawn(bench, ambid, job, whole):
 
 
 def test_options_reach_the_job(bench, ambid, job):
-    words = "--start-seconds 0.02 --every 0.5 --limit 2 --memory 3.5 --pace real-time --from 0.01 --to 0.1 --rate 1e4"
+    words = "--start 0.02 --every 0.5 --limit 2 --memory 3.5 --pace real-time --from 0.01 --to 0.1 --rate 1e4"
     flags = ("--flag", "5:track", "--flag", "1.5:hold")
     assert ambid("track", "record.csv", *words.split(), *flags).code == 0
     expected = {
-        "start": None, "start_s": 0.02, "every_s": 0.5, "limit": 2.0, "memory": 3.5, "pace": "real-time",
+        "start": 0.02, "every_s": 0.5, "limit": 2.0, "memory": 3.5, "pace": "real-time",
         "from_s": 0.01, "to_s": 0.1, "rate_hz": 1e4, "flags": ((1.5, "hold"), (5.0, "track")), "keep": False,
     }  # fmt: skip
     assert {name: job[name] for name in expected} == expected
@@ -84,7 +84,7 @@ REFUSED = {
     "no time": (["--flag", "hold"], "--flag hold is not of the form T:FLAG"),
     "no number": (["--flag", "soon:hold"], "--flag soon:hold is not of the form T:FLAG"),
     "pace": (["--pace", "slow"], "'--pace'"),
-    "two starts": (["--start", "rig.toml", "--start-seconds", "1"], "Omit one of them"),
+    "no seconds": (["--start", "-1"], "--start is -1.0; it must be a positive number"),
     "the record": (["--json", "record.csv"], "is also an input"),
     "the start": (["--start", "e.json", "--json", "e.json"], "is also an input"),
     "no picture": (["--plot", "track.jpeg"], "must end in .png"),

@@ -45,7 +45,7 @@ def here(folder, monkeypatch):
 
 
 def test_the_track_of_a_change_obeys_the_contract(here, ambid):
-    found = ambid("track", "change.csv", "--json", "t.jsonl", "--plot", "t.png", "--strict", "--start-seconds", "1")
+    found = ambid("track", "change.csv", "--json", "t.jsonl", "--plot", "t.png", "--strict", "--start", "1")
     assert (found.code, found.err) == (0, "")
     assert (here / "t.png").stat().st_size > 10_000
     first, *lines, last = lines_of(here / "t.jsonl")
@@ -81,7 +81,7 @@ def test_samples_that_were_lost_are_events_of_their_kind(here, ambid):
     rows = (here / "change.csv").read_text().splitlines()
     at = next(k for k, row in enumerate(rows) if row.startswith("1.2"))
     (here / "gap.csv").write_text("\n".join(rows[:at] + rows[at + 37 :]) + "\n")
-    assert ambid("track", "gap.csv", "--json", "g.jsonl", "--start-seconds", "1", "--to", "1.5").code == 0
+    assert ambid("track", "gap.csv", "--json", "g.jsonl", "--start", "1", "--to", "1.5").code == 0
     _, *lines, last = lines_of(here / "g.jsonl")
     (event,) = [x["event"] for x in lines if x["event"]]
     assert (event["kind"], event["samples"], last["summary"]["rejected_samples"]) == ("rejected", 37, 37)
@@ -120,7 +120,7 @@ def test_starts_that_do_not_fit_are_refused_on_one_line(here, ambid):
         (("--start", "fit.json"), "starts from linear physical parameters"),
         (("--start", "none.json"), "none.json"),
         (("--to", "0.001"), ""),
-        (("--start-seconds", "9"), "leaves nothing"),
+        (("--start", "9"), "leaves nothing"),
     )
     for words, said in cases:
         found = ambid("track", "change.csv", *words)

@@ -180,7 +180,7 @@ def test_the_start_passes_over_a_damaged_beginning(tmp_path, steady):
     assert found.lines[0].t > 0.83 + 100 / RATE
     assert far(found, TRUE) == {}
     with pytest.raises(AmbidError, match="damaged"):
-        track(tmp_path / "r.csv", start_s=0.5)
+        track(tmp_path / "r.csv", start=0.5)
 
 
 def test_a_start_from_a_file_begins_at_the_first_sample(tmp_path, steady):
@@ -204,7 +204,7 @@ def test_starts_that_do_not_fit_are_refused(tmp_path, steady):
 def test_records_that_are_too_short_are_refused(steady):
     record, _ = steady
     with pytest.raises(AmbidError, match="leaves nothing"):
-        track(record, start_s=5.0)
+        track(record, start=5.0)
     with pytest.raises(AmbidError):
         track(record, to_s=0.002)
 
@@ -263,8 +263,8 @@ SETTINGS = [
     {"every_s": float("nan")}, {"every_s": float("inf")}, {"every_s": 0.0}, {"every_s": -1.0},
     {"limit": float("inf")}, {"limit": float("nan")}, {"limit": 0.0}, {"memory": "x"}, {"memory": float("nan")},
     {"memory": 1e300}, {"memory": 0.0}, {"pace": "x"}, {"flags": [(float("nan"), "hold")]},
-    {"flags": [(0.1, "holt")]}, {"flags": [("x", "hold")]}, {"flags": "hold"}, {"start_s": 0.1}, {"rate_hz": 100.0},
-    {"rig": 3}, {"start": 3}, {"from_s": "x"},
+    {"flags": [(0.1, "holt")]}, {"flags": [("x", "hold")]}, {"flags": "hold"}, {"start": -0.1}, {"rate_hz": 100.0},
+    {"rig": 3}, {"start": [3]}, {"from_s": "x"},
 ]  # fmt: skip
 
 

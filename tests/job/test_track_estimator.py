@@ -79,7 +79,7 @@ def test_feedback_biases_and_is_told_unless_a_reference_is_the_instrument() -> N
 def test_joint_filters_follow_physical_parameters_from_an_identified_start(method: str) -> None:
     bench = preset("unstable-bearing")
     record = simulate_scenario("steady", bench, duration_s=1.0, seed=2).record
-    found = track(record, method=method, start_s=0.6, memory=5.0)
+    found = track(record, method=method, start=0.6, memory=5.0)
     value, sd = last(found)
     for name in ("m", "k_i", "R"):
         assert abs(value[name] - bench.parameters[name]) < 5 * sd[name]
@@ -98,7 +98,7 @@ def test_joint_filters_follow_physical_parameters_from_an_identified_start(metho
         ("lms", {"memory": 1.0}, "no memory"),
         ("iv", {}, "with reference"),
         ("armax", {"orders": None}, "needs orders"),
-        ("rls", {"start_s": 1.0}, "no start_s"),
+        ("rls", {"start": 1.0}, "no start"),
         ("ekf", {}, "no input"),
         ("rls", {"pace": "real-time"}, "no supervisor"),
         ("rls", {"output": ("y", "r")}, "one output"),

@@ -55,7 +55,7 @@ def test_it_follows_the_bench_from_an_estimate(start):
 
 def test_without_a_start_it_identifies_the_first_part_and_tracks_the_rest():
     with Spoiled(RIG) as device:
-        done = track_live(device, RIG, course(6.0), start_s=4.0)
+        done = track_live(device, RIG, course(6.0), start=4.0)
     assert done.run.complete
     assert done.track.totals.samples == 4000  # what came while it identified is tracked too, from the part's end on
     assert done.track.lines[-1].t == pytest.approx(6.0, abs=0.02)
@@ -165,7 +165,7 @@ def test_a_fault_before_there_is_enough_says_so(start):
         Spoiled(RIG, spoil=trip) as device,
         pytest.raises(DeviceError, match=r"stream ended after .* s \(\w+, .*limits"),
     ):
-        track_live(device, RIG, course(6.0), start_s=5.0)
+        track_live(device, RIG, course(6.0), start=5.0)
 
 
 def test_a_fault_while_it_tracks_ends_the_track_in_order(start):

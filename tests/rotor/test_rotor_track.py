@@ -90,7 +90,7 @@ def test_what_cannot_be_tracked_is_refused(jump: tuple[Any, Any, Record]) -> Non
     refused: list[tuple[dict[str, Any], str]] = [
         ({"record": record[0.0 : 1.5 * _PERIOD_S], "rig": rig}, "not periodic"),
         ({"record": record, "rig": rig, "method": "ekf"}, "for one axis"),
-        ({"record": record, "rig": rig, "start_s": 100.0}, "13 whole periods"),
+        ({"record": record, "rig": rig, "start": 100.0}, "13 whole periods"),
         ({"record": record, "start": start}, "estimate of a rotor"),
         ({"record": record_of(replace(spin, periods=2), 1), "rig": free_rig(spin), "start": start}, "has no Ip"),
     ]

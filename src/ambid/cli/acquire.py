@@ -75,7 +75,7 @@ def command(v: Values) -> None:
             else:
                 opening = ready(v.port, known, wanted, bench=behind, pace=v.pace, force=v.force, note=note, tick=stage)
                 with opening as (device, course):
-                    done, track_end = job.follow(device, course, start, v.json, quiet=v.no_live)
+                    done, track_end = job.follow(device, course, start, v.json)
     except KeyboardInterrupt:
         typer.echo(f"ambid: interrupted{_left(v.out, _changed(v.out) != before)}", err=True)
         raise typer.Exit(stop.code or INTERRUPTED) from None
@@ -93,7 +93,7 @@ class Recording:
         self.rig, self.port, self.path, self.settle_s, self.stop, self.force = rig, port, record, settle_s, stop, force
 
     def follow(
-        self, device: Device, course: Course, start: Estimate | None, json: str | None, *, quiet: bool
+        self, device: Device, course: Course, start: Estimate | None, json: str | None
     ) -> tuple[Acquired, Callable[[], None]]:
         """Record, and track what is recorded from `start`, or from an estimate of the first part.
 
@@ -103,7 +103,7 @@ class Recording:
         from ambid.cli.live import Follower
         from ambid.job.track_live import track_live
 
-        follower = Follower(json, keep=False, quiet=quiet, real_time=device.info.kind == "serial")
+        follower = Follower(json, keep=False, real_time=device.info.kind == "serial")
         runs: list[RunReport] = []
         failures: list[AmbidError] = []
 

@@ -49,6 +49,7 @@ _FORMER: Mapping[str, Mapping[str, str]] = {
     "design controller": {"method": "--kind", "export": "--law", "judges": ""}, "design experiment": {"lines": ""},
     "fleet run": {"limit": "--time-limit", "dask": "--scheduler local:N"},
     "fleet simulate": {"limit": "--time-limit"},
+    "acquire": {"no-live": "", "quiet": ""}, "track": {"start-seconds": "--start S", "no-live": "", "quiet": ""},
     "simulate": {"at": "--scenario NAME@S", "size": "--scenario NAME:SIZE"},
 }  # fmt: skip
 

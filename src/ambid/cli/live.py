@@ -51,11 +51,11 @@ class Stopped(KeyboardInterrupt):
 class Follower:
     """Follows one run.
 
-    `json`: as given: where lines are written; `keep`: keep columns for a figure; `quiet`: no live view; `real_time`:
-    whether the record is replayed as it was taken.
+    `json`: as given: where lines are written; `keep`: keep columns for a figure; `real_time`: whether the record
+    is replayed as it was taken.
     """
 
-    def __init__(self, json: str | None, *, keep: bool, quiet: bool, real_time: bool) -> None:
+    def __init__(self, json: str | None, *, keep: bool, real_time: bool) -> None:
         """Begin before the run."""
         from ambid.tracking.lines_file import TrackWriter
 
@@ -68,7 +68,7 @@ class Follower:
         self.code = 0
         target = self.path or (None if self.table else sys.stdout)
         self._writer = None if target is None else TrackWriter(target)
-        self._live = not quiet and sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
+        self._live = sys.stderr.isatty() and (self.table or not sys.stdout.isatty())
         self._keep, self._real_time = keep, real_time
         self._flags: deque[Flag] = deque()
         self._pressed = ""

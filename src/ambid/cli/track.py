@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -31,7 +32,8 @@ def command(v: Values) -> None:
     from ambid.rig import load_rig
 
     times = _flags(v.flags)
-    how = v.only("start start_s every_s limit pace rate_hz") | {"memory": _memory(v.memory), "flags": times}
+    start = Path(x) if isinstance(x := _number(v.start), str) else x
+    how = v.only("every_s limit pace rate_hz") | {"start": start, "memory": _number(v.memory), "flags": times}
     check_settings(how)
     own = {name: x for name, x in v.only("input output reference orders open_loop step").items() if x}
     if v.method == "rpem" and own:
@@ -40,15 +42,13 @@ def command(v: Values) -> None:
         )
     how |= own | ({"layout": v.layout} if v.layout else {}) | v.only("method from_s to_s")
     with keeping(v, "track", [v.record], **how) as store:
-        with Outputs(v.record, v.rig, v.start, **v.outputs | {"json": None}) as outputs:
+        with Outputs(
+            v.record, v.rig, start if isinstance(start, Path) else None, **v.outputs | {"json": None}
+        ) as outputs:
             outputs.claim(json_path(v.json), "json")
             bench = None if v.rig is None else load_rig(v.rig)
-            follower = Follower(
-                v.json,
-                keep=v.plot is not None or v.report is not None,
-                quiet=v.no_live,
-                real_time=v.pace == "real-time",
-            )
+            drawn = v.plot is not None or v.report is not None
+            follower = Follower(v.json, keep=drawn, real_time=v.pace == "real-time")
             follower.record, follower.rate_hz = v.record, v.rate_hz
 
             def begin(header: TrackHeader) -> None:
@@ -75,10 +75,10 @@ def _check_interval(every: float, rate_hz: float) -> None:
         )
 
 
-def _memory(text: str) -> Any:
-    """Read ``--memory``: a time in s, or a word, which is judged later."""
+def _number(text: str | None) -> Any:
+    """Read ``--memory`` or ``--start``: a time in s, or a word, which is judged later."""
     try:
-        return float(text)
+        return None if text is None else float(text)
     except ValueError:
         return text
 

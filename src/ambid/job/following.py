@@ -103,9 +103,11 @@ class EstimatorWords(TypedDict, total=False):
 
 def check_settings(said: Mapping[str, Any]) -> None:
     """Refuse what `track` is told where it makes no sense or contradicts itself."""
-    for name in ("every_s", "limit", "start_s", "rate_hz"):
-        if name in said and not (said[name] is None and name in ("start_s", "rate_hz")):
+    for name in ("every_s", "limit", "rate_hz"):
+        if name in said and not (said[name] is None and name == "rate_hz"):
             _positive(setting(name), said[name])
+    if isinstance(said.get("start"), (int, float)):
+        _positive(setting("start"), said["start"])
     for name in ("from_s", "to_s"):
         x = said.get(name)
         if x is not None and math.isnan(_number(x)):
@@ -122,11 +124,6 @@ def check_settings(said: Mapping[str, Any]) -> None:
     pace = said.get("pace", _PACES[0])
     if pace not in _PACES:
         raise EstimationError(f"{setting('pace')} is {pace!r}; known: {', '.join(_PACES)}. Correct it")
-    if said.get("start") is not None and said.get("start_s") is not None:
-        raise EstimationError(
-            f"{setting('start_s')} is for a start identified from the record, but "
-            f"{setting('start')} gives one. Omit one of them"
-        )
     for flag in said.get("flags", ()):
         _check_flag(flag)
 

@@ -66,13 +66,12 @@ def track_estimator(
     record: Source,
     rig: Rig | None,
     method: str,
-    start: Estimate | str | Path | None,
-    start_s: float | None,
+    start: Estimate | str | Path | float | None,
     part: Reading,
     how: Following,
     settings: EstimatorWords,
 ) -> Track:
-    """Follow a record with one of `METHODS` other than ``rpem``; `start` and `start_s` are of a joint filter."""
+    """Follow a record with one of `METHODS` other than ``rpem``; `start` is of a joint filter."""
     if method not in METHODS:
         raise EstimationError(f"method {method!r} is unknown; known: {', '.join(METHODS)}.{nearest(method, METHODS)}")
     inputs, outputs, references = (names_of(settings.get(x)) for x in ("input", "output", "reference"))  # type: ignore[arg-type]
@@ -81,9 +80,9 @@ def track_estimator(
     if method in JOINT:
         columns = {"input": inputs, "output": outputs, "reference": references, "orders": orders}
         refuse_given(columns, refusal)
-        job = _joint(method, record, rig, start, start_s, how.memory, part)
+        job = _joint(method, record, rig, start, how.memory, part)
     else:
-        refuse_given({"rig": rig, "start": start, "start_s": start_s}, refusal)
+        refuse_given({"rig": rig, "start": start}, refusal)
         whole = read_record(record, rate_hz=part.get("rate_hz"), units=part.get("units"), layout=part.get("layout"))
         span = part.get("from_s"), part.get("to_s")
         part_record = whole if span == WHOLE else cut(whole, *span)
@@ -216,14 +215,13 @@ def _joint(
     method: str,
     record: Source,
     rig: Rig | None,
-    start: Estimate | str | Path | None,
-    start_s: float | None,
+    start: Estimate | str | Path | float | None,
     memory: Memory,
     part: Reading,
 ) -> _Run:
     """Physical parameters in one filter with the plant's states; with a memory they walk as much as they are unsure."""
     source = rows_of(record, rig, **part)
-    begin = start_of(source, rig or default_rig(), start=start, start_s=start_s, rig_speaks=rig is not None)
+    begin = start_of(source, rig or default_rig(), start=start, rig_speaks=rig is not None)
     estimate, rate, plant = begin.estimate, source.replay.rate_hz, model(begin.estimate.model)
     free = estimate.covariance_names
     sd = dict(zip(free, np.sqrt(np.diag(estimate.covariance)).tolist(), strict=True))

@@ -58,8 +58,7 @@ def track_live(
     rig: Rig,
     course: Course,
     *,
-    start: Estimate | str | Path | None = None,
-    start_s: float | None = None,
+    start: Estimate | str | Path | float | None = None,
     taps: Sequence[Tap] = (),
     on_event: Callable[[DeviceEvent], object] | None = None,
     on_run: Callable[[RunReport], object] | None = None,
@@ -69,21 +68,19 @@ def track_live(
     **following: Unpack[FollowingWords],
 ) -> LiveTrack:
     """Let an opened, idle `device` do a `course`, and follow its bench once it has settled, to the course's end, a
-    fault, or an interrupt. `start`: default an identification of the first `start_s`; `taps`: other listeners, such as
-    a recorder; `on_event`: of the device, in the run's thread; `on_run`: given its result, also of interrupted
+    fault, or an interrupt. `start`: an estimate, or the seconds from which one is identified; `taps`: other listeners,
+    such as a recorder; `on_event`: of the device, in the run's thread; `on_run`: given its result, also of interrupted
     tracking; `on_lag`: told a block's time from last sample to done work, s. Times of `Following` count from the first
     tracked sample.
     """
     plant = model(rig.model)
     view = BenchView(device.info, rig, (*plant.inputs, *plant.outputs))
-    if start is not None:
-        wanted_s, lead_s = _CHECKED_S, None
-    else:
-        wanted_s = lead_s = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start_s is None else start_s
+    start = max(_IDENTIFIED_S, _IDENTIFIED_SAMPLES / view.rate_hz) if start is None else start
+    wanted_s = start if isinstance(start, (int, float)) else _CHECKED_S
     if course.seconds <= wanted_s:
         raise DeviceError(
             f"tracking needs {wanted_s:g} s for its start, and the run lasts {course.seconds:g} s. Run longer"
-            + ("" if start is not None else ", or give a start")
+            + (", or give a start" if wanted_s == start else "")
         )
     slots = max(64, ceil(_QUEUE_S * (_BLOCKS_PER_S + view.rate_hz / _BLOCK_SAMPLES)))
     with BlockRing.create(
@@ -94,7 +91,7 @@ def track_live(
         runner = LiveRun(job, ring_tap, ring, stopped, recorded=bool(taps), on_run=on_run, on_trouble=on_trouble)
         with runner:
             lead = _Lead(_frames(ring, ring_tap.fresh), runner, wanted_s, view, device.info.port)
-            begin = start_of(lead.source, rig, start=start, start_s=lead_s, rig_speaks=True)
+            begin = start_of(lead.source, rig, start=start, rig_speaks=True)
             track = follow(lead.frames(begin.first, on_lag), lead.source, begin, Following(**following), live=True)
         return LiveTrack(track=track, run=runner.report(), overruns=ring.overruns)
 

@@ -40,7 +40,6 @@ def track_rotor(
     record: Source,
     rig: Rig,
     start: object,
-    start_s: float | None,
     part: Reading,
     how: Following,
     say: Tick,
@@ -52,9 +51,8 @@ def track_rotor(
     still = separate(bench, model)
     speed = still.speed
     say("start")
-    if start is None:
-        n = _START if start_s is None else round(start_s * bench.rate_hz / excitation.period)
-        n = min(n, excitation.count // 3) if start_s is None else n
+    if start is None or isinstance(start, (int, float)):
+        n = min(_START, excitation.count // 3) if start is None else round(start * bench.rate_hz / excitation.period)
         if not _LEAST <= n < excitation.count:
             raise EstimationError(
                 f"the record has {excitation.count} whole periods of {excitation.period / bench.rate_hz:.4g} s, {n} of "

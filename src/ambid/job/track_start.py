@@ -167,14 +167,13 @@ def start_of(
     source: BenchRows,
     rig: Rig,
     *,
-    start: Estimate | str | Path | None,
-    start_s: float | None,
+    start: Estimate | str | Path | float | None,
     rig_speaks: bool,
 ) -> Start:
-    """Take the estimate or file to begin with, or (None) identify the first `start_s` of the record."""
+    """Take the estimate or file to begin with, or identify the first part of the record, of so many seconds."""
     warnings: list[str] = []
-    if start is None:
-        estimate, first = _identify_beginning(source, rig, start_s)
+    if start is None or isinstance(start, (int, float)):
+        estimate, first = _identify_beginning(source, rig, start)
         numbers = _numbers(estimate, source)
     else:
         estimate, first = start if isinstance(start, Estimate) else _read(start), 0
@@ -236,21 +235,23 @@ def _numbers(estimate: Estimate, source: BenchRows) -> TrackedNumbers:
     )
 
 
-def _identify_beginning(source: BenchRows, rig: Rig, start_s: float | None) -> tuple[Estimate, int]:
+def _identify_beginning(source: BenchRows, rig: Rig, seconds: float | None) -> tuple[Estimate, int]:
     length, rate = source.duration_s, source.replay.rate_hz
-    wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if start_s is None else start_s
+    wanted = min(max(_START_S, _START_SAMPLES / rate), length / 3) if seconds is None else seconds
     n = round(wanted * rate)
     if not 0 < n < length * rate:
         raise EstimationError(
             f"a start of {wanted:g} s leaves nothing of the {length:g} s to track. Give a shorter one, or an estimate"
         )
-    part, first = source.clean_part(n, begin_anywhere=start_s is None)
+    part, first = source.clean_part(n, begin_anywhere=seconds is None)
     return identify_axis(part, rig), first
 
 
 def _read(path: object) -> Estimate:
     if not isinstance(path, (str, Path)):
-        raise EstimationError(f"start is a {type(path).__name__}; it must be an Estimate or the path of one. Give one")
+        raise EstimationError(
+            f"start is a {type(path).__name__}; it must be an Estimate, the path of one, or seconds. Give one"
+        )
     return read_linear_estimate(
         path,
         f"{path} holds a black-box fit or a nonlinear estimate; tracking starts from linear physical parameters."

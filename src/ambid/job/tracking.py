@@ -58,8 +58,7 @@ def track(
     orders: Orders | str | None = None,
     open_loop: bool = False,
     step: float | None = None,
-    start: Estimate | RotorEstimate | str | Path | None = None,
-    start_s: float | None = None,
+    start: Estimate | RotorEstimate | str | Path | float | None = None,
     every_s: float = 0.01,
     limit: float = 1.5,
     memory: Memory = "auto",
@@ -96,10 +95,8 @@ def track(
         Declare the record open loop.
     step : float, optional
         Step size of ``lms`` and ``nlms``, for signals of size one.
-    start : Estimate, RotorEstimate, str or Path, optional
-        Where tracking begins; default: an identification of the first part of the record.
-    start_s : float, optional
-        Length of that part, s.
+    start : Estimate, RotorEstimate, str, Path or float, optional
+        Where tracking begins: an estimate, or an identification of so many seconds of the record's first part.
     every_s : float, optional
         Reporting interval, s of record.
     limit : float, optional
@@ -139,9 +136,7 @@ def track(
         every_s=every_s, limit=limit, memory=memory, pace=pace, flags=flags, on_header=on_header, on_line=on_line,
         keep=keep,
     )  # fmt: skip
-    check_settings(
-        {**following, "start": start, "start_s": start_s, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz}
-    )
+    check_settings({**following, "start": start, "from_s": from_s, "to_s": to_s, "rate_hz": rate_hz})
     say, how, settings = tick or silent, Following(**following), EstimatorWords(
         input=input, output=output, reference=reference, orders=orders, open_loop=open_loop, step=step,
     )  # fmt: skip
@@ -160,7 +155,7 @@ def track(
             },
             "{} is for one axis; a rotor is tracked from one period to the next. Omit it",
         )
-        return replace(track_rotor(record, bench, start, start_s, part, how, say), used=Followed(record=record))
+        return replace(track_rotor(record, bench, start, part, how, say), used=Followed(record=record))
     if isinstance(start, RotorEstimate):
         raise EstimationError("the start is the estimate of a rotor; the rig has no [bearings.X]. Give the rotor's rig")
     if method != "rpem" or any(settings.values()):
@@ -168,11 +163,11 @@ def track(
 
         if how.pace != "fastest" or how.flags:
             raise EstimationError(f"method {method} has no supervisor: it takes no pace and no flags. Omit them")
-        result = track_estimator(record, bench, method, start, start_s, part, how, settings)
+        result = track_estimator(record, bench, method, start, part, how, settings)
         return replace(result, used=Followed(record=record, rate_hz=rate_hz))
     source = rows_of(record, bench, **part)
     say("start")
-    begin = start_of(source, known_rig(bench), start=start, start_s=start_s, rig_speaks=bench is not None)
+    begin = start_of(source, known_rig(bench), start=start, rig_speaks=bench is not None)
     say("track")
     result = follow(source.replay.since(begin.first), source, begin, how)
     return replace(result, used=Followed(record=record, rate_hz=rate_hz))

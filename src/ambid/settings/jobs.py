@@ -64,7 +64,7 @@ _JOBS = (
     declare(
         "acquire",
         "port rig out seconds excitation amplitude band mode settle arm bench pace seed track json plot report "
-        "no_live force strict",
+        "force strict",
         rig={"help": "Rig file (TOML): calibrations, [loop], [daq].", "required": True},
         json={"help": "Write the result, with @track the track as lines of JSON; - for standard output."},
     ),
@@ -91,8 +91,8 @@ _JOBS = (
     ),
     declare(
         "track",
-        "record rig method input output orders reference open_loop step start start_s every_s limit memory pace "
-        "flags from_s to_s rate_hz layout json plot report ledger bearing taken_at no_live strict",
+        "record rig method input output orders reference open_loop step start every_s limit memory pace "
+        "flags from_s to_s rate_hz layout json plot report ledger bearing taken_at strict",
         method={
             "help": "rpem, the supervised tracker; ekf or ukf without supervisor; or coefficients from @input to "
             "@output by rls, lms, nlms, iv, or a recursive arx, armax, oe, bj, ...",
@@ -104,7 +104,6 @@ _JOBS = (
         pace={"help": "Replay as fast as possible, or in real time."},
         json={"help": "Write the track as lines of JSON as it is computed; - for standard output."},
         plot={"help": "Draw the tracks, with the truth if the record has columns true_NAME."},
-        no_live={"help": "No live view, even on a terminal."},
     ),
     declare(
         "margins",

@@ -237,7 +237,6 @@ SETTINGS = (
         " many. Without @input: operational modes.",
     ),
     Setting("no_browser", "switch", "", "Print the link only."),
-    Setting("no_live", "switch", "", "No live view of the track.", short="quiet"),
     Setting(
         "nonlinear", "switch", "", "Identify the nonlinear magnet: k_i, k_x and L as curves over position and current."
     ),
@@ -404,9 +403,11 @@ SETTINGS = (
         "Draw the poles of models of order 1 to 20 (by n4sid, moesp or cva if @structure names it, else pbsid).",
     ),
     Setting(
-        "start", "path", "ESTIMATE.json", "Start from this estimate instead of one from the beginning of the record."
+        "start",
+        "text",
+        "ESTIMATE.json|S",
+        "Start from this estimate, or from one of so many seconds of the record's beginning.",
     ),
-    Setting("start_s", "positive", "S", "Identify the start from this much of the record."),
     Setting(
         "state_space", "text", "n=3|auto", "Fit a state space by subspace identification with the Laguerre operator."
     ),
