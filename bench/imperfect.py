@@ -273,10 +273,12 @@ class Setup:
     def run(self) -> tuple[Array, Array]:
         b, p = self.bench, self.physics
         i, x = (b.bias, b.gap) if b.bias else (0.0, 0.0)
-        kept = p.air * i + (p.law == 0) * p.k_i * self.first if p.shunt > 0 or p.play > 0 else i
+        flux = p.air * i + (p.law == 0) * p.k_i * self.first
+        at, kept = x + self.first, flux if p.shunt > 0 or p.play > 0 else i
+        start, rest = np.array([at, 0.0, i, kept, 0.0, 0.0, 0.0, at, i]), np.array([b.R * i, i, x])
         return _run(
-            p, np.array([x + self.first, 0.0, i, kept, 0.0, 0.0, 0.0, x + self.first, i]), controller(b), np.array([b.R * i, i, x]), self.r,
-            self.force, self.volts, self.added, self.step, self.limit, self.late, b.seconds / self.force.size,
+            p, start, controller(b), rest, self.r, self.force, self.volts, self.added, self.step, self.limit,
+            self.late, b.seconds / self.force.size,
         )  # fmt: skip
 
 
