@@ -129,7 +129,7 @@ def _slope(p: Physics, s: Array, t: float, volts: float, force: float, out: Arra
         f += 0.5 * strength * (p.bias / p.gap) ** 2  # weight
     pull = (f + force) / p.m
     out[0], out[1], out[2], out[4] = s[1], pull, rate, s[5]
-    out[5] = p.share * pull - 0.02 * p.mode * s[5] - p.mode**2 * s[4]
+    out[5] = p.share * pull - 0.04 * p.mode * s[5] - p.mode**2 * s[4]
     out[7], out[8] = p.position_pole * (x - s[7]), p.current_pole * (i - s[8])
 
 
@@ -467,10 +467,12 @@ def judged(bench: str, imperfection: str, seed: int, folder: Path) -> dict[str, 
     import ambid
 
     columns, rate_hz, truth, text = records(bench, imperfection, seed)
+    rig, units = folder / "rig.toml", {"voltage": "V", "current": "A", "position": "m"}
+    rig.write_text(text)
     row: dict[str, Any] = {"bench": bench, "imperfection": imperfection, "seed": seed, "extended": [], "parameters": {}}
     began = time.perf_counter()
     try:
-        found = identified(columns, rate_hz, text, folder / "rig.toml")
+        found = ambid.identify(columns, rig, rate_hz=rate_hz, units=units)
     except ambid.AmbidError as refusal:
         reasons = [{"check": "refused", "text": str(refusal)}]
         return row | {"verdict": "refused", "reasons": reasons, "seconds": time.perf_counter() - began}
@@ -487,21 +489,6 @@ def judged(bench: str, imperfection: str, seed: int, folder: Path) -> dict[str, 
     told = ("check", "cause", "alternatives", "grave")
     reasons = [{key: value for key in told if (value := getattr(r, key, None))} for r in found.verdict.reasons]
     return row | {"verdict": found.verdict.word, "reasons": reasons}
-
-
-def identified(columns: dict[str, Array], rate_hz: float, text: str, rig: Path) -> Any:
-    """Identify; without what the rig says of calibration where ambid does not know those keys yet."""
-    import ambid
-
-    units = {"voltage": "V", "current": "A", "position": "m"}
-    try:
-        rig.write_text(text)
-        return ambid.identify(columns, rig, rate_hz=rate_hz, units=units)
-    except ambid.AmbidError as refusal:
-        if "unknown key" not in str(refusal):
-            raise
-    rig.write_text("\n".join(line for line in text.splitlines() if "_sd = " not in line))
-    return ambid.identify(columns, rig, rate_hz=rate_hz, units=units)
 
 
 def named(row: Mapping[str, Any]) -> str:
