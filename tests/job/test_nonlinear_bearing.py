@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ambid.errors import EstimationError
-from ambid.job.bearing_records import Reading, take_record
 from ambid.job.identification import identify_nonlinear
+from ambid.job.nonlinear_bearing import Reading, take_record
 from ambid.physics.coenergy_law import law_numbers
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
@@ -144,7 +144,7 @@ def test_a_rotor_at_its_stops_and_a_command_beyond_the_supply_are_told(balls, ri
 
 
 def test_one_signal_in_two_channels_is_refused_and_a_held_rotor_that_moves_is_told(balls, rig):
-    from ambid.job.bearing_records import Reading, bearing_rig, check_together, take_record
+    from ambid.job.nonlinear_bearing import Reading, bearing_rig, check_together, take_record
 
     bench = bearing_rig(rig)
     free = take_record(balls[0], bench, Reading())

@@ -12,8 +12,7 @@ from functools import cache
 import numpy as np
 
 from ambid.bearing.magnet_likelihood import search, uncertainty
-from ambid.job.bearing_estimate import judge_bearing
-from ambid.job.bearing_records import TakenRecord
+from ambid.job.nonlinear_bearing import TakenRecord, judge_bearing
 from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.presets import preset
 from ambid.validation.nonlinear_bearing import whiteness

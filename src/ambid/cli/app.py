@@ -38,7 +38,7 @@ VERBS = {
     "models": "list models, parameters, units, excitations, presets",
 }
 """What each verb does, in the order of the help."""
-_BESIDE = {"compare": "fit", "models": "info", "validate": "identify"}  # verbs in the file of another
+_BESIDE = {"compare": "fit", "margins": "frf", "models": "info", "validate": "identify"}  # verbs in the file of another
 _PART = "'ambid validate RESULT RECORD' with --from and --to"
 # Words of the releases before, by job: what each is now; nothing where it is gone.
 _FORMER: Mapping[str, Mapping[str, str]] = {

@@ -1,4 +1,4 @@
-"""``ambid frf``: a frequency response from one record, and models fitted to it."""
+"""``ambid frf``: a frequency response from one record, and models fitted to it; ``ambid margins``: of a loop."""
 
 from __future__ import annotations
 
@@ -30,6 +30,25 @@ def command(v: Values) -> None:
         with progress("measure") as tick:
             found = frf(v.record, **how, tick=tick)
             outputs.give(found, tick)
+    outputs.show(found, strict=v.strict)
+
+
+@verb("margins")
+def margins(v: Values) -> None:
+    """Show the margins of the loop: sensitivity by ISO 14839-3, gain, phase, delay, compliance.
+
+    The controller is identified where the excitation is logged as reference, else it is the rig's [loop], as for an
+    estimate alone. Without --rig, that of the estimate is used.
+    """
+    from ambid.job import margins
+
+    with (
+        Outputs(v.record, v.rig, v.estimate, **v.outputs) as outputs,
+        progress("margins") as show,
+    ):
+        how = v.only("estimate reference from_s to_s rate_hz gaps layout")
+        found = margins(v.record, v.rig, **how, tick=show)
+        outputs.give(found, show)
     outputs.show(found, strict=v.strict)
 
 

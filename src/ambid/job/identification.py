@@ -309,8 +309,7 @@ def identify_nonlinear(
     """
     from ambid.bearing.magnet_estimate import estimate_bearing
     from ambid.bearing.magnet_likelihood import uncertainty
-    from ambid.job.bearing_estimate import judge_bearing
-    from ambid.job.bearing_records import BearingWords, bearing_rig, laws_of, numbers_of, take_all
+    from ambid.job.nonlinear_bearing import BearingWords, bearing_rig, judge_bearing, laws_of, numbers_of, take_all
     from ambid.validation.nonlinear_bearing import validation
 
     words = BearingWords(

@@ -196,7 +196,7 @@ def data_of(
         return (load_bench(record, bench, **reading),)
     if isinstance(known, Estimate):
         return load_bench(record, bench, **reading)
-    from ambid.job.bearing_records import bearing_rig, take_record
+    from ambid.job.nonlinear_bearing import bearing_rig, take_record
 
     return take_record(record, bearing_rig(bench), reading)
 
