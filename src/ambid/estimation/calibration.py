@@ -13,33 +13,23 @@ would be without.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from types import MappingProxyType
 
 import numpy as np
 
-from ambid.arrays import Array, Complex
+from ambid.arrays import Array
 from ambid.estimation.estimate import EstimatedParameter
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.predictor import assemble
 from ambid.estimation.result import NORMAL_95
 from ambid.physics.linear_model import LinearModel, Parameter
 from ambid.physics.rotor_model import RotorModel
-from ambid.physics.sensor_errors import SensorError, error_moves
+from ambid.physics.sensor_errors import Lines, SensorError, error_moves
 from ambid.rig.rig import Rig
 
-_BANDS = 200  # of the spectrum of a record's inputs
+_BANDS, _EDGES = 200, 0.05  # of the spectrum of a record's inputs; part of the record in which it fades in, and out
 _DUST = 1e-9
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lines:
-    """What a record shows of a plant: rad/s, (n_lines, n_inputs, n_experiments) and (n_lines, n_outputs, n_outputs)."""
-
-    omega: Array
-    excitation: Complex
-    whiten: Complex
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -57,48 +47,74 @@ class Numbers:
 class Calibrated:
     """What calibration makes of an estimate.
 
-    `parameters`: with their intervals; `calibration`: by channel, and ``"rate"``, the per cent by which 1 % of it would
-    move each estimated parameter; `calibration_sd`: what the rig says of each source of error, relative or SI.
+    `parameters`: with their intervals; `calibration`: by channel, ``"rate"`` and plane of a rotor, the per cent by
+    which 1 % of it would move each estimated number; `calibration_sd`: what the rig says of each, relative, planes SI.
     """
 
     parameters: tuple[EstimatedParameter, ...]
     calibration: Mapping[str, Mapping[str, float]]
-    calibration_sd: Mapping[str, float] = field(default_factory=lambda: MappingProxyType({}))
+    calibration_sd: Mapping[str, float]
 
 
-def calibrated(parameters: Sequence[EstimatedParameter], numbers: Numbers, rig: Rig, lines: Lines) -> Calibrated:
-    """Return the intervals of an estimate with what its rig says of calibration."""
-    n, plant = numbers, numbers.plant
-    channels = [c for c in rig.channels if c.role in (*plant.inputs, *plant.outputs)]
-    errors = {c.role: SensorError(kind="gain", channel=c.role) for c in channels}
-    errors["rate"] = SensorError(kind="gain", channel="time")
-    sd = {**{c.role: c.gain_sd for c in channels}, "rate": rig.record.rate_sd}
-    moves = error_moves(
-        plant, n.theta, list(errors.values()), free=n.names,
-        omega=lines.omega, excitation=lines.excitation, whiten=lines.whiten,
-    )  # fmt: skip
-    moves[:, -1] *= -1.0  # a rate that is too high makes times too short
-    references = plant.references(n.theta)
-    size = np.array([n.theta[name] or references.get(name, 1.0) for name in n.names])
-    weight = {p.name: p.sd**-2 for p in n.known if p.role == "prior" and p.sd}
-    held = np.array([weight.get(name, 0.0) for name in n.names])
-    moved = size[:, None] * moves
-    moved -= n.covariance @ (held[:, None] * moved)
-    per_cent = moved / size[:, None]
-    stated = {name: x for name, x in sd.items() if x is not None}
-    spread = np.sqrt(np.sum((moved * [stated.get(name, 0.0) for name in errors]) ** 2, axis=1))
-    offsets = {f"{c.role}.offset": c.offset_sd for c in channels if c.offset_sd is not None}
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Source:
+    """Errors that go together, and their standard deviation where the rig says it."""
+
+    errors: Sequence[SensorError]
+    sd: float | None
+    whole: float = 1.0  # error of 100 %
+
+
+def calibrated(
+    parameters: Sequence[EstimatedParameter], numbers: Numbers, rig: Rig, lines: Sequence[Lines]
+) -> Calibrated:
+    """Return the intervals of an estimate with what its rig says of calibration; `lines`: of its records."""
+    n, sources = numbers, _sources(rig, numbers.plant, numbers.theta)
+    errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
+    references, lengths = n.plant.references(n.theta), {p.name for p in n.plant.parameters if p.unit == "m"}
+    moved = error_moves(n.plant, n.theta, errors, free=n.names, lines=lines)
+    moved *= np.array([n.theta[name] or references.get(name, 1.0) for name in n.names])[:, None]
+    weights = {p.name: p.sd**-2 for p in n.known if p.role == "prior" and p.sd}
+    moved -= n.covariance @ (np.array([weights.get(name, 0.0) for name in n.names])[:, None] * moved)
+    size = np.array([references[name] if name in lengths else n.theta[name] or 1.0 for name in n.names])
+    calibration, variance = dict[str, Mapping[str, float]](), np.zeros(len(n.names))
+    for name, s in sources.items():
+        column = np.sum([moved[:, errors.index(e)] for e in s.errors], axis=0)
+        variance += (column * (s.sd or 0.0)) ** 2
+        share = column * s.whole / size
+        share[abs(share) < _DUST] = 0.0
+        calibration[name] = dict(zip(n.names, share.tolist(), strict=True))
+    stated = {name: s.sd for name, s in sources.items() if s.sd is not None}
+    offsets = {f"{c.role}.offset": c.offset_sd for c in rig.channels if c.offset_sd is not None}
+    spread = dict(zip(n.names, np.sqrt(variance).tolist(), strict=True))
     return Calibrated(
-        parameters=tuple(
-            _widened(p, dict(zip(n.names, spread.tolist(), strict=True)).get(p.name, 0.0)) if stated else p
-            for p in parameters
-        ),
-        calibration={
-            error: dict(zip(n.names, np.where(abs(column) < _DUST, 0.0, column).tolist(), strict=True))
-            for error, column in zip(errors, per_cent.T, strict=True)
-        },
+        parameters=tuple(_widened(p, spread.get(p.name, 0.0)) if stated else p for p in parameters),
+        calibration=calibration,
         calibration_sd={**stated, **offsets},
     )
+
+
+def _sources(rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float]) -> dict[str, _Source]:
+    """Return what may be wrong of a bench: gains of inputs and outputs, the rate, planes that are fixed."""
+    sources = {
+        c.role: _Source(errors=[SensorError(kind="gain", channel=c.role)], sd=c.gain_sd)
+        for c in rig.channels
+        if c.role in (*plant.inputs, *plant.outputs)
+    }
+    # a rate that is too high makes times too short
+    sources["rate"] = _Source(errors=[SensorError(kind="gain", channel="time")], sd=rig.record.rate_sd, whole=-1.0)
+    if not isinstance(plant, RotorModel):
+        return sources
+    fixed, span = {p.name for p in rig.parameters if p.role == "fixed"}, plant.span(theta)
+    for b in (b for b in plant.bearings if not b.axial):
+        read = [b.sensor_parameter(k) for k in range(len(b.z_sensors))]
+        planes = {f"{b.name}.z": [f"{b.name}.z", *read], f"{b.name}.z_magnet": [f"{b.name}.z"]}
+        for name, places in {**planes, **{place: [place] for place in read}}.items():
+            if fixed.issuperset(places):
+                errors = [SensorError(kind="fixed", channel=place) for place in places]
+                sd = rig.plane_sd.get(f"{name.rstrip('0123456789')}_sd")
+                sources[name] = _Source(errors=errors, sd=sd, whole=span)
+    return sources
 
 
 def _widened(p: EstimatedParameter, spread: float) -> EstimatedParameter:
@@ -113,13 +129,15 @@ def lines_of(fit: Fit) -> Lines:
     H^-1 = I - C (z I - A + K C)^-1 K.
     """
     problem = fit.problem
-    spectrum = np.fft.rfft(problem.u, axis=0)[1:]
+    n = len(problem.u)
+    fade = np.minimum(np.minimum(np.arange(n), np.arange(n)[::-1]) / (_EDGES * n), 1.0)  # Tukey's window
+    spectrum = np.fft.rfft(problem.u * np.sin(0.5 * np.pi * fade)[:, None] ** 2, axis=0)[1:]
     edges = np.unique(np.geomspace(1, len(spectrum), _BANDS + 1).astype(int) - 1)
     bands = [slice(a, b) for a, b in pairwise(edges)]
     power = np.array([spectrum[band].T @ spectrum[band].conj() for band in bands])
     values, axes = np.linalg.eigh(power)
     middle = 0.5 * (edges[:-1] + edges[1:] - 1) + 1
-    omega = 2.0 * np.pi * middle * problem.rate_hz / len(problem.u)
+    omega = 2.0 * np.pi * middle * problem.rate_hz / n
     predictor = assemble(problem, fit.vector, with_derivatives=False)
     if predictor is None:
         raise ValueError("the fit has no predictor; it has failed")
@@ -128,6 +146,6 @@ def lines_of(fit: Fit) -> Lines:
     inverse = np.eye(len(C)) - C @ np.linalg.solve(z * np.eye(len(A)) - A + K @ C, K.astype(complex))
     root = np.linalg.inv(np.linalg.cholesky(fit.covariance))
     return Lines(
-        omega=omega, excitation=axes * np.sqrt(np.maximum(values, 0.0))[:, None, :],
+        plant=problem.model, omega=omega, excitation=axes * np.sqrt(np.maximum(values, 0.0))[:, None, :],
         whiten=np.asarray(root @ inverse / problem.scales.output, dtype=np.complex128),
     )  # fmt: skip

@@ -234,7 +234,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         plant=problem.model, theta=problem.parameters(fit.vector), names=spread.names, covariance=spread.information,
         known=rig.parameters,
     )  # fmt: skip
-    widened = calibrated(estimate.parameters, known, rig, lines_of(fit))
+    widened = calibrated(estimate.parameters, known, rig, [lines_of(fit)])
     return replace(
         estimate, global_search=fit.global_search, parameters=widened.parameters, calibration=widened.calibration,
         calibration_sd=widened.calibration_sd,

@@ -26,7 +26,8 @@ if TYPE_CHECKING:
     from ambid.arrays import Complex
     from ambid.control.closed import ClosedLoop
     from ambid.rotor.conclusion import Evidence
-    from ambid.rotor.estimator import Ending
+    from ambid.rotor.estimator import RotorFit
+    from ambid.rotor.prediction import PredictorFit
     from ambid.rotor.replay import RotorReplay
     from ambid.rotor.spectra import Excitation, PeriodSpectra
     from ambid.rotor.synchronous import Separated
@@ -47,8 +48,9 @@ def identify_rotor(
     """Identify a rotor by a `rig` with bearings: two or more whole periods by the estimator on period spectra, else by
     the predictor. `speed_rpm`: of each record; `reading`: of files. EstimationError where nothing can be identified.
     """
+    from ambid.estimation.calibration import Numbers, calibrated
     from ambid.job.closed_loop import loop_and_peaks
-    from ambid.rotor.conclusion import conclude
+    from ambid.rotor.conclusion import conclude, lines_seen
     from ambid.rotor.synchronous import separate
 
     say, clock, model = tick or silent, Clock(), rig.rotor
@@ -81,6 +83,16 @@ def identify_rotor(
             rig=rig_entry(rig), warnings=[*warnings, *outcome.warnings],
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
+        names = tuple(name for name in estimate.covariance_names if name in estimate.numbers)
+        known = Numbers(
+            plant=estimate.plant, theta=estimate.numbers, names=names, covariance=estimate.covariance_of(names),
+            known=rig.parameters,
+        )  # fmt: skip
+        widened = calibrated(estimate.parameters, known, rig, lines_seen(outcome.fit))
+        estimate = replace(
+            estimate, parameters=widened.parameters, calibration=widened.calibration,
+            calibration_sd=widened.calibration_sd,
+        )  # fmt: skip
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], outcome.seen[fastest], estimate.speed)
         try:
@@ -108,7 +120,7 @@ def _turning_rig(rig: Rig, speed: float) -> Rig:
 class _Found:
     """What either estimator leaves to be concluded from; `why` it was chosen."""
 
-    fit: Ending
+    fit: RotorFit | PredictorFit
     evidence: Evidence
     records: Sequence[Mapping[str, object]]
     spectra: PeriodSpectra  # of the record at the highest speed, which is that of the estimate's plant

@@ -36,6 +36,16 @@ class SensorError:
     other: str = ""  # channel that a cross-talk is of
 
 
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Lines:
+    """What a record shows at `omega`, rad/s, of a plant, such as a rotor at its speed."""
+
+    plant: LinearModel | RotorModel
+    omega: Array
+    excitation: Complex  # (n_lines, n_inputs, n_experiments)
+    whiten: Complex | None = None  # (n_lines, n_outputs, n_outputs); None: each output over its rms
+
+
 def logged_error(kind: Kind, signal: Complex, omega: Array, other: Complex | None = None) -> Complex:
     """Return what an error of one unit adds to the spectrum of its channel at `omega`; `other`: of cross-talk."""
     match kind:
@@ -78,20 +88,23 @@ class _Response:
         self.plant, self.theta, self.omega, self.u = plant, theta, omega[:, None], u
         self.space = plant.matrices(theta)
         self.states = np.linalg.inv(1j * self.omega[:, None] * np.eye(len(self.space.A)) - self.space.A)
+        self.read, self.names = self.space.C @ self.states, {p.name for p in plant.parameters}
         self.x = self.states @ self.space.B @ u
         self.y = self.space.C @ self.x
 
     def slope(self, name: str) -> Complex:
         """Derivative by a parameter."""
+        if name not in self.names:  # such as a gyroscopic term at rest
+            return np.zeros_like(self.y)
         d = self.plant.derivative(self.theta, name)
-        return np.asarray(self.space.C @ self.states @ (d.A @ self.x + d.B @ self.u) + d.C @ self.x)
+        return np.asarray(self.read @ (d.A @ self.x + d.B @ self.u) + d.C @ self.x)
 
     def column(self, error: SensorError) -> Complex:
         """Derivative by an error of what is logged, for the inputs that are logged."""
         if error.kind == "fixed":
             return -self.slope(error.channel)
         if error.channel == "time":  # G(jw) is taken for G(jw (1 + e))
-            return np.asarray(-1j * self.omega[:, None] * (self.space.C @ self.states @ self.x))
+            return np.asarray(-1j * self.omega[:, None] * (self.read @ self.x))
         roles, signals = self.plant.outputs, self.y
         if error.channel in self.plant.inputs:
             roles, signals = self.plant.inputs, self.u
@@ -99,7 +112,7 @@ class _Response:
         other = signals[:, roles.index(error.other)] if error.other else None
         moved[:, k] = logged_error(error.kind, signals[:, k], self.omega, other)
         # an input acts as it is: what is logged, less the error
-        return moved if roles is self.plant.outputs else np.asarray(-self.space.C @ self.states @ self.space.B @ moved)
+        return moved if roles is self.plant.outputs else np.asarray(-self.read @ self.space.B @ moved)
 
 
 def error_moves(
@@ -109,33 +122,30 @@ def error_moves(
     *,
     free: Sequence[str] | None = None,
     omega: Array | None = None,
-    excitation: Complex | None = None,
-    whiten: Complex | None = None,
+    lines: Sequence[Lines] = (),
 ) -> Array:
     """Return d ln(parameter) / d(error), (n_free, n_errors); of a parameter that is zero over its natural scale.
 
-    `omega` in rad/s, default around the poles; `excitation` (n_lines, n_inputs, n_experiments), default each input
-    alone; `whiten` (n_lines, n_outputs, n_outputs), default each output over its rms. Errors are in SI, a lag in s.
-    Directions that the outputs do not show are not moved along.
+    `lines`: what records show, default each input alone at `omega` in rad/s, by itself around the poles. Errors are in
+    SI, a lag in s. Directions that the outputs do not show are not moved along.
     """
     free = [p.name for p in plant.parameters if p.default is None] if free is None else list(free)
     if omega is None:
         poles = np.abs(np.linalg.eigvals(plant.matrices(theta).A))
         omega = np.geomspace(poles[poles > 0.0].min() / _BEYOND, _BEYOND * poles.max(), _LINES)
     alone = np.broadcast_to(np.eye(len(plant.inputs), dtype=complex), (omega.size, *(len(plant.inputs),) * 2))
-    response = _Response(plant, theta, omega, alone if excitation is None else excitation)
-    if whiten is None:
-        whiten = np.diag(1.0 / np.sqrt(np.mean(np.abs(response.y) ** 2, axis=(0, 2)))).astype(complex)
-
-    def rows(c: Complex) -> Array:
-        c = (whiten @ c).ravel()
-        return np.concatenate([c.real, c.imag])
-
     natural = {name: theta[name] or plant.references(theta).get(name, 1.0) for name in free}
-    J = np.column_stack([natural[name] * rows(response.slope(name)) for name in free])
+    parts = list[Array]()
+    for at in lines or [Lines(plant=plant, omega=omega, excitation=alone)]:
+        response = _Response(at.plant, theta, at.omega, at.excitation)
+        rms = np.sqrt(np.mean(np.abs(response.y) ** 2, axis=(0, 2)))
+        whiten = np.diag(1.0 / rms).astype(complex) if at.whiten is None else at.whiten
+        slopes = [natural[name] * response.slope(name) for name in free]
+        c = np.array([(whiten @ x).ravel() for x in (*slopes, *map(response.column, errors))]).T
+        parts += [c.real, c.imag]
+    J, columns = np.split(np.concatenate(parts), [len(free)], axis=1)
     size = np.linalg.norm(J, axis=0)
     size[size == 0.0] = 1.0
-    columns = np.column_stack([rows(response.column(e)) for e in errors])
     moves = np.linalg.lstsq(J / size, columns, rcond=_RANK)[0]
     return np.asarray(moves / size[:, None], dtype=float)
 

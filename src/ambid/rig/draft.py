@@ -82,6 +82,7 @@ def draft_rig(record: Record, ranked: Mapping[str, Sequence[Candidate]] | None =
         *_record_lines(record),
         "# from = 2.0          # s: leave out what comes before, such as the pick-up from rest",
         '# gaps = "error"      # or "interpolate", "cut"',
+        _RATE_SD,
     ]
     return "\n".join(lines) + "\n"
 
@@ -114,17 +115,20 @@ def _draft_rotor(record: Record, axes: Sequence[str]) -> str:
             f"[bearings.{chr(ord('A') + k // 2)}]",
             f"axes     = [{', '.join(toml_text(axis) for axis in axes[k : k + 2])}]   # CHECK",
             '# z        = { value = 0.0, unit = "mm" }   # CHECK: measure the plane of the magnets, from any datum',
-            '# z_sensor = { value = 0.0, unit = "mm" }   # CHECK: measure the plane of the sensors', "",
+            '# z_sensor = { value = 0.0, unit = "mm" }   # CHECK: measure the plane of the sensors',
+            '# z_sd     = { value = 0.5, unit = "mm" }   # how well both are known; each: z_magnet_sd, z_sensor_sd',
+            "",
         ]  # fmt: skip
     for axis in axes:
         for what in ("voltage", "current", "position", "reference"):
             if f"{axis}_{what}" in record:
-                lines += [f"[channels.{axis}_{what}]", f"column = {toml_text(f'{axis}_{what}')}", ""]
+                known = [] if what == "reference" else [_GAIN_SD]
+                lines += [f"[channels.{axis}_{what}]", f"column = {toml_text(f'{axis}_{what}')}", *known, ""]
     for role, column in _turning(record).items():
         lines += [f"[channels.{role}]", f"column = {toml_text(column.name)}   # CHECK", ""]
     return "\n".join(
-        [*lines, *_record_lines(record), "", "# What is not named here is free. A weighed rotor:", "# [parameters]",
-         '# m = { value = 6.2, unit = "kg", role = "fixed" }', "# [modes]", '# count = "auto"', ""]
+        [*lines, *_record_lines(record), _RATE_SD, "", "# What is not named here is free. A weighed rotor:",
+         "# [parameters]", '# m = { value = 6.2, unit = "kg", role = "fixed" }', "# [modes]", '# count = "auto"', ""]
     )  # fmt: skip
 
 
@@ -164,7 +168,7 @@ def _channel_lines(role: str, ranked: Sequence[Candidate], unit: str, record: Re
         ]
     if is_input:
         lines.append('delay  = "auto"   # samples between the logged value and the coil; "auto" finds it')
-    return lines
+    return [*lines, _GAIN_SD]
 
 
 def _parameter_lines(plant: LinearModel) -> list[str]:
@@ -186,6 +190,8 @@ def _magnet_lines() -> list[str]:
     ]
 
 
+_GAIN_SD = "# gain_sd = 0.01   # how well its gain is known, relative: no record shows that; offset_sd: its offset"
+_RATE_SD = "# rate_sd = 1e-4      # how well the sampling rate is known, relative: no record shows that"
 _FIXED = frozenset({"m", "c", "g", "i0"})  # what is weighed or set on a bench; the rest is to be found
 
 _HEAD = """\

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
+from ambid.estimation.calibration import lines_of
 from ambid.estimation.estimate import Check, Continuous, Delay, EstimatedParameter, OutputFit
 from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
+from ambid.physics.sensor_errors import Lines
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
+from ambid.rotor.prediction import PredictorFit
 from ambid.rotor.scores import agreement_checks, scores
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
@@ -79,6 +82,19 @@ def of_periods(fit: RotorFit) -> Evidence:
         fit=_fits(fit),
         checks={**_residual_checks(fit), **agreement_checks(scores(fit.problem, fit.vector), fit.model)},
     )
+
+
+def lines_seen(fit: RotorFit | PredictorFit) -> list[Lines]:
+    """Return what the records of a fit show, and how they count: to say how errors of calibration move it."""
+    if isinstance(fit, PredictorFit):
+        return [replace(lines_of(fit.fit), plant=fit.model)]
+    return [
+        Lines(
+            plant=fit.model.at_speed(e.speed), omega=e.spectra.omega, excitation=e.spectra.mean_u[:, :, None],
+            whiten=w.whiten,
+        )
+        for e, w in zip(fit.problem.experiments, fit.problem.weights, strict=True)
+    ]  # fmt: skip
 
 
 def conclude(

@@ -73,6 +73,12 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
     checks : Mapping[str, Check]
     sensitivity : Mapping[str, Any]
         Peak of the sensitivity by axis, where a loop is known or a reference is logged.
+    calibration : Mapping[str, Mapping[str, float]]
+        By channel, ``"rate"`` and plane (``"A.z"``: all of bearing A, ``"A.z_magnet"``, ``"A.z_sensor"``), the per cent
+        by which 1 % of it would move each estimated number; lengths count against the span of the bearings.
+    calibration_sd : Mapping[str, float]
+        What the rig says of these errors: relative standard deviations of gains and rate, of planes in m, of offsets
+        (``"ax_current.offset"``, which move the operating point alone) in SI units.
     synchronous : Mapping[str, Any]
         What the synchronous response of records at speed shows; empty without one. The angle runs from x to y, phases
         are in rad against its zero, a number is ``{"value", "sd", "phase", "phase_sd", "identifiable"}``.
@@ -117,6 +123,8 @@ class RotorEstimate(Parametric, Judged, Predicting, Linear):
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
     sensitivity: Mapping[str, Any] = field(default_factory=lambda: _EMPTY)
+    calibration: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: _EMPTY)
+    calibration_sd: Mapping[str, float] = field(default_factory=lambda: _EMPTY)
     synchronous: Mapping[str, Any] = field(default_factory=lambda: _EMPTY)
     validation: Mapping[str, object] | None = None
     warnings: tuple[str, ...] = ()
