@@ -31,6 +31,7 @@ def command() -> None:
     """
     from ambid.job.identification import identify_axis
     from ambid.physics.presets import preset
+    from ambid.report.calibration import calibration_lines
     from ambid.report.document import Checks, Lines, Section, sections_text
     from ambid.report.estimate import delay_lines, header, output_table
     from ambid.report.text import verdict_lines
@@ -62,6 +63,7 @@ def command() -> None:
                 ),
             ]
         ),
+        Section(parts=[Lines(lines=calibration_lines(estimate))]),
         Section(parts=[Lines(lines=delay_lines(estimate))]),
         Section(parts=[output_table(estimate)]),
         Section(parts=[Checks(checks=estimate.checks)]),

@@ -16,6 +16,7 @@ from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.estimation.result import RecordEntry
 from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import model
+from ambid.report.calibration import calibration_lines
 from ambid.report.document import (
     Checks,
     Document,
@@ -114,12 +115,13 @@ def estimate_document(estimate: AnyEstimate, evidence: Callable[[], Evidence | B
     e, linear = estimate, isinstance(estimate, Estimate)
     meanings = {spec.name: spec.meaning for spec in (*model(e.model).parameters, *BEARING_NUMBERS)}
     table = parameter_table(e.parameters, e.verdict, meanings)
+    said = [Lines(lines=calibration_lines(e))] if isinstance(e, Estimate) else []
     note = f"{_SIGNS} Standard deviations are from the {_SOURCES[e.covariance_method]}."
     warnings = Section(parts=[Warnings(warnings=other_warnings(e.checks, e.warnings))])
     sections = [
         Section(parts=header(e), page=False),
         *([] if linear else [warnings]),
-        Section(title="Parameters", parts=[table], note=note),
+        Section(title="Parameters", parts=[table, *said], note=note),
         correlations_section("Correlations of the estimated parameters", e.covariance_names, e.covariance),
         *([] if isinstance(e, Estimate) else [_curves(e)]),
         Section(title="Delay and fit", parts=[Lines(lines=delay_lines(e))]),

@@ -44,6 +44,15 @@ class ParameterRow:
         return f"{q.low} … {q.high}" if q.low else ""
 
     @property
+    def calibrated(self) -> str:
+        """The 95 % interval with calibration; empty where the rig says nothing of it."""
+        p = self.parameter
+        if not p.sd_calibrated or p.ci95_calibrated is None:
+            return ""
+        q = quantity(p.value, p.sd_calibrated, p.unit, ci95=p.ci95_calibrated)
+        return f"{q.low} … {q.high}" if q.low else ""
+
+    @property
     def judged(self) -> Cell:
         """Where the value comes from in a word or two, such as ``"prior, 87 % data"``."""
         p, word = self.parameter, word_for_all(self.verdict)
@@ -105,6 +114,17 @@ PARAMETERS: Sequence[Column] = (
         frame={
             "ci95_low": lambda row: row.parameter.ci95[0],
             "ci95_high": lambda row: row.parameter.ci95[1],
+        },
+    ),
+    Column(
+        label="with calibration",
+        cell=lambda row: row.calibrated,
+        right=True,
+        sparse=True,
+        frame={
+            "sd_calibrated": lambda row: row.parameter.sd_calibrated,
+            "ci95_calibrated_low": lambda row: (row.parameter.ci95_calibrated or (None, None))[0],
+            "ci95_calibrated_high": lambda row: (row.parameter.ci95_calibrated or (None, None))[1],
         },
     ),
     Column(label="in SI", cell=lambda row: row.quantity.si, spare=True),

@@ -12,6 +12,7 @@ from ambid.estimation.estimate import EstimatedParameter
 from ambid.estimation.result import RecordEntry
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.physics.shaft import Shaft
+from ambid.report.calibration import calibration_lines
 from ambid.report.document import Checks, Document, Fitting, Lines, Section, Warnings, grid, timing_section
 from ambid.report.estimate import computing_time, correlations_section, rig_sections, second_section
 from ambid.report.numbers import quantity, sized
@@ -86,12 +87,15 @@ def rotor_document(estimate: RotorEstimate, shaft: Shaft | None, evidence: Calla
         _UNSEEN in text_of([cell]) for b in e.plant.bearings for row in bearing_rows(e, b, b.axes) for cell in row
     )
     cross: list[Line] = [[(_UNSEEN, "bad"), " not identifiable from these data"]] if unseen else []
+    calibrated = any(p.sd_calibrated for p in e.parameters)
+    in_brackets = ["In brackets: one standard deviation with calibration"] if calibrated else []
     sections = [
         Section(parts=[Lines(lines=_records(e), wrap=False)], page=False),
         Section(title="Rotor", parts=[parameter_table(of_rotor, e.verdict, meanings, label="rotor")], note=speed),
         Section(title="Bending modes", parts=[grid(mode_rows(e, shaft))] if e.modes else []),
         *(replace(b, title="" if k else "Bearings", note=_SIGNS) for k, b in enumerate(bearings)),
         Section(parts=[Lines(lines=cross)], page=False),
+        Section(parts=[Lines(lines=[*in_brackets, *calibration_lines(e)])]),
         *synchronous_sections(e),
         Section(title="Checks", parts=[Checks(checks=e.checks, above=True)]),
         *([] if e.validation is None else [second_section(e.validation)]),
@@ -221,6 +225,8 @@ def _cell(p: EstimatedParameter | None) -> str:
     if p is None:
         return ""
     text = quantity(p.value, p.sd, p.unit).text
+    if p.sd_calibrated:
+        text += f" (± {quantity(p.value, p.sd_calibrated, p.unit).sd})"
     return f"{'' if p.identifiable else f'{_UNSEEN} '}{text}{'' if p.role == 'free' else f', {p.role}'}"
 
 

@@ -1,0 +1,65 @@
+"""What people read of calibration: a line where nothing is said of it, a column where it is."""
+
+from dataclasses import replace
+
+import pytest
+
+import ambid
+from ambid.job import presentation
+from ambid.report.calibration import calibration_lines
+from ambid.report.parameters import ParameterRow
+from tests.estimation.test_calibration import SD, rig_of
+
+
+@pytest.fixture(scope="module")
+def record():
+    return ambid.simulate("thesis", duration=0.3, seed=2)
+
+
+def words(estimate):
+    return " ".join(estimate.summary().split())
+
+
+def test_without_a_word_on_calibration_a_line_says_what_one_per_cent_would_do(record):
+    text = words(ambid.identify(record))
+    assert "identified" in text
+    assert "Intervals are from this record alone" in text
+    assert "1 % of gain moves: voltage m, k_x, k_i, R, L +1 %; position m, k_x -2 %, k_i -1 %; current" in text
+    assert "rate m -3 %, k_x, k_i, L -1 %. Give gain_sd and rate_sd in the rig" in text
+    assert "with calibration" not in text
+
+
+def test_where_all_is_said_a_column_takes_the_place_of_the_line(record):
+    estimate = ambid.identify(record, rig_of(SD))
+    L = estimate["L"]
+    assert "with calibration" in words(estimate)
+    assert ParameterRow(parameter=L).calibrated in words(estimate)
+    assert calibration_lines(estimate) == []
+    assert "<th>with calibration</th>" in presentation.page(estimate)
+    frame = estimate.to_dataframe()
+    assert frame["sd_calibrated"]["L"] == L.sd_calibrated
+    assert (frame["ci95_calibrated_low"]["L"], frame["ci95_calibrated_high"]["L"]) == L.ci95_calibrated
+
+
+def test_what_is_left_out_is_named(record):
+    (line,) = calibration_lines(ambid.identify(record, rig_of({"voltage": 0.01, "position": 0.0, "rate": 0.0})))
+    assert line.startswith("Some of the calibration is in no interval. 1 % of gain moves: current m, k_x +1 %")
+    assert "voltage" not in line
+
+
+def test_an_offset_moves_the_operating_point_alone(record):
+    rig = rig_of(SD)
+    offset = replace(rig, channels=tuple(replace(c, offset_sd=1e-3) for c in rig.channels if c.role == "current"))
+    rig = replace(rig, channels=tuple(offset.channels[0] if c.role == "current" else c for c in rig.channels))
+    estimate = ambid.identify(record, rig)
+    assert estimate.calibration_sd == {**SD, "current.offset": 1e-3}
+    assert calibration_lines(estimate) == ["An offset of current moves the operating point alone"]
+    assert estimate["L"].sd_calibrated == ambid.identify(record, rig_of(SD))["L"].sd_calibrated
+
+
+def test_what_is_hardly_moved_is_left_out(record):
+    """A weighed mass: a gain moves the others by parts of a per cent."""
+    rig = rig_of({}, m={"role": "fixed", "value": 0.1})
+    (line,) = calibration_lines(ambid.identify(record, rig))
+    assert " m" not in line.partition("moves: ")[2]
+    assert "+0 %" not in line
