@@ -376,7 +376,10 @@ def check_lag(signals: Signals) -> Check:
         return Check(passed=True, detail="the current explains too little of the motion to tell whether a channel lags")
     values = {"samples": lag.samples, "sd": lag.sd}
     if lag.shown:
-        return Check(passed=False, values=values, detail=lag.describe(signals.rate_hz))
+        late = "sensor_lag" if lag.samples > 0 else "current_sensor_pole"
+        others = ("sensor_pole", "eddy_pole") if lag.samples > 0 else ("current_lag",)
+        detail = lag.describe(signals.rate_hz)
+        return Check(passed=False, values=values, detail=detail, cause=late, alternatives=others)
     detail = f"position and current are logged at the same instants (lag {lag.samples:.2g} ± {lag.sd:.1g} samples)"
     return Check(passed=True, values=values, detail=detail)
 

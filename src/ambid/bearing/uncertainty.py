@@ -71,6 +71,7 @@ class Uncertainty:
     # (n,), SI, how far the parameters move when the data are used differently, where that is more than chance allows;
     # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
     disagreement: Array
+    bias: Array  # (n,), SI, what causes that the tests name have done to the estimate; part of all intervals
 
     @property
     def widening(self) -> float:
@@ -87,10 +88,11 @@ class Uncertainty:
         only near the truth: correlations from the scores, the larger of both deviations, plus the disagreement.
         """
         if not robust:
-            return self.information
+            return np.asarray(self.information + np.outer(self.bias, self.bias))
         plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
         larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
-        return np.asarray(self.robust * np.outer(larger, larger) + np.outer(self.disagreement, self.disagreement))
+        away = np.column_stack([self.disagreement, self.bias])
+        return np.asarray(self.robust * np.outer(larger, larger) + away @ away.T)
 
     def standard_deviations(self, *, robust: bool) -> Array:
         """Return deviations (n,), SI, from the information matrix, or `robust` ones, which are never smaller."""
@@ -132,6 +134,7 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
         delay_sd=delay_sd,
         fisher=whole[:n, :n] * unit,
         disagreement=np.zeros(n),
+        bias=np.zeros(n),
     )
 
 

@@ -120,6 +120,8 @@ _GRAVE = frozenset(
     }
 )  # fmt: skip
 """Checks after whose failure no number is to be used."""
+_OF_THE_RECORD = frozenset({"belonging", "position_size", "signals_sound", "log_runs", "sampling", "resolution"})
+"""Checks of the record itself: what they find is told first."""
 _EVIDENCE = frozenset({"ohm", "gravity_balance", "fixed_agree", "loop_agrees", "sampling"})
 """Checks of a fact each: two that contradict the estimate are as grave as one above."""
 
@@ -144,13 +146,15 @@ class Judged(Result):
         )
         against = {k: c for k, c in self.checks.items() if not c.passed}
         contradicted = len(_EVIDENCE & against.keys()) > 1
+        grave = {k for k, c in against.items() if c.grave or k in _GRAVE or (contradicted and k in _EVIDENCE)}
+        if grave:  # a fault of the record is what made the others grave
+            grave |= {k for k, c in against.items() if k in _OF_THE_RECORD and c.cause}
+        names = sorted(against, key=lambda k: (k not in _OF_THE_RECORD, not against[k].cause))
         failed += [
-            Reason(
-                check=k, text=c.detail, grave=c.grave or k in _GRAVE or (contradicted and k in _EVIDENCE),
-                cause=c.cause, size=c.size, alternatives=c.alternatives,
-            )
-            for k, c in against.items()
-        ]  # fmt: skip
+            Reason(check=k, text=c.detail, grave=k in grave, cause=c.cause, size=c.size, alternatives=c.alternatives)
+            for k, c in ((k, against[k]) for k in names)
+        ]
+        failed.sort(key=lambda r: r.check not in _OF_THE_RECORD)
         second = (getattr(self, "validation", None) or {}).get("checks", {})
         failed += [Reason(check=f"validation.{k}", text=c["detail"]) for k, c in second.items() if not c["passed"]]
         return tuple(failed)

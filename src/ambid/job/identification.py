@@ -210,13 +210,17 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     robust = fit.status != "converged" or not all(c.passed for c in checks.values())
     spread = replace(spread, disagreement=moved.disagreement() if robust else np.zeros(len(spread.names)))
     checks |= physical.assumption_checks(fit, spread, delay_how)
-    checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     signals = signals_of(bench, problem.model)
+    if problem.model.name == "one-axis":
+        from ambid.validation.causes import causes, causes_check, named_bias
+
+        in_time, named = check_lag(signals), causes(fit, means, thorough=robust)
+        checks |= {**causes_check(named, {**checks, "in_time": in_time}), "in_time": in_time}
+        spread = replace(spread, bias=named_bias(named, spread.bias))
+    checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
-        checks["in_time"] = check_lag(signals)
-        theta = problem.parameters(fit.vector)
-        checks |= physical.fact_checks(rig, bench, theta, spread, robust=robust)
+        checks |= physical.fact_checks(fit, rig, bench, spread, robust=robust, agree=moved.passed)
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import curvature_check
 

@@ -30,6 +30,7 @@ _CHANCE = 1e-3  # probability above which a relation may be chance
 _SHOWN = 3.0  # standard deviations of k_i above which current and position belong together
 _STILL = 4  # samples in which no channel changes: the log stood still
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
+_TOP = 0.2  # part of the voltage's power in the top octave, from which it may change between samples
 _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
 
 
@@ -152,11 +153,12 @@ def _log_runs(record: Record) -> Check:
 
 
 def agreements(
-    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
+    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float], *, agree: bool
 ) -> dict[str, Check]:
     """Compare the facts of a record with an estimate from it, model one-axis.
 
-    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: of those standard deviations, under the model.
+    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `agree`: whether
+    estimates from fewer samples agree.
     """
     checks = facts(record)
     if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
@@ -165,7 +167,20 @@ def agreements(
     if known is not None:
         checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
     checks["sampling"] = _sampling(theta, sd, record.rate_hz)
+    top = _top_octave(record["voltage"].values)
+    if checks["sampling"].passed and not agree and top > _TOP:
+        checks["sampling"] = Check(
+            passed=False, cause="sampling", values={**checks["sampling"].values, "top_octave": top},
+            detail=f"estimates from fewer samples differ, and {100.0 * top:.2g} % of the voltage's power lies in the "
+            "octave below half the rate: it changes between samples, where it is not logged. Sample faster, at the "
+            "controller's rate",
+        )  # fmt: skip
     return checks
+
+
+def _top_octave(x: Array) -> float:
+    power = np.abs(np.fft.rfft((x - x.mean())[:_LONGEST] * np.hanning(min(x.size, _LONGEST)))) ** 2
+    return float(power[power.size // 2 :].sum() / max(float(power.sum()), 1e-300))
 
 
 def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:

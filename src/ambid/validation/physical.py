@@ -38,7 +38,7 @@ from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
 from ambid.rig.rig import Rig, RigMagnet
-from ambid.signals.faults import Saturation, find_dropouts, find_outliers, find_saturation, resolution
+from ambid.signals.faults import Dropouts, Saturation, find_dropouts, find_outliers, find_saturation, resolution
 from ambid.simulation.plant import closed_loop_poles
 from ambid.validation.facts import agreements, one_sided
 from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
@@ -243,7 +243,7 @@ def assumption_checks(fit: Fit, spread: Uncertainty, delay_how: Literal["estimat
 def _fixed_agree(fit: Fit) -> Check:
     """Score test of each fixed value: would the record, if asked, put it elsewhere?"""
     units = {p.name: p.unit for p in fit.problem.model.parameters}
-    worst, detail = 1.0, "the data agree with every fixed value"
+    worst, most, detail = 1.0, 0.0, "the data agree with every fixed value"
     for name, value in fit.problem.known.items():
         statistic, there = free_one(fit, name)
         p = chi_squared_tail(1, statistic)
@@ -252,8 +252,8 @@ def _fixed_agree(fit: Fit) -> Check:
                 f"the data contradict the fixed {name} = {value:.4g} {units[name]}; a "
                 f"{'larger' if there > value else 'smaller'} value fits better ({p_text(p)}). Check it, or free it"
             )
-        worst = min(worst, p)
-    return Check(passed=worst >= P_LEAST, p=worst, detail=detail)
+        worst, most = min(worst, p), max(most, statistic)
+    return Check(passed=worst >= P_LEAST, p=worst, values={"gain": most}, detail=detail)
 
 
 def _priors_agree(fit: Fit) -> Check:
@@ -417,9 +417,11 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
         for fault in (find_outliers(record, role), find_dropouts(record, role, saturation=limits[role]))
     ]
     some = [f"{role}: {f}" for role, f in faults if f.count]
+    most = max(faults, key=lambda fault: fault[1].count)[1]
     few = max(f.count for _, f in faults) <= _ERRONEOUS * record.n_samples
     return Check(
         passed=few,
+        cause="" if few else "stuck" if isinstance(most, Dropouts) else "spikes",
         values={f"{role}_{type(f).__name__.lower()}": float(f.count) for role, f in faults},
         detail=f"{'; '.join(some)}. They were used unchanged; replace them (signals.replace_samples) or cut them out"
         if some
@@ -430,23 +432,27 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
 GRAVITY = 9.81
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
+_COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
 
 def fact_checks(
-    rig: Rig, bench: Record, theta: Mapping[str, float], spread: Uncertainty, *, robust: bool
+    fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool, agree: bool
 ) -> dict[str, Check]:
     """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
 
-    `theta`: parameters, SI; `robust`: which standard deviations count. The balance of gravity is asked for by default
-    where the current keeps its sign, as that of one magnet that carries a weight does, and its mean is that of the
-    voltage, so that it is no offset.
+    `robust`: which standard deviations count; `agree`: whether estimates from fewer samples agree. The balance of
+    gravity is asked for by default where the current keeps its sign, as that of one magnet that carries a weight does,
+    and its mean is that of the voltage, so that it is no offset.
     """
+    theta = fit.problem.parameters(fit.vector)
     sd, alone = (
         dict(zip(spread.names, spread.standard_deviations(robust=which).tolist(), strict=True))
         for which in (robust, False)
     )
-    checks = agreements(bench, theta, sd, alone)
+    checks = agreements(bench, theta, sd, alone, agree=agree)
+    if robust:
+        checks["resolution"] = _resolution(bench, fit)
     loop = loop_agrees(rig, theta, bench.rate_hz)
     checks |= {} if loop is None else {"loop_agrees": loop}
     magnet, means = rig.magnet, checks["ohm"].values
@@ -454,7 +460,9 @@ def fact_checks(
         magnet = RigMagnet()
     if carries_weight(magnet, bench["current"].values):
         assert magnet is not None
-        checks["gravity_balance"] = gravity_balance(magnet, bench, theta, spread.names, spread.information)
+        checks["gravity_balance"] = gravity_balance(
+            magnet, bench, theta, spread.names, spread.covariance(robust=robust)
+        )
         if theta["k_x"] > _FAR * sd.get("k_x", np.inf):
             checks["sign_of_k_x"] = Check(
                 passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},
@@ -462,6 +470,25 @@ def fact_checks(
                 "k_x > 0. Check that all columns are of one run, and their signs",
             )  # fmt: skip
     return checks
+
+
+def _resolution(record: Record, fit: Fit) -> Check:
+    """Check that the steps of the converters are small beside the innovations."""
+    problem, text, worst = fit.problem, "", 0.0
+    for k, role in enumerate(problem.model.outputs):
+        step = resolution(record, role).step
+        part = step**2 / 12.0 / (fit.covariance[k, k] * problem.scales.output[k] ** 2)
+        if part > max(worst, _COARSE):
+            worst = float(part)
+            unit = record[role].unit
+            text = (
+                f"the steps of the {role}, {step:.3g} {unit}, make up {100.0 * min(part, 1.0):.2g} % of its innovations"
+            )
+    return Check(
+        passed=not text, values={"part": worst}, cause="quantisation" if text else "",
+        detail=f"{text}, and are no white noise. Use a finer range, or excite more" if text
+        else "the steps of the converters are small beside the innovations",
+    )  # fmt: skip
 
 
 def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:

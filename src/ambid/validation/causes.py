@@ -1,0 +1,386 @@
+"""What the model of one axis leaves out: score tests of the innovations, by cause.
+
+Each cause is a known signal times an unknown size: a force or a voltage beyond the model, or an error of a sensor. It
+moves the innovations by a column c, the signal's way through the predictor; with J the slopes of all estimated numbers
+and c⊥ the part of c outside J's space,
+
+    size = -c⊥ᵀ e / |c⊥|²,   gain = (c⊥ᵀ e)² / |c⊥|²,   shift of the estimate = (JᵀJ)⁻¹ Jᵀ c · c⊥ᵀ e / |c⊥|²
+
+are what the cause would have to be, the fall of the criterion, chi-squared if the model is right (Rao 1948), and what
+leaving it out has done to the parameters. Causes of several columns are tested together. Lines stand out of the
+periodogram of the whitened innovations; the channel is told by the direction in which they point.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+
+import numpy as np
+
+from ambid.arrays import Array, Complex
+from ambid.estimation.estimate import Check
+from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, weight_of, workspace_near
+from ambid.estimation.linear import column_sizes
+from ambid.estimation.predictor import Predictor, assemble, busiest
+from ambid.estimation.uncertainty import chi_squared_tail
+
+_LONGEST = 50_000  # samples that are looked at, the busiest
+_CHANCE = 1e-4  # probability below which a cause counts as seen
+_ALIKE = 0.7  # part of the strongest cause's gain from which another explains the record about as well
+_BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
+_SAME = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
+_WAVES = 8  # half waves over the record of a force or voltage that walks
+_MANY = 40  # and of one that was looked for because a check failed
+_SMOOTH = 9  # lines that are averaged to see a mode
+_DAMPING = (0.005, 0.03)  # with which it is looked for
+_NARROW = 0.6  # part of the power around a line that its own three frequencies hold
+_PENALTY = 2.0  # gain that each column costs a cause when causes are compared
+_LINE = 1e-6  # probability of a line by chance, over all frequencies
+_REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
+_PLAY = 0.1  # of the current's range: width of a hysteresis
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Cause:
+    """A cause that the innovations may have."""
+
+    name: str = ""  # as `Check.cause`
+    channel: str = ""  # force, voltage, position or current
+    gain: float  # fall of the criterion
+    p: float  # probability of that by chance
+    size: float  # of its first column, SI; of a line its frequency, Hz
+    shift: Array  # (n_physical,), SI, what leaving it out has done to the estimate
+    columns: int = 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Course:
+    """Signals over the samples that are looked at, deviations from the operating point in SI."""
+
+    t: Array  # from -1 to 1
+    x: Array
+    v: Array
+    i: Array
+    u: Array
+    di: Array  # rate of the current after each sample, A/s
+    before: Array  # and before it
+    u_before: Array  # voltage before each sample: that after it may be fed back from the sample itself
+    theta: Mapping[str, float]
+    i0: float
+    rate_hz: float
+
+
+Column = tuple[str, Array]
+"""Where a signal enters, force, voltage, position or current, and its course, SI."""
+
+
+def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Cause]:
+    """Return the causes that the innovations of model one-axis may have, the strongest first.
+
+    `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed.
+    """
+    problem, work = fit.problem, workspace_near(fit, fit.problem)
+    predictor = assemble(problem, fit.vector, with_derivatives=False)
+    e = innovations(problem, fit.vector, work, predictor)
+    if predictor is None or e is None:
+        return []
+    at = busiest(problem.u[problem.skip :], min(_LONGEST, len(e)))
+    course = _course(fit, work.w[at, :3], work.z[at, 0], means)
+    weight = weight_of(fit.covariance)
+    spectra = _spectra(e[at] @ weight.T)
+    ways = _ways(predictor, fit, weight, len(e[at]))
+    line = _line(spectra, ways)
+    modes = _modes(spectra, problem.rate_hz, line) if thorough else ()
+    groups = list(_groups(course, modes, thorough=thorough))
+    if line is not None:
+        turn = 2.0 * np.pi * line.k / (at.stop - at.start) * np.arange(at.stop - at.start)
+        groups.append(("line", [(line.channel, np.cos(turn)), (line.channel, np.sin(turn))]))
+    C = np.stack([_through(predictor, fit, weight, column) for _, columns in groups for column in columns], axis=2)
+    found = []
+    for (name, columns), tested in zip(
+        groups, _tested(fit, C, at, [len(columns) for _, columns in groups]), strict=True
+    ):
+        own = line is not None and name == "line"
+        size = (line.k * problem.rate_hz / (at.stop - at.start)) if line is not None and own else tested.size
+        p = min(tested.p, line.p) if line is not None and own else tested.p
+        found.append(replace(tested, name=name, channel=columns[0][0], size=size, p=p, columns=len(columns)))
+    if thorough:
+        found += [c for c in _coloured(spectra, ways, problem.n_physical) if c.p < _CHANCE]
+    return sorted(found, key=lambda c: _PENALTY * c.columns - c.gain)
+
+
+def _course(fit: Fit, states: Array, u: Array, means: Mapping[str, float]) -> _Course:
+    problem, sc = fit.problem, fit.problem.scales
+    x, v, i = (states * sc.state).T
+    theta, u = problem.parameters(fit.vector), u * sc.input[0]
+    rest, last = theta["R"] * i + theta["k_i"] * v, np.concatenate([u[:1], u[:-1]])
+    return _Course(
+        t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
+        di=(u - rest) / theta["L"], before=(last - rest) / theta["L"],
+        theta=theta, i0=means.get("current", 0.0), rate_hz=problem.rate_hz,
+    )  # fmt: skip
+
+
+def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[tuple[str, list[Column]]]:
+    """Yield the causes with their signals; a size is that of the first. `modes`: frequencies, Hz."""
+    yield "eddy_pole", [("force", -s.theta["k_i"] * s.di)]
+    yield "sensor_lag", [("position", -s.v)]
+    yield "current_sensor_pole", [("current", -s.before)]
+    yield "cross_talk", [("position", s.i), ("position", s.u_before)]
+    yield "cross_talk", [("current", s.x), ("current", s.u_before)]
+    yield "r_drift", [("voltage", -s.t * (s.i0 + s.i))]
+    yield "slow_force", [("force", wave) for wave in _waves(s.t, _WAVES)]
+    yield "slow_voltage", [("voltage", wave) for wave in _waves(s.t, _WAVES)]
+    for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
+        yield "curvature", [term for j in range(degree + 1) for term in _energy(s, j, degree - j)]
+    if not thorough:
+        return
+    low, high = np.quantile(s.u, (1.0 - _REACH, _REACH))
+    yield "limiter", [("voltage", -np.maximum(s.u - high, 0.0)), ("voltage", -np.minimum(s.u - low, 0.0))]
+    yield "hysteresis", [("force", s.theta["k_i"] * (_play(s.i, _PLAY * float(np.ptp(s.i))) - s.i))]
+    yield "slow_force", [("force", wave) for wave in _waves(s.t, _MANY)]
+    for f in modes:
+        for damping in _DAMPING:
+            yield "flexible_mode", [("position", q) for q in _oscillation(s, f, damping)]
+
+
+def _waves(t: Array, count: int) -> list[Array]:
+    return [t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(2, count + 1))]
+
+
+def _energy(s: _Course, a: int, b: int) -> list[Column]:
+    """Force and voltage of the term x^a i^b of the co-energy, over the sizes of the motion."""
+    X, I = max(float(s.x.std()), 1e-300), max(float(s.i.std()), 1e-300)  # noqa: E741
+    unit = 1.0 / (X**a * I**b)
+    columns: list[Column] = []
+    if a:
+        columns.append(("force", unit * a * s.x ** (a - 1) * s.i**b))
+    if b:
+        columns.append(("voltage", np.append(-np.diff(unit * b * s.x**a * s.i ** (b - 1)), 0.0) * s.rate_hz))
+    return columns
+
+
+def _play(x: Array, width: float) -> Array:
+    """Return what follows x through a slack of a width."""
+    out, at = np.empty_like(x), float(x[0])
+    for k, value in enumerate(x.tolist()):
+        at = min(max(at, value - 0.5 * width), value + 0.5 * width)
+        out[k] = at
+    return out
+
+
+def _oscillation(s: _Course, f: float, damping: float) -> tuple[Array, Array]:
+    """Return position and velocity, over the frequency, of an oscillator of frequency `f` that the magnet drives."""
+    period, omega = 1.0 / s.rate_hz, 2.0 * np.pi * f
+    wave = np.exp((-damping + 1j) * omega * period)
+    state = run(np.array([[wave.real, -wave.imag, 0.0], [wave.imag, wave.real, 1.0]]), s.i[:, None], np.zeros(2))[:-1]
+    return state[:, 0], state[:, 1]
+
+
+def _through(predictor: Predictor, fit: Fit, weight: Array, column: Column) -> Array:
+    """Return what a signal of size one does to the whitened innovations, (n, n_outputs)."""
+    (where, signal), sc, model = column, fit.problem.scales, fit.problem.model
+    n = predictor.A.shape[0]
+    own = np.zeros((signal.size, len(model.outputs)))
+    if where in model.outputs:
+        k = model.outputs.index(where)
+        own[:, k] = signal / sc.output[k]
+        enter = -predictor.gain[:, [k]]
+        driven = own[:, [k]]
+    else:
+        k = model.disturbances.index(where)
+        enter, driven = predictor.E[:, [k]], _between(signal)[:, None] / sc.disturbance[k]
+    state = run(np.hstack([predictor.M[:, :n], enter]), driven, np.zeros(n))[:-1]
+    return np.asarray(-(own + state @ predictor.C.T) @ weight.T)
+
+
+def _between(signal: Array) -> Array:
+    """The mean from each sample to the next, as a disturbance that is held acts."""
+    return np.append(0.5 * (signal[1:] + signal[:-1]), signal[-1])
+
+
+def _tested(fit: Fit, C: Array, at: slice, sizes: Sequence[int]) -> list[Cause]:
+    """Test groups of columns (n, n_outputs, n_columns), `sizes`: of the groups; names are left open."""
+    problem, weight, work = fit.problem, weight_of(fit.covariance), workspace_near(fit, fit.problem)
+    # the levels of noise are left out: under the right model they are not correlated with what moves the mean, and
+    # under a wrong one they have taken up a part of it
+    kept = np.ones(problem.size, dtype=bool)
+    kept[problem.slices["noise"]] = False
+    near = work.turn
+    turn = np.eye(problem.size) if near is None else near[1]
+    p, first = problem.size, 0
+    own, cross, pull, squares = np.zeros((p, p)), np.zeros((p, C.shape[2])), np.zeros((p, 1)), 0.0
+    along = np.zeros(C.shape[2])
+    for block in residual_blocks(problem, fit.vector, weight, work, turn):
+        a, b = max(at.start - first, 0), min(at.stop - first, block.shape[0])
+        if a < b:
+            rows, columns = block[a:b], C[first + a - at.start : first + b - at.start]
+            for o in range(rows.shape[1]):
+                J, r = rows[:, o, :p], rows[:, o, p]
+                own += J.T @ J
+                cross += J.T @ columns[:, o]
+                pull[:, 0] += J.T @ r
+                along += columns[:, o].T @ r
+                squares += float(r @ r)
+        first += block.shape[0]
+    back = np.eye(p) if near is None else near[0]
+    prior = fit.J_prior[:, kept]
+    own = (back.T @ own @ back)[np.ix_(kept, kept)] + prior.T @ prior
+    cross, pull = (back.T @ cross)[kept], (back.T @ pull)[kept]
+    pull[:, 0] += prior.T @ fit.r_prior
+    scale = column_sizes(np.sqrt(np.diag(own))[None, :])
+    values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
+    visible = values > _BLIND * values[-1]
+    root = (vectors[:, visible] / np.sqrt(values[visible])).T / scale
+    seen, there = root @ cross, root @ pull[:, 0]
+    inner = np.einsum("koa,kob->ab", C, C, optimize=True)
+    rest, left = inner - seen.T @ seen, along - seen.T @ there
+    spread = max(1.0, squares / max((at.stop - at.start) * C.shape[1], 1))
+    out, start = list[Cause](), 0
+    for size in sizes:
+        g = slice(start, start + size)
+        start += size
+        unit = np.sqrt(np.maximum(np.diag(inner)[g], 1e-300))
+        values, vectors = np.linalg.eigh(rest[g, g] / np.outer(unit, unit))
+        distinct = values > _SAME
+        if not np.any(distinct):
+            out.append(Cause(gain=0.0, p=1.0, size=0.0, shift=np.zeros(problem.n_physical)))
+            continue
+        inside = (vectors[:, distinct].T @ (left[g] / unit)) / values[distinct]
+        epsilon = -(vectors[:, distinct] @ inside) / unit
+        gain = float(-epsilon @ left[g]) / spread
+        shift = -(root.T @ (seen[:, g] @ epsilon))[: problem.n_physical] * problem.magnitude
+        chance = chi_squared_tail(int(distinct.sum()), gain)
+        out.append(Cause(gain=gain, p=chance, size=float(epsilon[0]), shift=shift))
+    return out
+
+
+def _spectra(e: Array) -> Complex:
+    """Return the spectra of whitened innovations at k = 2, 3, ... over the length, of variance 1 each."""
+    n = e.shape[0]
+    window = np.hanning(n)[:, None] * np.sqrt(8.0 / 3.0 / n)
+    return np.asarray(np.fft.rfft(e * window, axis=0)[2:-1], dtype=np.complex128)
+
+
+def _ways(predictor: Predictor, fit: Fit, weight: Array, n: int) -> dict[str, Complex]:
+    """Return how a force, a voltage or an error of a sensor shows at those frequencies, (n_lines, n_outputs)."""
+    model, F = fit.problem.model, predictor.M[:, : predictor.A.shape[0]]
+    z = np.exp(2j * np.pi * np.arange(2, n // 2 + 1 - (n % 2 == 0)) / n)
+    values, vectors = np.linalg.eig(F)
+    inverse = np.linalg.inv(vectors)
+    left = predictor.C @ vectors
+    n_d = len(model.disturbances)
+    enter = inverse @ np.hstack([predictor.E, -predictor.gain])
+    through = -np.einsum("oj,kj,jb->kob", left, 1.0 / (z[:, None] - values), enter)
+    through[:, :, n_d:] -= np.eye(len(model.outputs))
+    return {name: through[:, :, j] @ weight.T for j, name in enumerate((*model.disturbances, *model.outputs))}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Line:
+    k: int  # periods over the samples that are looked at
+    channel: str
+    p: float
+
+
+def _line(spectra: Complex, ways: Mapping[str, Complex]) -> _Line | None:
+    """Return the strongest narrow line, None where none stands out."""
+    power = np.sum(np.abs(spectra) ** 2, axis=1)
+    n_y = spectra.shape[1]
+    usual = float(np.median(power)) / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
+    j = int(np.argmax(power))
+    ratio = float(power[j] / max(usual, 1e-300))
+    p = float(power.size * (1.0 + ratio * (n_y > 1)) * np.exp(-min(ratio, 700.0)))
+    around = power[max(j - 12, 0) : j + 13]
+    if p > _LINE or float(power[max(j - 1, 0) : j + 2].sum()) < _NARROW * float(around.sum()):
+        return None
+    shares = {
+        name: float(abs(np.vdot(way[j], spectra[j])) ** 2 / np.vdot(way[j], way[j]).real) for name, way in ways.items()
+    }
+    return _Line(k=j + 2, channel=max(shares, key=lambda name: shares[name]), p=p)
+
+
+def _modes(spectra: Complex, rate_hz: float, line: _Line | None) -> tuple[float, ...]:
+    """Return the frequency at which the innovations stand highest over some lines, Hz; not that of a line."""
+    power = np.sum(np.abs(spectra) ** 2, axis=1)
+    if line is not None:
+        power[max(line.k - 4, 0) : line.k + 1] = np.median(power)
+    smooth = np.convolve(power, np.ones(_SMOOTH) / _SMOOTH, mode="same")
+    smooth[: 2 * _SMOOTH] = 0.0
+    return (float((np.argmax(smooth) + 2) * 0.5 * rate_hz / (power.size + 2)),)
+
+
+def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) -> Iterator[Cause]:
+    """Yield a disturbing force or voltage that is not white: its power by octaves against that of white innovations."""
+    edges = np.unique(np.geomspace(1, max(spectra.shape[0] // 5, 2), 14).astype(int))
+    for name in ("force", "voltage"):
+        way = ways[name]
+        power = np.abs(np.sum(way.conj() * spectra, axis=1)) ** 2 / np.maximum(np.sum(np.abs(way) ** 2, axis=1), 1e-300)
+        sums = [(b - a, float(power[a:b].mean())) for a, b in pairwise(edges.tolist()) if b - a >= 4]
+        if len(sums) < 2 or max(m for _, m in sums[:2]) < 0.5 * max(m for _, m in sums):  # not slow
+            continue
+        gain = sum(2.0 * n * (mean - 1.0 - np.log(mean)) for n, mean in sums if mean > 1.0) / 1.5  # of a Hann window
+        yield Cause(
+            name=f"slow_{name}", channel=name, gain=float(gain), p=chi_squared_tail(max(len(sums), 1), float(gain)),
+            size=np.nan, shift=np.zeros(n_physical), columns=len(sums),
+        )  # fmt: skip
+
+
+_SAME_AS = {"sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",)}
+"""What the first order of a score does not tell apart."""
+_TEXT = {
+    "eddy_pole": "the force lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or identify "
+    "with the nonlinear magnet and its eddy pole",
+    "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
+    "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
+    "cross_talk": "the {channel} holds a part of voltage or current: cross-talk. Check cables and grounds",
+    "r_drift": "the resistance drifts by {size:.3g} of itself from the middle of the record to its end: the coil warms "
+    "up. Record shorter, or after it is warm",
+    "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
+    "longer, or excite above it",
+    "slow_voltage": "the voltage walks slowly, of the order of {size:.3g} V. Check the supply and the sensor's zero",
+    "curvature": "force or flux bends over this motion. Excite less, or identify the nonlinear magnet",
+    "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
+    "hysteresis": "the force follows the current with a slack: hysteresis. Excite more, or demagnetise",
+    "flexible_mode": "the position holds a further mode. Excite below it, or use model rotor",
+    "line": "a line at {size:.4g} Hz stands in the {channel}: unbalance, motion of the base, hum or an aliased tone. "
+    "Remove its source, or log what causes it",
+}
+
+
+def named_bias(found: Sequence[Cause], none: Array) -> Array:
+    """Return the largest shift, of each parameter, by the strongest cause and those about as strong; `none`: zeros."""
+    sure = [c for c in found if c.p < _CHANCE]
+    stacked = np.array([none, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
+    return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
+
+
+def causes_check(found: Sequence[Cause], checks: Mapping[str, Check]) -> dict[str, Check]:
+    """Judge the causes of `causes`: what explains the innovations best, and what explains them about as well.
+
+    `checks`: made before; a fixed value that the record contradicts less than it shows the cause is not blamed.
+    """
+    sure = [c for c in found if c.p < _CHANCE]
+    if not sure:
+        return {"causes": Check(passed=True, detail="no cause that was looked for shows in the innovations")}
+    first = sure[0]
+    alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
+    others = tuple(dict.fromkeys([*alike, *_SAME_AS.get(first.name, ())]))
+    late = checks.get("in_time")
+    if late is not None and not late.passed:
+        others = tuple(c for c in dict.fromkeys([*others, late.cause, *late.alternatives]) if c != first.name)
+    text = _TEXT[first.name].format(size=first.size, channel=first.channel)
+    if others:
+        text += f"; about as well explained by {' or '.join(others)}"
+    grave = checks["estimates_agree"].grave or (late is not None and not late.passed)
+    named = Check(
+        passed=False, p=first.p, values={"gain": first.gain}, detail=f"{text} (chi-squared {first.gain:.3g})",
+        grave=grave, cause=first.name, size=first.size, alternatives=others,
+    )  # fmt: skip
+    fixed = checks["fixed_agree"]
+    if fixed.passed or fixed.values["gain"] > first.gain:
+        return {"causes": named}
+    text = f"a fixed value would fit better elsewhere, by less than {first.name} explains"
+    return {"causes": named, "fixed_agree": replace(fixed, passed=True, detail=text)}

@@ -1,0 +1,105 @@
+"""Score tests of one axis: each cause is named where it is, and none where there is none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.bearing.linear import greybox
+from ambid.job.data import load_bench, signals_of
+from ambid.rig import default_rig
+from ambid.validation.causes import causes, named_bias
+from tests.tiers import runs
+
+
+def fitted(columns, rate_hz):
+    bench = load_bench(columns, default_rig(), rate_hz=rate_hz, units={"voltage": "V", "current": "A", "position": "m"})
+    rig = default_rig()
+    fit = greybox(rig.plant, signals_of(bench, rig.plant), rig.parameters)
+    return fit, {name: float(bench[name].values.mean()) for name in bench.names}
+
+
+def columns_of(preset, seed, duration=1.0):
+    record = ambid.simulate(preset, duration=duration, seed=seed)
+    return {c.name: c.values.copy() for c in record.channels}, record.rate_hz
+
+
+def strongest(columns, rate_hz):
+    fit, means = fitted(columns, rate_hz)
+    return [c for c in causes(fit, means, thorough=True) if c.p < 1e-4]
+
+
+def test_sound_records_name_no_cause():
+    seeds = range(1, 1 + runs(40, short=4))
+    named = [
+        c.name
+        for seed in seeds
+        for preset in ("thesis", "unstable-bearing")
+        for c in strongest(*columns_of(preset, seed))
+    ]
+    assert len(named) <= max(1, len(seeds) // 20)
+
+
+def hum(c, t):
+    c["current"] += 0.02 * c["current"].std() * np.sin(2 * np.pi * 50.0 * t)
+
+
+def drift(c, t):
+    c["voltage"] += 0.1 * c["voltage"].std() * (t / t[-1] - 0.5)
+
+
+def talk(c, t):
+    c["position"] += 0.02 * c["position"].std() / c["current"].std() * c["current"]
+
+
+@pytest.mark.parametrize("preset", ["thesis", "unstable-bearing"])
+@pytest.mark.parametrize(
+    ("spoil", "cause", "channel"),
+    [
+        (hum, "line", "current"),
+        (drift, "slow_voltage", "voltage"),
+        (talk, "cross_talk", "position"),
+    ],
+)
+def test_the_cause_is_named(preset, spoil, cause, channel):
+    columns, rate_hz = columns_of(preset, 1)
+    spoil(columns, np.arange(columns["voltage"].size) / rate_hz)
+    sure = strongest(columns, rate_hz)
+    alike = [c for c in sure if c.gain > 0.7 * sure[0].gain]
+    assert (cause, channel) in [(c.name, c.channel) for c in alike]
+    if cause == "line":
+        assert sure[0].size == pytest.approx(50.0, abs=1.0)
+
+
+def test_size_and_shift_are_what_a_drift_of_the_resistance_did():
+    """The estimate with its named shift taken back is that of the record without the drift."""
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    clean, _ = fitted(columns, rate_hz)
+    i = columns["current"] + 2.0
+    columns["current"] = i
+    columns["voltage"] += 1.6 * 2.0 + 0.02 * np.linspace(-1.0, 1.0, i.size) * i
+    spoiled, means = fitted(columns, rate_hz)
+    drift_found = next(c for c in causes(spoiled, means, thorough=False) if c.name == "r_drift")
+    assert drift_found.size == pytest.approx(0.02, rel=0.1)
+    n, size = spoiled.problem.n_physical, spoiled.problem.magnitude
+    moved = (spoiled.problem.parameters(spoiled.vector), clean.problem.parameters(clean.vector))
+    away = np.array([moved[0][k] - moved[1][k] for k in spoiled.problem.estimated])
+    sd = np.sqrt(np.diag(np.linalg.inv(clean.J.T @ clean.J)))[:n] * size
+    assert np.any(np.abs(away) > sd)
+    assert np.all(np.abs(away + drift_found.shift) < 0.3 * np.abs(away) + 0.2 * sd)
+
+
+def test_intervals_hold_what_a_named_cause_did():
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    columns["position"] += 0.01 * columns["position"].std() / columns["current"].std() * columns["current"]
+    spoiled, means = fitted(columns, rate_hz)
+    found = causes(spoiled, means, thorough=True)
+    bias = named_bias(found, np.zeros(spoiled.problem.n_physical))
+    assert np.any(np.abs(bias) > 0.0)
+    units = {"voltage": "V", "current": "A", "position": "m"}
+    estimate = ambid.identify(columns, rate_hz=rate_hz, units=units)
+    assert estimate.verdict.word != "usable"
+    assert estimate.verdict.reasons[0].cause
+    for shift, name in zip(bias, spoiled.problem.estimated, strict=True):
+        assert estimate[name].sd >= 0.99 * abs(shift)

@@ -1,0 +1,148 @@
+"""Facts of a record without a fit, and what they say of an estimate."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import ambid
+from ambid.record import Channel, Record
+from ambid.validation.facts import agreements, belonging, facts, mean_resistance, one_sided
+
+RATE = 1000.0
+
+
+def record(voltage, current, position):
+    columns = {"voltage": (voltage, "V"), "current": (current, "A"), "position": (position, "m")}
+    channels = tuple(
+        Channel(name=k, values=np.asarray(x, float), unit=u, source_unit=u) for k, (x, u) in columns.items()
+    )
+    return Record(channels=channels, rate_hz=RATE, start_s=0.0, provenance={}, history=())
+
+
+def carried(seed=1, n=4000, offset=0.0):
+    """A current of one sign through 4 ohm, and a position that it moves."""
+    rng = np.random.default_rng(seed)
+    i = 1.0 + 0.1 * np.convolve(rng.standard_normal(n + 40), np.hanning(41), mode="valid")[:n] / 4
+    x = np.cumsum(np.cumsum(i - i.mean())) * 1e-6
+    x = x - np.polyval(np.polyfit(np.arange(n), x, 3), np.arange(n)) + 1e-7 * rng.standard_normal(n)
+    return record(4.0 * i + offset + 0.01 * rng.standard_normal(n), i, x)
+
+
+def test_means_of_a_current_with_one_sign_give_the_resistance():
+    value, sd = mean_resistance(carried())
+    assert abs(value - 4.0) < 2 * sd < 0.15
+    assert mean_resistance(carried(offset=0.4))[0] == pytest.approx(4.4, abs=0.02)
+
+
+def test_a_current_of_both_signs_gives_none():
+    x = carried()
+    both = record(x["voltage"].values, x["current"].values - 1.0, x["position"].values)
+    assert mean_resistance(both) is None
+    assert not one_sided(both["current"].values)
+    assert one_sided(-x["current"].values)
+
+
+def test_offset_is_within_the_stated_deviation():
+    i = carried()["current"].values
+    near = record(4.0 * i + 0.005 * 4.8, i, i)
+    value, sd = mean_resistance(near)
+    assert abs(value - 4.0) < 1.5 * sd
+
+
+THETA = {"m": 0.1, "k_x": -50.0, "k_i": 2.0, "R": 4.0, "L": 0.04, "c": 0.0}
+SD = {"R": 0.01, "L": 1e-4, "k_i": 0.01}
+
+
+@pytest.mark.parametrize(("r", "passed"), [(4.0, True), (4.05, True), (4.4, False), (3.6, False)])
+def test_a_resistance_that_the_means_contradict_is_named(r, passed):
+    check = agreements(carried(), {**THETA, "R": r}, SD, SD, agree=True)["ohm"]
+    assert check.passed is passed
+    assert check.cause == ("" if passed else "ohm")
+    if not passed:
+        assert check.size == pytest.approx(4.0 - r, abs=0.05)
+        assert "offset" in check.detail
+
+
+def test_positions_of_another_run_do_not_belong():
+    own, other = carried(1), carried(2)
+    assert belonging(own).passed
+    mixed = record(own["voltage"].values, own["current"].values, other["position"].values)
+    assert not belonging(mixed).passed
+    assert facts(mixed)["belonging"].cause == "belonging"
+    assert not agreements(mixed, THETA, {**SD, "k_i": 1.0}, SD, agree=True)["belonging"].passed
+
+
+def test_belonging_is_seldom_denied_and_never_where_the_force_shows():
+    chances = [belonging(carried(seed)).passed for seed in range(20)]
+    assert all(chances)
+    mixed = record(carried(1)["voltage"].values, carried(1)["current"].values, carried(2)["position"].values)
+    assert agreements(mixed, THETA, SD, SD, agree=True)["belonging"].passed
+
+
+def test_slow_signals_of_two_runs_are_related_by_chance_only():
+    """Random walks always look alike; whitened, at most a few of a hundred pairs do."""
+    rng = np.random.default_rng(5)
+    walks = np.cumsum(rng.standard_normal((100, 2, 2000)), axis=2)
+    related = [belonging(record(w[0], w[0], w[1])).passed for w in walks]
+    assert sum(related) <= 3
+
+
+@pytest.mark.parametrize(
+    ("inductance", "cause", "grave"), [(0.04, "", False), (6e-3, "sampling", False), (1e-3, "sampling", True)]
+)
+def test_a_coil_faster_than_the_sampling_is_named(inductance, cause, grave):
+    check = agreements(carried(), {**THETA, "L": inductance}, {**SD, "L": 1e-5}, SD, agree=True)["sampling"]
+    assert (check.cause, check.grave) == (cause, grave)
+
+
+def test_voltage_that_changes_between_samples_is_named_where_refits_disagree():
+    x = carried()
+    rng = np.random.default_rng(3)
+    rough = record(x["voltage"].values + rng.standard_normal(x.n_samples), x["current"].values, x["position"].values)
+    assert agreements(rough, THETA, SD, SD, agree=True)["sampling"].passed
+    assert agreements(rough, THETA, SD, SD, agree=False)["sampling"].cause == "sampling"
+    assert agreements(x, THETA, SD, SD, agree=False)["sampling"].passed
+
+
+def test_a_log_that_stood_still_is_named_and_coarse_steps_are_not():
+    x = carried()
+    frozen = {c.name: c.values.copy() for c in x.channels}
+    for values in frozen.values():
+        values[1000:1012] = values[1000]
+    check = facts(record(**frozen))["log_runs"]
+    assert (check.passed, check.cause, check.values["longest"]) == (False, "stuck", 12.0)
+    assert "1 s" in check.detail
+    coarse = record(*(np.round(c.values / np.std(c.values) / 3) for c in x.channels))
+    assert facts(coarse)["log_runs"].passed
+
+
+def test_a_position_of_metres_is_grave():
+    x = carried()
+    far = record(x["voltage"].values, x["current"].values, x["position"].values + 18.5)
+    assert facts(far)["position_size"].cause == "unit"
+
+
+def test_two_contradicting_facts_are_do_not_use():
+    estimate = ambid.identify(ambid.simulate("thesis", duration=0.5, seed=1))
+    ohm = replace(estimate.checks["residuals_white"], passed=False, cause="ohm")
+    one = replace(estimate, checks={**estimate.checks, "ohm": ohm})
+    assert one.verdict.word == "caution"
+    both = replace(one, checks={**one.checks, "gravity_balance": replace(ohm, cause="weight")})
+    assert both.verdict.word == "unusable"
+    assert {r.cause for r in both.verdict.reasons} == {"ohm", "weight"}
+
+
+def test_causes_go_through_the_file(tmp_path):
+    estimate = ambid.identify(ambid.simulate("thesis", duration=0.5, seed=1))
+    line = replace(
+        estimate.checks["causes"], passed=False, cause="line", size=50.0, alternatives=("slow_force",), grave=True
+    )
+    named = replace(estimate, checks={**estimate.checks, "causes": line})
+    named.save(tmp_path / "e.json")
+    again = ambid.load(tmp_path / "e.json")
+    assert again.checks["causes"] == line
+    reason = again.verdict.reasons[0]
+    assert (reason.cause, reason.size, reason.alternatives, reason.grave) == ("line", 50.0, ("slow_force",), True)
