@@ -485,7 +485,7 @@ def judged(bench: str, imperfection: str, seed: int, folder: Path) -> dict[str, 
                 "value": p.value, "truth": truth[name], "sd": sd, "z": (p.value - truth[name]) / sd,
                 "identifiable": bool(p.identifiable), "covered": bool(ci and ci[0] <= truth[name] <= ci[1]),
             }  # fmt: skip
-    row["extended"] = [str(e) for e in getattr(found, "extended", None) or ()]
+    row["extended"] = [e.split(" (")[0] for e in found.extended]
     told = ("check", "cause", "alternatives", "grave")
     reasons = [{key: value for key in told if (value := getattr(r, key, None))} for r in found.verdict.reasons]
     return row | {"verdict": found.verdict.word, "reasons": reasons}

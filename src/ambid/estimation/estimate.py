@@ -582,6 +582,8 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
         What a global search did where the ordinary starts failed: ``why``, ``evaluations``, ``seconds``,
         ``criterion_before`` and ``criterion_after`` (per sample; None where there was none), ``taken``,
         ``interrupted``. None: it was not needed.
+    extended : tuple of str
+        Causes that checks named and the model was extended by, whose sizes were estimated too.
     """
 
     status: Literal["converged", "stalled", "failed"]
@@ -606,6 +608,7 @@ class Estimate(Parametric, Judged, Predicting, Simulating, Linear):
     information: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     rig: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
     global_search: Mapping[str, object] | None = None
+    extended: tuple[str, ...] = ()
 
     def dumps(self) -> str:
         """Return the estimate as JSON text, schema ``ambid.estimate/1``.

@@ -34,7 +34,9 @@ class Workspace:
         d, n_used = problem.delay, problem.n_used
         self.y = problem.y[problem.skip :: problem.stride] / problem.scales.output
         n, (n_u, n_y) = len(problem.model.states), (problem.u.shape[1], problem.y.shape[1])
-        self.w = np.empty((n_used, n + len(problem.lags) * n_u + n_y + 1))
+        extra = None if problem.extra is None else problem.extra[problem.skip :] / problem.scales.disturbance
+        n_d = 0 if extra is None else extra.shape[1]
+        self.w = np.empty((n_used, n + len(problem.lags) * n_u + n_d + n_y + 1))
         self.z = self.w[:, n:]
         for j, s in enumerate(problem.lags):
             # inputs after the last sample do not exist; they would act only after the last output
@@ -43,6 +45,9 @@ class Workspace:
             here[: there.shape[0]] = there
             here[there.shape[0] :] = problem.u[-1]
             here /= problem.scales.input
+        if extra is not None:  # over a step of several samples, their mean
+            ends = np.append(np.arange(0, len(extra), problem.stride), len(extra))
+            self.z[:, -1 - n_y - n_d : -1 - n_y] = np.add.reduceat(extra, ends[:-1]) / np.diff(ends)[:, None]
         self.z[:, -1 - n_y : -1], self.z[:, -1] = self.y, 1.0
         self.turn: tuple[Array, Array] | None = None
         self._problem = problem
@@ -55,7 +60,12 @@ class Workspace:
         same = (
             own.u is new.u and own.y is new.y and (own.delay, own.skip, own.stride) == (new.delay, new.skip, new.stride)
         )
-        same = same and own.lags == new.lags and np.array_equal(own.scales.input, new.scales.input)
+        same = (
+            same
+            and own.extra is new.extra
+            and own.lags == new.lags
+            and np.array_equal(own.scales.input, new.scales.input)
+        )
         if not same or not np.array_equal(own.scales.output, new.scales.output):
             return Workspace(problem)
         if self.turn is not None and self.turn[0].shape[0] != problem.size:

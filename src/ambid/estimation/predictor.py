@@ -66,6 +66,7 @@ class PredictorProblem:
     # slopes (n, n_estimated) and residuals (n,) of priors at the estimated physical parameters (n_estimated,), over
     # their standard deviations, where they are not each of one parameter
     joint_priors: Callable[[Array], tuple[Array, Array]] | None = None
+    extra: Array | None = None  # (n_samples, n_disturbances), known disturbances from each sample to the next, SI
 
     slices: Mapping[str, slice] = field(init=False)  # places of the groups in the vector
     taps: tuple[int, ...] = field(init=False)  # lags beyond `delay`, in samples, at which the input acts over one
@@ -406,13 +407,15 @@ def _recursion(
     F, offset = step.A - K @ plant.C, vector[sl["offset"]]
     if not stable(F):
         return None
-    M = np.hstack([F, step.inputs, K, (step.E @ offset)[:, None]])
+    extra = problem.extra is not None
+    M = np.hstack([F, step.inputs, *([step.E] if extra else []), K, (step.E @ offset)[:, None]])
     dM = np.zeros((*M.shape, 0 if dK is None else problem.size))
     dE, dC = np.zeros((*step.E.shape, dM.shape[2])), None
     if dK is not None:
         n, first_y = F.shape[0], M.shape[1] - 1 - K.shape[1]
         for q, d in enumerate(step_slopes):  # physical parameters, then the delay
-            dM[:, :n, q], dM[:, n:first_y, q], dM[:, -1, q] = d.A, d.inputs, d.E @ offset
+            dM[:, :n, q], dM[:, -1, q] = d.A, d.E @ offset
+            dM[:, n:first_y, q] = np.hstack([d.inputs, d.E]) if extra else d.inputs
             dE[:, :, q] = d.E
         dC = _slopes_of_C(slopes, plant.C)
         if dC is not None:

@@ -171,7 +171,7 @@ def identify_axis(
         clock.split("fit", "global_search", float(str(fit.global_search["seconds"])))
     say("check")
     with one_thread():
-        estimate = judge(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
+        estimate = _grown(fit, rig, bench, delay_how="estimated" if delay == "auto" else "given")
         if "reference" in bench or (rig.loop is not None and not rig.open_loop):
             from ambid.job.closed_loop import loop_and_peaks
 
@@ -186,6 +186,24 @@ def identify_axis(
         estimate = replace(estimate, validation=validation(estimate, other))
         clock.lap("validate")
     return replace(estimate, timing_s=clock.laps, used=bench)
+
+
+def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
+    """Judge a fit; where checks name a cause that the model can take in, judge one with it, and keep it if all passes.
+
+    At most three causes, each asked for by a check; where they do not do, the first estimate stays, with its causes.
+    """
+    first = estimate = judge(fit, rig, bench, delay_how=delay_how)
+    named: tuple[str, ...] = ()
+    while len(named) < _CAUSES and "causes" in estimate.checks and not estimate.checks["causes"].passed:
+        from ambid.validation.causes import extended, told
+
+        cause, more = estimate.checks["causes"], extended(fit, estimate.operating_point)
+        if more is None:
+            return first
+        fit, named = more, (*named, told(cause))
+        estimate = replace(judge(fit, rig, bench, delay_how=delay_how), extended=named)
+    return estimate if estimate.verdict.word == "usable" else first
 
 
 def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
@@ -243,6 +261,9 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         estimate, global_search=fit.global_search, parameters=widened.parameters, calibration=widened.calibration,
         calibration_sd=widened.calibration_sd,
     )  # fmt: skip
+
+
+_CAUSES = 3  # that a model is extended by, at most
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

@@ -287,7 +287,8 @@ def delay_lines(estimate: AnyEstimate) -> list[str]:
     """Say by how much each input is delayed; of a bearing the voltage, at each sampling rate."""
     if isinstance(estimate, Estimate):
         rate = RecordEntry.of(estimate.record).rate_hz
-        return [delay_line(role, d, rate) for role, d in estimate.delay.items()]
+        more = [f"model extended by: {', '.join(estimate.extended)}"] if estimate.extended else []
+        return [delay_line(role, d, rate) for role, d in estimate.delay.items()] + more
     return [delay_line(f"voltage at {rate}", d, float(rate.removesuffix(" Hz"))) for rate, d in estimate.delay.items()]
 
 

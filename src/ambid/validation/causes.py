@@ -21,12 +21,12 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
-from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, weight_of, workspace_near
+from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes
-from ambid.estimation.predictor import Predictor, assemble, busiest
+from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 
-_LONGEST = 50_000  # samples that are looked at, the busiest
+_LONGEST = 100_000  # samples that are looked at, the busiest
 _CHANCE = 1e-4  # probability below which a cause counts as seen
 _ALIKE = 0.7  # part of the strongest cause's gain from which another explains the record about as well
 _BLIND = 1e-12  # eigenvalue, over the largest, of directions that are not seen
@@ -40,6 +40,15 @@ _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
+_QUICK = frozenset({"eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"})
+_GROWING = _QUICK | {"line", "slow_force", "slow_voltage"}
+"""Causes whose signals are known but for their sizes."""
+_TURNS = 6  # in which sizes and parameters are found in turn
+_SETTLED = 0.1  # gain below which they are
+
+
+Column = tuple[str, Array]
+"""Where a signal enters, force, voltage, position or current, and its course, SI."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -52,7 +61,8 @@ class Cause:
     p: float  # probability of that by chance
     size: float  # of its first column, SI; of a line its frequency, Hz
     shift: Array  # (n_physical,), SI, what leaving it out has done to the estimate
-    columns: int = 1
+    sizes: Array  # (n_columns,), SI, of all its columns
+    columns: tuple[Column, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -72,8 +82,27 @@ class _Course:
     rate_hz: float
 
 
-Column = tuple[str, Array]
-"""Where a signal enters, force, voltage, position or current, and its course, SI."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Look:
+    """A fit with its innovations over the samples that are looked at."""
+
+    fit: Fit
+    predictor: Predictor
+    weight: Array
+    e: Array  # (n, n_outputs), scaled
+    at: slice
+    course: _Course
+
+
+def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
+    problem, work = fit.problem, workspace_near(fit, fit.problem)
+    predictor = assemble(problem, fit.vector, with_derivatives=False)
+    e = innovations(problem, fit.vector, work, predictor)
+    if predictor is None or e is None:
+        return None
+    at = busiest(problem.u[problem.skip :], min(_LONGEST, len(e)))
+    course = _course(fit, work.w[at, :3], work.z[at, 0], means)
+    return _Look(fit=fit, predictor=predictor, weight=weight_of(fit.covariance), e=e[at], at=at, course=course)
 
 
 def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Cause]:
@@ -81,34 +110,80 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Caus
 
     `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed.
     """
-    problem, work = fit.problem, workspace_near(fit, fit.problem)
-    predictor = assemble(problem, fit.vector, with_derivatives=False)
-    e = innovations(problem, fit.vector, work, predictor)
-    if predictor is None or e is None:
+    look = _look(fit, means)
+    if look is None:
         return []
-    at = busiest(problem.u[problem.skip :], min(_LONGEST, len(e)))
-    course = _course(fit, work.w[at, :3], work.z[at, 0], means)
-    weight = weight_of(fit.covariance)
-    spectra = _spectra(e[at] @ weight.T)
-    ways = _ways(predictor, fit, weight, len(e[at]))
+    course, rate_hz = look.course, fit.problem.rate_hz
+    spectra, ways = _spectra(look.e @ look.weight.T), _ways(look)
     line = _line(spectra, ways)
-    modes = _modes(spectra, problem.rate_hz, line) if thorough else ()
+    modes = _modes(spectra, rate_hz, line) if thorough else ()
     groups = list(_groups(course, modes, thorough=thorough))
     if line is not None:
-        turn = 2.0 * np.pi * line.k / (at.stop - at.start) * np.arange(at.stop - at.start)
-        groups.append(("line", [(line.channel, np.cos(turn)), (line.channel, np.sin(turn))]))
-    C = np.stack([_through(predictor, fit, weight, column) for _, columns in groups for column in columns], axis=2)
-    found = []
-    for (name, columns), tested in zip(
-        groups, _tested(fit, C, at, [len(columns) for _, columns in groups]), strict=True
-    ):
-        own = line is not None and name == "line"
-        size = (line.k * problem.rate_hz / (at.stop - at.start)) if line is not None and own else tested.size
-        p = min(tested.p, line.p) if line is not None and own else tested.p
-        found.append(replace(tested, name=name, channel=columns[0][0], size=size, p=p, columns=len(columns)))
+        turn = 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)
+        groups.append(("line", ((line.channel, np.cos(turn)), (line.channel, np.sin(turn)))))
+    found = _tested(look, groups)
+    if line is not None:
+        found[-1] = replace(found[-1], size=line.k * rate_hz / course.t.size, p=min(found[-1].p, line.p))
     if thorough:
-        found += [c for c in _coloured(spectra, ways, problem.n_physical) if c.p < _CHANCE]
-    return sorted(found, key=lambda c: _PENALTY * c.columns - c.gain)
+        found += _coloured(spectra, ways, fit.problem.n_physical)
+    return sorted(found, key=lambda c: _PENALTY * c.sizes.size - c.gain)
+
+
+def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
+    """Fit again with the strongest cause in the model, its sizes estimated beside the parameters.
+
+    None where the record does not tell it from another, or the search does not settle. The record is corrected by an
+    error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
+    information of the parameters is what is left beside the sizes.
+    """
+    found = [c for c in causes(fit, means, thorough=True) if c.p < _CHANCE]
+    if not found or fit.problem.n_used > _LONGEST:
+        return None
+    cause, plain, total = found[0], fit.problem, np.zeros(found[0].sizes.size)
+    alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in found[1:])
+    if alike or not cause.columns or cause.name not in _GROWING:
+        return None
+    for _ in range(_TURNS):
+        total = total + cause.sizes
+        problem = _corrected(plain, cause.columns, total)
+        fit = search(problem, fit.vector, work=workspace_near(fit, problem))
+        look = None if fit.status != "converged" else _look(fit, means)
+        if look is None:
+            return None
+        columns = _again(cause, look.course)
+        cause = replace(_tested(look, [(cause.name, columns)])[0], size=cause.size)
+        if cause.gain < _SETTLED:
+            return replace(fit, J=_beside(look, columns))
+    return None
+
+
+def told(check: Check) -> str:
+    """Return a named cause and its size, as what a model is extended by."""
+    unit = {"line": " Hz", "r_drift": " ohm", "sensor_lag": " s", "eddy_pole": " s", "current_sensor_pole": " s"}
+    return f"{check.cause} ({check.size:.3g}{unit[check.cause]})" if check.cause in unit else check.cause
+
+
+def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
+    """Return a cause's signals at another fit: those of lines and walks are the same."""
+    if cause.name in ("line", "slow_force", "slow_voltage"):
+        return cause.columns
+    own = (cause.name, cause.channel, len(cause.columns))
+    groups = _groups(course, (), thorough=cause.name not in _QUICK)
+    return next(columns for name, columns in groups if (name, columns[0][0], len(columns)) == own)
+
+
+def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Array) -> PredictorProblem:
+    """Return a problem that holds signals of some sizes."""
+    model, skip = problem.model, problem.skip
+    y, extra = problem.y.copy(), np.zeros((problem.y.shape[0], len(model.disturbances)))
+    if problem.extra is not None:
+        extra += problem.extra
+    for (where, signal), size in zip(columns, sizes.tolist(), strict=True):
+        if where in model.outputs:
+            y[skip:, model.outputs.index(where)] -= size * signal
+        else:
+            extra[skip:, model.disturbances.index(where)] += size * _between(signal)
+    return replace(problem, y=y, extra=extra)
 
 
 def _course(fit: Fit, states: Array, u: Array, means: Mapping[str, float]) -> _Course:
@@ -123,27 +198,27 @@ def _course(fit: Fit, states: Array, u: Array, means: Mapping[str, float]) -> _C
     )  # fmt: skip
 
 
-def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[tuple[str, list[Column]]]:
+def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
     """Yield the causes with their signals; a size is that of the first. `modes`: frequencies, Hz."""
-    yield "eddy_pole", [("force", -s.theta["k_i"] * s.di)]
-    yield "sensor_lag", [("position", -s.v)]
-    yield "current_sensor_pole", [("current", -s.before)]
-    yield "cross_talk", [("position", s.i), ("position", s.u_before)]
-    yield "cross_talk", [("current", s.x), ("current", s.u_before)]
-    yield "r_drift", [("voltage", -s.t * (s.i0 + s.i))]
-    yield "slow_force", [("force", wave) for wave in _waves(s.t, _WAVES)]
-    yield "slow_voltage", [("voltage", wave) for wave in _waves(s.t, _WAVES)]
+    yield "eddy_pole", (("force", -s.theta["k_i"] * s.di),)
+    yield "sensor_lag", (("position", -s.v),)
+    yield "current_sensor_pole", (("current", -s.before),)
+    yield "cross_talk", (("position", s.i), ("position", s.u_before))
+    yield "cross_talk", (("current", s.x), ("current", s.u_before))
+    yield "r_drift", (("voltage", -s.t * (s.i0 + s.i)),)
+    yield "slow_force", tuple(("force", wave) for wave in _waves(s.t, _WAVES))
+    yield "slow_voltage", tuple(("voltage", wave) for wave in _waves(s.t, _WAVES))
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
-        yield "curvature", [term for j in range(degree + 1) for term in _energy(s, j, degree - j)]
+        yield "curvature", tuple(term for j in range(degree + 1) for term in _energy(s, j, degree - j))
     if not thorough:
         return
     low, high = np.quantile(s.u, (1.0 - _REACH, _REACH))
-    yield "limiter", [("voltage", -np.maximum(s.u - high, 0.0)), ("voltage", -np.minimum(s.u - low, 0.0))]
-    yield "hysteresis", [("force", s.theta["k_i"] * (_play(s.i, _PLAY * float(np.ptp(s.i))) - s.i))]
-    yield "slow_force", [("force", wave) for wave in _waves(s.t, _MANY)]
+    yield "limiter", (("voltage", -np.maximum(s.u - high, 0.0)), ("voltage", -np.minimum(s.u - low, 0.0)))
+    yield "hysteresis", (("force", s.theta["k_i"] * (_play(s.i, _PLAY * float(np.ptp(s.i))) - s.i)),)
+    yield "slow_force", tuple(("force", wave) for wave in _waves(s.t, _MANY))
     for f in modes:
         for damping in _DAMPING:
-            yield "flexible_mode", [("position", q) for q in _oscillation(s, f, damping)]
+            yield "flexible_mode", tuple(("position", q) for q in _oscillation(s, f, damping))
 
 
 def _waves(t: Array, count: int) -> list[Array]:
@@ -179,21 +254,22 @@ def _oscillation(s: _Course, f: float, damping: float) -> tuple[Array, Array]:
     return state[:, 0], state[:, 1]
 
 
-def _through(predictor: Predictor, fit: Fit, weight: Array, column: Column) -> Array:
-    """Return what a signal of size one does to the whitened innovations, (n, n_outputs)."""
-    (where, signal), sc, model = column, fit.problem.scales, fit.problem.model
-    n = predictor.A.shape[0]
-    own = np.zeros((signal.size, len(model.outputs)))
-    if where in model.outputs:
-        k = model.outputs.index(where)
-        own[:, k] = signal / sc.output[k]
-        enter = -predictor.gain[:, [k]]
-        driven = own[:, [k]]
-    else:
-        k = model.disturbances.index(where)
-        enter, driven = predictor.E[:, [k]], _between(signal)[:, None] / sc.disturbance[k]
-    state = run(np.hstack([predictor.M[:, :n], enter]), driven, np.zeros(n))[:-1]
-    return np.asarray(-(own + state @ predictor.C.T) @ weight.T)
+def _through(look: _Look, columns: Sequence[Column]) -> Array:
+    """Return what signals of size one do to the whitened innovations, (n, n_outputs, n_columns)."""
+    predictor, sc, model = look.predictor, look.fit.problem.scales, look.fit.problem.model
+    n, out = predictor.A.shape[0], np.zeros((*look.e.shape, len(columns)))
+    for j, (where, signal) in enumerate(columns):
+        own = np.zeros_like(look.e)
+        if where in model.outputs:
+            k = model.outputs.index(where)
+            own[:, k] = signal / sc.output[k]
+            enter, driven = -predictor.gain[:, [k]], own[:, [k]]
+        else:
+            k = model.disturbances.index(where)
+            enter, driven = predictor.E[:, [k]], _between(signal)[:, None] / sc.disturbance[k]
+        state = run(np.hstack([predictor.M[:, :n], enter]), driven, np.zeros(n))[:-1]
+        out[:, :, j] = -(own + state @ predictor.C.T) @ look.weight.T
+    return out
 
 
 def _between(signal: Array) -> Array:
@@ -201,19 +277,35 @@ def _between(signal: Array) -> Array:
     return np.append(0.5 * (signal[1:] + signal[:-1]), signal[-1])
 
 
-def _tested(fit: Fit, C: Array, at: slice, sizes: Sequence[int]) -> list[Cause]:
-    """Test groups of columns (n, n_outputs, n_columns), `sizes`: of the groups; names are left open."""
-    problem, weight, work = fit.problem, weight_of(fit.covariance), workspace_near(fit, fit.problem)
-    # the levels of noise are left out: under the right model they are not correlated with what moves the mean, and
-    # under a wrong one they have taken up a part of it
-    kept = np.ones(problem.size, dtype=bool)
-    kept[problem.slices["noise"]] = False
-    near = work.turn
-    turn = np.eye(problem.size) if near is None else near[1]
-    p, first = problem.size, 0
-    own, cross, pull, squares = np.zeros((p, p)), np.zeros((p, C.shape[2])), np.zeros((p, 1)), 0.0
-    along = np.zeros(C.shape[2])
-    for block in residual_blocks(problem, fit.vector, weight, work, turn):
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Sums:
+    """Scalar products of slopes J, residuals r and columns C, whitened; priors are part of J and r."""
+
+    own: Array  # J'J, (size, size)
+    cross: Array  # J'C, (size, n_columns), zero for the levels of noise
+    pull: Array  # J'r
+    along: Array  # C'r
+    inner: Array  # C'C
+    square: float  # mean of r^2
+
+
+def _sums(look: _Look, C: Array) -> _Sums:
+    """Sum over the samples that are looked at.
+
+    Levels of noise are left out of what is projected: under the right model they are not correlated with what moves
+    the mean, and under a wrong one they have taken up a part of it.
+    """
+    fit, at = look.fit, look.at
+    problem, work, p, first = fit.problem, workspace_near(fit, fit.problem), fit.problem.size, 0
+    turn, back = (np.eye(p), np.eye(p)) if work.turn is None else (work.turn[1], work.turn[0])
+    own, cross, pull, along, square = (
+        np.zeros((p, p)),
+        np.zeros((p, C.shape[2])),
+        np.zeros(p),
+        np.zeros(C.shape[2]),
+        0.0,
+    )
+    for block in residual_blocks(problem, fit.vector, look.weight, work, turn):
         a, b = max(at.start - first, 0), min(at.stop - first, block.shape[0])
         if a < b:
             rows, columns = block[a:b], C[first + a - at.start : first + b - at.start]
@@ -221,61 +313,78 @@ def _tested(fit: Fit, C: Array, at: slice, sizes: Sequence[int]) -> list[Cause]:
                 J, r = rows[:, o, :p], rows[:, o, p]
                 own += J.T @ J
                 cross += J.T @ columns[:, o]
-                pull[:, 0] += J.T @ r
+                pull += J.T @ r
                 along += columns[:, o].T @ r
-                squares += float(r @ r)
+                square += float(r @ r)
         first += block.shape[0]
-    back = np.eye(p) if near is None else near[0]
-    prior = fit.J_prior[:, kept]
-    own = (back.T @ own @ back)[np.ix_(kept, kept)] + prior.T @ prior
-    cross, pull = (back.T @ cross)[kept], (back.T @ pull)[kept]
-    pull[:, 0] += prior.T @ fit.r_prior
+    cross = back.T @ cross
+    cross[problem.slices["noise"]] = 0.0
+    return _Sums(
+        own=back.T @ own @ back + fit.J_prior.T @ fit.J_prior, cross=cross,
+        pull=back.T @ pull + fit.J_prior.T @ fit.r_prior, along=along,
+        inner=np.einsum("koa,kob->ab", C, C, optimize=True), square=square / max(look.e.size, 1),
+    )  # fmt: skip
+
+
+def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> list[Cause]:
+    """Test groups of signals, each together."""
+    problem = look.fit.problem
+    sums = _sums(look, _through(look, [column for _, columns in groups for column in columns]))
+    kept = np.ones(problem.size, dtype=bool)
+    kept[problem.slices["noise"]] = False
+    own = sums.own[np.ix_(kept, kept)]
     scale = column_sizes(np.sqrt(np.diag(own))[None, :])
     values, vectors = np.linalg.eigh(own / np.outer(scale, scale))
     visible = values > _BLIND * values[-1]
     root = (vectors[:, visible] / np.sqrt(values[visible])).T / scale
-    seen, there = root @ cross, root @ pull[:, 0]
-    inner = np.einsum("koa,kob->ab", C, C, optimize=True)
-    rest, left = inner - seen.T @ seen, along - seen.T @ there
-    spread = max(1.0, squares / max((at.stop - at.start) * C.shape[1], 1))
+    seen = root @ sums.cross[kept]
+    rest, left = sums.inner - seen.T @ seen, sums.along - seen.T @ (root @ sums.pull[kept])
     out, start = list[Cause](), 0
-    for size in sizes:
-        g = slice(start, start + size)
-        start += size
-        unit = np.sqrt(np.maximum(np.diag(inner)[g], 1e-300))
+    for name, columns in groups:
+        g = slice(start, start + len(columns))
+        start = g.stop
+        unit = np.sqrt(np.maximum(np.diag(sums.inner)[g], 1e-300))
         values, vectors = np.linalg.eigh(rest[g, g] / np.outer(unit, unit))
         distinct = values > _SAME
-        if not np.any(distinct):
-            out.append(Cause(gain=0.0, p=1.0, size=0.0, shift=np.zeros(problem.n_physical)))
-            continue
         inside = (vectors[:, distinct].T @ (left[g] / unit)) / values[distinct]
-        epsilon = -(vectors[:, distinct] @ inside) / unit
-        gain = float(-epsilon @ left[g]) / spread
-        shift = -(root.T @ (seen[:, g] @ epsilon))[: problem.n_physical] * problem.magnitude
-        chance = chi_squared_tail(int(distinct.sum()), gain)
-        out.append(Cause(gain=gain, p=chance, size=float(epsilon[0]), shift=shift))
+        sizes = -(vectors[:, distinct] @ inside) / unit
+        gain = float(-sizes @ left[g]) / max(1.0, sums.square)
+        shift = -(root.T @ (seen[:, g] @ sizes))[: problem.n_physical] * problem.magnitude
+        out.append(Cause(
+            name=name, channel=columns[0][0], gain=gain, p=chi_squared_tail(max(int(distinct.sum()), 1), gain),
+            size=float(sizes[0]), shift=shift, sizes=sizes, columns=columns,
+        ))  # fmt: skip
     return out
+
+
+def _beside(look: _Look, columns: Sequence[Column]) -> Array:
+    """Return slopes with the information that is left beside the sizes of signals, (size, size)."""
+    sums = _sums(look, _through(look, columns))
+    unit = np.sqrt(np.maximum(np.diag(sums.inner), 1e-300))
+    taken = sums.cross / unit @ np.linalg.pinv(sums.inner / np.outer(unit, unit), rcond=_SAME, hermitian=True)
+    prior = look.fit.J_prior
+    left = sums.own - prior.T @ prior - taken @ (sums.cross / unit).T
+    scale = np.sqrt(np.maximum(np.diag(left), 1e-300))
+    values, vectors = np.linalg.eigh(left / np.outer(scale, scale))
+    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T * scale)
 
 
 def _spectra(e: Array) -> Complex:
     """Return the spectra of whitened innovations at k = 2, 3, ... over the length, of variance 1 each."""
     n = e.shape[0]
     window = np.hanning(n)[:, None] * np.sqrt(8.0 / 3.0 / n)
-    return np.asarray(np.fft.rfft(e * window, axis=0)[2:-1], dtype=np.complex128)
+    return np.asarray(np.fft.rfft(e * window, axis=0)[2 : (n + 1) // 2], dtype=np.complex128)
 
 
-def _ways(predictor: Predictor, fit: Fit, weight: Array, n: int) -> dict[str, Complex]:
+def _ways(look: _Look) -> dict[str, Complex]:
     """Return how a force, a voltage or an error of a sensor shows at those frequencies, (n_lines, n_outputs)."""
-    model, F = fit.problem.model, predictor.M[:, : predictor.A.shape[0]]
-    z = np.exp(2j * np.pi * np.arange(2, n // 2 + 1 - (n % 2 == 0)) / n)
-    values, vectors = np.linalg.eig(F)
-    inverse = np.linalg.inv(vectors)
-    left = predictor.C @ vectors
-    n_d = len(model.disturbances)
-    enter = inverse @ np.hstack([predictor.E, -predictor.gain])
-    through = -np.einsum("oj,kj,jb->kob", left, 1.0 / (z[:, None] - values), enter)
-    through[:, :, n_d:] -= np.eye(len(model.outputs))
-    return {name: through[:, :, j] @ weight.T for j, name in enumerate((*model.disturbances, *model.outputs))}
+    predictor, model, n = look.predictor, look.fit.problem.model, look.e.shape[0]
+    values, vectors = np.linalg.eig(predictor.M[:, : predictor.A.shape[0]])
+    z = np.exp(2j * np.pi * np.arange(2, (n + 1) // 2) / n)
+    enter = np.linalg.solve(vectors, np.hstack([predictor.E, -predictor.gain]).astype(complex))
+    through = -np.einsum("oj,kj,jb->kob", predictor.C @ vectors, 1.0 / (z[:, None] - values), enter)
+    through[:, :, len(model.disturbances) :] -= np.eye(len(model.outputs))
+    return {name: through[:, :, j] @ look.weight.T for j, name in enumerate((*model.disturbances, *model.outputs))}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -324,7 +433,7 @@ def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) ->
         gain = sum(2.0 * n * (mean - 1.0 - np.log(mean)) for n, mean in sums if mean > 1.0) / 1.5  # of a Hann window
         yield Cause(
             name=f"slow_{name}", channel=name, gain=float(gain), p=chi_squared_tail(max(len(sums), 1), float(gain)),
-            size=np.nan, shift=np.zeros(n_physical), columns=len(sums),
+            size=np.nan, shift=np.zeros(n_physical), sizes=np.zeros(len(sums)),
         )  # fmt: skip
 
 
@@ -336,8 +445,8 @@ _TEXT = {
     "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
     "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk. Check cables and grounds",
-    "r_drift": "the resistance drifts by {size:.3g} of itself from the middle of the record to its end: the coil warms "
-    "up. Record shorter, or after it is warm",
+    "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
+    " Record shorter, or after it is warm",
     "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
     "longer, or excite above it",
     "slow_voltage": "the voltage walks slowly, of the order of {size:.3g} V. Check the supply and the sensor's zero",
