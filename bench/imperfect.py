@@ -399,9 +399,9 @@ IMPERFECTIONS = {
     "r_drift": Imperfection(r_drift, 0.05, ("r_drift",)),
     "curvature": Imperfection(curvature, 0.06, ("curvature",)),
     # poles and lags, by the rate
-    "eddy_pole": Imperfection(lambda s, z: s.alter(eddy=TURN * z * s.bench.rate), 0.1, ("eddy_pole", "eddy_currents")),
+    "eddy_pole": Imperfection(lambda s, z: s.alter(eddy=TURN * z * s.bench.rate), 0.1, ("eddy_pole",)),
     "eddy_flux": Imperfection(
-        lambda s, z: s.alter(shunt=TURN * z * s.bench.rate * s.physics.air), 0.1, ("eddy_pole", "eddy_currents")),
+        lambda s, z: s.alter(shunt=TURN * z * s.bench.rate * s.physics.air), 0.1, ("eddy_pole",)),
     "sensor_pole": Imperfection(
         lambda s, z: s.alter(position_pole=TURN * z * s.bench.rate), 0.15, ("sensor_pole", "sensor_lag", "in_time")),
     "current_sensor_pole": Imperfection(
@@ -460,6 +460,8 @@ _GENERAL = {
     "fixed_agree",
 }  # fmt: skip
 """Checks that name no cause."""
+_WORDS = {"lags behind": "in_time", "eddy currents": "eddy_pole", "is unrelated": "belonging", "too slow": "sampling"}
+"""What a refusal's words name."""
 
 
 def judged(bench: str, imperfection: str, seed: int, folder: Path) -> dict[str, Any]:
@@ -491,18 +493,23 @@ def judged(bench: str, imperfection: str, seed: int, folder: Path) -> dict[str, 
     return row | {"verdict": found.verdict.word, "reasons": reasons}
 
 
-def named(row: Mapping[str, Any]) -> str:
-    """Say whether the strongest reason names the true cause: right, wrong (alone), general (no cause), or silent."""
+def named(row: Mapping[str, Any], first: bool = False) -> str:
+    """Say whether the strongest cause is the true one: right, wrong (alone), general (none is named), or silent.
+
+    It is that of the first reason which names one; with `first`, of the first reason alone.
+    """
     true, reasons = IMPERFECTIONS[row["imperfection"]].causes, row["reasons"]
     if not reasons and not row["extended"]:
         return "silent"
-    first = reasons[0] if reasons else {"check": "extended", "alternatives": row["extended"]}
-    text = first.get("text", "")  # of a refusal
-    check = "in_time" if "lags behind" in text else first["check"]
-    said = [check, first.get("cause"), *map(str, first.get("alternatives", ()))]
-    if any(t in said or t.replace("_", " ") in text for t in true):
-        return "right"
-    return "general" if "cause" not in first and check in _GENERAL else "wrong"
+    reasons = reasons or [{"check": "extended", "alternatives": row["extended"]}]
+    for reason in reasons[:1] if first else reasons:
+        words = [name for word, name in _WORDS.items() if word in reason.get("text", "")]
+        said = [reason["check"], reason.get("cause"), *map(str, reason.get("alternatives", ())), *words]
+        if any(t in said for t in true):
+            return "right"
+        if words or "cause" in reason or reason["check"] not in _GENERAL:
+            return "wrong"
+    return "general"
 
 
 def worst(row: Mapping[str, Any]) -> tuple[float, str]:
@@ -536,6 +543,7 @@ def summary(rows: Sequence[Mapping[str, Any]]) -> dict[str, float | None]:
         "cause right, of those that say or do harm": share(
             [named(r) == "right" for r in wrong if named(r) != "silent" or worst(r)[0] > 4]
         ),
+        "cause right, as the first reason": share([named(r, first=True) == "right" for r in wrong]),
         "cause wrong alone": share([named(r) == "wrong" for r in wrong]),
         "no cause named": share([named(r) == "general" for r in wrong]),
         "silent": share([named(r) == "silent" for r in wrong]),
