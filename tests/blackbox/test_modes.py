@@ -7,7 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ambid.blackbox.modes import _Window, excited_band, find_modes, spectra
+from ambid.blackbox.mode_starts import excited_band, spectra
+from ambid.blackbox.modes import _Window, find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.errors import EstimationError
 from ambid.estimation.modes import mac

@@ -18,7 +18,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.blackbox.data import IOData
-from ambid.blackbox.modes import MOST_DAMPED, light_poles, lines_in_band, overlapping_bands
+from ambid.blackbox.mode_starts import MOST_DAMPED, light_poles, lines_in_band, overlapping_bands
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
 from ambid.estimation.modes import (

@@ -17,8 +17,9 @@ from ambid.bearing.frequency import FrequencyEstimate
 from ambid.bearing.measured import Measured
 from ambid.blackbox.data import IOData, Orders, orders_of
 from ambid.blackbox.fit import BlackBoxFit
+from ambid.blackbox.mode_starts import MOST_DAMPED
 from ambid.blackbox.model import Offsets
-from ambid.blackbox.modes import MOST_DAMPED, find_modes
+from ambid.blackbox.modes import find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.errors import EstimationError
 from ambid.estimation.linear import one_thread
