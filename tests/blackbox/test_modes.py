@@ -12,7 +12,7 @@ from ambid.blackbox.modes import _Window, find_modes
 from ambid.blackbox.operational import operational_modes
 from ambid.errors import EstimationError
 from ambid.estimation.modes import mac
-from tests.blackbox.sweeps import io, structure, sweep
+from tests.blackbox.sweeps import RATE, io, structure, sweep
 
 MODES = ((42.0, 0.004), (92.0, 0.003), (93.1, 0.004), (180.0, 0.006), (335.0, 0.003))  # two of them close together
 
@@ -102,6 +102,61 @@ def test_two_modes_within_a_bandwidth_are_two():
     assert len(near.modes) == 2
     for m, f in zip(near.modes, (120.0, 120.2), strict=True):
         assert abs(m.frequency_hz.value - f) < 4 * m.frequency_hz.sd < 0.1
+
+
+# A rotor in magnets as a short sweep sees it: a suspension mode that is passed at once, a damped mode of the loop, and
+# bending modes that are larger by far.
+ROTOR = ((14.0, 0.006), (52.0, 0.06), (118.0, 0.012), (166.0, 0.012), (221.0, 0.01), (290.0, 0.008))
+
+
+def rotor(modes, noise, seed):
+    """Eight seconds of a sweep in white noise, `noise` times as large as the motion."""
+    rng, u = np.random.default_rng(seed), sweep(8.0)
+    y, _ = structure(modes, u, rng, noise=0.0)
+    return io(y + noise * y.std() * rng.standard_normal(y.shape), u)
+
+
+def check_modes(modal, modes):
+    assert frequencies(modal) == pytest.approx([f for f, _ in modes], rel=5e-3)
+    for m, (f, damping) in zip(modal.modes, modes, strict=True):
+        assert abs(m.frequency_hz.value - f) < 4 * m.frequency_hz.sd < 2 * damping * f
+        assert abs(m.damping.value - damping) < 4 * m.damping.sd < 2 * damping
+
+
+@pytest.mark.parametrize("seed", [20, 21, 22])
+def test_a_mode_that_the_sweep_passes_as_smoothly_as_leakage_is_found(seed):
+    check_modes(find_modes(rotor(ROTOR, 0.05, seed)), ROTOR)
+
+
+@pytest.mark.parametrize("seed", [23, 24])
+def test_modes_that_noise_covers_line_by_line_are_found(seed):
+    check_modes(find_modes(rotor(ROTOR[2:], 0.8, seed)), ROTOR[2:])
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_what_the_input_does_not_cause_is_no_mode_where_the_sweep_is_smooth(seed):
+    """Resonances that nobody excites on purpose, and lines of the mains, steady and wandering."""
+    rng, u = np.random.default_rng(seed), sweep(16.0)
+    y, _ = structure(((9.0, 0.006), (18.0, 0.006), (60.0, 0.003)), rng.standard_normal(u.size), rng)
+    for line in (16.7, 49.98):
+        wander = np.cumsum(rng.standard_normal(u.size)) * 1e-4
+        y += y.std() * rng.uniform(0.1, 3.0, 6) * np.sin(2 * np.pi * line * np.arange(u.size) / RATE + wander)[:, None]
+    assert find_modes(io(y, u)).modes == ()
+
+
+def test_a_mode_sixty_decibels_below_the_largest_is_found():
+    rng, u = np.random.default_rng(50), sweep(8.0)
+    modes = ((35.0, 0.01), (90.0, 0.006), (210.0, 0.005), (330.0, 0.004))
+    y, _ = structure(modes, u, rng, noise=1e-4, inputs=np.array([1.0, 1.0, 1e-3, 1.0, 1.0]))
+    check_modes(find_modes(io(y, u)), modes)
+
+
+def test_ten_modes_are_ten():
+    rng, u = np.random.default_rng(51), sweep(16.0)
+    at = (21.0, 33.0, 47.0, 62.0, 66.0, 110.0, 158.0, 220.0, 223.0, 390.0)
+    modes = tuple(zip(at, rng.uniform(0.004, 0.01, 10), strict=True))
+    y, _ = structure(modes, u, rng, quadratic=0.01)
+    check_modes(find_modes(io(y, u)), modes)
 
 
 def test_one_output_is_enough():

@@ -2,7 +2,8 @@
 
 A common denominator of all outputs in powers of z, numerators for inputs and leakage, is fitted by linear least squares
 in overlapping bands for all orders (Guillaume et al. 2003); its lowest coefficient is 1, so that poles of noise come
-out unstable (Cauberghe 2004).
+out unstable (Cauberghe 2004). So do those of modes that noise or distortion covers line by line: responses averaged
+over ever more lines show these.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ DEGREE = 2  # of polynomials that stand for what is far away
 MOST_DAMPED = 0.15  # above, a resonance is no line: rigid and control modes are taken for what is far away
 _BAND_LINES, _BAND_SHARE = 600, 0.15  # lines, and part of its frequency, that a band has at least
 _ORDERS = (2, 32)
+_BESIDE = 3  # lines to either side of a pole that show its shape
 _NEAR = Tolerance(frequency=0.001, damping=0.25, least=0.002, shape=0.9)
 _DROP_DB = 15.0  # between the excitation's band and the floor beside it
 _LEAST_LINES = 60
@@ -32,7 +34,7 @@ class Spectra:
     """Spectra of a record in a band, and the variance of the noise of each output."""
 
     omega: Array  # (n_lines,), rad/s
-    U: Complex  # (n_lines, 1 + n_inputs), a column of ones for the leakage, then the inputs
+    U: Complex  # (n_lines, 1 + n_inputs), a column of ones for the leakage, then inputs; of a response the ones alone
     Y: Complex  # (n_lines, n_outputs)
     variance: Array  # (n_lines, n_outputs)
     step: float  # rad/s from line to line
@@ -149,6 +151,19 @@ def starting_poles(lines: Spectra, say: Callable[[float], None]) -> tuple[list[c
     return stable, tried
 
 
+def averaged_responses(lines: Spectra) -> Iterator[Spectra]:
+    """Yield responses to the inputs, averaged over ever more lines: less noise, for modes that are wider than that."""
+    m = lines.U.shape[1] - 1
+    width = 4 * m
+    while (n := lines.omega.size // width) >= _LEAST_LINES:
+        U, Y = (x[: n * width].reshape(n, width, -1) for x in (lines.U[:, 1:], lines.Y))
+        floor = 1e-12 * width * np.mean(np.abs(U) ** 2) * np.eye(m)
+        G = np.asarray(np.linalg.solve(conjugate(U) @ U + floor, conjugate(U) @ Y), dtype=np.complex128).reshape(n, -1)
+        centre, ones = lines.omega[: n * width].reshape(n, width).mean(axis=1), np.ones((n, 1), dtype=np.complex128)
+        yield Spectra(omega=centre, U=ones, Y=G, variance=_local_noise(ones, G), step=width * lines.step)
+        width *= 4
+
+
 def overlapping_bands(
     omega: Array, step: float, lines: int = _BAND_LINES, share: float = _BAND_SHARE
 ) -> Iterator[tuple[int, int, int, int]]:
@@ -212,14 +227,17 @@ def _common_denominators(lines: Spectra, models: Sequence[int]) -> list[tuple[in
         a = np.r_[1.0, np.linalg.lstsq(M[1:, 1:], -M[1:, 0], rcond=1e-14)[0]]
         roots = np.roots(a[::-1])
         roots = roots[np.abs(roots) > 1e-3]
-        numerator = (solved @ a).reshape(n_y, m, order + 1)[:, 1:]
+        numerator = (solved @ a).reshape(n_y, m, order + 1)
         residues = np.einsum("jum,pm->pju", numerator, roots[:, None] ** at[: order + 1])
-        out.append((order, 1j * centre + np.log(roots) / period, principal(residues)))
+        # In its response about the pole, since what leakage and input share may be told apart badly.
+        nearest = np.clip(np.rint(np.angle(roots) / angle).astype(int) + n_lines // 2, _BESIDE, n_lines - 1 - _BESIDE)
+        about = residues @ lines.U[nearest[:, None] + np.arange(-_BESIDE, _BESIDE + 1)].swapaxes(1, 2)
+        out.append((order, 1j * centre + np.log(roots) / period, principal(about)))
     return out
 
 
 def principal(residues: Complex) -> Complex:
-    """Return the shape (n, n_outputs) that residues (n, n_outputs, n_inputs) of all inputs share most."""
+    """Return the shape (n, n_outputs) that columns (n, n_outputs, n_columns) share most."""
     if residues.shape[2] == 1:
         return np.asarray(residues[:, :, 0])
     u, s, _ = np.linalg.svd(residues, full_matrices=False)

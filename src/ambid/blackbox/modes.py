@@ -22,6 +22,7 @@ from ambid.blackbox.mode_starts import (
     DEGREE,
     MOST_DAMPED,
     Spectra,
+    averaged_responses,
     conjugate,
     principal,
     spectra,
@@ -29,7 +30,7 @@ from ambid.blackbox.mode_starts import (
 )
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import one_thread
-from ambid.estimation.modes import Modal, assurance, mode_of, modes_checks, student
+from ambid.estimation.modes import Modal, TrialPole, assurance, mode_of, modes_checks, student
 from ambid.estimation.result import NORMAL_95
 from ambid.estimation.search import Rows, search
 from ambid.settings.caller import setting
@@ -38,12 +39,13 @@ _REACH = 10.0  # of a window to either side, in half bandwidths of its mode
 _FEWEST = 24  # lines of a window to either side, at least
 _SMOOTH = 10  # lines to either side over which what the fit leaves is averaged
 _LEVERAGE = 0.9  # most that a line's own share in its fit counts
-_PASSES = 5  # at most
-_WHITE = 0.3  # correlation of what is left from line to line, up to which it is noise
+_PASSES = 8  # at most
+_WHITE = 0.2  # correlation of what is left from line to line, up to which it is noise
 _ALIKE, _WEAK = 0.9, 0.1  # likeness of two shapes, and size of one beside the other, that make them one mode
 _SHARE, _LEAST_SHARE = 0.01, 0.001  # part of an output's energy at a mode's frequency that must be the mode's ...
 _CLEAR = 10.0  # ... the less where it stands so many times out of what is left
 _MISFIT, _COLOURED = 0.1, 0.5  # energy left at a mode, and its correlation from line to line, that speak of model error
+_DIES = 0.5  # half bandwidth, in lines, from which a vibration dies away within the record
 _DOUBLE = 0.3  # second singular value of a mode's residues over the first, from which it is two
 _LOST = 0.5  # energy left from which a mode's numbers are not shown
 
@@ -84,18 +86,17 @@ class _Window:
         self.smooth = (lines.U[:, :, None] * powers[:, None, :]).reshape(omega.size, -1)
         self._at: tuple[bytes, _Projected] | None = None
 
-    def project(self, poles: Complex, *, without_input: int | None = None) -> _Projected:
-        """Fit what is linear; `without_input`: a pole that the inputs do not excite."""
+    def project(self, poles: Complex, omit: range = range(0)) -> _Projected:
+        """Fit what is linear; `omit`: columns that are left out, with coefficients of zero."""
         key = poles.tobytes()
-        if without_input is None and self._at is not None and self._at[0] == key:
+        if not omit and self._at is not None and self._at[0] == key:
             return self._at[1]
         lines = self.lines
         inverse = lines.step / (1j * lines.omega[:, None] - np.r_[poles, self.fixed])
         of_poles = (inverse[:, :, None] * lines.U[:, None, :]).reshape(lines.omega.size, -1)
-        if without_input is not None:
-            m = lines.U.shape[1]
-            of_poles = np.delete(of_poles, np.arange(without_input * m + 1, (without_input + 1) * m), axis=1)
         columns = np.concatenate([of_poles, self.smooth], axis=1)
+        kept = np.delete(np.arange(columns.shape[1]), omit)
+        columns = columns[:, kept]
         weight = 1.0 / np.sqrt(self.variance.T)
         weighted = weight[:, :, None] * columns
         size = np.maximum(np.linalg.norm(weighted, axis=1, keepdims=True), 1e-300)
@@ -105,8 +106,10 @@ class _Window:
         root = np.linalg.inv(R) / np.swapaxes(size, 1, 2)
         y = (weight * lines.Y.T)[:, :, None]
         along = conjugate(Q) @ y
-        projected = _Projected(inverse=inverse, Q=Q, root=root, c=(root @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
-        if without_input is None:
+        whole = np.zeros((root.shape[0], kept.size + len(omit), kept.size), dtype=np.complex128)
+        whole[:, kept] = root
+        projected = _Projected(inverse=inverse, Q=Q, root=whole, c=(whole @ along)[:, :, 0], e=(y - Q @ along)[:, :, 0])
+        if not omit:
             self._at = key, projected
         return projected
 
@@ -193,6 +196,7 @@ class _Candidate:
     misfit: float = 0.0  # energy left there
     correlation: float = 0.0  # of what is left, from line to line
     shape: Complex = field(default_factory=lambda: np.zeros(0, dtype=np.complex128))
+    settled: bool = False  # whether it and what is about it are as they were when it was fitted
     second: float = 0.0  # of the residues over all inputs: second singular value over the first
     shape_variance: Array = field(default_factory=lambda: np.zeros(0))
     likelihood: Array = field(default_factory=lambda: np.zeros((2, 2)))
@@ -225,25 +229,47 @@ def _window(lines: Spectra, k: int, poles: Complex) -> tuple[_Window, Complex, i
 
 
 def _refine(lines: Spectra, candidates: list[_Candidate], say: Callable[[float], None]) -> list[_Candidate]:
-    """Fit each candidate in its window, drop what is no mode, and again with those that are left."""
+    """Fit each candidate that is not settled in its window, drop what is no mode, and again with what is left."""
     for turn in range(_PASSES):
         poles = np.array([c.pole for c in candidates])
         for k, c in enumerate(candidates):
-            _fit(lines, k, poles, c, judge=turn > 0)
+            if not c.settled:
+                _fit(lines, k, poles, c, judge=turn > 0)
             say((turn + (k + 1) / len(candidates)) / _PASSES)
-        modes = _kept(candidates, lines, judged=turn > 0)
+        modes = _kept(candidates, lines, judged=turn > 0, last=turn == _PASSES - 1)
         before, candidates = len(candidates), modes
         if turn == 1:
             poles = np.array([c.pole for c in modes])
             candidates = [x for k, c in enumerate(modes) for x in _split(lines, k, poles, c)]
         if not candidates or (turn > 0 and len(candidates) == before == len(modes)):
-            return candidates
+            break
+    for c in candidates:
+        c.settled = True
     return candidates
+
+
+def _joined(
+    lines: Spectra, found: list[_Candidate], starts: Sequence[complex], step: float, say: Callable[[float], None]
+) -> list[_Candidate]:
+    """Modes with those that more starts lead to; `step`: rad/s up to which these cannot be told from a mode's."""
+    apart = [p for p in starts if all(abs(p - c.pole) > abs(p.real) + abs(c.pole.real) + step for c in found)]
+    new = _kept([_Candidate(pole=p) for p in apart], lines, judged=False)
+    if not new:
+        return found
+    for c in found:
+        c.settled = not any(_near(c, x, lines.step, 3.0) for x in new)
+    return _refine(lines, sorted([*found, *new], key=lambda c: c.pole.imag), say)
+
+
+def _near(one: _Candidate, other: _Candidate, step: float, widths: float = 1.0) -> bool:
+    """Whether one of two poles is in the other's window."""
+    reach = max(_half_width(one.pole, step), _half_width(other.pole, step))
+    return abs(one.pole.imag - other.pole.imag) < widths * reach
 
 
 def _split(lines: Spectra, k: int, poles: Complex, c: _Candidate) -> list[_Candidate]:
     """Two modes of different shape where one pole stands for both, else the one."""
-    if c.correlation < _WHITE:  # what one pole leaves of two is no noise
+    if c.settled or c.correlation < _WHITE:  # what one pole leaves of two is no noise
         return [c]
     window, inside, at = _window(lines, k, poles)
     n, m = lines.Y.shape[1], lines.U.shape[1]
@@ -279,23 +305,30 @@ def _fit(lines: Spectra, k: int, poles: Complex, c: _Candidate, *, judge: bool) 
     own, m = window.project(fitted), lines.U.shape[1]
     rest = np.delete(fitted, at)
     without = window.project(window.search(rest)) if rest.size else window.project(rest)
-    deaf = window.project(fitted, without_input=at)
+    deaf = window.project(fitted, range(at * m + 1, (at + 1) * m))
     numbers, n = own.e.size * 2, lines.Y.shape[1]
     price = np.log(numbers)
-    c.gain = min(
-        2 * (without.cost - own.cost) - (2 + 2 * n * m) * price, 2 * (deaf.cost - own.cost) - 2 * n * (m - 1) * price
-    )
-    _describe(window, fitted, at, c, deaf)
+    of_input = 2 * (deaf.cost - own.cost) - 2 * n * (m - 1) * price
+    # Over a few lines a sweep's spectrum can be as smooth as leakage is, which then explains as much as the input does:
+    # a mode is also what the input explains alone and what dies away within the record, as no line of the mains does.
+    quiet = window.project(fitted, range(at * m, at * m + 1))
+    alone = 2 * (quiet.cost - own.cost) < 2 * n * price and (of_input > 0 or -c.pole.real > _DIES * lines.step)
+    if alone:
+        c.gain = 2 * (without.cost - quiet.cost) - (2 + 2 * n * (m - 1)) * price
+        _describe(window, quiet, at, c, window.project(fitted, range(at * m, (at + 1) * m)))
+    if not alone or (of_input <= 0 and c.misfit > _MISFIT):
+        c.gain = min(2 * (without.cost - own.cost) - (2 + 2 * n * m) * price, of_input)
+        _describe(window, own, at, c, deaf)
     likelihood, jackknife = window.covariance(fitted)
     own_two = slice(2 * at, 2 * at + 2)
     c.likelihood, c.jackknife = likelihood[own_two, own_two], jackknife[own_two, own_two]
 
 
-def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Projected) -> None:
+def _describe(window: _Window, fitted: _Projected, at: int, c: _Candidate, deaf: _Projected) -> None:
     """Shape, share of the energy and what is left at the mode's frequency; `deaf`: the fit where inputs do not excite
-    the mode, which leaves what nothing else explains.
+    the mode, or it is not there, which leaves what nothing else explains.
     """
-    fitted, lines, m = window.project(poles), window.lines, window.lines.U.shape[1]
+    lines, m = window.lines, window.lines.U.shape[1]
     residues = fitted.c[:, at * m : (at + 1) * m]
     near = np.abs(lines.omega - c.pole.imag) <= max(1.5 * abs(c.pole.real), 1.5 * lines.step)
     energy = np.maximum(np.sum(np.abs(lines.Y[near]) ** 2, axis=0), 1e-300)
@@ -314,17 +347,22 @@ def _describe(window: _Window, poles: Complex, at: int, c: _Candidate, deaf: _Pr
     c.shape_variance = np.mean(covariance, axis=1)
 
 
-def _kept(candidates: list[_Candidate], lines: Spectra, *, judged: bool) -> list[_Candidate]:
-    """Candidates that are modes: damped, in the band, not twice, and where judged worth their numbers and energy."""
+def _kept(candidates: list[_Candidate], lines: Spectra, *, judged: bool, last: bool = False) -> list[_Candidate]:
+    """Candidates that are modes: damped, in the band, not twice, and where judged worth their numbers and energy.
+
+    Two that stand for one mode make each other worthless: of those in a window only the least goes, until the `last`.
+    """
     low, high = lines.omega[0], lines.omega[-1]
-    modes = list[_Candidate]()
+    modes, poor = list[_Candidate](), list[_Candidate]()
     for c in sorted(candidates, key=lambda c: -c.gain if judged else abs(c.pole.real)):
         damped = c.pole.real < 0 and c.damping <= (MOST_DAMPED if judged else 2 * MOST_DAMPED)
-        wanted = _LEAST_SHARE if c.clear >= _CLEAR else _SHARE
-        worth = not judged or (c.gain > 0 and c.share >= wanted)
-        if damped and worth and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in modes):
+        if damped and low <= c.pole.imag <= high and not any(_same(c, d, lines.step) for d in modes):
             modes.append(c)
-    return sorted(modes, key=lambda c: c.pole.imag)
+    for c in reversed(modes if judged else []):
+        worth = c.gain > 0 and c.share >= (_LEAST_SHARE if c.clear >= _CLEAR else _SHARE)
+        if not worth and (last or not any(_near(c, d, lines.step) for d in poor)):
+            poor.append(c)
+    return sorted((c for c in modes if c not in poor), key=lambda c: c.pole.imag)
 
 
 def _same(one: _Candidate, other: _Candidate, step: float) -> bool:
@@ -358,9 +396,12 @@ def find_modes(
 
     with one_thread():
         lines = spectra(data, band)
-        starts, tried = starting_poles(lines, lambda x: say("modes: starts", x))
-        unique = _kept([_Candidate(pole=p) for p in starts], lines, judged=False)
-        candidates = _refine(lines, unique, lambda x: say("modes: likelihood", x)) if unique else []
+        candidates, tried = list[_Candidate](), list[TrialPole]()
+        for view in (lines, *averaged_responses(lines)):
+            starts, poles = starting_poles(view, lambda x: say("modes: starts", x))
+            tried += poles
+            blur = 2 * (view.step - lines.step)
+            candidates = _joined(lines, candidates, starts, blur, lambda x: say("modes: likelihood", x))
     if count != "auto":
         candidates = sorted(sorted(candidates, key=lambda c: -c.gain)[:count], key=lambda c: c.pole.imag)
     limits = float(lines.omega[0] / (2 * np.pi)), float(lines.omega[-1] / (2 * np.pi))
