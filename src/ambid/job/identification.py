@@ -233,7 +233,10 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         from ambid.validation.causes import causes, causes_check, named_bias
 
         in_time, named = check_lag(signals), causes(fit, means, thorough=robust)
-        checks |= {**causes_check(named, {**checks, "in_time": in_time}), "in_time": in_time}
+        own = np.sqrt(np.diag(spread.information))
+        checks |= {
+            **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust), "in_time": in_time
+        }  # fmt: skip
         spread = replace(spread, bias=named_bias(named, spread.bias))
     checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)

@@ -43,6 +43,7 @@ _PLAY = 0.1  # of the current's range: width of a hysteresis
 _QUICK = frozenset({"eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"})
 _GROWING = _QUICK | {"line", "slow_force", "slow_voltage"}
 """Causes whose signals are known but for their sizes."""
+_HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _TURNS = 6  # in which sizes and parameters are found in turn
 _SETTLED = 0.1  # gain below which they are
 
@@ -60,7 +61,7 @@ class Cause:
     gain: float  # fall of the criterion
     p: float  # probability of that by chance
     size: float  # of its first column, SI; of a line its frequency, Hz
-    shift: Array  # (n_physical,), SI, what leaving it out has done to the estimate
+    shift: Array  # (n_physical,), SI, what leaving it out has done to the estimate, as far as it is more than chance
     sizes: Array  # (n_columns,), SI, of all its columns
     columns: tuple[Column, ...] = ()
 
@@ -101,7 +102,7 @@ def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
     if predictor is None or e is None:
         return None
     at = busiest(problem.u[problem.skip :], min(_LONGEST, len(e)))
-    course = _course(fit, work.w[at, :3], work.z[at, 0], means)
+    course = _course(fit, work.w[at, :3], at, means)
     return _Look(fit=fit, predictor=predictor, weight=weight_of(fit.covariance), e=e[at], at=at, course=course)
 
 
@@ -186,11 +187,15 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
     return replace(problem, y=y, extra=extra)
 
 
-def _course(fit: Fit, states: Array, u: Array, means: Mapping[str, float]) -> _Course:
-    problem, sc = fit.problem, fit.problem.scales
-    x, v, i = (states * sc.state).T
-    theta, u = problem.parameters(fit.vector), u * sc.input[0]
-    rest, last = theta["R"] * i + theta["k_i"] * v, np.concatenate([u[:1], u[:-1]])
+def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _Course:
+    problem = fit.problem
+    x, v, i = (states * problem.scales.state).T
+    theta, delay = problem.parameters(fit.vector), problem.delay_samples(fit.vector)
+    whole = int(np.floor(delay))
+    first = problem.skip + at.start - whole - 2
+    raw = problem.u[first : first + x.size + 2, 0]
+    held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from one before on
+    rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
     return _Course(
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
         di=(u - rest) / theta["L"], before=(last - rest) / theta["L"],
@@ -349,7 +354,10 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
         inside = (vectors[:, distinct].T @ (left[g] / unit)) / values[distinct]
         sizes = -(vectors[:, distinct] @ inside) / unit
         gain = float(-sizes @ left[g]) / max(1.0, sums.square)
-        shift = -(root.T @ (seen[:, g] @ sizes))[: problem.n_physical] * problem.magnitude
+        along = (root.T @ seen[:, g])[: problem.n_physical]
+        shift = -(along @ sizes)
+        spread = np.sum((along @ (vectors[:, distinct] / unit[:, None])) ** 2 / values[distinct], axis=1)
+        shift = np.sign(shift) * np.sqrt(np.maximum(shift**2 - spread, 0.0)) * problem.magnitude
         out.append(Cause(
             name=name, channel=columns[0][0], gain=gain, p=chi_squared_tail(max(int(distinct.sum()), 1), gain),
             size=float(sizes[0]), shift=shift, sizes=sizes, columns=columns,
@@ -438,7 +446,7 @@ def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) ->
 
 
 _SAME_AS = {"sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag",)}
-"""What the first order of a score does not tell apart."""
+"""What the first order of a score does not distinguish."""
 _TEXT = {
     "eddy_pole": "the force lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or identify "
     "with the nonlinear magnet and its eddy pole",
@@ -466,14 +474,19 @@ def named_bias(found: Sequence[Cause], none: Array) -> Array:
     return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
 
 
-def causes_check(found: Sequence[Cause], checks: Mapping[str, Check]) -> dict[str, Check]:
+def causes_check(found: Sequence[Cause], checks: Mapping[str, Check], sd: Array, *, robust: bool) -> dict[str, Check]:
     """Judge the causes of `causes`: what explains the innovations best, and what explains them about as well.
 
-    `checks`: made before; a fixed value that the record contradicts less than it shows the cause is not blamed.
+    `checks`: made before; a fixed value that the record contradicts less than it shows the cause is not blamed. `sd`:
+    (n_physical,), SI; a cause that moves no number by more than 1.5 of them is told and does no harm, unless other
+    tests of the innovations failed (`robust`).
     """
     sure = [c for c in found if c.p < _CHANCE]
     if not sure:
         return {"causes": Check(passed=True, detail="no cause that was looked for shows in the innovations")}
+    if not robust and all(np.all(np.abs(c.shift) <= _HARMLESS * sd) for c in sure):
+        detail = f"{sure[0].name} shows in the innovations, and moves no number by more than {_HARMLESS:g} sd"
+        return {"causes": Check(passed=True, p=sure[0].p, values={"gain": sure[0].gain}, detail=detail)}
     first = sure[0]
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
     others = tuple(dict.fromkeys([*alike, *_SAME_AS.get(first.name, ())]))

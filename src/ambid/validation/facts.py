@@ -29,6 +29,7 @@ _LONGEST = 40_000  # samples that are compared
 _CHANCE = 1e-3  # probability above which a relation may be chance
 _SHOWN = 3.0  # standard deviations of k_i above which current and position belong together
 _STILL = 4  # samples in which no channel changes: the log stood still
+_GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
 _TOP = 0.2  # part of the voltage's power in the top octave, from which it may change between samples
 _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
@@ -71,6 +72,7 @@ def facts(record: Record) -> dict[str, Check]:
         checks["ohm"] = Check(passed=True, detail=text, values=_level(known))
     if {"position", "current"} <= roles:
         checks["belonging"] = belonging(record)
+        checks["weight"] = _weight(record["current"].values)
     if "position" in roles:
         checks["position_size"] = _position_size(record["position"].values)
     checks["log_runs"] = _log_runs(record)
@@ -123,6 +125,18 @@ def _whitened(x: Array) -> Array:
     return np.asarray(np.clip(rest, -reach, reach) if reach > 0.0 else rest)
 
 
+def _weight(current: Array) -> Check:
+    i0 = float(current.mean())
+    if not one_sided(current):
+        return Check(
+            passed=True, detail="the current has both signs: it does not tell of one magnet that carries a weight"
+        )
+    return Check(
+        passed=True, values={"k_i_over_m": -2.0 * _GRAVITY / i0},
+        detail=f"if one magnet carries the weight, k_i/m is -2 g/i0 = {-2.0 * _GRAVITY / i0:.4g} N/(A kg)",
+    )  # fmt: skip
+
+
 def _position_size(x: Array) -> Check:
     far = float(np.abs(x).max())
     return Check(
@@ -160,7 +174,7 @@ def agreements(
     `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `agree`: whether
     estimates from fewer samples agree.
     """
-    checks = facts(record)
+    checks = {name: check for name, check in facts(record).items() if name != "weight"}  # see `gravity_balance`
     if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
         checks["belonging"] = Check(passed=True, p=checks["belonging"].p, detail="position and current are of one run")
     known = mean_resistance(record)

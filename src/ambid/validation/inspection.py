@@ -15,6 +15,7 @@ from ambid.rig.roles import rank_roles
 from ambid.settings.caller import setting
 from ambid.signals import find_dropouts, find_outliers, find_saturation, persistent_excitation, resolution, snr
 from ambid.units import UNKNOWN
+from ambid.validation.facts import facts
 
 SCHEMA = "ambid.inspection/1"
 _ORDER = 20  # of persistent excitation: far above what a plant of three states needs
@@ -72,6 +73,11 @@ def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
     notes = [f"SNR: noise is {method}{'' if inputs else '; without a rig a lower bound'}"]
     notes += [_excitation(record, name) for name in inputs or record.names]
     ranked = {} if inputs else rank_roles(record)
+    known = facts(record) if {"voltage", "current", "position"} <= set(record.names) else {}
+    notes += [c.detail for name, c in known.items() if c.passed and name in ("ohm", "belonging", "weight")]
+    against = [
+        Reason(check=k, text=c.detail, grave=bool(inputs), cause=c.cause) for k, c in known.items() if not c.passed
+    ]
     about = {
         "file": record.provenance.get("file"), "samples": record.n_samples, "rate_hz": record.rate_hz,
         "start_s": record.start_s, "history": [str(step) for step in record.history],
@@ -80,7 +86,7 @@ def inspect(record: Record, *, inputs: Sequence[str] = ()) -> Inspection:
         used=record,
         record=about,
         channels=tuple(_look(record, c, inputs) for c in record.channels),
-        faults=tuple(fault for c in record.channels for fault in _faults(record, c, grave=bool(inputs))),
+        faults=(*against, *(fault for c in record.channels for fault in _faults(record, c, grave=bool(inputs)))),
         roles={
             role: tuple(f"{x.channel.name} (score {x.score:.2f}), because {x.why}" for x in candidates)
             for role, candidates in ranked.items()
