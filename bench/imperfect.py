@@ -405,7 +405,8 @@ IMPERFECTIONS = {
     "sensor_pole": Imperfection(
         lambda s, z: s.alter(position_pole=TURN * z * s.bench.rate), 0.15, ("sensor_pole", "sensor_lag", "in_time")),
     "current_sensor_pole": Imperfection(
-        lambda s, z: s.alter(current_pole=TURN * z * s.bench.rate), 0.15, ("current_sensor_pole", "current_lag", "in_time")),
+        lambda s, z: s.alter(current_pole=TURN * z * s.bench.rate),
+        0.15, ("current_sensor_pole", "current_lag", "in_time")),
     "sensor_lag": Imperfection(lambda s, z: setattr(s, "late", round(z)), 1.0, ("sensor_lag", "in_time")),
     "limiter": Imperfection(lambda s, z: setattr(s, "limit", z * s.rms[0]), 2.0, ("limiter", "within_limits")),
     "flexible_mode": Imperfection(flexible_mode, 0.2, ("flexible_mode",)),

@@ -103,13 +103,16 @@ def test_resistance_and_inductance_on_every_record(levitation, name):
 
 
 @pytest.mark.parametrize(("name", "least", "most"), [("stairs_a", 9, 12), ("stairs_b", 15, 18), ("sine_d", 8, 11)])
-def test_the_verdict_shows_by_how_much_gravity_asks_for_more(levitation, name, least, most):
+def test_the_interval_holds_what_gravity_asks_for_and_the_cause_is_named(levitation, name, least, most):
+    """The linear k_i falls short of the weight, by curvature and motion that is not logged: no narrow interval."""
     run = levitation[name]
     check = run.estimate.checks["gravity_balance"]
     assert check.values["expected"] == pytest.approx(run.balance / MASS, rel=1e-3)
     assert least < -100.0 * check.values["relative"] < most
-    assert not check.passed
-    assert "gravity_balance" in [r.check for r in run.estimate.verdict.reasons]
+    assert abs(run.estimate["k_i"].value - run.balance) < 3.0 * run.estimate["k_i"].sd
+    assert run.estimate.verdict.word != "usable"
+    named = run.estimate.checks["causes"]
+    assert {"curvature", "line", "slow_force"} & {named.cause, *named.alternatives}
 
 
 def plain_least_squares(name, cutoff_hz):

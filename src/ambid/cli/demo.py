@@ -63,7 +63,7 @@ def command() -> None:
                 ),
             ]
         ),
-        Section(parts=[Lines(lines=calibration_lines(estimate))]),
+        Section(parts=[Lines(lines=calibration_lines(estimate), indent=2)]),
         Section(parts=[Lines(lines=delay_lines(estimate))]),
         Section(parts=[output_table(estimate)]),
         Section(parts=[Checks(checks=estimate.checks)]),

@@ -235,13 +235,13 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         in_time, named = check_lag(signals), causes(fit, means, thorough=robust)
         own = np.sqrt(np.diag(spread.information))
         checks |= {
-            **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust), "in_time": in_time
+            **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust, record=bench), "in_time": in_time
         }  # fmt: skip
         spread = replace(spread, bias=named_bias(named, spread.bias))
     checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
-        checks |= physical.fact_checks(fit, rig, bench, spread, robust=robust, agree=moved.passed)
+        checks |= physical.fact_checks(fit, rig, bench, spread, robust=robust)
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import curvature_check
 

@@ -115,7 +115,7 @@ def estimate_document(estimate: AnyEstimate, evidence: Callable[[], Evidence | B
     e, linear = estimate, isinstance(estimate, Estimate)
     meanings = {spec.name: spec.meaning for spec in (*model(e.model).parameters, *BEARING_NUMBERS)}
     table = parameter_table(e.parameters, e.verdict, meanings)
-    said = [Lines(lines=calibration_lines(e))] if isinstance(e, Estimate) else []
+    said = [Lines(lines=calibration_lines(e), indent=2)] if isinstance(e, Estimate) else []
     note = f"{_SIGNS} Standard deviations are from the {_SOURCES[e.covariance_method]}."
     warnings = Section(parts=[Warnings(warnings=other_warnings(e.checks, e.warnings))])
     sections = [

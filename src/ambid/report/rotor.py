@@ -95,7 +95,7 @@ def rotor_document(estimate: RotorEstimate, shaft: Shaft | None, evidence: Calla
         Section(title="Bending modes", parts=[grid(mode_rows(e, shaft))] if e.modes else []),
         *(replace(b, title="" if k else "Bearings", note=_SIGNS) for k, b in enumerate(bearings)),
         Section(parts=[Lines(lines=cross)], page=False),
-        Section(parts=[Lines(lines=[*in_brackets, *calibration_lines(e)])]),
+        Section(parts=[Lines(lines=[*in_brackets, *calibration_lines(e)], indent=2)]),
         *synchronous_sections(e),
         Section(title="Checks", parts=[Checks(checks=e.checks, above=True)]),
         *([] if e.validation is None else [second_section(e.validation)]),

@@ -25,6 +25,8 @@ from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, 
 from ambid.estimation.linear import column_sizes
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
+from ambid.record import Record
+from ambid.validation.facts import between_samples
 
 _LONGEST = 100_000  # samples that are looked at, the busiest
 _CHANCE = 1e-4  # probability below which a cause counts as seen
@@ -474,7 +476,9 @@ def named_bias(found: Sequence[Cause], none: Array) -> Array:
     return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
 
 
-def causes_check(found: Sequence[Cause], checks: Mapping[str, Check], sd: Array, *, robust: bool) -> dict[str, Check]:
+def causes_check(
+    found: Sequence[Cause], checks: Mapping[str, Check], sd: Array, *, robust: bool, record: Record
+) -> dict[str, Check]:
     """Judge the causes of `causes`: what explains the innovations best, and what explains them about as well.
 
     `checks`: made before; a fixed value that the record contradicts less than it shows the cause is not blamed. `sd`:
@@ -490,6 +494,8 @@ def causes_check(found: Sequence[Cause], checks: Mapping[str, Check], sd: Array,
     first = sure[0]
     alike = [c.name for c in sure[1:] if c.gain > _ALIKE * first.gain and c.name != first.name]
     others = tuple(dict.fromkeys([*alike, *_SAME_AS.get(first.name, ())]))
+    if not checks["estimates_agree"].passed and between_samples(record):
+        others = (*others, "sampling")
     late = checks.get("in_time")
     if late is not None and not late.passed:
         others = tuple(c for c in dict.fromkeys([*others, late.cause, *late.alternatives]) if c != first.name)

@@ -32,6 +32,7 @@ _STILL = 4  # samples in which no channel changes: the log stood still
 _GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
 _TOP = 0.2  # part of the voltage's power in the top octave, from which it may change between samples
+_SAYS, _ORDER = 0.25, 6  # part of the current's next change that a logged voltage says at least, from six samples
 _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance is hardly seen
 
 
@@ -167,12 +168,11 @@ def _log_runs(record: Record) -> Check:
 
 
 def agreements(
-    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float], *, agree: bool
+    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
 ) -> dict[str, Check]:
     """Compare the facts of a record with an estimate from it, model one-axis.
 
-    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model; `agree`: whether
-    estimates from fewer samples agree.
+    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model.
     """
     checks = {name: check for name, check in facts(record).items() if name != "weight"}  # see `gravity_balance`
     if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
@@ -181,20 +181,31 @@ def agreements(
     if known is not None:
         checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
     checks["sampling"] = _sampling(theta, sd, record.rate_hz)
-    top = _top_octave(record["voltage"].values)
-    if checks["sampling"].passed and not agree and top > _TOP:
-        checks["sampling"] = Check(
-            passed=False, cause="sampling", values={**checks["sampling"].values, "top_octave": top},
-            detail=f"estimates from fewer samples differ, and {100.0 * top:.2g} % of the voltage's power lies in the "
-            "octave below half the rate: it changes between samples, where it is not logged. Sample faster, at the "
-            "controller's rate",
-        )  # fmt: skip
     return checks
 
 
-def _top_octave(x: Array) -> float:
-    power = np.abs(np.fft.rfft((x - x.mean())[:_LONGEST] * np.hanning(min(x.size, _LONGEST)))) ** 2
-    return float(power[power.size // 2 :].sum() / max(float(power.sum()), 1e-300))
+def between_samples(record: Record) -> bool:
+    """Return whether the voltage may change between samples, where it is not logged.
+
+    It has much power in the octave below half the rate, and says little of the next change of the current, beyond what
+    the past of current and position says.
+    """
+    v, i, x = (
+        record[name].values[:_LONGEST] - record[name].values.mean() for name in ("voltage", "current", "position")
+    )
+    power = np.abs(np.fft.rfft(v * np.hanning(v.size))) ** 2
+    if power[power.size // 2 :].sum() < _TOP * power.sum():
+        return False
+    at = np.arange(_ORDER, i.size - 1)
+    own = [s[at - k] for s in (i, x) for k in range(4)]
+    left = [_left(i[at + 1], np.column_stack(rows)) for rows in (own, [*own, *(v[at - k] for k in range(_ORDER))])]
+    return left[1] > (1.0 - _SAYS) * left[0]
+
+
+def _left(y: Array, rows: Array) -> float:
+    rows = rows / np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+    rest = y - rows @ np.linalg.lstsq(rows, y, rcond=1e-10)[0]
+    return float(rest @ rest)
 
 
 def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Check:

@@ -436,12 +436,10 @@ _COARSE = 0.4  # part of the innovations' variance that steps of a converter mak
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
 
-def fact_checks(
-    fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool, agree: bool
-) -> dict[str, Check]:
+def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool) -> dict[str, Check]:
     """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
 
-    `robust`: which standard deviations count; `agree`: whether estimates from fewer samples agree. The balance of
+    `robust`: which standard deviations count. The balance of
     gravity is asked for by default where the current keeps its sign, as that of one magnet that carries a weight does,
     and its mean is that of the voltage, so that it is no offset.
     """
@@ -450,7 +448,7 @@ def fact_checks(
         dict(zip(spread.names, spread.standard_deviations(robust=which).tolist(), strict=True))
         for which in (robust, False)
     )
-    checks = agreements(bench, theta, sd, alone, agree=agree)
+    checks = agreements(bench, theta, sd, alone)
     if robust:
         checks["resolution"] = _resolution(bench, fit)
     loop = loop_agrees(rig, theta, bench.rate_hz)
@@ -460,9 +458,7 @@ def fact_checks(
         magnet = RigMagnet()
     if carries_weight(magnet, bench["current"].values):
         assert magnet is not None
-        checks["gravity_balance"] = gravity_balance(
-            magnet, bench, theta, spread.names, spread.covariance(robust=robust)
-        )
+        checks["gravity_balance"] = gravity_balance(magnet, bench, theta, spread.names, spread.covariance(robust=False))
         if theta["k_x"] > _FAR * sd.get("k_x", np.inf):
             checks["sign_of_k_x"] = Check(
                 passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},

@@ -38,7 +38,9 @@ def test_the_contract_is_kept(estimate):
     assert document["model"] == "one-axis"
     assert set(document["record"]) >= {"samples", "rate_hz", "sha256"}
     assert [r["file"] for r in document["records"]] == ["ball.csv", "other.csv"]
-    assert set(document["parameters"]["k"]) == {"value", "sd", "ci95", "unit", "role", "identifiable"}
+    assert set(document["parameters"]["k"]) == {
+        "value", "sd", "ci95", "unit", "role", "identifiable", "sd_calibrated", "ci95_calibrated"
+    }  # fmt: skip
     assert document["delay"]["voltage"]["samples"] == 1
     assert set(document["fit"]) == {"position", "current"}
     assert document["fit"]["position"] == {"one_step": pytest.approx(0.999), "simulation": None,
