@@ -72,7 +72,10 @@ def calibrated(
     n, sources = numbers, _sources(rig, numbers.plant, numbers.theta)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
     references, lengths = n.plant.references(n.theta), {p.name for p in n.plant.parameters if p.unit == "m"}
-    moved = error_moves(n.plant, n.theta, errors, free=n.names, lines=lines)
+    try:
+        moved = error_moves(n.plant, n.theta, errors, free=n.names, lines=lines)
+    except np.linalg.LinAlgError:  # an estimate far from a plant, such as one that did not converge
+        return Calibrated(parameters=tuple(parameters), calibration={}, calibration_sd={})
     moved *= np.array([n.theta[name] or references.get(name, 1.0) for name in n.names])[:, None]
     weights = {p.name: p.sd**-2 for p in n.known if p.role == "prior" and p.sd}
     moved -= n.covariance @ (np.array([weights.get(name, 0.0) for name in n.names])[:, None] * moved)
