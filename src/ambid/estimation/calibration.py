@@ -15,15 +15,16 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
+from typing import Any, TypeVar, cast
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.estimate import EstimatedParameter
+from ambid.estimation.estimate import EstimatedParameter, Parametric
 from ambid.estimation.likelihood import Fit
 from ambid.estimation.predictor import assemble
 from ambid.estimation.result import NORMAL_95
-from ambid.physics.linear_model import LinearModel, Parameter
+from ambid.physics.linear_model import LinearModel
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import Lines, SensorError, error_moves
 from ambid.rig.rig import Rig
@@ -32,28 +33,7 @@ _BANDS, _EDGES = 200, 0.05  # of the spectrum of a record's inputs; part of the 
 _DUST = 1e-9
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Numbers:
-    """Estimated numbers of a plant, SI, with the covariance that the record and the priors give them."""
-
-    plant: LinearModel | RotorModel
-    theta: Mapping[str, float]
-    names: tuple[str, ...]
-    covariance: Array
-    known: Sequence[Parameter]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Calibrated:
-    """What calibration makes of an estimate.
-
-    `parameters`: with their intervals; `calibration`: by channel, ``"rate"`` and plane of a rotor, the per cent by
-    which 1 % of it would move each estimated number; `calibration_sd`: what the rig says of each, relative, planes SI.
-    """
-
-    parameters: tuple[EstimatedParameter, ...]
-    calibration: Mapping[str, Mapping[str, float]]
-    calibration_sd: Mapping[str, float]
+E = TypeVar("E", bound=Parametric)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,34 +46,42 @@ class _Source:
 
 
 def calibrated(
-    parameters: Sequence[EstimatedParameter], numbers: Numbers, rig: Rig, lines: Sequence[Lines]
-) -> Calibrated:
-    """Return the intervals of an estimate with what its rig says of calibration; `lines`: of its records."""
-    n, sources = numbers, _sources(rig, numbers.plant, numbers.theta)
+    estimate: E,
+    rig: Rig,
+    plant: LinearModel | RotorModel,
+    theta: Mapping[str, float],
+    names: Sequence[str],
+    covariance: Array,
+    lines: Sequence[Lines],
+) -> E:
+    """Return an estimate with its intervals for what its rig says of calibration.
+
+    `theta`: all numbers of the `plant`, SI; `names`: those that were estimated, in the order of the `covariance` that
+    the records and priors give; `lines`: what the records show.
+    """  # fmt: skip
+    made, sources, references = cast("Any", estimate), _sources(rig, plant, theta), plant.references(theta)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
-    references, lengths = n.plant.references(n.theta), {p.name for p in n.plant.parameters if p.unit == "m"}
     try:
-        moved = error_moves(n.plant, n.theta, errors, free=n.names, lines=lines)
+        moved = error_moves(plant, theta, errors, free=names, lines=lines)
     except np.linalg.LinAlgError:  # an estimate far from a plant, such as one that did not converge
-        return Calibrated(parameters=tuple(parameters), calibration={}, calibration_sd={})
-    moved *= np.array([n.theta[name] or references.get(name, 1.0) for name in n.names])[:, None]
-    weights = {p.name: p.sd**-2 for p in n.known if p.role == "prior" and p.sd}
-    moved -= n.covariance @ (np.array([weights.get(name, 0.0) for name in n.names])[:, None] * moved)
-    size = np.array([references[name] if name in lengths else n.theta[name] or 1.0 for name in n.names])
-    calibration, variance = dict[str, Mapping[str, float]](), np.zeros(len(n.names))
+        return estimate
+    moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
+    weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
+    moved -= covariance @ (np.array([weights.get(name, 0.0) for name in names])[:, None] * moved)
+    lengths = {p.name for p in plant.parameters if p.unit == "m"}
+    size = np.array([references[name] if name in lengths else theta[name] or 1.0 for name in names])
+    calibration, variance = dict[str, Mapping[str, float]](), np.zeros(len(names))
     for name, s in sources.items():
         column = np.sum([moved[:, errors.index(e)] for e in s.errors], axis=0)
         variance += (column * (s.sd or 0.0)) ** 2
         share = column * s.whole / size
-        share[abs(share) < _DUST] = 0.0
-        calibration[name] = dict(zip(n.names, share.tolist(), strict=True))
+        calibration[name] = dict(zip(names, np.where(abs(share) < _DUST, 0.0, share).tolist(), strict=True))
     stated = {name: s.sd for name, s in sources.items() if s.sd is not None}
     offsets = {f"{c.role}.offset": c.offset_sd for c in rig.channels if c.offset_sd is not None}
-    spread = dict(zip(n.names, np.sqrt(variance).tolist(), strict=True))
-    return Calibrated(
-        parameters=tuple(_widened(p, spread.get(p.name, 0.0)) if stated else p for p in parameters),
-        calibration=calibration,
-        calibration_sd={**stated, **offsets},
+    spread = dict(zip(names, np.sqrt(variance).tolist(), strict=True))
+    parameters = tuple(_widened(p, spread.get(p.name, 0.0)) if stated else p for p in estimate.parameters)
+    return cast(
+        "E", replace(made, parameters=parameters, calibration=calibration, calibration_sd={**stated, **offsets})
     )
 
 

@@ -210,7 +210,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     """Check a fit that has not failed on its own record `bench`, by role, and make the estimate, without timings."""
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
-    from ambid.estimation.calibration import Numbers, calibrated, lines_of
+    from ambid.estimation.calibration import calibrated, lines_of
     from ambid.estimation.likelihood import innovations, simulation_error
     from ambid.validation import physical
     from ambid.validation.residuals import fit_of
@@ -255,15 +255,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         simulation=None if error is None else fit_of(error, y),
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
-    known = Numbers(
-        plant=problem.model, theta=problem.parameters(fit.vector), names=spread.names, covariance=spread.information,
-        known=rig.parameters,
-    )  # fmt: skip
-    widened = calibrated(estimate.parameters, known, rig, [lines_of(fit)])
-    return replace(
-        estimate, global_search=fit.global_search, parameters=widened.parameters, calibration=widened.calibration,
-        calibration_sd=widened.calibration_sd,
-    )  # fmt: skip
+    estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
+    return calibrated(estimate, rig, problem.model, theta, spread.names, spread.information, [lines_of(fit)])
 
 
 _CAUSES = 3  # that a model is extended by, at most

@@ -48,7 +48,7 @@ def identify_rotor(
     """Identify a rotor by a `rig` with bearings: two or more whole periods by the estimator on period spectra, else by
     the predictor. `speed_rpm`: of each record; `reading`: of files. EstimationError where nothing can be identified.
     """
-    from ambid.estimation.calibration import Numbers, calibrated
+    from ambid.estimation.calibration import calibrated
     from ambid.job.closed_loop import loop_and_peaks
     from ambid.rotor.conclusion import conclude, lines_seen
     from ambid.rotor.synchronous import separate
@@ -84,15 +84,8 @@ def identify_rotor(
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
         names = tuple(name for name in estimate.covariance_names if name in estimate.numbers)
-        known = Numbers(
-            plant=estimate.plant, theta=estimate.numbers, names=names, covariance=estimate.covariance_of(names),
-            known=rig.parameters,
-        )  # fmt: skip
-        widened = calibrated(estimate.parameters, known, rig, lines_seen(outcome.fit))
-        estimate = replace(
-            estimate, parameters=widened.parameters, calibration=widened.calibration,
-            calibration_sd=widened.calibration_sd,
-        )  # fmt: skip
+        covariance, seen = estimate.covariance_of(names), lines_seen(outcome.fit)
+        estimate = calibrated(estimate, rig, estimate.plant, estimate.numbers, names, covariance, seen)
         fastest = max(range(len(clean)), key=lambda k: abs(speeds[k]))  # its speed is that of the estimate's plant
         loop, sensitivity, said = loop_and_peaks(estimate, rig, clean[fastest], outcome.seen[fastest], estimate.speed)
         try:

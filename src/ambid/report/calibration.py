@@ -51,14 +51,11 @@ def _shown(moves: Mapping[str, float]) -> dict[str, float]:
 
 def _grouped(moves: Mapping[str, float]) -> str:
     """Return names by how far they move, those of all axes as one where they move alike."""
-    groups = dict[str, dict[str, None]]()
-    alike = dict[str, set[str]]()
+    groups, short = dict[str, dict[str, None]](), {name: name.rpartition(".")[2] for name in moves}
     for name, x in moves.items():
-        alike.setdefault(name.rpartition(".")[2], set()).add(_per_cent(x))
-    for name, x in moves.items():
-        short = name.rpartition(".")[2]
+        by, alike = _per_cent(x), {_per_cent(y) for other, y in moves.items() if short[other] == short[name]}
         if abs(x) >= _FELT:
-            groups.setdefault(_per_cent(x), {})[short if len(alike[short]) == 1 else name] = None
+            groups.setdefault(by, {})[short[name] if len(alike) == 1 else name] = None
     return ", ".join(f"{', '.join(names)} {by}" for by, names in groups.items())
 
 
