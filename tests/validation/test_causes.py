@@ -41,6 +41,19 @@ def test_sound_records_name_no_cause():
     assert len(named) <= max(1, len(seeds) // 20)
 
 
+def test_probabilities_are_those_of_chance_on_sound_records():
+    """Of all scores on sound records as many are below a probability as it says: none holds what is fed back."""
+    chances = []
+    for seed in range(1, 1 + runs(60, short=8)):
+        for preset in ("thesis", "unstable-bearing", "prototype"):
+            fit, means = fitted(*columns_of(preset, seed, 0.5))
+            chances += [c.p for c in causes(fit, means, thorough=False)]
+    p = np.array(chances)
+    n = p.size
+    for level in (0.01, 0.1, 0.5):
+        assert abs(np.count_nonzero(p < level) - level * n) < 4.5 * np.sqrt(level * (1 - level) * n) + 0.02 * n
+
+
 def hum(c, t):
     c["current"] += 0.02 * c["current"].std() * np.sin(2 * np.pi * 50.0 * t)
 

@@ -9,6 +9,7 @@ import pytest
 
 import ambid
 from ambid.record import Channel, Record
+from ambid.rig import default_rig
 from ambid.validation.facts import agreements, belonging, between_samples, facts, mean_resistance, one_sided
 
 RATE = 1000.0
@@ -58,7 +59,7 @@ SD = {"R": 0.01, "L": 1e-4, "k_i": 0.01}
 
 @pytest.mark.parametrize(("r", "passed"), [(4.0, True), (4.05, True), (4.4, False), (3.6, False)])
 def test_a_resistance_that_the_means_contradict_is_named(r, passed):
-    check = agreements(carried(), {**THETA, "R": r}, SD, SD)["ohm"]
+    check = agreements(carried(), default_rig(), {**THETA, "R": r}, SD, SD)["ohm"]
     assert check.passed is passed
     assert check.cause == ("" if passed else "ohm")
     if not passed:
@@ -72,14 +73,14 @@ def test_positions_of_another_run_do_not_belong():
     mixed = record(own["voltage"].values, own["current"].values, other["position"].values)
     assert not belonging(mixed).passed
     assert facts(mixed)["belonging"].cause == "belonging"
-    assert not agreements(mixed, THETA, {**SD, "k_i": 1.0}, SD)["belonging"].passed
+    assert not agreements(mixed, default_rig(), THETA, {**SD, "k_i": 1.0}, SD)["belonging"].passed
 
 
 def test_belonging_is_seldom_denied_and_never_where_the_force_shows():
     chances = [belonging(carried(seed)).passed for seed in range(20)]
     assert all(chances)
     mixed = record(carried(1)["voltage"].values, carried(1)["current"].values, carried(2)["position"].values)
-    assert agreements(mixed, THETA, SD, SD)["belonging"].passed
+    assert agreements(mixed, default_rig(), THETA, SD, SD)["belonging"].passed
 
 
 def test_slow_signals_of_two_runs_are_related_by_chance_only():
@@ -94,7 +95,7 @@ def test_slow_signals_of_two_runs_are_related_by_chance_only():
     ("inductance", "cause", "grave"), [(0.04, "", False), (6e-3, "sampling", False), (1e-3, "sampling", True)]
 )
 def test_a_coil_faster_than_the_sampling_is_named(inductance, cause, grave):
-    check = agreements(carried(), {**THETA, "L": inductance}, {**SD, "L": 1e-5}, SD)["sampling"]
+    check = agreements(carried(), default_rig(), {**THETA, "L": inductance}, {**SD, "L": 1e-5}, SD)["sampling"]
     assert (check.cause, check.grave) == (cause, grave)
 
 

@@ -120,8 +120,8 @@ _GRAVE = frozenset(
     }
 )  # fmt: skip
 """Checks after whose failure no number is to be used."""
-_OF_THE_RECORD = frozenset({"belonging", "position_size", "signals_sound", "log_runs", "sampling", "resolution"})
-"""Checks of the record itself: what they find is told first."""
+_OF_THE_RECORD = ("belonging", "position_size", "resolution", "signals_sound", "log_runs", "sampling")
+"""Checks of the record itself: what they find is told first, in this order."""
 _EVIDENCE = frozenset({"ohm", "gravity_balance", "fixed_agree", "loop_agrees", "sampling"})
 """Checks of a fact each: two that contradict the estimate are as grave as one above."""
 
@@ -149,7 +149,8 @@ class Judged(Result):
         grave = {k for k, c in against.items() if c.grave or k in _GRAVE or (contradicted and k in _EVIDENCE)}
         if grave:  # a fault of the record is what made the others grave
             grave |= {k for k, c in against.items() if k in _OF_THE_RECORD and c.cause}
-        names = sorted(against, key=lambda k: (k not in _OF_THE_RECORD, not against[k].cause))
+        names = [*filter(against.__contains__, _OF_THE_RECORD)]
+        names += sorted(against.keys() - set(names), key=lambda k: (not against[k].cause, [*against].index(k)))
         failed += [
             Reason(check=k, text=c.detail, grave=k in grave, cause=c.cause, size=c.size, alternatives=c.alternatives)
             for k, c in ((k, against[k]) for k in names)

@@ -46,12 +46,15 @@ _QUICK = frozenset({"eddy_pole", "sensor_lag", "current_sensor_pole", "cross_tal
 _GROWING = _QUICK | {"line", "slow_force", "slow_voltage"}
 """Causes whose signals are known but for their sizes."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
+_STEPS = 40  # of a search that begins at a fit
 _TURNS = 6  # in which sizes and parameters are found in turn
 _SETTLED = 0.1  # gain below which they are
 
 
-Column = tuple[str, Array]
-"""Where a signal enters, force, voltage, position or current, and its course, SI."""
+Column = tuple[tuple[str, Array], ...]
+"""Where signals of one size enter, force, voltage, position or current, and their courses, SI: at each sample, of a
+force or a voltage the mean up to the next. None may hold more than what is known before the sample that it shows in.
+"""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -77,8 +80,7 @@ class _Course:
     v: Array
     i: Array
     u: Array
-    di: Array  # rate of the current after each sample, A/s
-    before: Array  # and before it
+    before: Array  # rate of the current before each sample, A/s
     u_before: Array  # voltage before each sample: that after it may be fed back from the sample itself
     theta: Mapping[str, float]
     i0: float
@@ -123,7 +125,7 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Caus
     groups = list(_groups(course, modes, thorough=thorough))
     if line is not None:
         turn = 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)
-        groups.append(("line", ((line.channel, np.cos(turn)), (line.channel, np.sin(turn)))))
+        groups.append(("line", tuple(((line.channel, wave),) for wave in (np.cos(turn), np.sin(turn)))))
     found = _tested(look, groups)
     if line is not None:
         found[-1] = replace(found[-1], size=line.k * rate_hz / course.t.size, p=min(found[-1].p, line.p))
@@ -149,7 +151,7 @@ def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
     for _ in range(_TURNS):
         total = total + cause.sizes
         problem = _corrected(plain, cause.columns, total)
-        fit = search(problem, fit.vector, work=workspace_near(fit, problem))
+        fit = search(problem, fit.vector, steps=_STEPS, work=workspace_near(fit, problem))
         look = None if fit.status != "converged" else _look(fit, means)
         if look is None:
             return None
@@ -172,7 +174,7 @@ def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
     groups = _groups(course, (), thorough=cause.name not in _QUICK)
-    return next(columns for name, columns in groups if (name, columns[0][0], len(columns)) == own)
+    return next(columns for name, columns in groups if (name, columns[0][0][0], len(columns)) == own)
 
 
 def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Array) -> PredictorProblem:
@@ -181,11 +183,12 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
     y, extra = problem.y.copy(), np.zeros((problem.y.shape[0], len(model.disturbances)))
     if problem.extra is not None:
         extra += problem.extra
-    for (where, signal), size in zip(columns, sizes.tolist(), strict=True):
+    parts = [(*part, size) for column, size in zip(columns, sizes.tolist(), strict=True) for part in column]
+    for where, signal, size in parts:
         if where in model.outputs:
             y[skip:, model.outputs.index(where)] -= size * signal
         else:
-            extra[skip:, model.disturbances.index(where)] += size * _between(signal)
+            extra[skip:, model.disturbances.index(where)] += size * signal
     return replace(problem, y=y, extra=extra)
 
 
@@ -200,48 +203,53 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _
     rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
     return _Course(
         t=np.linspace(-1.0, 1.0, x.size), x=x, v=v, i=i, u=u, u_before=last,
-        di=(u - rest) / theta["L"], before=(last - rest) / theta["L"],
+        before=(last - rest) / theta["L"],
         theta=theta, i0=means.get("current", 0.0), rate_hz=problem.rate_hz,
     )  # fmt: skip
 
 
 def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[tuple[str, tuple[Column, ...]]]:
     """Yield the causes with their signals; a size is that of the first. `modes`: frequencies, Hz."""
-    yield "eddy_pole", (("force", -s.theta["k_i"] * s.di),)
-    yield "sensor_lag", (("position", -s.v),)
-    yield "current_sensor_pole", (("current", -s.before),)
-    yield "cross_talk", (("position", s.i), ("position", s.u_before))
-    yield "cross_talk", (("current", s.x), ("current", s.u_before))
-    yield "r_drift", (("voltage", -s.t * (s.i0 + s.i)),)
-    yield "slow_force", tuple(("force", wave) for wave in _waves(s.t, _WAVES))
-    yield "slow_voltage", tuple(("voltage", wave) for wave in _waves(s.t, _WAVES))
+    eddy = _rate(s.before, s.rate_hz)  # of the flux, where it shunts the coil; of the force alone
+    yield "eddy_pole", ((("force", -s.theta["k_i"] * _rate(s.i, s.rate_hz)),), (("voltage", s.theta["L"] * eddy),))
+    yield "sensor_lag", ((("position", -s.v),),)
+    yield "current_sensor_pole", ((("current", -s.before),),)
+    yield "cross_talk", ((("position", s.i),), (("position", s.u_before),))
+    yield "cross_talk", ((("current", s.x),), (("current", s.u_before),))
+    yield "r_drift", ((("voltage", _between(-s.t * (s.i0 + s.i))),),)
+    yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _WAVES))
+    yield "slow_voltage", tuple((("voltage", wave),) for wave in _waves(s.t, _WAVES))
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
-        yield "curvature", tuple(term for j in range(degree + 1) for term in _energy(s, j, degree - j))
+        yield "curvature", tuple(_energy(s, a, degree - a) for a in range(degree + 1))
     if not thorough:
         return
     low, high = np.quantile(s.u, (1.0 - _REACH, _REACH))
-    yield "limiter", (("voltage", -np.maximum(s.u - high, 0.0)), ("voltage", -np.minimum(s.u - low, 0.0)))
-    yield "hysteresis", (("force", s.theta["k_i"] * (_play(s.i, _PLAY * float(np.ptp(s.i))) - s.i)),)
-    yield "slow_force", tuple(("force", wave) for wave in _waves(s.t, _MANY))
+    ends = (np.maximum(s.u - high, 0.0), np.minimum(s.u - low, 0.0))
+    yield "limiter", tuple((("voltage", -end),) for end in ends)
+    slack = _play(s.i, _PLAY * float(np.ptp(s.i))) - s.i
+    flux = -s.theta["L"] * _rate(slack, s.rate_hz)
+    yield "hysteresis", ((("force", s.theta["k_i"] * _between(slack)),), (("voltage", flux),))
+    yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _MANY))
     for f in modes:
         for damping in _DAMPING:
-            yield "flexible_mode", tuple(("position", q) for q in _oscillation(s, f, damping))
+            yield "flexible_mode", tuple((("position", q),) for q in _oscillation(s, f, damping))
 
 
 def _waves(t: Array, count: int) -> list[Array]:
     return [t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(2, count + 1))]
 
 
-def _energy(s: _Course, a: int, b: int) -> list[Column]:
+def _energy(s: _Course, a: int, b: int) -> Column:
     """Force and voltage of the term x^a i^b of the co-energy, over the sizes of the motion."""
-    X, I = max(float(s.x.std()), 1e-300), max(float(s.i.std()), 1e-300)  # noqa: E741
-    unit = 1.0 / (X**a * I**b)
-    columns: list[Column] = []
-    if a:
-        columns.append(("force", unit * a * s.x ** (a - 1) * s.i**b))
-    if b:
-        columns.append(("voltage", np.append(-np.diff(unit * b * s.x**a * s.i ** (b - 1)), 0.0) * s.rate_hz))
-    return columns
+    size_x, size_i = max(float(s.x.std()), 1e-300), max(float(s.i.std()), 1e-300)
+    unit = 1.0 / (size_x**a * size_i**b)
+    force, flux = unit * a * s.x ** max(a - 1, 0) * s.i**b, unit * b * s.x**a * s.i ** max(b - 1, 0)
+    return ("force", _between(force)), ("voltage", -_rate(flux, s.rate_hz))
+
+
+def _rate(signal: Array, rate_hz: float) -> Array:
+    """The mean rate from each sample to the next."""
+    return np.append(np.diff(signal), 0.0) * rate_hz
 
 
 def _play(x: Array, width: float) -> Array:
@@ -264,18 +272,19 @@ def _oscillation(s: _Course, f: float, damping: float) -> tuple[Array, Array]:
 def _through(look: _Look, columns: Sequence[Column]) -> Array:
     """Return what signals of size one do to the whitened innovations, (n, n_outputs, n_columns)."""
     predictor, sc, model = look.predictor, look.fit.problem.scales, look.fit.problem.model
-    n, out = predictor.A.shape[0], np.zeros((*look.e.shape, len(columns)))
-    for j, (where, signal) in enumerate(columns):
-        own = np.zeros_like(look.e)
-        if where in model.outputs:
-            k = model.outputs.index(where)
-            own[:, k] = signal / sc.output[k]
-            enter, driven = -predictor.gain[:, [k]], own[:, [k]]
-        else:
-            k = model.disturbances.index(where)
-            enter, driven = predictor.E[:, [k]], _between(signal)[:, None] / sc.disturbance[k]
-        state = run(np.hstack([predictor.M[:, :n], enter]), driven, np.zeros(n))[:-1]
-        out[:, :, j] = -(own + state @ predictor.C.T) @ look.weight.T
+    n, n_y = predictor.A.shape[0], look.e.shape[1]
+    out, enter = np.zeros((*look.e.shape, len(columns))), np.hstack([predictor.M[:, :n], predictor.E, -predictor.gain])
+    for j, column in enumerate(columns):
+        driven = np.zeros((look.e.shape[0], len(model.disturbances) + n_y))
+        for where, signal in column:
+            if where in model.outputs:
+                k = model.outputs.index(where)
+                driven[:, k - n_y] = signal / sc.output[k]
+            else:
+                k = model.disturbances.index(where)
+                driven[:, k] = signal / sc.disturbance[k]
+        state = run(enter, driven, np.zeros(n))[:-1]
+        out[:, :, j] = -(driven[:, -n_y:] + state @ predictor.C.T) @ look.weight.T
     return out
 
 
@@ -361,7 +370,7 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
         spread = np.sum((along @ (vectors[:, distinct] / unit[:, None])) ** 2 / values[distinct], axis=1)
         shift = np.sign(shift) * np.sqrt(np.maximum(shift**2 - spread, 0.0)) * problem.magnitude
         out.append(Cause(
-            name=name, channel=columns[0][0], gain=gain, p=chi_squared_tail(max(int(distinct.sum()), 1), gain),
+            name=name, channel=columns[0][0][0], gain=gain, p=chi_squared_tail(max(int(distinct.sum()), 1), gain),
             size=float(sizes[0]), shift=shift, sizes=sizes, columns=columns,
         ))  # fmt: skip
     return out

@@ -19,6 +19,7 @@ from ambid.arrays import Array
 from ambid.estimation.estimate import Check
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
+from ambid.rig import Rig
 
 _FAR = 2.5  # standard deviations between R and the means, whose offsets are allowed for generously
 _OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
@@ -42,7 +43,7 @@ def one_sided(current: Array) -> bool:
     return low * high > 0 or abs(low) <= _ONE_SIDED * abs(high)
 
 
-def mean_resistance(record: Record) -> tuple[float, float] | None:
+def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, float] | None:
     """Return mean voltage over mean current with its standard deviation, ohm; None where the current has both signs.
 
     The deviation holds the scatter of means of stretches, and offsets of both channels, sd 0.5 % of each
@@ -55,12 +56,12 @@ def mean_resistance(record: Record) -> tuple[float, float] | None:
     length = max(1, len(v) // _BLOCKS)
     rest = (v - ratio * i)[: len(v) // length * length].reshape(-1, length).mean(axis=1)
     scatter = float(rest.std(ddof=1)) / np.sqrt(rest.size) if rest.size > 1 else float(np.abs(v).max())
-    volts, amperes = _offset(v), _offset(i)
+    known = {c.role: c for c in rig.channels} if rig else {}
+    volts, amperes = (
+        _OFFSET * float(np.abs(x).max()) if role not in known or (sd := known[role].offset_sd) is None else sd
+        for role, x in (("voltage", v), ("current", i))
+    )
     return ratio, float(np.sqrt(scatter**2 + volts**2 + (ratio * amperes) ** 2) / abs(i.mean()))
-
-
-def _offset(x: Array) -> float:
-    return _OFFSET * float(np.abs(x).max())
 
 
 def facts(record: Record) -> dict[str, Check]:
@@ -168,7 +169,7 @@ def _log_runs(record: Record) -> Check:
 
 
 def agreements(
-    record: Record, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
+    record: Record, rig: Rig, theta: Mapping[str, float], sd: Mapping[str, float], alone: Mapping[str, float]
 ) -> dict[str, Check]:
     """Compare the facts of a record with an estimate from it, model one-axis.
 
@@ -177,7 +178,7 @@ def agreements(
     checks = {name: check for name, check in facts(record).items() if name != "weight"}  # see `gravity_balance`
     if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
         checks["belonging"] = Check(passed=True, p=checks["belonging"].p, detail="position and current are of one run")
-    known = mean_resistance(record)
+    known = mean_resistance(record, rig)
     if known is not None:
         checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
     checks["sampling"] = _sampling(theta, sd, record.rate_hz)

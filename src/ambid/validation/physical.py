@@ -448,7 +448,7 @@ def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robus
         dict(zip(spread.names, spread.standard_deviations(robust=which).tolist(), strict=True))
         for which in (robust, False)
     )
-    checks = agreements(bench, theta, sd, alone)
+    checks = agreements(bench, rig, theta, sd, alone)
     if robust:
         checks["resolution"] = _resolution(bench, fit)
     loop = loop_agrees(rig, theta, bench.rate_hz)
@@ -458,7 +458,9 @@ def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robus
         magnet = RigMagnet()
     if carries_weight(magnet, bench["current"].values):
         assert magnet is not None
-        checks["gravity_balance"] = gravity_balance(magnet, bench, theta, spread.names, spread.covariance(robust=False))
+        checks["gravity_balance"] = gravity_balance(
+            magnet, bench, theta, spread.names, spread.covariance(robust=False), scale_sd=_scale_sd(rig)
+        )
         if theta["k_x"] > _FAR * sd.get("k_x", np.inf):
             checks["sign_of_k_x"] = Check(
                 passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},
@@ -496,7 +498,13 @@ def carries_weight(magnet: RigMagnet | None, current: Array) -> bool:
 
 
 def gravity_balance(
-    magnet: RigMagnet, record: Record, theta: Mapping[str, float], names: tuple[str, ...], covariance: Array
+    magnet: RigMagnet,
+    record: Record,
+    theta: Mapping[str, float],
+    names: tuple[str, ...],
+    covariance: Array,
+    *,
+    scale_sd: float = 0.0,
 ) -> Check:
     """Check k_i/m against -2 g/i0, within what is not known: of the estimate, of gravity and the current's zero (of the
     rig, else its resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
@@ -509,7 +517,7 @@ def gravity_balance(
     i0, (spread, along) = float(i.mean()) - zero, np.cov(x, i)
     ratio, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
     slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
-    sd = abs(ratio) * float(np.sqrt(max(slope @ covariance @ slope, 0.0)))
+    sd = abs(ratio) * float(np.sqrt(max(slope @ covariance @ slope, 0.0) + scale_sd**2))
     rise = theta["k_x"] / (theta["m"] * g)  # f_x/f, as f = -m g
     ripple = float(along[1]) / i0**2
     bend = ripple + 2.0 * rise * float(along[0]) / i0 + 0.75 * rise**2 * float(spread[0])
@@ -539,6 +547,11 @@ def gravity_balance(
     return Check(
         passed=passed, values=values, detail=detail, cause="" if passed else "weight", size=None if passed else off
     )
+
+
+def _scale_sd(rig: Rig) -> float:
+    """What a rig says of the scale of k_i/m, which position and the square of the rate share, relative."""
+    return float(np.hypot(2.0 * (rig.record.rate_sd or 0.0), rig.channel("position").gain_sd or 0.0))
 
 
 def _value(p: object, value: float, sd: float) -> tuple[float, float]:
