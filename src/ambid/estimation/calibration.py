@@ -46,19 +46,14 @@ class _Source:
 
 
 def calibrated(
-    estimate: E,
-    rig: Rig,
-    plant: LinearModel | RotorModel,
-    theta: Mapping[str, float],
-    names: Sequence[str],
-    covariance: Array,
-    lines: Sequence[Lines],
-) -> E:
+    estimate: E, rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
+    covariance: Array, lines: Sequence[Lines],
+) -> E:  # fmt: skip
     """Return an estimate with its intervals for what its rig says of calibration.
 
     `theta`: all numbers of the `plant`, SI; `names`: those that were estimated, in the order of the `covariance` that
     the records and priors give; `lines`: what the records show.
-    """  # fmt: skip
+    """
     made, sources, references = cast("Any", estimate), _sources(rig, plant, theta), plant.references(theta)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
     try:
