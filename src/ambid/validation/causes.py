@@ -22,7 +22,7 @@ import numpy as np
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
-from ambid.estimation.linear import column_sizes
+from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
@@ -46,6 +46,7 @@ _QUICK = frozenset({"eddy_pole", "sensor_lag", "current_sensor_pole", "cross_tal
 _GROWING = _QUICK | {"line", "slow_force", "slow_voltage"}
 """Causes whose signals are known but for their sizes."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
+_BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
 _TURNS = 6  # in which sizes and parameters are found in turn
 _SETTLED = 0.1  # gain below which they are
@@ -148,6 +149,10 @@ def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
     alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in found[1:])
     if alike or not cause.columns or cause.name not in _GROWING:
         return None
+    n, size = fit.problem.n_physical, fit.problem.magnitude
+    sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
+    if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
+        return None  # what is of higher degree would move them too
     for _ in range(_TURNS):
         total = total + cause.sizes
         problem = _corrected(plain, cause.columns, total)
