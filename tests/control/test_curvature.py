@@ -34,7 +34,8 @@ def test_the_shift_expected_is_the_shift_seen(bent):
     law = laws_of(of, rig, {})[0][""]
     truth = dict(zip(("k_x", "k_i", "L"), law.numbers(*law.rest), strict=True))
     expected = np.array([[x.checks["curvature"].values[n] for n in truth] for x in bent])
-    seen = np.array([[(x[n].value - truth[n]) / x[n].sd for n in truth] for x in bent])
+    # the stated sd holds the shift too, in quadrature
+    seen = np.array([[(x[n].value - truth[n]) / x[n].sd for n in truth] for x in bent]) * np.sqrt(1.0 + expected**2)
     assert expected[:, 2].mean() > 3.0  # of L
     # sd of a mean of four is a half; 4 of those
     assert np.all(np.abs((seen - expected).mean(axis=0)) < 2.0)
@@ -46,6 +47,7 @@ def test_a_curved_record_is_used_with_caution_and_told_what_to_do(bent):
         assert estimate.verdict.word == "caution"
         assert "L by +" in reason.text
         assert "ambid.identify_nonlinear" in reason.text
+        assert reason.cause == "curvature"
 
 
 def test_a_linear_bench_is_not_cautioned_for_the_magnet_of_its_rig(experiment):
@@ -86,7 +88,8 @@ def test_a_record_away_from_the_rest_of_the_rig_is_judged_where_it_is():
     law, check = laws_of(of, rig, found.operating_point)[0][""], found.checks["curvature"]
     assert law.rest[0] == pytest.approx(0.012, abs=1e-4)
     truth = dict(zip(("k_x", "k_i", "L"), law.numbers(*law.rest), strict=True))
-    seen = {n: (found[n].value - x) / found[n].sd for n, x in truth.items()}
+    own = {n: found[n].sd / np.hypot(1.0, check.values[n]) for n in truth}  # without the shift
+    seen = {n: (found[n].value - x) / own[n] for n, x in truth.items()}
     assert seen["k_i"] > 4.0
     assert all(abs(check.values[n] - x) < 3.0 for n, x in seen.items()), (seen, check.values)
     moved = laws_of(of, rig, {"position": 0.0, "current": 0.0})[0][""]  # of a record of deviations

@@ -112,7 +112,8 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
             f". Record with {advised(values):.2g} of the excitation or less, or identify with "
             f"{setting('identify_nonlinear')}"
         )
-    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=text)
+    cause = "" if passed else "curvature"
+    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=text, cause=cause)
 
 
 def advised(shift: Mapping[str, float]) -> float:

@@ -233,7 +233,16 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         from ambid.validation.causes import causes, causes_check, named_bias
 
         in_time, named = check_lag(signals), causes(fit, means, thorough=robust)
-        own = np.sqrt(np.diag(spread.information))
+        curved, own = None, np.sqrt(np.diag(spread.information))
+        if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
+            from ambid.control.curvature import curvature_check
+
+            sd = spread.standard_deviations(robust=robust)
+            curved = curvature_check(fit, e, rig, means, sd)
+            checks |= {} if curved is None else {"curvature": curved}
+        if curved is not None and not curved.passed:  # a law says more than powers of the motion
+            named = [c for c in named if c.name != "curvature"]
+            spread = replace(spread, bias=np.array([curved.values[name] for name in spread.names]) * sd)
         checks |= {
             **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust, record=bench), "in_time": in_time
         }  # fmt: skip
@@ -242,11 +251,6 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
     if problem.model.name == "one-axis":
         checks |= physical.fact_checks(fit, rig, bench, spread, robust=robust)
-        if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
-            from ambid.control.curvature import curvature_check
-
-            curved = curvature_check(fit, e, rig, means, spread.standard_deviations(robust=robust))
-            checks |= {} if curved is None else {"curvature": curved}
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(

@@ -483,10 +483,10 @@ _TEXT = {
 }
 
 
-def named_bias(found: Sequence[Cause], none: Array) -> Array:
-    """Return the largest shift, of each parameter, by the strongest cause and those about as strong; `none`: zeros."""
+def named_bias(found: Sequence[Cause], known: Array) -> Array:
+    """Return the largest shift of each parameter by the strongest cause and those about as strong, or as is `known`."""
     sure = [c for c in found if c.p < _CHANCE]
-    stacked = np.array([none, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
+    stacked = np.array([known, *(c.shift for c in sure if c.gain > _ALIKE * sure[0].gain)])
     return np.asarray(np.take_along_axis(stacked, np.argmax(np.abs(stacked), axis=0)[None], axis=0)[0])
 
 

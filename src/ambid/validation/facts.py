@@ -24,6 +24,7 @@ from ambid.rig import Rig
 _FAR = 2.5  # standard deviations between R and the means, whose offsets are allowed for generously
 _OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
 _ONE_SIDED = 0.02  # part of a current's largest value that may lie beyond zero
+_SHARP, _OFFSETS = 0.02, 0.5  # R known so well (sd over R) and so far from the means is not of the same mean current
 _BLOCKS = 30  # stretches whose means show the scatter of a mean
 _PAST, _LAGS = 20, 40  # samples that whiten a signal, and between which two are compared
 _LONGEST = 40_000  # samples that are compared
@@ -214,6 +215,8 @@ def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Ch
     passed = abs(far) <= _FAR
     i0 = float(record["current"].values.mean())
     detail = f"{_ohms(mean, mean_sd)}; R is {R:.4g} ± {sd:.2g} ohm"
+    if not passed and sd < _SHARP * R and abs(mean / R - 1.0) > _OFFSETS:
+        passed, detail = True, f"{detail}: the means are those of offsets"
     if not passed:
         detail += (
             f": {abs(far):.2g} sd apart. An offset of {(mean - R) * i0:+.2g} V or {i0 * (1.0 - mean / R):+.2g} A, or a "
