@@ -85,6 +85,18 @@ def test_the_cause_is_named(preset, spoil, cause, channel):
         assert sure[0].size == pytest.approx(50.0, abs=1.0)
 
 
+def test_a_delay_that_is_given_wrong_is_named():
+    columns, rate_hz = columns_of("unstable-bearing", 1)
+    columns["voltage"] = np.concatenate([columns["voltage"][1:], columns["voltage"][-1:]])  # acts a sample later now
+    bench = load_bench(columns, default_rig(), rate_hz=rate_hz, units={"voltage": "V", "current": "A", "position": "m"})
+    rig = default_rig()
+    fit = greybox(rig.plant, signals_of(bench, rig.plant), rig.parameters, delay=0.0)
+    first = causes(fit, {}, thorough=True, delay_given=True)[0]
+    assert first.name == "input_delay"
+    assert first.size > 0.25 / rate_hz
+    assert "input_delay" not in [c.name for c in causes(fit, {}, thorough=True)]
+
+
 def test_size_and_shift_are_what_a_drift_of_the_resistance_did():
     """The estimate with its named shift taken back is that of the record without the drift."""
     columns, rate_hz = columns_of("unstable-bearing", 1)

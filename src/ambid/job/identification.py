@@ -232,7 +232,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     if problem.model.name == "one-axis":
         from ambid.validation.causes import causes, causes_check, named_bias
 
-        in_time, named = check_lag(signals), causes(fit, means, thorough=robust)
+        in_time, named = check_lag(signals), causes(fit, means, thorough=robust, delay_given=delay_how == "given")
         curved, own = None, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import curvature_check

@@ -111,10 +111,11 @@ def _look(fit: Fit, means: Mapping[str, float]) -> _Look | None:
     return _Look(fit=fit, predictor=predictor, weight=weight_of(fit.covariance), e=e[at], at=at, course=course)
 
 
-def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Cause]:
+def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given: bool = False) -> list[Cause]:
     """Return the causes that the innovations of model one-axis may have, the strongest first.
 
-    `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed.
+    `means`: operating point by role, SI; `thorough`: look for those too that take long, because a check failed;
+    `delay_given`: the delay of the voltage was not estimated.
     """
     look = _look(fit, means)
     if look is None:
@@ -124,6 +125,9 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool) -> list[Caus
     line = _line(spectra, ways)
     modes = _modes(spectra, rate_hz, line) if thorough else ()
     groups = list(_groups(course, modes, thorough=thorough))
+    if delay_given:
+        later = -(course.u - course.u_before) * rate_hz
+        groups.append(("input_delay", ((("voltage", later),),)))
     if line is not None:
         turn = 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)
         groups.append(("line", tuple(((line.channel, wave),) for wave in (np.cos(turn), np.sin(turn)))))
@@ -466,6 +470,7 @@ _SAME_AS = {"sensor_lag": ("sensor_pole",), "current_sensor_pole": ("current_lag
 _TEXT = {
     "eddy_pole": "the force lags behind the current by {size:.3g} s: eddy currents. Excite more slowly, or identify "
     "with the nonlinear magnet and its eddy pole",
+    "input_delay": "the voltage acts {size:.3g} s later than said. Leave channels.voltage.delay open, or give it",
     "sensor_lag": "the position is logged {size:.3g} s late: a filter of its sensor. Log without it, or say the delay",
     "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk. Check cables and grounds",
