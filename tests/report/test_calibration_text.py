@@ -6,8 +6,7 @@ import pytest
 
 import ambid
 from ambid.job import presentation
-from ambid.report.calibration import calibration_lines
-from ambid.report.parameters import ParameterRow
+from ambid.report.parameters import ParameterRow, calibration_lines
 from tests.estimation.test_calibration import SD, rig_of
 
 

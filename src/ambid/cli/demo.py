@@ -31,9 +31,9 @@ def command() -> None:
     """
     from ambid.job.identification import identify_axis
     from ambid.physics.presets import preset
-    from ambid.report.calibration import calibration_lines
     from ambid.report.document import Checks, Lines, Section, sections_text
     from ambid.report.estimate import delay_lines, header, output_table
+    from ambid.report.parameters import calibration_lines
     from ambid.report.text import verdict_lines
     from ambid.rig import load_rig
 

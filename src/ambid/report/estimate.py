@@ -16,7 +16,6 @@ from ambid.estimation.estimate import Check, Estimate, Judged
 from ambid.estimation.result import RecordEntry
 from ambid.physics.law_magnet import BEARING_NUMBERS
 from ambid.physics.linear_model import model
-from ambid.report.calibration import calibration_lines
 from ambid.report.document import (
     Checks,
     Document,
@@ -32,7 +31,7 @@ from ambid.report.document import (
     timing_section,
 )
 from ambid.report.numbers import prefixed, sized
-from ambid.report.parameters import fit_table, parameter_table, short_numbers
+from ambid.report.parameters import calibration_lines, fit_table, parameter_table, short_numbers
 from ambid.report.text import (
     Cell,
     Line,

@@ -12,11 +12,10 @@ from ambid.estimation.estimate import EstimatedParameter
 from ambid.estimation.result import RecordEntry
 from ambid.physics.rotor_model import Bearing, position_role
 from ambid.physics.shaft import Shaft
-from ambid.report.calibration import calibration_lines
 from ambid.report.document import Checks, Document, Fitting, Lines, Section, Warnings, grid, timing_section
 from ambid.report.estimate import computing_time, correlations_section, rig_sections, second_section
 from ambid.report.numbers import quantity, sized
-from ambid.report.parameters import parameter_table, short_numbers
+from ambid.report.parameters import calibration_lines, parameter_table, short_numbers
 from ambid.report.rotor_drawing import expected_rotor, partners_of, synchronous_sections
 from ambid.report.text import Line, late, names_words, other_warnings, pure, status_words, text_of
 from ambid.rotor.estimate import RotorEstimate
