@@ -115,7 +115,8 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
     n, size = problem.n_physical, problem.magnitude
     whole = directions(np.vstack([fit.J, fit.J_prior])).inverse()
     unit = np.outer(size, size)
-    information = (whole[:n, :n] + _left_open(fit)) * unit
+    more = 0.0 if fit.beside is None else fit.beside
+    information = (whole[:n, :n] + _left_open(fit) + more) * unit
     noise_only = fit.J_prior.copy()
     noise_only[:, :n] = 0.0
     data_only = np.sqrt(np.diag(directions(np.vstack([fit.J, noise_only])).inverse())[:n]) * size
@@ -126,13 +127,13 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
     return Uncertainty(
         names=problem.estimated,
         information=information,
-        robust=_gram(whole[:n] @ _scatter(_scores(fit) if scores is None else scores).T) * unit,
+        robust=(_gram(whole[:n] @ _scatter(_scores(fit) if scores is None else scores).T) + more) * unit,
         data_only_sd=data_only,
         scale=scale,
         singular_values=singular_values,
         weakest=weakest,
         delay_sd=delay_sd,
-        fisher=whole[:n, :n] * unit,
+        fisher=(whole[:n, :n] + more) * unit,
         disagreement=np.zeros(n),
         bias=np.zeros(n),
     )

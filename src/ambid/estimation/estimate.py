@@ -125,6 +125,16 @@ _OF_THE_RECORD = ("belonging", "position_size", "resolution", "signals_sound", "
 _EVIDENCE = frozenset({"ohm", "gravity_balance", "fixed_agree", "loop_agrees", "sampling"})
 """Checks of a fact each: two that contradict the estimate are as grave as one above."""
 
+
+def _independent(against: Mapping[str, Check]) -> int:
+    """Count facts against an estimate; those that one fault explains, a reversed position or an offset, count once."""
+    facts = _EVIDENCE & against.keys()
+    once = {"gravity_balance", "loop_agrees"} <= facts
+    offsets = [against[k].values.get("current_offset", 0.0) for k in ("ohm", "gravity_balance") if k in facts]
+    same = len(offsets) == 2 and offsets[0] * offsets[1] > 0.0 and 0.5 < offsets[0] / offsets[1] < 2.0
+    return len(facts) - once - same
+
+
 _UNFINISHED = {
     "stalled": "the search did not converge: its numbers are a first guess. Excite more, or give start values",
     "failed": "the search found no model of this record. Check columns, signs and fixed values",
@@ -145,7 +155,7 @@ class Judged(Result):
             [] if self.status == "converged" else [Reason(check="status", text=_UNFINISHED[self.status], grave=True)]
         )
         against = {k: c for k, c in self.checks.items() if not c.passed}
-        contradicted = len(_EVIDENCE & against.keys()) > 1
+        contradicted = _independent(against) > 1
         grave = {k for k, c in against.items() if c.grave or k in _GRAVE or (contradicted and k in _EVIDENCE)}
         if grave:  # a fault of the record is what made the others grave
             grave |= {k for k, c in against.items() if k in _OF_THE_RECORD and c.cause}

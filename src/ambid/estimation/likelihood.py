@@ -352,6 +352,7 @@ class Fit(PhysicalFit):
     start_s: float = 0.0  # time that finding start values took before this search, s
     work: Workspace | None = None  # scaled data, and the triangle near the optimum, for those who go on from here
     freed: Array | None = None  # Jacobian with the delay freed as well, where that was asked and is not needed
+    beside: Array | None = None  # (n_physical, n_physical), what sizes of causes add to the covariance of the numbers
 
 
 def prior_rows(problem: PredictorProblem, vector: Array) -> tuple[Array, Array]:

@@ -189,20 +189,19 @@ def identify_axis(
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Judge a fit; where checks name a cause that the model can take in, judge one with it, and keep it if all passes.
-
-    At most three causes, each asked for by a check; where they do not do, the first estimate stays, with its causes.
+    """Judge a fit; where a check names a cause that the model can take in, judge one with it, and keep it if it is
+    usable. Else the first estimate stays, with its causes.
     """
-    first = estimate = judge(fit, rig, bench, delay_how=delay_how)
-    named: tuple[str, ...] = ()
-    while len(named) < _CAUSES and "causes" in estimate.checks and not estimate.checks["causes"].passed:
-        from ambid.validation.causes import extended, told
+    first = judge(fit, rig, bench, delay_how=delay_how)
+    named = first.checks.get("causes")
+    if named is None or named.passed:
+        return first
+    from ambid.validation.causes import extended, told
 
-        cause, more = estimate.checks["causes"], extended(fit, estimate.operating_point)
-        if more is None:
-            return first
-        fit, named = more, (*named, told(cause))
-        estimate = replace(judge(fit, rig, bench, delay_how=delay_how), extended=named)
+    more = extended(fit, first.operating_point, named.cause)
+    if more is None:
+        return first
+    estimate = replace(judge(more, rig, bench, delay_how=delay_how), extended=(told(named),))
     return estimate if estimate.verdict.word == "usable" else first
 
 
@@ -261,9 +260,6 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
     return calibrated(estimate, rig, problem.model, theta, spread.names, spread.information, [lines_of(fit)])
-
-
-_CAUSES = 3  # that a model is extended by, at most
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

@@ -21,6 +21,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
+from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
 from ambid.estimation.linear import column_sizes, directions
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
@@ -67,7 +68,7 @@ class Cause:
     gain: float  # fall of the criterion
     p: float  # probability of that by chance
     size: float  # of its first column, SI; of a line its frequency, Hz
-    shift: Array  # (n_physical,), SI, what leaving it out has done to the estimate, as far as it is more than chance
+    shift: Array  # (n_physical,), SI, what the estimate lacks for leaving it out, as far as it is more than chance
     sizes: Array  # (n_columns,), SI, of all its columns
     columns: tuple[Column, ...] = ()
 
@@ -121,8 +122,8 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     if look is None:
         return []
     course, rate_hz = look.course, fit.problem.rate_hz
-    spectra, ways = _spectra(look.e @ look.weight.T), _ways(look)
-    line = _line(spectra, ways)
+    spectra = _spectra(look.e @ look.weight.T)
+    line = _line(spectra, look)
     modes = _modes(spectra, rate_hz, line) if thorough else ()
     groups = list(_groups(course, modes, thorough=thorough))
     if delay_given:
@@ -135,12 +136,12 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
     if line is not None:
         found[-1] = replace(found[-1], size=line.k * rate_hz / course.t.size, p=min(found[-1].p, line.p))
     if thorough:
-        found += _coloured(spectra, ways, fit.problem.n_physical)
+        found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     return sorted(found, key=lambda c: _PENALTY * c.sizes.size - c.gain)
 
 
-def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
-    """Fit again with the strongest cause in the model, its sizes estimated beside the parameters.
+def extended(fit: Fit, means: Mapping[str, float], named: str) -> Fit | None:
+    """Fit again with the strongest cause, which a check has `named`, its sizes estimated beside the parameters.
 
     None where the record does not tell it from another, or the search does not settle. The record is corrected by an
     error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
@@ -151,7 +152,7 @@ def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
         return None
     cause, plain, total = found[0], fit.problem, np.zeros(found[0].sizes.size)
     alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in found[1:])
-    if alike or not cause.columns or cause.name not in _GROWING:
+    if alike or not cause.columns or cause.name not in _GROWING or cause.name != named:
         return None
     n, size = fit.problem.n_physical, fit.problem.magnitude
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
@@ -167,7 +168,7 @@ def extended(fit: Fit, means: Mapping[str, float]) -> Fit | None:
         columns = _again(cause, look.course)
         cause = replace(_tested(look, [(cause.name, columns)])[0], size=cause.size)
         if cause.gain < _SETTLED:
-            return replace(fit, J=_beside(look, columns))
+            return replace(fit, beside=_beside(look, columns))
     return None
 
 
@@ -207,7 +208,7 @@ def _course(fit: Fit, states: Array, at: slice, means: Mapping[str, float]) -> _
     theta, delay = problem.parameters(fit.vector), problem.delay_samples(fit.vector)
     whole = int(np.floor(delay))
     first = problem.skip + at.start - whole - 2
-    raw = problem.u[first : first + x.size + 2, 0]
+    raw = problem.u[np.maximum(np.arange(first, first + x.size + 2), 0), 0]
     held = raw[1:] + (delay - whole) * (raw[:-1] - raw[1:])  # mean from each sample to the next, from one before on
     rest, u, last = theta["R"] * i + theta["k_i"] * v, held[1:], held[:-1]
     return _Course(
@@ -229,7 +230,7 @@ def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[t
     yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _WAVES))
     yield "slow_voltage", tuple((("voltage", wave),) for wave in _waves(s.t, _WAVES))
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
-        yield "curvature", tuple(_energy(s, a, degree - a) for a in range(degree + 1))
+        yield "curvature", tuple(_curvature(s, degree))
     if not thorough:
         return
     low, high = np.quantile(s.u, (1.0 - _REACH, _REACH))
@@ -248,12 +249,17 @@ def _waves(t: Array, count: int) -> list[Array]:
     return [t, *(np.cos(0.5 * np.pi * k * (t + 1.0)) for k in range(2, count + 1))]
 
 
-def _energy(s: _Course, a: int, b: int) -> Column:
-    """Force and voltage of the term x^a i^b of the co-energy, over the sizes of the motion."""
+def _curvature(s: _Course, degree: int) -> Iterator[Column]:
+    """Yield force and voltage of the terms x^a i^b of the co-energy, a + b = degree, over the sizes of the motion."""
     size_x, size_i = max(float(s.x.std()), 1e-300), max(float(s.i.std()), 1e-300)
-    unit = 1.0 / (size_x**a * size_i**b)
-    force, flux = unit * a * s.x ** max(a - 1, 0) * s.i**b, unit * b * s.x**a * s.i ** max(b - 1, 0)
-    return ("force", _between(force)), ("voltage", -_rate(flux, s.rate_hz))
+    x, i = [np.ones_like(s.x)], [np.ones_like(s.i)]
+    for _ in range(degree):
+        x.append(x[-1] * (s.x / size_x))
+        i.append(i[-1] * (s.i / size_i))
+    for a in range(degree + 1):
+        b = degree - a
+        force, flux = a / size_x * x[max(a - 1, 0)] * i[b], b / size_i * x[a] * i[max(b - 1, 0)]
+        yield ("force", _between(force)), ("voltage", -_rate(flux, s.rate_hz))
 
 
 def _rate(signal: Array, rate_hz: float) -> Array:
@@ -279,21 +285,25 @@ def _oscillation(s: _Course, f: float, damping: float) -> tuple[Array, Array]:
 
 
 def _through(look: _Look, columns: Sequence[Column]) -> Array:
-    """Return what signals of size one do to the whitened innovations, (n, n_outputs, n_columns)."""
+    """Return what signals of size one do to the whitened innovations, (n_outputs, n_columns, n)."""
     predictor, sc, model = look.predictor, look.fit.problem.scales, look.fit.problem.model
-    n, n_y = predictor.A.shape[0], look.e.shape[1]
-    out, enter = np.zeros((*look.e.shape, len(columns))), np.hstack([predictor.M[:, :n], predictor.E, -predictor.gain])
+    n, (length, n_y) = predictor.A.shape[0], look.e.shape
+    out, away = np.empty((n_y, len(columns), length)), -(look.weight @ predictor.C)
     for j, column in enumerate(columns):
-        driven = np.zeros((look.e.shape[0], len(model.disturbances) + n_y))
-        for where, signal in column:
+        enter, own = [predictor.M[:, :n]], np.zeros((n_y, 1))
+        w = np.empty((length, n + len(column)))
+        for k, (where, signal) in enumerate(column):
             if where in model.outputs:
-                k = model.outputs.index(where)
-                driven[:, k - n_y] = signal / sc.output[k]
+                o = model.outputs.index(where)
+                w[:, n + k] = signal / sc.output[o]
+                enter.append(-predictor.gain[:, [o]])
+                own = -look.weight[:, [o]] * w[:, n + k]
             else:
-                k = model.disturbances.index(where)
-                driven[:, k] = signal / sc.disturbance[k]
-        state = run(enter, driven, np.zeros(n))[:-1]
-        out[:, :, j] = -(driven[:, -n_y:] + state @ predictor.C.T) @ look.weight.T
+                o = model.disturbances.index(where)
+                w[:, n + k] = signal / sc.disturbance[o]
+                enter.append(predictor.E[:, [o]])
+        state_scan(np.hstack(enter), w, np.zeros(n))
+        out[:, j] = own + away @ w[:, :n].T
     return out
 
 
@@ -325,21 +335,21 @@ def _sums(look: _Look, C: Array) -> _Sums:
     turn, back = (np.eye(p), np.eye(p)) if work.turn is None else (work.turn[1], work.turn[0])
     own, cross, pull, along, square = (
         np.zeros((p, p)),
-        np.zeros((p, C.shape[2])),
+        np.zeros((p, C.shape[1])),
         np.zeros(p),
-        np.zeros(C.shape[2]),
+        np.zeros(C.shape[1]),
         0.0,
     )
     for block in residual_blocks(problem, fit.vector, look.weight, work, turn):
         a, b = max(at.start - first, 0), min(at.stop - first, block.shape[0])
         if a < b:
-            rows, columns = block[a:b], C[first + a - at.start : first + b - at.start]
+            rows, columns = block[a:b], C[:, :, first + a - at.start : first + b - at.start]
             for o in range(rows.shape[1]):
                 J, r = rows[:, o, :p], rows[:, o, p]
                 own += J.T @ J
-                cross += J.T @ columns[:, o]
+                cross += (columns[o] @ J).T
                 pull += J.T @ r
-                along += columns[:, o].T @ r
+                along += columns[o] @ r
                 square += float(r @ r)
         first += block.shape[0]
     cross = back.T @ cross
@@ -347,7 +357,7 @@ def _sums(look: _Look, C: Array) -> _Sums:
     return _Sums(
         own=back.T @ own @ back + fit.J_prior.T @ fit.J_prior, cross=cross,
         pull=back.T @ pull + fit.J_prior.T @ fit.r_prior, along=along,
-        inner=np.einsum("koa,kob->ab", C, C, optimize=True), square=square / max(look.e.size, 1),
+        inner=np.sum(C @ C.swapaxes(1, 2), axis=0), square=square / max(look.e.size, 1),
     )  # fmt: skip
 
 
@@ -386,15 +396,15 @@ def _tested(look: _Look, groups: Sequence[tuple[str, tuple[Column, ...]]]) -> li
 
 
 def _beside(look: _Look, columns: Sequence[Column]) -> Array:
-    """Return slopes with the information that is left beside the sizes of signals, (size, size)."""
+    """Return what the covariance of the physical parameters gains by the sizes of signals, over the magnitudes."""
     sums = _sums(look, _through(look, columns))
     unit = np.sqrt(np.maximum(np.diag(sums.inner), 1e-300))
     taken = sums.cross / unit @ np.linalg.pinv(sums.inner / np.outer(unit, unit), rcond=_SAME, hermitian=True)
-    prior = look.fit.J_prior
-    left = sums.own - prior.T @ prior - taken @ (sums.cross / unit).T
-    scale = np.sqrt(np.maximum(np.diag(left), 1e-300))
-    values, vectors = np.linalg.eigh(left / np.outer(scale, scale))
-    return np.asarray((vectors * np.sqrt(np.maximum(values, 0.0))).T * scale)
+    scale = column_sizes(np.sqrt(np.diag(sums.own))[None, :])
+    both = [sums.own - taken @ (sums.cross / unit).T, sums.own]
+    n = look.fit.problem.n_physical
+    left, plain = (np.linalg.pinv(x / np.outer(scale, scale), rcond=_BLIND, hermitian=True)[:n, :n] for x in both)
+    return np.asarray((left - plain) / np.outer(scale[:n], scale[:n]))
 
 
 def _spectra(e: Array) -> Complex:
@@ -404,11 +414,11 @@ def _spectra(e: Array) -> Complex:
     return np.asarray(np.fft.rfft(e * window, axis=0)[2 : (n + 1) // 2], dtype=np.complex128)
 
 
-def _ways(look: _Look) -> dict[str, Complex]:
-    """Return how a force, a voltage or an error of a sensor shows at those frequencies, (n_lines, n_outputs)."""
+def _ways(look: _Look, which: slice) -> dict[str, Complex]:
+    """Return how a force, a voltage or an error of a sensor shows at some frequencies, (n_lines, n_outputs)."""
     predictor, model, n = look.predictor, look.fit.problem.model, look.e.shape[0]
     values, vectors = np.linalg.eig(predictor.M[:, : predictor.A.shape[0]])
-    z = np.exp(2j * np.pi * np.arange(2, (n + 1) // 2) / n)
+    z = np.exp(2j * np.pi * np.arange(2, (n + 1) // 2)[which] / n)
     enter = np.linalg.solve(vectors, np.hstack([predictor.E, -predictor.gain]).astype(complex))
     through = -np.einsum("oj,kj,jb->kob", predictor.C @ vectors, 1.0 / (z[:, None] - values), enter)
     through[:, :, len(model.disturbances) :] -= np.eye(len(model.outputs))
@@ -422,7 +432,7 @@ class _Line:
     p: float
 
 
-def _line(spectra: Complex, ways: Mapping[str, Complex]) -> _Line | None:
+def _line(spectra: Complex, look: _Look) -> _Line | None:
     """Return the strongest narrow line, None where none stands out."""
     power = np.sum(np.abs(spectra) ** 2, axis=1)
     n_y = spectra.shape[1]
@@ -433,9 +443,8 @@ def _line(spectra: Complex, ways: Mapping[str, Complex]) -> _Line | None:
     around = power[max(j - 12, 0) : j + 13]
     if p > _LINE or float(power[max(j - 1, 0) : j + 2].sum()) < _NARROW * float(around.sum()):
         return None
-    shares = {
-        name: float(abs(np.vdot(way[j], spectra[j])) ** 2 / np.vdot(way[j], way[j]).real) for name, way in ways.items()
-    }
+    ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
+    shares = {name: float(abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real) for name, way in ways.items()}
     return _Line(k=j + 2, channel=max(shares, key=lambda name: shares[name]), p=p)
 
 
@@ -461,7 +470,7 @@ def _coloured(spectra: Complex, ways: Mapping[str, Complex], n_physical: int) ->
         gain = sum(2.0 * n * (mean - 1.0 - np.log(mean)) for n, mean in sums if mean > 1.0) / 1.5  # of a Hann window
         yield Cause(
             name=f"slow_{name}", channel=name, gain=float(gain), p=chi_squared_tail(max(len(sums), 1), float(gain)),
-            size=np.nan, shift=np.zeros(n_physical), sizes=np.zeros(len(sums)),
+            size=0.0, shift=np.zeros(n_physical), sizes=np.zeros(len(sums)),
         )  # fmt: skip
 
 
@@ -478,7 +487,7 @@ _TEXT = {
     " Record shorter, or after it is warm",
     "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
     "longer, or excite above it",
-    "slow_voltage": "the voltage walks slowly, of the order of {size:.3g} V. Check the supply and the sensor's zero",
+    "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",
     "curvature": "force or flux bends over this motion. Excite less, or identify the nonlinear magnet",
     "limiter": "the amplifier does not follow the logged voltage at its ends. Log the coil's voltage, or excite less",
     "hysteresis": "the force follows the current with a slack: hysteresis. Excite more, or demagnetise",
@@ -522,12 +531,13 @@ def causes_check(
     if others:
         text += f"; about as well explained by {' or '.join(others)}"
     grave = checks["estimates_agree"].grave or (late is not None and not late.passed)
+    net = first.gain - _PENALTY * first.sizes.size
     named = Check(
         passed=False, p=first.p, values={"gain": first.gain}, detail=f"{text} (chi-squared {first.gain:.3g})",
         grave=grave, cause=first.name, size=first.size, alternatives=others,
     )  # fmt: skip
     fixed = checks["fixed_agree"]
-    if fixed.passed or fixed.values["gain"] > first.gain:
+    if fixed.passed or fixed.values["gain"] - _PENALTY > net:
         return {"causes": named}
     text = f"a fixed value would fit better elsewhere, by less than {first.name} explains"
     return {"causes": named, "fixed_agree": replace(fixed, passed=True, detail=text)}

@@ -41,7 +41,7 @@ _PER_COIL = 2.0  # samples in a coil's time constant below which its inductance 
 def one_sided(current: Array) -> bool:
     """Return whether a current keeps its sign, but for what an offset may do."""
     low, high = sorted((float(current.min()), float(current.max())), key=abs)
-    return low * high > 0 or abs(low) <= _ONE_SIDED * abs(high)
+    return low * high > 0 or abs(low) <= _ONE_SIDED * abs(high) != 0.0
 
 
 def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, float] | None:
@@ -51,7 +51,7 @@ def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, floa
     channel's largest value.
     """
     v, i = record["voltage"].values, record["current"].values
-    if not one_sided(i) or abs(i.mean()) < float(i.std()):
+    if not one_sided(i) or abs(i.mean()) <= float(i.std()):
         return None
     ratio = float(v.mean() / i.mean())
     length = max(1, len(v) // _BLOCKS)
@@ -65,8 +65,10 @@ def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, floa
     return ratio, float(np.sqrt(scatter**2 + volts**2 + (ratio * amperes) ** 2) / abs(i.mean()))
 
 
-def facts(record: Record) -> dict[str, Check]:
-    """Return what the record says by itself, channels named by role; a check that fails names a cause."""
+def facts(record: Record, *, belongs: bool = False) -> dict[str, Check]:
+    """Return what the record says by itself, channels named by role; a check that fails names a cause. `belongs`:
+    whether position and current are known to.
+    """
     roles = set(record.names)
     checks: dict[str, Check] = {}
     if {"voltage", "current"} <= roles:
@@ -74,7 +76,8 @@ def facts(record: Record) -> dict[str, Check]:
         text = "voltage and current have no mean that shows R" if known is None else _ohms(*known)
         checks["ohm"] = Check(passed=True, detail=text, values=_level(known))
     if {"position", "current"} <= roles:
-        checks["belonging"] = belonging(record)
+        known_pair = Check(passed=True, detail="position and current are of one run: the force shows")
+        checks["belonging"] = known_pair if belongs else belonging(record)
         checks["weight"] = _weight(record["current"].values)
     if "position" in roles:
         checks["position_size"] = _position_size(record["position"].values)
@@ -176,9 +179,8 @@ def agreements(
 
     `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model.
     """
-    checks = {name: check for name, check in facts(record).items() if name != "weight"}  # see `gravity_balance`
-    if checks["belonging"].passed or abs(theta["k_i"]) > _SHOWN * sd.get("k_i", 0.0):
-        checks["belonging"] = Check(passed=True, p=checks["belonging"].p, detail="position and current are of one run")
+    force = abs(theta["k_i"]) > _SHOWN * sd.get("k_i", np.inf) and rig.parameter("k_i").role == "free"
+    checks = {name: c for name, c in facts(record, belongs=force).items() if name != "weight"}  # see `gravity_balance`
     known = mean_resistance(record, rig)
     if known is not None:
         checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
@@ -223,7 +225,8 @@ def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Ch
             "coil that warms up, would explain it; else the model does not hold. Measure R, and both channels at rest"
         )
     return Check(
-        passed=passed, values={"value": mean, "sd": mean_sd, "apart_sd": far}, detail=detail,
+        passed=passed, detail=detail,
+        values={"value": mean, "sd": mean_sd, "apart_sd": far, "current_offset": i0 * (1.0 - mean / R)},
         cause="" if passed else "ohm", size=None if passed else mean - R,
     )  # fmt: skip
 
@@ -231,6 +234,8 @@ def _ohm(record: Record, R: float, sd: float, mean: float, mean_sd: float) -> Ch
 def _sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: float) -> Check:
     """Check that the coil is slower than the sampling, in samples of L/R at the upper end of L's interval."""
     R, L = theta["R"], theta["L"]
+    if "L" not in sd:
+        return Check(passed=True, detail="the inductance is given")
     samples = (L + 2.0 * sd.get("L", 0.0)) / R * rate_hz if R > 0 else np.inf
     passed = samples >= _PER_COIL
     return Check(

@@ -459,9 +459,15 @@ def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robus
     if carries_weight(magnet, bench["current"].values):
         assert magnet is not None
         checks["gravity_balance"] = gravity_balance(
-            magnet, bench, theta, spread.names, spread.covariance(robust=False), scale_sd=_scale_sd(rig)
+            magnet,
+            bench,
+            theta,
+            spread.names,
+            spread.covariance(robust=False),
+            scale_sd=_scale_sd(rig),
+            offset_sd=rig.channel("current").offset_sd or 0.0,
         )
-        if theta["k_x"] > _FAR * sd.get("k_x", np.inf):
+        if not checks["gravity_balance"].passed and theta["k_x"] > _FAR * sd.get("k_x", np.inf):
             checks["sign_of_k_x"] = Check(
                 passed=False, grave=True, cause="belonging", values={"k_x": theta["k_x"]},
                 detail=f"k_x = {theta['k_x']:.3g} N/m is that of a spring, and no magnet that carries a weight has "
@@ -505,6 +511,7 @@ def gravity_balance(
     covariance: Array,
     *,
     scale_sd: float = 0.0,
+    offset_sd: float = 0.0,
 ) -> Check:
     """Check k_i/m against -2 g/i0, within what is not known: of the estimate, of gravity and the current's zero (of the
     rig, else its resolution), and of the law beyond its tangent, E[f] = f (1 + var(i)/i0^2 + ...), for the motion seen.
@@ -513,7 +520,7 @@ def gravity_balance(
     x, i = record["position"].values, record["current"].values
     numbers = {name: magnet.known(name) for name in ("g", "i_offset")}
     g, g_sd = _value(numbers["g"], GRAVITY, 0.0)
-    zero, zero_sd = _value(numbers["i_offset"], 0.0, resolution(record, "current").step / np.sqrt(12.0))
+    zero, zero_sd = _value(numbers["i_offset"], 0.0, max(resolution(record, "current").step / np.sqrt(12.0), offset_sd))
     i0, (spread, along) = float(i.mean()) - zero, np.cov(x, i)
     ratio, expected = theta["k_i"] / theta["m"], -2.0 * g / i0
     slope = np.array([(name == "k_i") / theta["k_i"] - (name == "m") / theta["m"] for name in names])
@@ -543,7 +550,14 @@ def gravity_balance(
         )
     if not passed and magnet == RigMagnet():
         detail += ". If a pair of magnets carries the rotor, or none of its weight, give magnet.kind = 'pair'"
-    values = {"k_i_over_m": ratio, "expected": expected, "relative": off, "sd": sd, "expected_sd": doubt}
+    values = {
+        "current_offset": i0 * off / (1.0 + off),
+        "k_i_over_m": ratio,
+        "expected": expected,
+        "relative": off,
+        "sd": sd,
+        "expected_sd": doubt,
+    }
     return Check(
         passed=passed, values=values, detail=detail, cause="" if passed else "weight", size=None if passed else off
     )
