@@ -227,8 +227,9 @@ def _groups(s: _Course, modes: Sequence[float], *, thorough: bool) -> Iterator[t
     yield "cross_talk", ((("position", s.i),), (("position", s.u_before),))
     yield "cross_talk", ((("current", s.x),), (("current", s.u_before),))
     yield "r_drift", ((("voltage", _between(-s.t * (s.i0 + s.i))),),)
-    yield "slow_force", tuple((("force", wave),) for wave in _waves(s.t, _WAVES))
-    yield "slow_voltage", tuple((("voltage", wave),) for wave in _waves(s.t, _WAVES))
+    waves = _waves(s.t, _WAVES)
+    yield "slow_force", tuple((("force", wave),) for wave in waves)
+    yield "slow_voltage", tuple((("voltage", wave),) for wave in waves)
     for degree in (3, 4):  # of the co-energy W: force dW/dx and flux dW/di bend evenly, or oddly
         yield "curvature", tuple(_curvature(s, degree))
     if not thorough:
@@ -404,7 +405,9 @@ def _beside(look: _Look, columns: Sequence[Column]) -> Array:
     both = [sums.own - taken @ (sums.cross / unit).T, sums.own]
     n = look.fit.problem.n_physical
     left, plain = (np.linalg.pinv(x / np.outer(scale, scale), rcond=_BLIND, hermitian=True)[:n, :n] for x in both)
-    return np.asarray((left - plain) / np.outer(scale[:n], scale[:n]))
+    values, vectors = np.linalg.eigh(0.5 * (left - plain + (left - plain).T))
+    more = (vectors * np.maximum(values, 0.0)) @ vectors.T  # sizes never tell of the numbers
+    return np.asarray(more / np.outer(scale[:n], scale[:n]))
 
 
 def _spectra(e: Array) -> Complex:
