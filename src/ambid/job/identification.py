@@ -190,11 +190,13 @@ def identify_axis(
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
     """Judge a fit; where a check names a cause that the model can take in, judge one with it, and keep it if it is
-    usable. Else the first estimate stays, with its causes.
+    usable. Else the first estimate stays, with its causes; also where a fixed value may be what is wrong.
     """
+    from ambid.validation.residuals import P_LEAST
+
     first = judge(fit, rig, bench, delay_how=delay_how)
     named = first.checks.get("causes")
-    if named is None or named.passed:
+    if named is None or named.passed or (first.checks["fixed_agree"].p or 1.0) < P_LEAST:
         return first
     from ambid.validation.causes import extended, told
 
