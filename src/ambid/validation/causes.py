@@ -43,8 +43,9 @@ _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
-_QUICK = frozenset({"eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"})
-_GROWING = _QUICK | {"line", "slow_force", "slow_voltage"}
+_SAME_COURSE = ("line", "slow_force", "slow_voltage")
+"""Causes whose signals do not depend on the fit."""
+_GROWING = {*_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
 """Causes whose signals are known but for their sizes."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
@@ -180,10 +181,10 @@ def told(check: Check) -> str:
 
 def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
     """Return a cause's signals at another fit: those of lines and walks are the same."""
-    if cause.name in ("line", "slow_force", "slow_voltage"):
+    if cause.name in _SAME_COURSE:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
-    groups = _groups(course, (), thorough=cause.name not in _QUICK)
+    groups = _groups(course, (), thorough=False)
     return next(columns for name, columns in groups if (name, columns[0][0][0], len(columns)) == own)
 
 
@@ -191,8 +192,6 @@ def _corrected(problem: PredictorProblem, columns: Sequence[Column], sizes: Arra
     """Return a problem that holds signals of some sizes."""
     model, skip = problem.model, problem.skip
     y, extra = problem.y.copy(), np.zeros((problem.y.shape[0], len(model.disturbances)))
-    if problem.extra is not None:
-        extra += problem.extra
     parts = [(*part, size) for column, size in zip(columns, sizes.tolist(), strict=True) for part in column]
     for where, signal, size in parts:
         if where in model.outputs:
@@ -334,13 +333,8 @@ def _sums(look: _Look, C: Array) -> _Sums:
     fit, at = look.fit, look.at
     problem, work, p, first = fit.problem, workspace_near(fit, fit.problem), fit.problem.size, 0
     turn, back = (np.eye(p), np.eye(p)) if work.turn is None else (work.turn[1], work.turn[0])
-    own, cross, pull, along, square = (
-        np.zeros((p, p)),
-        np.zeros((p, C.shape[1])),
-        np.zeros(p),
-        np.zeros(C.shape[1]),
-        0.0,
-    )
+    own, cross, pull = np.zeros((p, p)), np.zeros((p, C.shape[1])), np.zeros(p)
+    along, square = np.zeros(C.shape[1]), 0.0
     for block in residual_blocks(problem, fit.vector, look.weight, work, turn):
         a, b = max(at.start - first, 0), min(at.stop - first, block.shape[0])
         if a < b:
@@ -487,7 +481,7 @@ _TEXT = {
     "current_sensor_pole": "the current is logged {size:.3g} s late: a filter of its sensor. Log without it",
     "cross_talk": "the {channel} holds a part of voltage or current: cross-talk. Check cables and grounds",
     "r_drift": "the resistance drifts by {size:.3g} ohm from the middle of the record to its end: the coil warms up. "
-    " Record shorter, or after it is warm",
+    "Record shorter, or after it is warm",
     "slow_force": "a force beyond the model walks or is coloured: load, friction or a drifting sensor. Record "
     "longer, or excite above it",
     "slow_voltage": "the voltage walks slowly or is coloured. Check the supply and the sensor's zero",

@@ -31,7 +31,7 @@ _LONGEST = 40_000  # samples that are compared
 _CHANCE = 1e-3  # probability above which a relation may be chance
 _SHOWN = 3.0  # standard deviations of k_i above which current and position belong together
 _STILL = 4  # samples in which no channel changes: the log stood still
-_GRAVITY = 9.81  # m/s^2
+GRAVITY = 9.81  # m/s^2
 _FURTHEST = 1.0  # m, from zero that a position sensor can be
 _TOP = 0.2  # part of the voltage's power in the top octave, from which it may change between samples
 _SAYS, _ORDER = 0.25, 6  # part of the current's next change that a logged voltage says at least, from six samples
@@ -47,8 +47,8 @@ def one_sided(current: Array) -> bool:
 def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, float] | None:
     """Return mean voltage over mean current with its standard deviation, ohm; None where the current has both signs.
 
-    The deviation holds the scatter of means of stretches, and offsets of both channels, sd 0.5 % of each
-    channel's largest value.
+    The deviation holds the scatter of means of stretches, and offsets of both channels: of sd as the rig says, else
+    0.5 % of each channel's largest value.
     """
     v, i = record["voltage"].values, record["current"].values
     if not one_sided(i) or abs(i.mean()) <= float(i.std()):
@@ -65,16 +65,17 @@ def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, floa
     return ratio, float(np.sqrt(scatter**2 + volts**2 + (ratio * amperes) ** 2) / abs(i.mean()))
 
 
-def facts(record: Record, *, belongs: bool = False) -> dict[str, Check]:
-    """Return what the record says by itself, channels named by role; a check that fails names a cause. `belongs`:
-    whether position and current are known to.
+def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> dict[str, Check]:
+    """Return what the record says by itself, channels named by role; a check that fails names a cause. `rig`: for the
+    offsets of its channels; `belongs`: whether position and current are known to.
     """
     roles = set(record.names)
     checks: dict[str, Check] = {}
     if {"voltage", "current"} <= roles:
-        known = mean_resistance(record)
+        known = mean_resistance(record, rig)
         text = "voltage and current have no mean that shows R" if known is None else _ohms(*known)
-        checks["ohm"] = Check(passed=True, detail=text, values=_level(known))
+        level = {} if known is None else {"value": known[0], "sd": known[1]}
+        checks["ohm"] = Check(passed=True, detail=text, values=level)
     if {"position", "current"} <= roles:
         known_pair = Check(passed=True, detail="position and current are of one run: the force shows")
         checks["belonging"] = known_pair if belongs else belonging(record)
@@ -87,10 +88,6 @@ def facts(record: Record, *, belongs: bool = False) -> dict[str, Check]:
 
 def _ohms(value: float, sd: float) -> str:
     return f"mean voltage over mean current is {value:.4g} ± {sd:.2g} ohm, if neither has a larger offset"
-
-
-def _level(known: tuple[float, float] | None) -> dict[str, float]:
-    return {} if known is None else {"value": known[0], "sd": known[1]}
 
 
 def belonging(record: Record) -> Check:
@@ -138,8 +135,8 @@ def _weight(current: Array) -> Check:
             passed=True, detail="the current has both signs: it does not tell of one magnet that carries a weight"
         )
     return Check(
-        passed=True, values={"k_i_over_m": -2.0 * _GRAVITY / i0},
-        detail=f"if one magnet carries the weight, k_i/m is -2 g/i0 = {-2.0 * _GRAVITY / i0:.4g} N/(A kg)",
+        passed=True, values={"k_i_over_m": -2.0 * GRAVITY / i0},
+        detail=f"if one magnet carries the weight, k_i/m is -2 g/i0 = {-2.0 * GRAVITY / i0:.4g} N/(A kg)",
     )  # fmt: skip
 
 
@@ -177,13 +174,14 @@ def agreements(
 ) -> dict[str, Check]:
     """Compare the facts of a record with an estimate from it, model one-axis.
 
-    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model.
+    `theta`, `sd`: parameters and their standard deviations, SI; `alone`: the latter under the model. The weight has a
+    check of its own, `ambid.validation.physical.gravity_balance`.
     """
     force = abs(theta["k_i"]) > _SHOWN * sd.get("k_i", np.inf) and rig.parameter("k_i").role == "free"
-    checks = {name: c for name, c in facts(record, belongs=force).items() if name != "weight"}  # see `gravity_balance`
-    known = mean_resistance(record, rig)
-    if known is not None:
-        checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), *known)
+    checks = {name: c for name, c in facts(record, rig, belongs=force).items() if name != "weight"}
+    means = checks["ohm"].values
+    if means:
+        checks["ohm"] = _ohm(record, theta["R"], alone.get("R", 0.0), means["value"], means["sd"])
     checks["sampling"] = _sampling(theta, sd, record.rate_hz)
     return checks
 
@@ -236,7 +234,7 @@ def _sampling(theta: Mapping[str, float], sd: Mapping[str, float], rate_hz: floa
     R, L = theta["R"], theta["L"]
     if "L" not in sd:
         return Check(passed=True, detail="the inductance is given")
-    samples = (L + 2.0 * sd.get("L", 0.0)) / R * rate_hz if R > 0 else np.inf
+    samples = (L + 2.0 * sd["L"]) / R * rate_hz if R > 0 else np.inf
     passed = samples >= _PER_COIL
     return Check(
         passed=passed, values={"samples": L / R * rate_hz if R > 0 else np.nan}, grave=samples < 1.0,

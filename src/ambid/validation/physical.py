@@ -40,7 +40,7 @@ from ambid.record import Record
 from ambid.rig.rig import Rig, RigMagnet
 from ambid.signals.faults import Dropouts, Saturation, find_dropouts, find_outliers, find_saturation, resolution
 from ambid.simulation.plant import closed_loop_poles
-from ambid.validation.facts import agreements, one_sided
+from ambid.validation.facts import GRAVITY, agreements, one_sided
 from ambid.validation.residuals import P_LEAST, ResidualTest, uncorrelated_check, white_check
 
 _INFLATION = 1.7  # robust over information standard deviation from which the model, not the noise, sets the error
@@ -429,7 +429,6 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
     )
 
 
-GRAVITY = 9.81
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
 _COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
@@ -439,9 +438,9 @@ _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean curren
 def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robust: bool) -> dict[str, Check]:
     """Check an estimate of model one-axis against what its record, gravity and the rig's controller say without a fit.
 
-    `robust`: which standard deviations count. The balance of
-    gravity is asked for by default where the current keeps its sign, as that of one magnet that carries a weight does,
-    and its mean is that of the voltage, so that it is no offset.
+    `robust`: which standard deviations count. The balance of gravity is asked for by default where the current keeps
+    its sign, as that of one magnet that carries a weight does, and its mean is that of the voltage, so that it is no
+    offset.
     """
     theta = fit.problem.parameters(fit.vector)
     sd, alone = (
