@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import column_sizes, directions, triangle_of
+from ambid.estimation.linear import column_sizes, directions, periods_near, triangle_of
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest, predictor_gain
 from ambid.estimation.search import NOT_CONVERGED, PhysicalFit, predictable
 from ambid.estimation.search import search as descend
@@ -336,6 +336,7 @@ _FLAT = 0.001  # fall of the criterion in one step below which a search has conv
 PAST = 10  # samples of innovations that a regression looks at, which tells whether a fit has failed
 _INPUTS = 28  # and of inputs: a delay that was missed shows there
 _LOOKED = 2048  # samples that it looks at
+_LINES, _STANDS = 6, 100.0  # lines that no model can explain, and from which power over the median one counts as such
 _POOR = 0.1  # share of the squares that offsets and initial state would take off, above which they are set first
 
 
@@ -635,13 +636,33 @@ def _predictor(fit: Fit) -> Predictor:
 
 
 def failure(fit: Fit) -> str:
-    """Return why a fit counts as failed, empty where it did not."""
-    return predictable(unexplained(fit)) if fit.status == "converged" else NOT_CONVERGED
+    """Return why a fit counts as failed, empty where it did not: lines in the innovations are of no other model."""
+    if fit.status != "converged":
+        return NOT_CONVERGED
+    why = predictable(unexplained(fit))
+    return predictable(unexplained(fit, lines=False)) if why else ""
 
 
-def unexplained(fit: Fit) -> float:
+def _without_lines(e: Array) -> Array:
+    """Return innovations without their strongest narrow lines, each of an amplitude and a phase that may drift."""
+    n, t = len(e), np.linspace(-1.0, 1.0, len(e))
+    for _ in range(_LINES):
+        spectra = np.fft.rfft(e * np.hanning(n)[:, None], axis=0)
+        power = np.sum(np.abs(spectra) ** 2 / np.maximum(np.median(np.abs(spectra) ** 2, axis=0), 1e-300), axis=1)
+        j = int(np.argmax(power))
+        if power[j] < _STANDS or j < 2:
+            break
+        k = periods_near((e @ spectra[j].conj()), j)
+        turn = 2.0 * np.pi * k / n * np.arange(n)
+        waves = np.column_stack([s * wave(turn) for s in (1.0, t) for wave in (np.cos, np.sin)])
+        e = e - waves @ np.linalg.lstsq(waves, e, rcond=None)[0]
+    return e
+
+
+def unexplained(fit: Fit, *, lines: bool = True) -> float:
     """Return the part of the innovations' variance that a linear regression on past innovations and inputs explains:
-    about 0 where a search ended well, as no linear model of high order predicts better; 1 without a predictor.
+    about 0 where a search ended well, as no linear model of high order predicts better; 1 without a predictor. Without
+    `lines`: what stands far out of their spectra at few frequencies is taken off first.
     """
     work = None if fit.work is None else fit.work.of(fit.problem)
     e = None if fit.status == "failed" else innovations(fit.problem, fit.vector, work)
@@ -649,4 +670,5 @@ def unexplained(fit: Fit) -> float:
         return 1.0
     u = fit.problem.u[fit.problem.skip :]
     at = busiest(u, _LOOKED)
+    e = e if lines else _without_lines(e)
     return explained_by_past([(e[at], ((e[at], PAST), (u[at], _INPUTS)))])[0]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ambid.arrays import Array
+from ambid.arrays import Array, Complex
 
 BLIND = 1e-11  # singular values of the scaled matrix below this part of the largest are directions nobody sees
 _ROUNDING = 1e-15  # least singular value, over the largest, that a variance is taken from
@@ -132,3 +132,17 @@ def _controller(_with_scipy: bool) -> Any:
     from threadpoolctl import ThreadpoolController
 
     return ThreadpoolController()
+
+
+def periods_near(signal: Array | Complex, k: int) -> float:
+    """Return at how many periods over a signal, about `k`, its windowed transform is largest."""
+    n = signal.size
+    turn = 2j * np.pi / n * np.arange(n)
+    rest = signal * np.hanning(n) * np.exp(-k * turn)
+    length = max(1, n // 256)  # over which a fraction of a period hardly turns
+    short = np.add.reduceat(rest, np.arange(0, n, length))
+    beside = np.linspace(-0.75, 0.75, 61)
+    power = np.abs(np.exp(-np.outer(beside, turn[::length])) @ short)
+    j = min(max(int(np.argmax(power)), 1), 59)
+    a, b, c = power[j - 1 : j + 2].tolist()
+    return k + float(beside[j] + (beside[1] - beside[0]) * 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-300))

@@ -29,6 +29,9 @@ if TYPE_CHECKING:
     from ambid.estimation.estimate import Check
     from ambid.estimation.likelihood import Fit
     from ambid.rotor.estimate import RotorEstimate
+    from ambid.validation.causes import Cause
+
+_CAUSES = 3  # by which a model is extended, one after another
 
 
 def identify(
@@ -189,22 +192,32 @@ def identify_axis(
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Judge a fit; where a check names a cause that the model can take in, judge one with it, and keep it if it is
-    usable. Else the first estimate stays, with its causes; also where a fixed value may be what is wrong.
+    """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if only
+    checks fail that failed before, and fewer. Else the first estimate stays, with its causes; also where a fixed value
+    may be what is wrong, unless the cause is a course of its own in time.
     """
+    from ambid.validation.causes import COURSES, extended, told
     from ambid.validation.residuals import P_LEAST
 
-    first = judge(fit, rig, bench, delay_how=delay_how)
-    named = first.checks.get("causes")
-    if named is None or named.passed or (first.checks["fixed_agree"].p or 1.0) < P_LEAST:
-        return first
-    from ambid.validation.causes import extended, told
-
-    more = extended(fit, first.operating_point, named.cause)
-    if more is None:
-        return first
-    estimate = replace(judge(more, rig, bench, delay_how=delay_how), extended=(told(named),))
-    return estimate if estimate.verdict.word == "usable" else first
+    first = estimate = judge(fit, rig, bench, delay_how=delay_how)
+    plain = fit.problem
+    taken: tuple[Cause, ...] = ()
+    for _ in range(_CAUSES):
+        named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
+        if (
+            named is None
+            or named.passed
+            or (named.cause not in COURSES and (1.0 if fixed is None else fixed) < P_LEAST)
+        ):
+            break
+        more = extended(fit, first.operating_point, named.cause, plain, taken)
+        if more is None:
+            break
+        fit, taken = more
+        estimate = judge(fit, rig, bench, delay_how=delay_how)
+        estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
+    before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
+    return estimate if after < before and "causes" not in after else first
 
 
 def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:

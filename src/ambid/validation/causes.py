@@ -23,7 +23,7 @@ from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
-from ambid.estimation.linear import column_sizes, directions
+from ambid.estimation.linear import column_sizes, directions, periods_near
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
@@ -39,13 +39,14 @@ _MANY = 40  # and of one that was looked for because a check failed
 _SMOOTH = 9  # lines that are averaged to see a mode
 _DAMPING = (0.005, 0.03)  # with which it is looked for
 _NARROW = 0.6  # part of the power around a line that its own three frequencies hold
+_LINES, _SKIRT = 6, 4  # lines that are taken together, and how far each reaches
 _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
-_SAME_COURSE = ("line", "slow_force", "slow_voltage")
-"""Causes whose signals do not depend on the fit."""
-_GROWING = {*_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
+COURSES = ("line", "slow_force", "slow_voltage")
+"""Causes whose signals are courses in time, which no number of the plant can imitate."""
+_GROWING = {*COURSES, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
 """Causes whose signals are known but for their sizes."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
@@ -124,26 +125,32 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
         return []
     course, rate_hz = look.course, fit.problem.rate_hz
     spectra = _spectra(look.e @ look.weight.T)
-    line = _line(spectra, look)
-    modes = _modes(spectra, rate_hz, line) if thorough else ()
+    lines = _lines(spectra, look)
+    modes = _modes(spectra, rate_hz, lines) if thorough else ()
     groups = list(_groups(course, modes, thorough=thorough))
     if delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
-    if line is not None:
-        turn = 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)
-        groups.append(("line", tuple(((line.channel, wave),) for wave in (np.cos(turn), np.sin(turn)))))
+    if lines:
+        turns = [(line.channel, 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)) for line in lines]
+        waves = [
+            (channel, s * wave(turn)) for channel, turn in turns for s in (1.0, course.t) for wave in (np.cos, np.sin)
+        ]
+        groups.append(("line", tuple((wave,) for wave in waves)))
     found = _tested(look, groups)
-    if line is not None:
-        found[-1] = replace(found[-1], size=line.k * rate_hz / course.t.size, p=min(found[-1].p, line.p))
+    if lines:
+        found[-1] = replace(found[-1], size=lines[0].k * rate_hz / course.t.size, p=min(found[-1].p, lines[0].p))
     if thorough:
         found += _coloured(spectra, _ways(look, slice(None)), fit.problem.n_physical)
     return sorted(found, key=lambda c: _PENALTY * c.sizes.size - c.gain)
 
 
-def extended(fit: Fit, means: Mapping[str, float], named: str) -> Fit | None:
+def extended(
+    fit: Fit, means: Mapping[str, float], named: str, plain: PredictorProblem, taken: Sequence[Cause] = ()
+) -> tuple[Fit, tuple[Cause, ...]] | None:
     """Fit again with the strongest cause, which a check has `named`, its sizes estimated beside the parameters.
 
+    `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new one.
     None where the record does not tell it from another, or the search does not settle. The record is corrected by an
     error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
     information of the parameters is what is left beside the sizes.
@@ -151,7 +158,7 @@ def extended(fit: Fit, means: Mapping[str, float], named: str) -> Fit | None:
     found = [c for c in causes(fit, means, thorough=True) if c.p < _CHANCE]
     if not found or fit.problem.n_used > _LONGEST:
         return None
-    cause, plain, total = found[0], fit.problem, np.zeros(found[0].sizes.size)
+    cause = found[0]
     alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in found[1:])
     if alike or not cause.columns or cause.name not in _GROWING or cause.name != named:
         return None
@@ -159,29 +166,36 @@ def extended(fit: Fit, means: Mapping[str, float], named: str) -> Fit | None:
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
     if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
         return None  # what is of higher degree would move them too
+    parts = (*taken, cause)
+    total = np.concatenate([*(c.sizes for c in taken), np.zeros(cause.sizes.size)])
+    step = np.concatenate([np.zeros(total.size - cause.sizes.size), cause.sizes])
     for _ in range(_TURNS):
-        total = total + cause.sizes
-        problem = _corrected(plain, cause.columns, total)
+        total = total + step
+        problem = _corrected(plain, [column for c in parts for column in c.columns], total)
         fit = search(problem, fit.vector, steps=_STEPS, work=workspace_near(fit, problem))
-        look = None if fit.status != "converged" else _look(fit, means)
+        look = None if fit.status == "failed" else _look(fit, means)
         if look is None:
             return None
-        columns = _again(cause, look.course)
-        cause = replace(_tested(look, [(cause.name, columns)])[0], size=cause.size)
-        if cause.gain < _SETTLED:
-            return replace(fit, beside=_beside(look, columns))
+        parts = tuple(replace(c, columns=_again(c, look.course)) for c in parts)
+        columns = [column for c in parts for column in c.columns]
+        left = _tested(look, [("", tuple(columns))])[0]
+        step = left.sizes
+        if left.gain < _SETTLED and fit.status == "converged":
+            ends = np.cumsum([c.sizes.size for c in parts])[:-1]
+            parts = tuple(replace(c, sizes=z) for c, z in zip(parts, np.split(total, ends), strict=True))
+            return replace(fit, beside=_beside(look, columns)), parts
     return None
 
 
-def told(check: Check) -> str:
-    """Return a named cause and its size, as what a model is extended by."""
+def told(cause: Cause) -> str:
+    """Return a cause and its size, as what a model is extended by."""
     unit = {"line": " Hz", "r_drift": " ohm", "sensor_lag": " s", "eddy_pole": " s", "current_sensor_pole": " s"}
-    return f"{check.cause} ({check.size:.3g}{unit[check.cause]})" if check.cause in unit else check.cause
+    return f"{cause.name} ({cause.size:.3g}{unit[cause.name]})" if cause.name in unit else cause.name
 
 
 def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
     """Return a cause's signals at another fit: those of lines and walks are the same."""
-    if cause.name in _SAME_COURSE:
+    if cause.name in COURSES:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
     groups = _groups(course, (), thorough=False)
@@ -424,32 +438,39 @@ def _ways(look: _Look, which: slice) -> dict[str, Complex]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Line:
-    k: int  # periods over the samples that are looked at
+    k: float  # periods over the samples that are looked at
     channel: str
     p: float
 
 
-def _line(spectra: Complex, look: _Look) -> _Line | None:
-    """Return the strongest narrow line, None where none stands out."""
+def _lines(spectra: Complex, look: _Look) -> list[_Line]:
+    """Return narrow lines that stand out, the strongest first."""
     power = np.sum(np.abs(spectra) ** 2, axis=1)
-    n_y = spectra.shape[1]
-    usual = float(np.median(power)) / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
-    j = int(np.argmax(power))
-    ratio = float(power[j] / max(usual, 1e-300))
-    p = float(power.size * (1.0 + ratio * (n_y > 1)) * np.exp(-min(ratio, 700.0)))
-    around = power[max(j - 12, 0) : j + 13]
-    if p > _LINE or float(power[max(j - 1, 0) : j + 2].sum()) < _NARROW * float(around.sum()):
-        return None
-    ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
-    shares = {name: float(abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real) for name, way in ways.items()}
-    return _Line(k=j + 2, channel=max(shares, key=lambda name: shares[name]), p=p)
+    n_y, lines = spectra.shape[1], list[_Line]()
+    median = float(np.median(power))
+    usual = median / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
+    power[: _WAVES // 2] = median  # what walks as slowly is no line
+    while len(lines) < _LINES:
+        j = int(np.argmax(power))
+        ratio = float(power[j] / max(usual, 1e-300))
+        p = float(power.size * (1.0 + ratio * (n_y > 1)) * np.exp(-min(ratio, 700.0)))
+        around = power[max(j - 12, 0) : j + 13]
+        if p > _LINE or float(power[max(j - 1, 0) : j + 2].sum()) < _NARROW * float(around.sum()):
+            break
+        ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
+        shares = {name: abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real for name, way in ways.items()}
+        channel = max(shares, key=lambda name: float(shares[name]))
+        k = periods_near(look.e @ look.weight.T @ ways[channel].conj(), j + 2)
+        lines.append(_Line(k=k, channel=channel, p=p))
+        power[max(j - _SKIRT, 0) : j + _SKIRT + 1] = median
+    return lines
 
 
-def _modes(spectra: Complex, rate_hz: float, line: _Line | None) -> tuple[float, ...]:
+def _modes(spectra: Complex, rate_hz: float, lines: Sequence[_Line]) -> tuple[float, ...]:
     """Return the frequency at which the innovations stand highest over some lines, Hz; not that of a line."""
     power = np.sum(np.abs(spectra) ** 2, axis=1)
-    if line is not None:
-        power[max(line.k - 4, 0) : line.k + 1] = np.median(power)
+    for at in (round(line.k) - 2 for line in lines):
+        power[max(at - _SKIRT, 0) : at + _SKIRT + 1] = np.median(power)
     smooth = np.convolve(power, np.ones(_SMOOTH) / _SMOOTH, mode="same")
     smooth[: 2 * _SMOOTH] = 0.0
     return (float((np.argmax(smooth) + 2) * 0.5 * rate_hz / (power.size + 2)),)
@@ -525,6 +546,8 @@ def causes_check(
     if late is not None and not late.passed:
         others = tuple(c for c in dict.fromkeys([*others, late.cause, *late.alternatives]) if c != first.name)
     text = _TEXT[first.name].format(size=first.size, channel=first.channel)
+    if first.name == "line" and first.sizes.size > 4:
+        text += f"; {first.sizes.size // 4 - 1} more beside it"
     if others:
         text += f"; about as well explained by {' or '.join(others)}"
     grave = checks["estimates_agree"].grave or (late is not None and not late.passed)
