@@ -104,12 +104,16 @@ def test_resistance_and_inductance_on_every_record(levitation, name):
 
 @pytest.mark.parametrize(("name", "least", "most"), [("stairs_a", 9, 12), ("stairs_b", 15, 18), ("sine_d", 8, 11)])
 def test_the_interval_holds_what_gravity_asks_for_and_the_cause_is_named(levitation, name, least, most):
-    """The linear k_i falls short of the weight, by curvature and motion that is not logged: no narrow interval."""
+    """The record's k_i falls short of the weight, by curvature and motion that is not logged: its interval is wide, and
+    the weight, which the rig says one magnet carries, moves the estimate where the two agree.
+    """
     run = levitation[name]
     check = run.estimate.checks["gravity_balance"]
     assert check.values["expected"] == pytest.approx(run.balance / MASS, rel=1e-3)
     assert least < -100.0 * check.values["relative"] < most
-    assert abs(run.estimate["k_i"].value - run.balance) < 3.0 * run.estimate["k_i"].sd
+    assert abs(run.estimate["k_i"].value - run.balance) < 2.0 * run.estimate["k_i"].sd
+    assert not check.passed or run.estimate["k_i"].value == pytest.approx(run.balance, rel=0.03)
+    assert abs(run.estimate["R"].value - RESISTANCE) < 2.0 * np.hypot(run.estimate["R"].sd, 0.01 * RESISTANCE)
     assert run.estimate.verdict.word != "usable"
     named = run.estimate.checks["causes"]
     assert {"curvature", "line", "slow_force"} & {named.cause, *named.alternatives}

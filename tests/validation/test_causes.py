@@ -132,7 +132,7 @@ def test_intervals_hold_what_a_named_cause_did():
 
 @pytest.mark.parametrize("seed", range(1, 1 + runs(10, short=2)))
 def test_a_model_is_extended_by_lines_between_the_frequencies_of_the_record_and_by_a_walk(seed):
-    """Hum with a harmonic in the current beside a voltage that walks: taken in one after another, and nothing is off."""
+    """Hum with a harmonic in the current beside a voltage that walks: taken in, and nothing is off."""
     columns, rate_hz = columns_of("unstable-bearing", seed)
     clean = ambid.identify(columns, rate_hz=rate_hz, units=(units := {"voltage": "V", "current": "A", "position": "m"}))
     t = np.arange(columns["voltage"].size) / rate_hz

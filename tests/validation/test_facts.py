@@ -151,3 +151,34 @@ def test_causes_go_through_the_file(tmp_path):
     assert again.checks["causes"] == line
     reason = again.verdict.reasons[0]
     assert (reason.cause, reason.size, reason.alternatives, reason.grave) == ("line", 50.0, ("slow_force",), True)
+
+
+def test_a_weight_that_one_magnet_carries_moves_an_estimate_and_its_intervals(tmp_path):
+    """Of a record that hardly shows k_i the weight does, by the current's scale and no longer by the position's."""
+    record = ambid.simulate("levitated-ball", duration=2.0, seed=1)
+    columns = {c.name: c.values.copy() for c in record.channels}
+    rng = np.random.default_rng(1)
+    columns["position"] += 3e-5 * rng.standard_normal(columns["position"].size)
+    units = {c.name: c.unit for c in record.channels}
+    text = """schema = "ambid.rig/1"
+model = "one-axis"
+channels.voltage.column = "voltage"
+channels.current.column = "current"
+channels.position.column = "position"
+parameters.m = {{ value = {m}, unit = "kg", role = "fixed" }}
+parameters.c = {{ value = 0.0, unit = "N s/m", role = "fixed" }}
+"""
+    m = ambid.preset("levitated-ball").parameters["m"]
+    made = {}
+    for name, more in (("alone", ""), ("weighed", 'magnet.kind = "single"')):
+        (tmp_path / f"{name}.toml").write_text(text.format(m=m) + more)
+        made[name] = ambid.identify(columns, tmp_path / f"{name}.toml", rate_hz=record.rate_hz, units=units)
+    expected = -2.0 * 9.81 / columns["current"].mean() * m
+    alone, weighed = made["alone"]["k_i"], made["weighed"]["k_i"]
+    assert weighed.sd < 0.02 * abs(expected) < alone.sd
+    assert abs(weighed.value - expected) < 2.0 * weighed.sd
+    assert abs(weighed.value - expected) < abs(alone.value - expected)
+    assert "uses it" in made["weighed"].checks["gravity_balance"].detail
+    assert made["alone"].calibration["position"]["k_i"] == pytest.approx(1.0, abs=0.2)
+    assert abs(made["weighed"].calibration["position"]["k_i"]) < 0.3
+    assert made["weighed"].calibration["current"]["k_i"] == pytest.approx(-1.0, abs=0.3)

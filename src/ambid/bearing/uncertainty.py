@@ -8,7 +8,7 @@ where the model is only near the truth (the sandwich of White 1982, by batches).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -72,6 +72,7 @@ class Uncertainty:
     # else 0. Part of the robust standard deviations: a bias of this size cannot be ruled out.
     disagreement: Array
     bias: Array  # (n,), SI, what causes that the tests name have done to the estimate; part of all intervals
+    apart: Array  # (n,), SI, how far facts without a fit are from the numbers that they contradict; part of them too
 
     @property
     def widening(self) -> float:
@@ -88,11 +89,11 @@ class Uncertainty:
         only near the truth: correlations from the scores, the larger of both deviations, plus the disagreement.
         """
         if not robust:
-            return np.asarray(self.information + np.outer(self.bias, self.bias))
+            return np.asarray(self.information + np.outer(self.bias, self.bias) + np.diag(self.apart**2))
         plain, own = np.sqrt(np.diag(self.information)), np.sqrt(np.diag(self.robust))
         larger = np.maximum(1.0, plain / np.maximum(own, 1e-300))
         away = np.column_stack([self.disagreement, self.bias])
-        return np.asarray(self.robust * np.outer(larger, larger) + away @ away.T)
+        return np.asarray(self.robust * np.outer(larger, larger) + away @ away.T + np.diag(self.apart**2))
 
     def standard_deviations(self, *, robust: bool) -> Array:
         """Return deviations (n,), SI, from the information matrix, or `robust` ones, which are never smaller."""
@@ -101,6 +102,15 @@ class Uncertainty:
     def relative_sd(self, *, robust: bool) -> Array:
         """Return standard deviations (n,) over `scale`."""
         return np.asarray(self.standard_deviations(robust=robust) / self.scale)
+
+    def weighed(self, gain: Array, slope: Array, sd: float) -> Uncertainty:
+        """Return it after the numbers were moved by gain (z - slopeᵀ θ), (n,) each, for a fact z of deviation `sd`."""
+        kept = np.eye(len(self.names)) - np.outer(gain, slope)
+        own = sd**2 * np.outer(gain, gain)
+        parts = {name: kept @ getattr(self, name) @ kept.T + own for name in ("information", "robust", "fisher")}
+        away = {name: kept @ getattr(self, name) for name in ("disagreement", "bias")}
+        values, weakest = weakest_direction(self.names, parts["information"], self.scale)
+        return replace(self, **parts, **away, singular_values=values, weakest=weakest)
 
     def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
         """Return which parameters have a relative standard deviation below 25 %."""
@@ -136,6 +146,7 @@ def uncertainty(fit: Fit, scores: Array | None = None) -> Uncertainty:
         fisher=(whole[:n, :n] + more) * unit,
         disagreement=np.zeros(n),
         bias=np.zeros(n),
+        apart=np.zeros(n),
     )
 
 

@@ -47,12 +47,13 @@ class _Source:
 
 def calibrated(
     estimate: E, rig: Rig, plant: LinearModel | RotorModel, theta: Mapping[str, float], names: Sequence[str],
-    covariance: Array, lines: Sequence[Lines],
+    covariance: Array, lines: Sequence[Lines], *, weight: tuple[Array, Array] | None = None,
 ) -> E:  # fmt: skip
     """Return an estimate with its intervals for what its rig says of calibration.
 
     `theta`: all numbers of the `plant`, SI; `names`: those that were estimated, in the order of the `covariance` that
-    the records and priors give; `lines`: what the records show.
+    the records and priors give; `lines`: what the records show; `weight`: gain and slope of k_i/m over
+    what the weight asks for, by which it moved the estimate.
     """
     made, sources, references = cast("Any", estimate), _sources(rig, plant, theta), plant.references(theta)
     errors = list(dict.fromkeys(e for s in sources.values() for e in s.errors))
@@ -63,6 +64,10 @@ def calibrated(
     moved *= np.array([theta[name] or references.get(name, 1.0) for name in names])[:, None]
     weights = {p.name: p.sd**-2 for p in rig.parameters if p.role == "prior" and p.sd}
     moved -= covariance @ (np.array([weights.get(name, 0.0) for name in names])[:, None] * moved)
+    if weight is not None:
+        gain, slope = weight
+        by_weight = np.array([-float(e == SensorError(kind="gain", channel="current")) for e in errors])
+        moved += np.outer(gain, by_weight - slope @ moved)
     lengths = {p.name for p in plant.parameters if p.unit == "m"}
     size = np.array([references[name] if name in lengths else theta[name] or 1.0 for name in names])
     calibration, variance = dict[str, Mapping[str, float]](), np.zeros(len(names))

@@ -32,6 +32,10 @@ if TYPE_CHECKING:
     from ambid.validation.causes import Cause
 
 _CAUSES = 3  # by which a model is extended, one after another
+_OF_THE_MODEL = {
+    "causes", "residuals_white", "residuals_uncorrelated", "uncertainty_consistent", "estimates_agree",
+}  # fmt: skip
+"""Checks that an extension has to pass: those that asked for it."""
 
 
 def identify(
@@ -192,9 +196,9 @@ def identify_axis(
 
 
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if only
-    checks fail that failed before, and fewer. Else the first estimate stays, with its causes; also where a fixed value
-    may be what is wrong, unless the cause is a course of its own in time.
+    """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if the
+    model fits now and no check fails that did not before. Else the first estimate stays, with its causes; also where a
+    fixed value may be what is wrong, unless the cause is a course of its own in time.
     """
     from ambid.validation.causes import COURSES, extended, told
     from ambid.validation.residuals import P_LEAST
@@ -217,7 +221,7 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
         estimate = judge(fit, rig, bench, delay_how=delay_how)
         estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
-    return estimate if after < before and "causes" not in after else first
+    return estimate if after < before and not after & _OF_THE_MODEL else first
 
 
 def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
@@ -261,10 +265,17 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
             **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust, record=bench), "in_time": in_time
         }  # fmt: skip
         spread = replace(spread, bias=named_bias(named, spread.bias))
+    facts: Mapping[str, Check] = {}
+    used = None
+    if problem.model.name == "one-axis":
+        facts = physical.fact_checks(fit, rig, bench, spread, robust=robust)
+        fit, spread, used = physical.informed(fit, rig, facts, spread, robust=robust)
+        if used is not None:
+            text = f"{facts['gravity_balance'].detail}. The estimate uses it"
+            facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
     checks |= physical.physical_checks(fit, spread, bench, robust=robust)
     checks["units"] = _units(fit, rig, signals, doubt=not checks["fixed_agree"].passed)
-    if problem.model.name == "one-axis":
-        checks |= physical.fact_checks(fit, rig, bench, spread, robust=robust)
+    checks |= facts
     y, error = problem.y[problem.skip :], simulation_error(fit)
     inflated = "scatter over the record, disagreement of refits" if robust else ""
     estimate = estimate_of(
@@ -274,7 +285,8 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
-    return calibrated(estimate, rig, problem.model, theta, spread.names, spread.information, [lines_of(fit)])
+    covariance, lines = spread.information, [lines_of(fit)]
+    return calibrated(estimate, rig, problem.model, theta, spread.names, covariance, lines, weight=used)
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

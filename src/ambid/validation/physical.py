@@ -34,6 +34,7 @@ from ambid.estimation.likelihood import (
     workspace_near,
 )
 from ambid.estimation.linear import column_sizes, directions
+from ambid.estimation.predictor import assemble
 from ambid.estimation.uncertainty import chi_squared_tail, p_text
 from ambid.physics.linear_model import LinearModel
 from ambid.record import Record
@@ -443,6 +444,7 @@ def _signals_sound(record: Record, outputs: tuple[str, ...], limits: Mapping[str
 _MIRROR = 0.5  # of the difference to the mirrored value: nearer to that, the sign is wrong and not the size
 _NEAR = 0.3  # relative, up to which a calibration may explain it
 _COARSE = 0.4  # part of the innovations' variance that steps of a converter make up
+_LAW = 0.01  # part of a force that may not grow as the square of the current
 _EVEN = 0.02  # change of a known disturbance within a sample of a refit, over its size
 _OWN_CURRENT = 0.5  # relative, between R and the means: nearer, the mean current is the magnet's and no offset
 
@@ -485,6 +487,34 @@ def fact_checks(fit: Fit, rig: Rig, bench: Record, spread: Uncertainty, *, robus
                 "k_x > 0. Check that all columns are of one run, and their signs",
             )  # fmt: skip
     return checks
+
+
+def informed(
+    fit: Fit, rig: Rig, facts: Mapping[str, Check], spread: Uncertainty, *, robust: bool
+) -> tuple[Fit, Uncertainty, tuple[Array, Array] | None]:
+    """Let facts tell of an estimate: what one contradicts is widened by how far apart they are, and the weight moves it
+    where the rig says that one magnet carries it and both agree; then gain and h are given, (n,) each.
+
+    The weight says k_i - w m = 0 within a part s of k_i, h = (1, -w)/(w m) over k_i and m; with covariance P of the
+    estimate, the gain is P h / (hᵀ P h + s²).
+    """
+    theta, names, apart = fit.problem.parameters(fit.vector), spread.names, {"R": facts["ohm"].size or 0.0}
+    weight = facts.get("gravity_balance")
+    if weight is not None and not weight.passed:
+        apart["k_i"] = (weight.values["expected"] - weight.values["k_i_over_m"]) * theta["m"]
+    spread = replace(spread, apart=np.array([apart.get(name, 0.0) for name in names]))
+    single = rig.magnet is not None and rig.magnet.kind == "single"
+    if weight is None or not weight.passed or not single or "k_i" not in names:
+        return fit, spread, None
+    expected, covariance = weight.values["expected"], spread.covariance(robust=robust)
+    slope = np.array([(name == "k_i") / (expected * theta["m"]) - (name == "m") / theta["m"] for name in names])
+    sd = float(np.hypot(weight.values["expected_sd"] / expected, _LAW))
+    gain = covariance @ slope / (slope @ covariance @ slope + sd**2)
+    vector = fit.vector.copy()
+    vector[: len(names)] += gain * (1.0 - weight.values["k_i_over_m"] / expected) / fit.problem.magnitude
+    if assemble(fit.problem, vector, with_derivatives=False) is None:
+        return fit, spread, None
+    return replace(fit, vector=vector), spread.weighed(gain, slope, sd), (gain, slope)
 
 
 def _resolution(record: Record, fit: Fit) -> Check:
