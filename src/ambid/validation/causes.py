@@ -366,7 +366,7 @@ def _sums(look: _Look, C: Array) -> _Sums:
     return _Sums(
         own=back.T @ own @ back + fit.J_prior.T @ fit.J_prior, cross=cross,
         pull=back.T @ pull + fit.J_prior.T @ fit.r_prior, along=along,
-        inner=np.sum(C @ C.swapaxes(1, 2), axis=0), square=square / max(look.e.size, 1),
+        inner=sum((c @ c.T for c in C[1:]), C[0] @ C[0].T), square=square / max(look.e.size, 1),
     )  # fmt: skip
 
 

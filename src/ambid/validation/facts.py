@@ -21,7 +21,7 @@ from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
 from ambid.rig import Rig
 
-_FAR = 2.5  # standard deviations between R and the means, whose offsets are allowed for generously
+_FAR = 2.0  # standard deviations between R and the means, whose offsets are allowed for generously
 _OFFSET = 0.005  # of a channel's largest value: its offset (sd), where the rig says nothing
 _ONE_SIDED = 0.02  # part of a current's largest value that may lie beyond zero
 _SHARP, _OFFSETS = 0.02, 0.5  # R known so well (sd over R) and so far from the means is not of the same mean current
