@@ -203,8 +203,8 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
     from ambid.validation.causes import COURSES, extended, told
     from ambid.validation.residuals import P_LEAST
 
-    first = estimate = judge(fit, rig, bench, delay_how=delay_how)
-    plain = fit.problem
+    estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
+    first, plain = estimate, fit.problem
     taken: tuple[Cause, ...] = ()
     for _ in range(_CAUSES):
         named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
@@ -214,18 +214,22 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
             or (named.cause not in COURSES and (1.0 if fixed is None else fixed) < P_LEAST)
         ):
             break
-        more = extended(fit, first.operating_point, named.cause, plain, taken)
+        more = extended(fit, first.operating_point, found, plain, taken)
         if more is None:
             break
         fit, taken = more
-        estimate = judge(fit, rig, bench, delay_how=delay_how)
+        estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
         estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     return estimate if after < before and not after & _OF_THE_MODEL else first
 
 
-def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
-    """Check a fit that has not failed on its own record `bench`, by role, and make the estimate, without timings."""
+def _judged(
+    fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]
+) -> tuple[Estimate, list[Cause]]:
+    """Check a fit that has not failed on its own record `bench`, by role; return the estimate, without timings, and the
+    causes that the innovations may have, the strongest first.
+    """
     from ambid.bearing.columns import check_lag
     from ambid.bearing.uncertainty import estimate_of, uncertainty
     from ambid.estimation.calibration import calibrated, lines_of
@@ -247,6 +251,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     spread = replace(spread, disagreement=moved.disagreement() if robust else np.zeros(len(spread.names)))
     checks |= physical.assumption_checks(fit, spread, delay_how)
     signals = signals_of(bench, problem.model)
+    named: list[Cause] = []
     if problem.model.name == "one-axis":
         from ambid.validation.causes import causes, causes_check, named_bias
 
@@ -286,7 +291,7 @@ def judge(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", 
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
     covariance, lines = spread.information, [lines_of(fit)]
-    return calibrated(estimate, rig, problem.model, theta, spread.names, covariance, lines, weight=used)
+    return calibrated(estimate, rig, problem.model, theta, spread.names, covariance, lines, weight=used), named
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

@@ -146,21 +146,21 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
 
 
 def extended(
-    fit: Fit, means: Mapping[str, float], named: str, plain: PredictorProblem, taken: Sequence[Cause] = ()
+    fit: Fit, means: Mapping[str, float], found: Sequence[Cause], plain: PredictorProblem, taken: Sequence[Cause] = ()
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Fit again with the strongest cause, which a check has `named`, its sizes estimated beside the parameters.
+    """Fit again with the strongest cause of those `found`, its sizes estimated beside the parameters.
 
     `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new one.
     None where the record does not tell it from another, or the search does not settle. The record is corrected by an
     error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
     information of the parameters is what is left beside the sizes.
     """
-    found = [c for c in causes(fit, means, thorough=True) if c.p < _CHANCE]
-    if not found or fit.problem.n_used > _LONGEST:
+    sure = [c for c in found if c.p < _CHANCE]
+    if not sure or fit.problem.n_used > _LONGEST:
         return None
-    cause = found[0]
-    alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in found[1:])
-    if alike or not cause.columns or cause.name not in _GROWING or cause.name != named:
+    cause = sure[0]
+    alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in sure[1:])
+    if alike or not cause.columns or cause.name not in _GROWING:
         return None
     n, size = fit.problem.n_physical, fit.problem.magnitude
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
