@@ -198,9 +198,9 @@ def identify_axis(
 def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated", "given"]) -> Estimate:
     """Judge a fit; while a check names a cause that the model can take in, judge one with it, and keep the last if the
     model fits now and no check fails that did not before. Else the first estimate stays, with its causes; also where a
-    fixed value may be what is wrong, unless the cause is a course of its own in time.
+    fixed value may be what is wrong, unless the cause changes in time.
     """
-    from ambid.validation.causes import COURSES, extended, told
+    from ambid.validation.causes import extended, told
     from ambid.validation.residuals import P_LEAST
 
     estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
@@ -208,13 +208,10 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
     taken: tuple[Cause, ...] = ()
     for _ in range(_CAUSES):
         named, fixed = estimate.checks.get("causes"), estimate.checks["fixed_agree"].p
-        if (
-            named is None
-            or named.passed
-            or (named.cause not in COURSES and (1.0 if fixed is None else fixed) < P_LEAST)
-        ):
+        if named is None or named.passed:
             break
-        more = extended(fit, first.operating_point, found, plain, taken)
+        doubtful = fixed is not None and fixed < P_LEAST
+        more = extended(fit, first.operating_point, found, plain, taken, doubtful=doubtful)
         if more is None:
             break
         fit, taken = more

@@ -44,9 +44,11 @@ _PENALTY = 2.0  # gain that each column costs a cause when causes are compared
 _LINE = 1e-6  # probability of a line by chance, over all frequencies
 _REACH = 0.9  # quantile of a voltage beyond which an amplifier may limit
 _PLAY = 0.1  # of the current's range: width of a hysteresis
-COURSES = ("line", "slow_force", "slow_voltage")
-"""Causes whose signals are courses in time, which no number of the plant can imitate."""
-_GROWING = {*COURSES, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
+_SAME_COURSE = ("line", "slow_force", "slow_voltage")
+"""Causes whose signals do not depend on the fit."""
+_IN_TIME = {*_SAME_COURSE, "r_drift"}
+"""Causes that change in time, which no constant of the plant can imitate."""
+_GROWING = {*_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
 """Causes whose signals are known but for their sizes."""
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
@@ -146,12 +148,20 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
 
 
 def extended(
-    fit: Fit, means: Mapping[str, float], found: Sequence[Cause], plain: PredictorProblem, taken: Sequence[Cause] = ()
+    fit: Fit,
+    means: Mapping[str, float],
+    found: Sequence[Cause],
+    plain: PredictorProblem,
+    taken: Sequence[Cause],
+    *,
+    doubtful: bool,
 ) -> tuple[Fit, tuple[Cause, ...]] | None:
-    """Fit again with the strongest cause of those `found`, its sizes estimated beside the parameters.
+    """Fit again with the strongest cause of those `found`, and those about as strong, their sizes estimated beside the
+    parameters.
 
-    `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new one.
-    None where the record does not tell it from another, or the search does not settle. The record is corrected by an
+    `plain`, `taken`: the problem before any cause, and those that `fit` holds already; they come back with the new
+    ones. None where one of them cannot be taken in, or may stand for a fixed value that is `doubtful`, or the search
+    does not settle. The record is corrected by an
     error of a sensor; a force or a voltage is known to the predictor. Sizes and parameters are found in turn, and the
     information of the parameters is what is left beside the sizes.
     """
@@ -159,16 +169,18 @@ def extended(
     if not sure or fit.problem.n_used > _LONGEST:
         return None
     cause = sure[0]
-    alike = any(c.gain > _ALIKE * cause.gain and c.name != cause.name for c in sure[1:])
-    if alike or not cause.columns or cause.name not in _GROWING:
+    alike = {c.name: c for c in reversed(sure) if c.gain > _ALIKE * cause.gain and c.name != cause.name}
+    allowed = _IN_TIME if doubtful else _GROWING
+    if any(not c.columns or c.name not in allowed for c in (cause, *alike.values())):
         return None
     n, size = fit.problem.n_physical, fit.problem.magnitude
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
     if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
         return None  # what is of higher degree would move them too
-    parts = (*taken, cause)
-    total = np.concatenate([*(c.sizes for c in taken), np.zeros(cause.sizes.size)])
-    step = np.concatenate([np.zeros(total.size - cause.sizes.size), cause.sizes])
+    parts, step = (*taken, cause, *alike.values()), np.zeros(0)
+    for c in parts:
+        step = np.append(step, c.sizes if c is cause else np.zeros(c.sizes.size))
+    total = np.concatenate([*(c.sizes for c in taken), np.zeros(step.size - sum(c.sizes.size for c in taken))])
     for _ in range(_TURNS):
         total = total + step
         problem = _corrected(plain, [column for c in parts for column in c.columns], total)
@@ -195,7 +207,7 @@ def told(cause: Cause) -> str:
 
 def _again(cause: Cause, course: _Course) -> tuple[Column, ...]:
     """Return a cause's signals at another fit: those of lines and walks are the same."""
-    if cause.name in COURSES:
+    if cause.name in _SAME_COURSE:
         return cause.columns
     own = (cause.name, cause.channel, len(cause.columns))
     groups = _groups(course, (), thorough=False)
