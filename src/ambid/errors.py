@@ -51,10 +51,14 @@ def nearest(word: object, known: Sequence[str]) -> str:
 
     `word`: what was written; `known`: what may be written. Returns a sentence that begins with a space, or ``""``.
     """
-    turned = [k for k in known if sorted(k) == sorted(str(word))]  # two letters exchanged come before another word
-    alike = {k: difflib.SequenceMatcher(None, k, str(word)).ratio() for k in known}
-    close = turned[:1] or [k for k in known if alike[k] == max(alike.values()) >= _ALIKE]  # the first of several
-    return f" Did you mean {close[0]!r}?" if close else ""
+    written = str(word)
+    turned = [k for k in known if sorted(k) == sorted(written)]  # two letters exchanged come before another word
+    begun = [k for k in known if written and k.startswith(f"{written}_")]  # then a unit left out, as of rate_hz
+    alike = {k: difflib.SequenceMatcher(None, k, written).ratio() for k in known}
+    close = [k for k in known if alike[k] == max(alike.values()) >= _ALIKE]
+    held = [k for k in close if written in k or k in written]  # of equally close words one that holds the other
+    best = (*turned, *begun, *held, *close)
+    return f" Did you mean {best[0]!r}?" if best else ""
 
 
 def counted(n: float | str, noun: str) -> str:
