@@ -35,6 +35,8 @@ class IOData:
         SI unit by name.
     open_loop : bool
         Whether the user declares the record open loop. False means "not told so".
+    looped : bool
+        Whether the loop of its rig says that the record was taken in it.
     reference : ndarray, shape (n_samples, n_references), SI
         Outer excitation of the loop, independent of the noise; no columns where there is none.
     record : Mapping[str, object]
@@ -50,6 +52,7 @@ class IOData:
     outputs: tuple[str, ...]
     units: Mapping[str, str]
     open_loop: bool = False
+    looped: bool = False
     reference: Array = field(default_factory=lambda: np.empty((0, 0)))
     references: tuple[str, ...] = ()
     record: Mapping[str, object] = field(default_factory=lambda: MappingProxyType({}))
@@ -83,6 +86,11 @@ class IOData:
                     f"channels {names[i]!r} and {names[k]!r} hold the same values; a model cannot distinguish "
                     "them. Omit one"
                 )
+
+    @property
+    def closed(self) -> bool:
+        """Whether something says that there was feedback: the loop of a rig, or its reference."""
+        return (self.looped or bool(self.references)) and not self.open_loop
 
     @property
     def n_samples(self) -> int:
@@ -122,6 +130,7 @@ def io_data(
     *,
     references: Sequence[str] = (),
     open_loop: bool = False,
+    looped: bool = False,
 ) -> IOData:
     """Take channels `inputs` (none for a time series), `outputs` and `references` (the loop's outer excitation) out of
     a record; `open_loop`: whether it is declared so.
@@ -141,6 +150,7 @@ def io_data(
         outputs=tuple(outputs),
         units={x: record.channel(x).unit for x in (*inputs, *outputs, *references)},
         open_loop=open_loop,
+        looped=looped,
         reference=columns(references),
         references=tuple(references),
         record={

@@ -245,7 +245,8 @@ class Channels:
         inputs = [_role(x, rig, plant.inputs, "input") for x in self.inputs] or list(plant.inputs)
         outputs = [_role(x, rig, plant.outputs, "output") for x in self.outputs] or list(plant.outputs)
         open_loop = self.open_loop or rig.open_loop
-        return io_data(bench, inputs, outputs, references=self.references, open_loop=open_loop)
+        looped = rig.loop is not None and rig.loop.closed
+        return io_data(bench, inputs, outputs, references=self.references, open_loop=open_loop, looped=looped)
 
 
 def _cut_by(rig: Rig, bench: Record, part: Part) -> Record:

@@ -84,7 +84,7 @@ def _judge_linear(fit: BlackBoxFit, data: IOData, second: IOData | None) -> Blac
             more += _coloured_warning(fit, adjusted=again is not None)
             fit = fit if again is None else replace(fit, covariance=again)
         biased = structure(fit.structure).feedback == "biased"
-        subject = Subject(name=fit.structure, coloured=not found.claims_noise, biased=biased)
+        subject = Subject(name=fit.structure, coloured=not found.claims_noise, biased=biased, closed=data.closed)
         checks |= residual_checks(tests, subject)
         more += _feedback_warning(subject, tests, open_loop=data.open_loop)
     supported = orders_supported(fit)
@@ -100,7 +100,8 @@ def _judge_nonlinear(fit: NonlinearFit, records: Sequence[IOData], second: IODat
     coloured = leaves_colour_open(fit, records, runs)
     kind = nonlinear_structure(fit.structure).feedback
     biased = kind == "biased" or (kind == "with noise model" and coloured)
-    subject = Subject(name=f"this {fit.structure}", coloured=coloured, biased=biased)
+    closed = any(x.closed for x in records)
+    subject = Subject(name=f"this {fit.structure}", coloured=coloured, biased=biased, closed=closed)
     tests = None
     if checks["finite_prediction"].passed:
         residuals = nonlinear_residuals(fit, records, runs, coloured=coloured)

@@ -27,15 +27,15 @@ def record(model=TRUTH, seed=0, n=800, **options):
     return io(u, run(model, u, 0.3 * rng.standard_normal((n, 1))), **options)
 
 
-def loop(seed=0, n=800, gain=0.5, **options):
-    """An output-error plant with coloured noise under u = r - gain y."""
+def loop(seed=0, n=800, gain=0.5, integral=False, **options):
+    """An output-error plant with coloured noise under u = r - gain y, or a tenth of the sum of y in its place."""
     rng = np.random.default_rng(seed)
     v = lfilter([1.0], [1, -0.9], 0.3 * rng.standard_normal(n))
     x, u, y = np.zeros(n), np.zeros(n), np.zeros(n)
     for k in range(2, n):
         x[k] = 1.5 * x[k - 1] - 0.7 * x[k - 2] + 0.3 * u[k - 1] + 0.1 * u[k - 2]
         y[k] = x[k] + v[k]
-        u[k] = rng.standard_normal() - gain * y[k]
+        u[k] = rng.standard_normal() - gain * (0.1 * y[:k].sum() if integral else y[k])
     return io(u, y, **options)
 
 
@@ -88,6 +88,43 @@ def test_feedback_fails_an_output_error_model_and_warns_a_noise_model(told):
     assert "feedback" not in failed(consistent)
     assert consistent.checks["feedback"].values["seen"] == 1.0
     assert any("open_loop was given" in w for w in consistent.warnings) == told
+
+
+@pytest.mark.parametrize("method", [lambda d: oe(d, {"nb": 2, "nf": 2, "nk": 1}), lambda d: n4sid(d, {"n": 3})])
+def test_what_says_that_there_is_a_loop_counts_where_the_data_do_not_show_it(method):
+    """Of weak feedback, a bias that one record does not show is one all the same."""
+    for how in ({"looped": True}, {"reference": loop(n=400).u, "references": ("r",)}):
+        data = loop(gain=0.01, n=400, **how)
+        fit = judge(method(data), data)
+        assert fit.checks["feedback"].values["seen"] == 0.0
+        assert "feedback" in failed(fit)
+        assert fit.verdict.word != "usable"
+    declared = loop(gain=0.0, n=400, looped=True, open_loop=True)
+    assert "feedback" not in failed(judge(method(declared), declared))
+
+
+def test_feedback_by_an_integral_is_seen():
+    """It moves an input over far more samples than the lags that are looked at one by one."""
+    found = []
+    for seed in range(8):
+        data = loop(seed=seed, n=2000, gain=0.1, integral=True)
+        found.append("feedback" in failed(judge(oe(data, {"nb": 2, "nf": 2, "nk": 1}), data)))
+    assert sum(found) >= 6
+
+
+@pytest.mark.parametrize("kind", ["noise", "periodic", "slow"])
+def test_slow_noise_without_feedback_is_none(kind):
+    seen, rng = 0, np.random.default_rng(0)
+    for _ in range(30):
+        u = rng.standard_normal(1500)
+        if kind == "slow":
+            u = lfilter([0.1], [1, -0.98], u)
+        if kind == "periodic":
+            u = np.tile(u[:250], 6)
+        x = lfilter([0, 0.3, 0.1], [1, -1.5, 0.7], u)
+        data = io(u, x + lfilter([0.3], [1, -0.9], rng.standard_normal(1500)))
+        seen += "feedback" in failed(judge(oe(data, {"nb": 2, "nf": 2, "nk": 1}), data))
+    assert seen <= 1  # 0.1 % of each test
 
 
 def test_in_a_loop_an_output_error_model_is_judged_by_the_reference():
