@@ -1,5 +1,7 @@
 """The magnet's curvature in linear estimates: what the check expects is what estimates are off by."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -94,3 +96,66 @@ def test_a_record_away_from_the_rest_of_the_rig_is_judged_where_it_is():
     assert all(abs(check.values[n] - x) < 3.0 for n, x in seen.items()), (seen, check.values)
     moved = laws_of(of, rig, {"position": 0.0, "current": 0.0})[0][""]  # of a record of deviations
     assert moved.rest == pytest.approx((0.01, 0.95))
+
+
+def told_less(rig, *, parameters=(), magnet=(), **other):
+    """A rig without some values of [parameters], and some numbers of [magnet]; others are given, fixed."""
+    numbers = tuple(
+        replace(p, value=other.get(p.name, p.value), role="fixed")
+        for p in rig.magnet.parameters
+        if p.name not in magnet
+    )
+    return replace(
+        rig,
+        parameters=tuple(replace(p, value=None) if p.name in parameters else p for p in rig.parameters),
+        magnet=replace(rig.magnet, parameters=numbers),
+    )
+
+
+@pytest.fixture(scope="module")
+def swinging():
+    """A record of a ball under one magnet that moves far."""
+    wave = ambid.design_experiment("levitated-ball", seconds=4.0, lines=20, use=0.8)
+    return ambid.simulate("levitated-ball", duration=4.0, seed=3, nonlinear=True, excitation=wave)
+
+
+@pytest.mark.parametrize("magnet", [(), ("k", "s", "L_leak")])
+def test_one_magnet_is_one_whatever_the_rig_leaves_out(swinging, magnet):
+    """The estimate says what the rig does not: R, which a plant needs, and the numbers of the law."""
+    rig = told_less(rig_of_preset(preset("levitated-ball")), parameters=("R",), magnet=magnet)
+    found = ambid.identify(swinging, rig)
+    assert found.checks["curvature"].cause == "curvature"
+    assert abs(found.checks["curvature"].values["k_x"]) > 3.0
+    for name, true in (("k_x", -117.72), ("k_i", -1.23916)):
+        assert found[name].ci95[0] < true < found[name].ci95[1]
+
+
+def test_the_law_of_one_magnet_follows_from_its_numbers_at_rest():
+    rig = rig_of_preset(preset("levitated-ball"))
+    theta = {p.name: p.value for p in rig.parameters}
+    of = Plant(model=rig.plant, theta=theta, delays=np.zeros(1), rate_hz=1000.0)
+    known, made = (
+        laws_of(of, r, rig.operating_point)[0][""] for r in (rig, told_less(rig, magnet=("k", "s", "L_leak")))
+    )
+    for x in (0.009, 0.012):
+        assert made.numbers(x, 0.9) == pytest.approx(known.numbers(x, 0.9), rel=1e-9)
+    bent = replace(rig.magnet, gap="exponential", parameters=())
+    law = laws_of(of, replace(rig, magnet=bent), rig.operating_point)[0][""]
+    assert law.numbers(*law.rest) == pytest.approx([theta["k_x"], theta["k_i"], theta["L"]], rel=1e-9)
+
+
+def test_a_rig_whose_magnet_contradicts_its_numbers_is_told():
+    """k_x is k i^2/d^3 of the gap d, where i is measured: 11 % by a gap that is 4 % too small."""
+    rig = rig_of_preset(preset("levitated-ball"))
+    wrong = told_less(rig, s=-0.00038)
+    record = ambid.simulate("levitated-ball", duration=1.0, seed=1)
+    for given, passed in ((told_less(rig), True), (wrong, False)):
+        check = ambid.identify(record, given).checks["magnet_agrees"]
+        assert check.passed == passed
+        assert check.values["k_x"] == pytest.approx(0.0 if passed else -0.11, abs=0.04)
+    check = ambid.design_experiment(wrong, seconds=1.0, lines=10, use=0.1).checks["magnet_agrees"]
+    assert not check.passed
+    assert "k_x" in check.detail
+    start = replace(wrong, magnet=replace(
+        wrong.magnet, parameters=tuple(replace(p, role="free") for p in wrong.magnet.parameters)))  # fmt: skip
+    assert ambid.identify(record, start).checks["magnet_agrees"].passed  # nobody said that it is right

@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array
 from ambid.control.closed import Plant
-from ambid.control.drawn import GAP_OF_TRAVEL
+from ambid.control.drawn import GAP_OF_TRAVEL, UNKNOWN_SINGLE, nominal_of
 from ambid.errors import ModelError, RigError
 from ambid.physics.law_magnet import LawMagnet
 from ambid.physics.linear_model import LinearModel, OneAxis, Parameter
@@ -26,7 +26,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.rig.rig import Rig, RigMagnet
 from ambid.simulation.bench import VaryingLoop
 from ambid.simulation.plant import LinearPlant, closed_loop_poles
-from ambid.simulation.rig_bench import enough_steps, plant_of_rig, rest_of_rig
+from ambid.simulation.rig_bench import enough_steps, rest_of_rig
 from ambid.simulation.rotor_bench import Poles, RotorBench, poles_of
 
 
@@ -227,10 +227,11 @@ def _around_rest(
         return linear, point, f"{_LINEAR}k_x is not negative, which no magnet's law explains"
     if rig.magnet is not None:
         try:
-            body, rest = _scaled(theta, plant_of_rig(rig), rig)
+            body, rest = _scaled(theta, nominal_of(rig, theta, rig.operating_point), rig)
             return body, rest, f"the law of the magnet is the rig's [magnet], scaled to the plant's numbers{_BEYOND}"
         except (RigError, ModelError):  # some numbers are to be found by an identification, or are of another plant
-            pass
+            if rig.magnet.kind == "single":
+                return linear, point, f"{_LINEAR}{UNKNOWN_SINGLE}"
     farthest = max(abs(end - point.position) for end in limits.position)
     gap, how = _gap(rig, farthest)
     if not math.isfinite(gap):

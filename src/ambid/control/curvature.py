@@ -15,7 +15,7 @@ import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.control.closed import Plant
-from ambid.control.drawn import Law, laws_of
+from ambid.control.drawn import Law, laws_of, magnet_check
 from ambid.control.experiment import Lines, Task
 from ambid.control.information import Information
 from ambid.estimation.estimate import Check
@@ -87,8 +87,9 @@ def seen_shift(fit: Fit, e: Array, law: Law) -> tuple[Array, float, float]:
     return shift, float(pull / left), float(left**-0.5)
 
 
-def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Array) -> Check | None:
-    """Check that curvature moves no number by more than its `sd` (n_physical,), SI, allows; None where no law is known.
+def magnet_checks(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: Array) -> dict[str, Check]:
+    """Check that curvature moves no number by more than its `sd` (n_physical,), SI, allows, as far as a law is known,
+    and that what the rig gives of it is that of the estimate.
     `e`: see `seen_shift`. A rig's law counts unless the record contradicts it; with an assumed gap only as far as the
     record shows it, and what that shows beyond the law is of second order in the shift, and no larger one.
     """
@@ -96,10 +97,10 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
     plant = Plant(model=fit.problem.model, theta=theta, delays=np.zeros(1), rate_hz=fit.problem.rate_hz)
     laws, assumed = laws_of(plant, rig, at)
     if not laws:
-        return None
+        return {}
     shift, part, part_sd = seen_shift(fit, e, laws[""])
     if not np.all(np.isfinite([*shift, part, part_sd])):  # a gap that the motion would close
-        return None
+        return {}
     counted = float(np.clip(part, 0.0, 1.0 if laws[""].known else np.inf))
     if part_sd > _TOLD:
         counted = float(laws[""].known and (part > 0.5 or part_sd > _UNTOLD))
@@ -113,7 +114,10 @@ def curvature_check(fit: Fit, e: Array, rig: Rig, at: Mapping[str, float], sd: A
             f"{setting('identify_nonlinear')}"
         )
     cause = "" if passed else "curvature"
-    return Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=text, cause=cause)
+    curved = Check(passed=passed, values={**values, "part": part, "part_sd": part_sd}, detail=text, cause=cause)
+    spread = dict(zip(names, np.hypot(sd, counted * shift).tolist(), strict=True))
+    agrees = magnet_check(laws, theta, spread)
+    return {"curvature": curved} if agrees is None else {"curvature": curved, "magnet_agrees": agrees}
 
 
 def advised(shift: Mapping[str, float]) -> float:

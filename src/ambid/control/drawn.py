@@ -10,21 +10,26 @@ touch-down bearings stand at half of it.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from types import MappingProxyType
+from typing import Literal
 
 import numpy as np
 
 from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.errors import EstimationError, ModelError, RigError
-from ambid.physics.linear_model import LinearModel, OneAxis, ParameterSpec, StateSpace
+from ambid.estimation.estimate import Check
+from ambid.physics.law_magnet import BEARING_NUMBERS, LawMagnet
+from ambid.physics.linear_model import LinearModel, OneAxis, Parameter, ParameterSpec, StateSpace
 from ambid.physics.loop import UNLIMITED, Interval
 from ambid.physics.magnet import CoEnergy, Energy
+from ambid.physics.nonlinear import NonlinearPlant
 from ambid.physics.rotor_model import EDDY, RotorModel
-from ambid.rig import Rig
+from ambid.rig import Rig, RigMagnet
 from ambid.simulation.rig_bench import plant_of_rig, rest_of_rig
+from ambid.validation.facts import GRAVITY
 
 COPPER = 0.0039
 """Rise of the resistance of copper over its value at 20 °C, 1/K."""
@@ -36,6 +41,7 @@ _NARROW = 0.3  # relative standard deviation up to which a number is drawn in it
 _TRIES = 100  # of one draw
 _STEPS = 6  # of Newton's method; the force is nearly a square of the current
 _GOLDEN = (math.sqrt(5.0) - 1.0) / 2.0  # whose multiples are spread evenly
+_UNITS = {spec.name: spec.unit for spec in BEARING_NUMBERS}
 _TOLD = 3  # numbers that `Drawn.words` names
 
 
@@ -174,6 +180,7 @@ class Law:
     position: Interval  # from rest, m
     current: Interval  # from rest, A
     known: bool  # whether the rig gives the law, or its gap
+    rigs: Literal["", "free", "fixed"] = ""  # of the rig's own numbers: whether they are starts of a search alone
 
     def numbers(self, x: float, i: float) -> Array:
         """Return k_x, k_i, L at some position and current."""
@@ -293,6 +300,72 @@ def _lagged(
     ), lag
 
 
+UNKNOWN_SINGLE = "neither the rig's [magnet] nor its numbers at rest tell the law of one magnet"
+
+
+_AGREES, _FAR = 0.05, 4.0  # relative difference from a law that is none, and one in standard deviations
+_BALANCED = 0.3  # relative difference of force and weight, from which a point is not the law's
+
+
+def _whose(magnet: RigMagnet, names: Sequence[str]) -> Literal["", "free", "fixed"]:
+    """Return whether a rig gives the numbers of a magnet's law, and holds them fixed."""
+    own = [magnet.known(n) for n in (*names, *(["i0"] if magnet.kind == "pair" else []))]
+    if any(p is None or p.value is None for p in own):
+        return ""
+    return "fixed" if all(p is not None and p.role == "fixed" for p in own) else "free"
+
+
+def magnet_check(laws: Mapping[str, Law], theta: Mapping[str, float], sd: Mapping[str, float] = _NONE) -> Check | None:
+    """Check that k_x and k_i, with standard deviations where they are estimated, are those of the rig's [magnet]; a
+    start of its search may be off. None where the rig does not give the law, or not at this point.
+    """
+    law = laws.get("")
+    if law is None or not law.rigs:
+        return None
+    numbers = dict(zip(("k_x", "k_i"), law.numbers(*law.rest)[:2].tolist(), strict=True))
+    weight, known = theta["m"] * GRAVITY, law.energy.force(*law.rest)
+    if known and not abs(abs(known) / weight - 1.0) < _BALANCED:
+        return None
+    values = {n: theta[n] / x - 1.0 for n, x in numbers.items() if n in theta and x}
+    far = [n for n, off in values.items() if abs(off) > max(_AGREES, _FAR * sd.get(n, 0.0) / abs(numbers[n]))]
+    text = ", ".join(f"{n} = {theta[n]:.4g}, by the law {numbers[n]:.4g} ({100.0 * values[n]:+.2g} %)" for n in far)
+    return Check(
+        passed=not far or (bool(sd) and law.rigs == "free"), values=values,
+        detail=f"the rig's [magnet] contradicts {text}: what lies away from rest is that law's. Correct its numbers, "
+        "or those of [parameters]" if far else "k_x and k_i are those of the rig's [magnet]",
+    )  # fmt: skip
+
+
+def nominal_of(rig: Rig, theta: Mapping[str, float], at: Mapping[str, float]) -> NonlinearPlant:
+    """Return the nonlinear plant of a rig's [magnet]; what the rig leaves out of one axis is what an estimate `theta`
+    at the operating point `at` says: m, R and c, and of one magnet strength, length and leakage (thesis eq. 1.9, 2.7).
+
+    With i = -2 m g/k_i, which holds the weight, g(d) = k/d has d = i k_i/k_x, k = -k_i d²/i and L_leak = L - k/d, and
+    L_g exp(-d/zeta) has zeta = i k_i/(2 k_x). RigError or ModelError where numbers are missing still.
+    """
+    magnet = rig.magnet or RigMagnet()
+    body = tuple(replace(p, value=theta[p.name]) if p.value is None and p.name in theta else p for p in rig.parameters)
+    known = {p.name: p for p in magnet.parameters if p.value is not None}
+    value = {name: p.value or 0.0 for name, p in known.items()}
+    g, x = value.get("g", GRAVITY), at.get("position", 0.0) - value.get("x_offset", 0.0)
+    found = dict[str, float]()
+    k_x, k_i = theta.get("k_x", 0.0), theta.get("k_i", 0.0)
+    if magnet.kind == "single" and not magnet.saturation and k_x < 0.0 and k_i:
+        i = -2.0 * theta["m"] * g / k_i if g else at.get("current", 0.0)
+        if magnet.gap == "exponential":
+            zeta = value.get("zeta", 0.5 * i * k_i / k_x)
+            found = {"zeta": zeta, "L_g": value.get("L_g", -k_i * zeta / i * math.exp(x / zeta)) if i and zeta else 0.0}
+            share = found["L_g"] * math.exp(-x / zeta) if zeta else 0.0
+        else:
+            s = value.get("s", i * k_i / k_x - x)
+            found = {"s": s, "k": value.get("k", -k_i * (s + x) ** 2 / i) if i else 0.0}
+            share = found["k"] / (s + x) if s + x else 0.0
+        found["L_leak"] = max(theta.get("L", share) - share, 0.0)
+    numbers = tuple(Parameter(name=n, unit=_UNITS[n], value=v) for n, v in found.items() if n not in known)
+    kept = tuple(p for p in magnet.parameters if p.name not in {n.name for n in numbers})
+    return plant_of_rig(replace(rig, parameters=body, magnet=replace(magnet, parameters=(*kept, *numbers))))
+
+
 def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, Law], tuple[str, ...]]:
     """Return the law of each axis by the prefix of its numbers, and what is assumed of it."""
     plant_model, theta = plant.model, plant.theta
@@ -300,8 +373,11 @@ def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, 
     prefixes = [p for p in prefixes if f"{p}k_x" in theta and f"{p}k_i" in theta]
     travel, most = (UNLIMITED, UNLIMITED) if rig.limits is None else (rig.limits.position, rig.limits.current)
     if not isinstance(plant_model, RotorModel) and rig.magnet is not None:
+        if not travel[0] < at.get("position", 0.0) < travel[1]:  # a record of deviations from rest
+            at = rig.operating_point
         try:
-            nominal = plant_of_rig(rig)
+            nominal = nominal_of(rig, theta, at)
+            assert isinstance(nominal.magnet, LawMagnet)
             rest = rest_of_rig(rig, nominal)
             x, i = at.get("position", rest.position), at.get("current", rest.current)
             if not (travel[0] < x < travel[1] and most[0] < i < most[1]):  # a record of deviations from rest
@@ -312,10 +388,13 @@ def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, 
                 position=_ways(x, travel),
                 current=_ways(i, most),
                 known=True,
+                rigs=_whose(rig.magnet, nominal.magnet.law.names[:2]),
             )
-            return {"": law}, ("the law of the magnet is the rig's [magnet]",)
+            how = "" if law.rigs else ", with the numbers of the estimate"
+            return {"": law}, (f"the law of the magnet is the rig's [magnet]{how}",)
         except (RigError, ModelError):  # some numbers are to be found by an identification
-            pass
+            if rig.magnet.kind == "single":
+                return {}, (f"{UNKNOWN_SINGLE}: the plants are those of the rotor at rest",)
     if not all(map(math.isfinite, travel)):
         return {}, ("limits.position is not given: the plants are those of the rotor at rest",)
     pulled = [p for p in prefixes if theta[f"{p}k_x"] < 0.0 and theta[f"{p}k_i"] != 0.0]

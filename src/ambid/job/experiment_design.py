@@ -15,7 +15,7 @@ from ambid.acquisition.trials import USE, VOLTAGE, Room
 from ambid.arrays import Array
 from ambid.control.closed import Plant
 from ambid.control.curvature import advised, expected_shift, judge_shift
-from ambid.control.drawn import Spread, draw_plants, laws_of
+from ambid.control.drawn import Spread, draw_plants, laws_of, magnet_check
 from ambid.control.experiment import (
     SLEW,
     Design,
@@ -465,9 +465,10 @@ def _told(
         found = replace(found, c=found.c / (used.max() + quantum / table.amplitude))  # a step less at least
     information, power = task.information(lines, [0]), np.abs(c) ** 2
     expected = _expected(task, information, power, _flat_sd(task, found), wanted.target)
-    curved = None
+    curved = agrees = None
     if isinstance(bench, Bench) and of.name == "one-axis":
         laws, assumed = laws_of(loop.plant, bench.rig, bench.point._asdict())
+        agrees = magnet_check(laws, loop.plant.theta)
         if laws:
             shift = expected_shift(task, lines, c, information, laws[""]).tolist()
             expected = {
@@ -490,7 +491,9 @@ def _told(
         excitation=dict(zip(of.inputs, wave.T, strict=True)), table=table,
         closed=bench.loop.closed, signals=_signals(loop, ends, used, waves), expected=expected, target=wanted.target,
         gap=found.gap, drawn=len(task.loops) - 1,
-        checks=_checks(used, expected, unstable) | ({} if curved is None else {"curvature": curved}),
+        checks=_checks(used, expected, unstable) | {
+            n: c for n, c in (("curvature", curved), ("magnet_agrees", agrees)) if c is not None
+        },
         warnings=(*_lowered(task, wanted), *_cautions(bench.rig, task, lines, power, information)),
         shown=Shown(
             waves={name: rounded(x) for name, x in waves.items()},

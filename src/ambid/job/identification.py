@@ -255,11 +255,11 @@ def _judged(
         in_time, named = check_lag(signals), causes(fit, means, thorough=robust, delay_given=delay_how == "given")
         curved, own = None, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
-            from ambid.control.curvature import curvature_check
+            from ambid.control.curvature import magnet_checks
 
             sd = spread.standard_deviations(robust=robust)
-            curved = curvature_check(fit, e, rig, means, sd)
-            checks |= {} if curved is None else {"curvature": curved}
+            checks |= magnet_checks(fit, e, rig, means, sd)
+            curved = checks.get("curvature")
         if curved is not None and not curved.passed:  # a law says more than powers of the motion
             named = [c for c in named if c.name != "curvature"]
             spread = replace(spread, bias=np.array([curved.values[name] for name in spread.names]) * sd)
