@@ -52,6 +52,22 @@ def test_a_loop_with_a_higher_peak_is_offered_only_when_asked_for(monkeypatch):
         design_controller(known, rig, plants=3)
 
 
+def test_what_is_promised_counts_disturbances_as_they_were_identified(monkeypatch):
+    """The noise of the sensors alone makes less of the command than a bench shows that is pushed as well."""
+    rig = rig_of_preset(ambid.preset("rmit-axis"))
+    rig = replace(rig, noise=replace(rig.noise, force=12.0 * rig.noise.force))
+    known = ambid.identify(ambid.simulate(rig, duration=1.0, seed=1, amplitude=5.0), rig)
+    monkeypatch.setattr(room, "_JUDGES", 2)
+    monkeypatch.setitem(room.METHODS, "pid", lambda: lambda plants, rig, goals, tick, **_: rig.loop)
+    found = design_controller(known, replace(rig, noise=None), plants=2)
+    quiet = ambid.simulate(rig, duration=2.0, seed=2, amplitude=1e-9)
+    for s in (found.before, found.after):
+        assert s.rms["x"]["voltage"] == pytest.approx(quiet["voltage"].values.std(), rel=0.05)
+        assert s.rms["x"]["position"] < quiet["position"].values.std()  # its sensor's noise is none of the rotor
+    assert found.before.figures.noise < 0.95 * found.before.rms["x"]["voltage"]
+    assert "voltage by all noise, rms" in found.summary()
+
+
 def test_a_rotors_loop_with_a_higher_peak_is_refused_too(monkeypatch):
     rig = rig_of_preset(ambid.preset("rmit"))
     known = ambid.identify(ambid.simulate("rmit", duration=1.0, seed=1), rig)

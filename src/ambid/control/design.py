@@ -8,6 +8,7 @@ are limited, by the present loop's where nothing else is said, as the peak alone
 from __future__ import annotations
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -27,6 +28,7 @@ from ambid.control.margins import (
     Compliance,
     compliance_by_axis,
     margins_by_axis,
+    room_by_axis,
     sensitivity_by_axis,
 )
 from ambid.control.verification import Verification
@@ -286,6 +288,9 @@ class Situation:
     sensitivity: Mapping[str, AxisSensitivity]
     margins: Mapping[str, AxisMargins]
     compliance: Mapping[str, Compliance]
+    # rms by axis of position, current and command on the estimate, m, A and V, by disturbances as well as the noise of
+    # the sensors; empty where nothing is known of them
+    rms: Mapping[str, Mapping[str, float]] = field(default_factory=lambda: MappingProxyType({}))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -442,14 +447,18 @@ def _turning(plant_model: LinearModel, speed: float) -> LinearModel:
     return plant_model.at_speed(speed)
 
 
-def situation_of(examined: Sequence[Examined], estimate: Plant, loop: Loop) -> Situation:
-    """Return what there is to say of a loop; `estimate`: with its covariance."""
+def situation_of(
+    examined: Sequence[Examined], estimate: Plant, loop: Loop, noise: Mapping[str, float] | None
+) -> Situation:
+    """Return what there is to say of a loop; `estimate`: with its covariance; `noise`: as `room_by_axis` takes it."""
     closed = closed_loop_of(estimate, loop)
+    rooms = {} if noise is None else room_by_axis(closed, noise, defaultdict(lambda: None), None)
     return Situation(
         loop=loop_entry(loop), figures=examined[0].figures, worst=worst_of([x.figures for x in examined]),
         unstable=sum(not x.figures.stable for x in examined), sensitivity=sensitivity_by_axis(closed),
         singular=float(np.max(closed.singular)),
         margins=margins_by_axis(closed), compliance=compliance_by_axis(closed),
+        rms={axis: {q: d.rms for q, d in x.quantities.items() if d.rms is not None} for axis, x in rooms.items()},
     )  # fmt: skip
 
 

@@ -37,7 +37,7 @@ from ambid.control.design import (
     worst_of,
     worst_plant,
 )
-from ambid.control.drawn import Draws, Spread, draw_plants, over_speeds
+from ambid.control.drawn import Draws, Spread, draw_plants, laws_of, magnet_check, over_speeds
 from ambid.control.gain_sets import FORMS
 from ambid.control.verification import Trials, checks_of_verifications, verify_all
 from ambid.errors import EstimationError, nearest
@@ -46,7 +46,7 @@ from ambid.estimation.linear import one_thread
 from ambid.estimation.progress import Tick, part_of, silent
 from ambid.job.closed_loop import Numbers, plant_of
 from ambid.job.data import Clock, rig_entry
-from ambid.job.loop_margins import given
+from ambid.job.loop_margins import given, noise_by_name
 from ambid.physics.law import StateLaw
 from ambid.physics.loop import Interval, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
@@ -200,6 +200,17 @@ class _Problem:
     assumed: str  # of the noise
 
     @property
+    def point(self) -> Mapping[str, float] | None:
+        """Where the estimate's record was."""
+        return self.known.operating_point if isinstance(self.known, Estimate) else None
+
+    @property
+    def sd(self) -> dict[str, float]:
+        """Standard deviations of the estimated numbers."""
+        names, covariance = self.plant.names, self.plant.covariance
+        return {} if covariance is None else dict(zip(names, np.sqrt(np.diag(covariance)).tolist(), strict=True))
+
+    @property
     def present(self) -> Loop:
         """The loop as it is."""
         assert self.rig.loop is not None
@@ -333,7 +344,8 @@ def _result(
     say: Tick,
 ) -> Design:  # fmt: skip
     """Return the result; `made`: the new loop before rounding, which the controller rounds once."""
-    was, now = (situation_of(seen, of.plant, loop) for loop, seen in loops)
+    noise = _disturbed(of)
+    was, now = (situation_of(seen, of.plant, loop, noise) for loop, seen in loops)
     loop, seen = loops[1]
     worst = worst_plant(of.judging.plants, seen)
     bench = replace(of.bench, noise=of.bench.noise or of.rig.noise)  # with its resolutions
@@ -350,6 +362,8 @@ def _result(
     if not of.known.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in of.known.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
+    agrees = magnet_check(laws_of(of.plant, of.rig, of.point or of.rig.operating_point)[0], of.plant.theta, of.sd)
+    checks |= {} if agrees is None else {"magnet_agrees": agrees}
     turns = of.speeds is not None and of.speeds[1] > of.speeds[0]
     say("speeds")
     curve = (
@@ -371,6 +385,16 @@ def _result(
             "assumed": [*of.judging.assumed, of.assumed],
         },
     )  # fmt: skip
+
+
+def _disturbed(of: _Problem) -> dict[str, float] | None:
+    """Return the noise of disturbances and outputs by name: as estimated, and as the rig says where nothing is."""
+    noise, names = noise_by_name(of.known, of.bench, of.plant)[0], of.plant.model.disturbances
+    if isinstance(of.known, Estimate) and of.known.noise.disturbance_sd:
+        slower = math.sqrt(of.plant.rate_hz / float(str(of.known.record["rate_hz"])))  # held over a sample, white
+        found = {**of.known.noise.disturbance_sd, **of.known.noise.sensor_sd}
+        noise = {**(noise or {}), **{n: x * (slower if n in names else 1.0) for n, x in found.items()}}
+    return None if noise is None else dict(noise)
 
 
 def at_rate(plant: Plant, rate_hz: float) -> Plant:

@@ -13,7 +13,7 @@ from typing import Any, Literal, cast
 
 import numpy as np
 
-from ambid.control.closed import ClosedLoop
+from ambid.control.closed import ClosedLoop, Plant
 from ambid.control.margins import (
     QUANTITIES,
     Disk,
@@ -204,7 +204,7 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     if not estimate.passed:
         reasons = "; ".join(f"{r.check}: {r.text}" for r in estimate.verdict.reasons)
         checks = {"estimate": Check(passed=False, detail=f"of the plant: {reasons}"), **checks}
-    noise, whose = _noise(estimate, rig, loop)
+    noise, whose = noise_by_name(estimate, rig, loop.plant)
     room = _room(estimate, rig, loop)
     machine = _machine(estimate, rig)
     return Margins(
@@ -220,13 +220,13 @@ def _margins(estimate: Numbers, rig: Rig, bench: Record | None) -> Margins:
     )  # fmt: skip
 
 
-def _noise(
-    estimate: Numbers, rig: Rig, loop: ClosedLoop
+def noise_by_name(
+    estimate: Numbers, rig: Rig, plant: Plant
 ) -> tuple[Mapping[str, float] | None, Literal["rig", "estimate"] | None]:
     """Return the noise of the loop by the names of the model, and whose it is: the rig's, else the estimate's."""
-    of = loop.plant.model
+    of = plant.model
     if rig.noise is not None:
-        force, voltage = rig.noise.held_rms(loop.plant.rate_hz)
+        force, voltage = rig.noise.held_rms(plant.rate_hz)
         by_kind = {"force": force, "voltage": voltage}
         for kind in ("position", "current"):
             step = getattr(rig.noise, f"{kind}_resolution")

@@ -80,6 +80,12 @@ def _figures(d: Design) -> Section:
     if len(d.after.sensitivity) > 1:
         both = (figure_text("peak", s.singular) for s in (d.before, d.after))
         rows.append(("largest singular value", *both, "", ""))
+    for quantity, unit in (("voltage", "V"), ("current", "A"), ("position", "m")):
+        both_rms = [
+            max((x[quantity] for x in s.rms.values() if quantity in x), default=0.0) for s in (d.before, d.after)
+        ]
+        if any(both_rms):
+            rows.append((f"{quantity} by all noise, rms", *(sized(x, unit) for x in both_rms), "", ""))
     n = d.plants["verification"]
     stable = [f"{int(str(n)) - s.unstable} of {n}" for s in (d.before, d.after)]
     rows.append(("plants that are held", "", "", *stable))
