@@ -5,14 +5,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import ambid as package
 from ambid.errors import EstimationError
 from ambid.job.identification import identify_nonlinear
 from ambid.job.nonlinear_bearing import Reading, take_record
 from ambid.physics.coenergy_law import law_numbers
+from ambid.physics.linear_model import Parameter
 from ambid.physics.loop import Limits
 from ambid.physics.presets import preset
-from ambid.rig import load_rig
+from ambid.rig import load_rig, rig_of_preset
 from ambid.simulation import simulate
+from ambid.simulation.rig_bench import plant_of_rig
 
 RIG = """schema = "ambid.rig/1"
 name = "ball under one magnet"
@@ -165,3 +168,63 @@ def test_a_failed_search_is_refused_in_words(balls, rig, monkeypatch):
     )
     with pytest.raises(EstimationError, match="the search ended without a stable predictor"):
         identify_nonlinear(balls, rig)
+
+
+FREE = ("g",)  # numbers of the magnet that stay known
+
+
+def ball(*, leak=None, **numbers):
+    """A rig of the levitated ball whose law has these numbers, and one that knows nothing of it but gravity."""
+    rig = rig_of_preset(preset("levitated-ball"))
+    given = tuple(
+        replace(p, value=leak) if p.name == "L_leak" and leak is not None else p for p in rig.magnet.parameters
+    )
+    more = tuple(Parameter(name=n, unit="1/A^2", value=x, role="fixed") for n, x in numbers.items())
+    known = tuple(p for p in rig.magnet.parameters if p.name in FREE)
+    true = replace(rig, magnet=replace(rig.magnet, saturation="sigma" in numbers, parameters=(*given, *more)))
+    return true, replace(rig, magnet=replace(rig.magnet, parameters=known))
+
+
+def test_a_leakage_that_is_none_is_judged_by_what_it_moves():
+    """No record shows nothing to a part of itself; of L, k_x and k_i it moves a few per cent at most."""
+    true, told = ball(leak=0.0)
+    for seed in (1, 2, 3):
+        found = identify_nonlinear(package.simulate(true, duration=3.0, seed=seed, nonlinear=True), told)
+        leak = found.parameter("L_leak")
+        assert abs(leak.value) < 4.0 * leak.sd
+        assert leak.sd > 0.25 * leak.value
+        assert leak.identifiable
+        assert found.verdict.word == "usable"
+
+
+@pytest.fixture(scope="module")
+def contradicting():
+    """Estimates from two records each, at two gaps, by a law without the saturation that the bench has."""
+    true, told = ball(sigma=0.3)
+    found = []
+    for seed in range(3):
+        places = enumerate((0.008, 0.012))
+        records = [
+            package.simulate(true, duration=3.0, seed=10 * seed + j, nonlinear=True, position=x) for j, x in places
+        ]
+        found.append(identify_nonlinear(records, told))
+    return true, found
+
+
+def test_records_that_contradict_each_other_are_told_and_their_intervals_hold_the_truth(contradicting):
+    """Two places fix two numbers of any law by the weight alone, a hundred times more sharply than the motion does: the
+    residuals are white, and k_x is five per cent off."""
+    true, found = contradicting
+    law = plant_of_rig(true).magnet
+    for estimate in found:
+        assert "records_agree" in {r.check for r in estimate.verdict.reasons}
+        x = estimate.operating_point["position"]
+        i = law.holding_current(x, 0.06 * 9.81)
+        at = estimate.curves(x, i)
+        for curve, truth in ((at.k_x, law.displacement_coefficient(x, i)), (at.k_i, law.force_per_current(x, i))):
+            assert abs(curve.value[0] - truth) < 3.0 * curve.sd[0]
+
+
+def test_sound_records_agree(estimate):
+    assert estimate.checks["records_agree"].passed
+    assert estimate.covariance_method == "information"

@@ -26,6 +26,7 @@ _LEFT = 1.0  # and below which it has converged where rounding leaves no way dow
 _SEARCHING = "identify"
 _ABOUT = 4  # samples before and after a beginning that show where the rotor is and how fast it moves
 _BLOCK = 4096  # samples of one block: their rows stay near
+_DUST = 1e-9  # part of a weak prior that is left over where the records say nothing
 _LONGEST = 1.0  # step of a logarithm at once
 
 
@@ -350,6 +351,8 @@ class BearingUncertainty:
     robust: Array
     delay_sd: dict[float, float]  # by rate, in samples, where it was estimated
     inflation: float  # largest ratio of robust to information standard deviation
+    # (n,), SI, how far numbers move beyond chance where the records are used otherwise; part of the robust covariance
+    disagreement: Array
 
     def covariance(self, *, robust: bool) -> Array:
         """Return the covariance (n, n), SI; the robust one is nowhere smaller than the information's."""
@@ -357,7 +360,7 @@ class BearingUncertainty:
             return self.information
         ratio = np.sqrt(np.diag(self.information) / np.maximum(np.diag(self.robust), 1e-300))
         wider = np.maximum(ratio, 1.0)
-        return np.asarray(self.robust * np.outer(wider, wider))
+        return np.asarray(self.robust * np.outer(wider, wider) + np.outer(self.disagreement, self.disagreement))
 
 
 def uncertainty(fit: BearingFit) -> BearingUncertainty:
@@ -366,6 +369,10 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
     problem, at = fit.problem, fit.at
     n, chain = len(problem.estimated), problem.chain(fit.vector)
     whole = directions(at.J).inverse()
+    for j, number in enumerate(problem.estimated):  # a weak prior on a logarithm says nothing of what may be zero
+        if not (number.signed or np.isfinite(number.prior_sd)) and whole[j, j] > 1.0:
+            left = max(1.0 - whole[j, j] / NOISE_PRIOR_SD**2, _DUST)
+            whole = whole + np.outer(whole[:, j], whole[:, j]) / (NOISE_PRIOR_SD**2 * left)
     centred = at.scores - at.scores.mean(axis=0)
     middle = centred * np.sqrt(len(centred) / max(len(centred) - 1, 1))
     half = whole @ middle.T
@@ -383,4 +390,5 @@ def uncertainty(fit: BearingFit) -> BearingUncertainty:
         robust=wide,
         delay_sd=dict(zip(problem.rates, extra, strict=True)),
         inflation=float(ratio.max()),
+        disagreement=np.zeros(n),
     )

@@ -79,15 +79,12 @@ class BearingRecord:
     def first(self, count: int) -> BearingRecord:
         """Return the beginning of the record, `count` used samples."""
         n = count if self.cut is None else int(np.searchsorted(np.cumsum(~self.cut), count)) + 1
-        return replace(
-            self,
-            u=self.u[:n],
-            loose=self.loose[:n],
-            y=self.y[:n],
-            valid=self.valid[:n],
-            knock=None if self.knock is None else self.knock[:n],
-            cut=None if self.cut is None else self.cut[:n],
-        )
+        return self.part(slice(0, n))
+
+    def part(self, samples: slice) -> BearingRecord:
+        """Return some samples in a row of the record."""
+        names = [n for n in ("u", "loose", "y", "valid", "knock", "cut") if getattr(self, n) is not None]
+        return replace(self, **{name: getattr(self, name)[samples] for name in names})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -28,7 +28,7 @@ from ambid.physics.coenergy_law import MagnetLaw
 from ambid.physics.linear_model import Parameter
 from ambid.rig import Rig, RigMagnet
 from ambid.settings.caller import setting
-from ambid.validation.nonlinear_bearing import WhitenessTest, whiteness, whiteness_checks
+from ambid.validation.nonlinear_bearing import WhitenessTest, agreement, agreement_check, whiteness, whiteness_checks
 
 _OFF_SD = 1.0  # of the voltage of a stage that is off, V: a diode's, or none
 _LINEAR = ("m", "R", "c")  # numbers that stand with the linear model's
@@ -262,7 +262,14 @@ def judge_bearing(
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as threads:
         tests = list(threads.map(lambda r: whiteness(fit, r), range(len(problem.records))))
     residuals = whiteness_checks(tests, names)
+    alone = agreement(fit, spread, alone=True)
+    residuals |= {"records_agree": agreement_check(alone)} if alone.strides else {}
     robust = not all(c.passed for c in residuals.values()) or spread.inflation > _INFLATION or fit.status != "converged"
+    if robust:
+        others = agreement(fit, spread, alone=False)
+        shift, sd = np.vstack([alone.shift, others.shift]), np.vstack([alone.sd, others.sd])
+        both = replace(alone, shift=shift, sd=sd)
+        spread = replace(spread, disagreement=both.beyond_chance())
     parameters = _parameters(fit, spread, robust=robust)
     checks = {**residuals, "identifiable": _shown(parameters)} | _gravity(fit)
     noise = {
@@ -321,7 +328,8 @@ def _names(fit: BearingFit) -> list[str]:
 
 def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) -> tuple[EstimatedParameter, ...]:
     """Return every number that acts."""
-    law, values, parameters = fit.problem.law, fit.problem.values(fit.vector), []
+    law, values, parameters = fit.problem.law, fit.problem.values(fit.vector), list[EstimatedParameter]()
+    moves = _moves(fit)
     sds = np.sqrt(np.diag(spread.covariance(robust=robust)))
     acts = {"sigma": law.saturation, "L_rise": law.rise, "i_knee": law.rise, "i0": law.pair, "a": fit.problem.eddy}
     acts |= dict.fromkeys(("k_asym", "i0_asym"), law.asymmetric)
@@ -338,12 +346,28 @@ def _parameters(fit: BearingFit, spread: BearingUncertainty, *, robust: bool) ->
         if prior and n.estimated:
             share = float(np.clip(1.0 - spread.information[j, j] / n.prior_sd**2, 0.0, 1.0))
         role: Literal["free", "fixed", "prior"] = "fixed" if not n.estimated else "prior" if prior else "free"
-        identifiable = not n.estimated or sd < WEAK * abs(size)
+        identifiable = not n.estimated or sd < WEAK * abs(size) or sd * moves.get(n.name, np.inf) < WEAK
         parameters.append(EstimatedParameter(
             name=n.name, unit=UNITS[n.name], value=value, sd=sd, ci95=(value - 1.96 * sd, value + 1.96 * sd),
             role=role, identifiable=identifiable, data_share=share,
         ))  # fmt: skip
     return tuple(parameters)
+
+
+def _moves(fit: BearingFit) -> dict[str, float]:
+    """Return by how much of themselves k_x, k_i and L at the records' mean, and the voltage, move at most with a number
+    that may be zero; a leakage that is none is not known by a part of itself, and need not be.
+    """
+    problem, law, values = fit.problem, fit.problem.law, fit.problem.values(fit.vector)
+    moving = [r for r in problem.records if not r.held]
+    at = np.concatenate([r.kept for r in moving]).mean(axis=0) - [values["x_offset"], values["i_offset"]]
+    table, slopes = law.table(at[:1], at[1:], values)
+    turned = law.gradients(at[:1], at[1:], values)[0]
+    by = {n: slopes[0, :, j] for j, n in enumerate(law.names)} | {"x_offset": turned[:, 0], "i_offset": turned[:, 1]}
+    voltage = float(np.sqrt(np.mean(np.concatenate([r.u for r in moving]) ** 2)))
+    known = {n.name for n in problem.numbers if n.signed} | {"L_leak", "L_rise", "i_knee"}
+    found = {n: float(np.max(np.abs(x[1:] / table[0, 1:]))) for n, x in by.items() if n in known}
+    return {**found, "v_offset": 1.0 / voltage, "v_drop": 1.0 / voltage}
 
 
 def _shown(parameters: Sequence[EstimatedParameter]) -> Check:
@@ -394,7 +418,10 @@ def _unseen(fit: BearingFit) -> list[str]:
 
 def _warnings(fit: BearingFit, checks: Mapping[str, Check], *, robust: bool) -> tuple[str, ...]:
     """What a reader has to know before using the numbers, most important first."""
-    warnings = [*warnings_of(fit, checks, "scatter over the records" if robust else ""), *_unseen(fit)]
+    warnings = [
+        *warnings_of(fit, checks, "scatter over the records, disagreement of refits" if robust else ""),
+        *_unseen(fit),
+    ]
     if fit.problem.drift:
         warnings.append("a random-walk force absorbs what the force law does not explain; static forces count for less")
     return tuple(warnings)

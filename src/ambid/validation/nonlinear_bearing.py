@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.bearing.magnet_likelihood import BearingFit, run, sweep
+from ambid.bearing.magnet_likelihood import BearingFit, BearingUncertainty, run, search, sweep, uncertainty
 from ambid.bearing.magnet_problem import BODY, LEVELS, SIGNED, BearingProblem, BearingRecord, Number, weight_carried
 from ambid.bearing.magnet_result import NonlinearBearingEstimate
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import triangle_of
 from ambid.estimation.uncertainty import p_text
+from ambid.validation.physical import Agreement
 from ambid.validation.residuals import P_LEAST, fit_of, joint_triangle, score_of
 from ambid.validation.second_record import conclude, consistency_check
 
@@ -22,7 +23,9 @@ _ROLES = ("position", "current")
 _NEUTRAL = {"i_knee": 1.0, "a": 1.0, "i_drop": 1.0}  # of a number that does not act; 0 for the others
 _LAGS = (1, 2, 3, 5, 8, 13)
 _INPUT_LAGS = (1, 2, 3, 4, 6, 9, 14, 21)
+_STRIDES, _REFIT, _LEAST = (2, 4), 30, 500  # of samples, iterations of a refit, and samples of half a record
 _OUTSIDE = 0.1  # share of the samples beyond what the records covered that a check lets pass
+_CONTRADICTS = 5.0  # standard deviations, of the largest of many moves
 _WEIGHT = 0.1  # relative error of the force at rest that a check lets pass
 
 
@@ -210,6 +213,75 @@ def validation(estimate: NonlinearBearingEstimate, record: BearingRecord) -> dic
         "outside": outside,
         "noise_of": replayed.noise_of,
     }
+
+
+def agreement(fit: BearingFit, spread: BearingUncertainty, *, alone: bool) -> Agreement:
+    """Refit the numbers to other uses of the records: each moving one `alone`, where there are several, or else to
+    halves of a single one and to every second and fourth sample. Refits that do not converge are left out.
+    """
+    plain, values = np.diag(spread.information), fit.problem.values(fit.vector)
+    shifts, sds, used = list[list[float]](), list[Array](), list[int]()
+    for k, problem in enumerate(_each(fit) if alone else _parts(fit)):
+        again = search(problem, problem.start(), iterations=_REFIT)
+        if again.status == "converged":
+            own, found = np.diag(uncertainty(again).information), problem.values(again.vector)
+            shifts.append([found[name] - values[name] for name in spread.names])
+            sds.append(np.sqrt(np.maximum(own - plain, 0.25 * own)))  # as of physical.agreement
+            used.append(k)
+    n = len(spread.names)
+    shift, sd = np.array(shifts).reshape(-1, n), np.array(sds).reshape(-1, n)
+    return Agreement(names=spread.names, shift=shift, sd=sd, strides=tuple(used))
+
+
+def agreement_check(alone: Agreement) -> Check:
+    """Check that records alone give what they give together."""
+    ratio = np.abs(alone.shift / alone.sd)
+    record, number = np.unravel_index(int(np.argmax(ratio)), ratio.shape)
+    text = f"{alone.names[number]} moves by {alone.largest:.2g} sd with record {alone.strides[record] + 1} alone"
+    passed = alone.largest < _CONTRADICTS
+    return Check(
+        passed=passed, values={"largest": alone.largest},
+        detail=f"each record alone gives what they give together ({text} at most)" if passed
+        else f"the records contradict each other: {text}. The law does not hold for all of them, or the bench changed",
+    )  # fmt: skip
+
+
+def _begun(fit: BearingFit) -> BearingProblem:
+    """Return the problem of a fit, beginning where it ended."""
+    problem, values, centre = fit.problem, fit.problem.values(fit.vector), fit.problem.noise_center.copy()
+    for r, place in enumerate(problem.noise_slices):
+        centre[r, list(problem.levels(r))] = fit.vector[place]
+    return replace(
+        problem, noise_center=centre, delays={rate: problem.delay_at(fit.vector, rate) for rate in problem.delays},
+        numbers=tuple(replace(n, value=values[n.name]) if np.isinf(n.prior_sd) else n for n in problem.numbers),
+    )  # fmt: skip
+
+
+def _each(fit: BearingFit) -> Iterator[BearingProblem]:
+    """Yield each moving record alone, with those of a held rotor, where there are several."""
+    problem = _begun(fit)
+    moving = [r for r, x in enumerate(problem.records) if not x.held]
+    for r in moving if len(moving) > 1 else ():
+        kept = [k for k, x in enumerate(problem.records) if x.held or k == r]
+        rates = {problem.records[k].rate_hz for k in kept}
+        yield replace(
+            problem, records=tuple(problem.records[k] for k in kept), noise_center=problem.noise_center[kept],
+            delays={rate: x for rate, x in problem.delays.items() if rate in rates},
+            free_delay=problem.free_delay & rates,
+        )  # fmt: skip
+
+
+def _parts(fit: BearingFit) -> Iterator[BearingProblem]:
+    """Yield halves of a single moving record, and all records with some of their samples."""
+    problem = _begun(fit)
+    moving = [x for x in problem.records if not x.held]
+    half = moving[0].u.size // 2
+    for part in (slice(0, half), slice(half, None)) if len(moving) == 1 and half > _LEAST else ():
+        yield replace(problem, records=tuple(x if x.held else x.part(part) for x in problem.records))
+    for stride in _STRIDES:
+        thin = [(np.arange(x.u.size) % stride == 0)[:, None] for x in problem.records]
+        pairs = zip(problem.records, thin, strict=True)
+        yield replace(problem, records=tuple(replace(x, valid=x.valid & on) for x, on in pairs))
 
 
 def whiteness_checks(tests: Sequence[WhitenessTest], names: Sequence[str] = ()) -> dict[str, Check]:

@@ -86,6 +86,12 @@ class Agreement:
         """Whether there was a refit, if one was possible, and every shift is within 4 standard deviations."""
         return (bool(self.strides) or self.fast) and self.largest < _MOST
 
+    def beyond_chance(self) -> Array:
+        """Return how far each parameter (n,), SI, moves beyond chance in the refit that is least likely for it."""
+        away = np.sign(self.shift) * np.sqrt(np.maximum(self.shift**2 - self.sd**2, 0.0))
+        least = np.argmax(np.abs(self.shift / self.sd), axis=0) if len(away) else []
+        return np.asarray([away[k, j] for j, k in enumerate(least)] or np.zeros(len(self.names)))
+
     def disagreement(self) -> Array:
         """Return how far parameters (n,), SI, move in the refit in which they move most; zeros where none converged."""
         if not self.strides:
