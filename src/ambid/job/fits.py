@@ -192,12 +192,45 @@ def _estimate_nonlinear(
 ) -> NonlinearFit:
     from ambid.validation.fits import judge
 
-    found = nonlinear_structure(name).estimator(data, settings, seed=seed, tick=part_of(say, 0.0, _SEARCH))
+    more = {"linear": _physical_weights} if name == "nn" else {}
+    found = nonlinear_structure(name).estimator(data, settings, seed=seed, tick=part_of(say, 0.0, _SEARCH), **more)
     clock.lap("fit")
     say("check", _SEARCH)
     checked = judge(found, data, second=second)
     say("check", 1.0)
     return replace(checked, details={**checked.details, "fit_timing_s": dict(checked.timing_s)})
+
+
+def _physical_weights(data: IOData, delay: int) -> Mapping[str, float] | None:
+    """Return A, B (thesis eq. 4.8) and the predictor gain by the names of their entries, SI, as `identify` finds them;
+    None if it does not.
+    """
+    import numpy as np
+
+    from ambid.bearing.linear import greybox
+    from ambid.bearing.multistart import Signals
+    from ambid.estimation.predictor import assemble
+    from ambid.physics.linear_model import OneAxis, Parameter
+
+    plant, units = OneAxis(), [data.units[x] for x in data.outputs]
+    places = [units.index("m"), units.index("A")]
+    known = [
+        Parameter(name=p.name, unit=p.unit, role="fixed", value=0.0) if p.name == "c"
+        else Parameter(name=p.name, unit=p.unit) for p in plant.parameters
+    ]  # fmt: skip
+    try:
+        signals = Signals(u=data.u, y=data.y[:, places], rate_hz=1.0 / data.dt)
+        found = greybox(plant, signals, known, delay=float(delay), evaluations=0)
+    except (EstimationError, np.linalg.LinAlgError):
+        return None
+    predictor, scales = assemble(found.problem, found.vector, with_derivatives=False), found.problem.scales
+    if predictor is None:
+        return None
+    K = predictor.gain[:3] * scales.state[:3, None] / scales.output
+    space = plant.matrices(found.problem.parameters(found.vector))
+    A = {f"a{r + 1}{c + 1}": float(space.A[r, c]) for r, c in ((1, 0), (1, 2), (2, 1), (2, 2))}
+    gain = {f"k{r + 1}{c + 1}": float(K[r, k]) for r in range(3) for k, c in enumerate(places)}
+    return {**A, "b3": float(space.B[2, 0]), **gain}
 
 
 def physics(found: BlackBoxFit, rig: Rig | str | Path) -> PhysicalFit:

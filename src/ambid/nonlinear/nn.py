@@ -8,7 +8,7 @@ Behind a sensor without sign (output=magnitude), such as a pulse counter: a grid
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -104,12 +104,22 @@ class NnSettings:
     )
 
 
-def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None) -> NonlinearFit:
+Linear = Callable[[IOData, int], "Mapping[str, float] | None"]
+"""From a record and the delay of its input to the weights of thesis eq. 4.8 and the predictor gain by name, SI, as
+another method finds them.
+"""
+
+
+def nn(
+    records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Tick | None = None,
+    linear: Linear | None = None,
+) -> NonlinearFit:  # fmt: skip
     """Train a state-space network whose weights are A and B (thesis eqs 5.1-5.2, fig. 5.9; with G(x, u): eq. 4.9),
     consistent under feedback as far as the predictor gain holds the noise. In the form ``one-axis`` (position, current
     and perhaps velocity from a voltage) they are entries of thesis eq. 4.8, with a global search where all starts fail;
     states of ``free``, started from subspace models of several horizons, have no fixed meaning, and nothing bounds the
-    entries.
+    entries. Of the form ``one-axis`` a `linear` estimate is one more start, as a local minimum may have nearly the
+    right errors.
     """
     chosen = {k: v for k, v in asdict(read_settings(NnSettings, "nn", settings)).items() if v is not None}
     unsigned = chosen["output"] == "magnitude"
@@ -139,6 +149,8 @@ def nn(records: Sequence[IOData], settings: Settings, *, seed: int = 0, tick: Ti
             reason = _start(fitting, tick)
             if not reason:
                 _train_all(fitting, part_of(tick, *_TRAINING))
+                if linear is not None and s["form"] == "one-axis" and not s["neurons"]:
+                    _train_again(fitting, linear)
             reason = _rescue(fitting, tick, reason, requested="evaluations" in settings)
             _caution(fitting)
     except KeyboardInterrupt:
@@ -241,6 +253,24 @@ def _train_all(fitting: Fitting, tick: Tick | None, *, descent: bool = True) -> 
             trained = _train_units(s, fitting.state, data, neurons, [fitting.seed], hidden, fitting=fitting)
             fitting.rivals = [x.state for x in trained]
         _train_gain(fitting, first, gain)
+
+
+def _train_again(fitting: Fitting, linear: Linear) -> None:
+    """Train the physics once more from another method's estimate, and keep what is likelier."""
+    before, data = fitting.state, fitting.data
+    weights = linear(max(fitting.records, key=lambda x: x.n_samples), fitting.delay)
+    if before is None or weights is None:
+        return
+    bare = before.widen(gain=False)
+    layout, size = bare.layout, np.array(bare.layout.scale)
+    theta = np.array([weights.get(name, 0.0) for name in layout.names]) / layout.unit  # constants of no mean
+    begun = State.of(layout, theta, data)
+    if before.layout.gain:
+        gains = [(i, j) for i in range(layout.n) for j in range(layout.p)]
+        K = [weights.get(f"k{i + 1}{j + 1}", 0.0) * size[layout.heads[j]] / size[i] for i, j in gains]
+        begun = replace(begun.widen(gain=True), theta=np.concatenate([theta, K]))
+    with fitting.stage("training"):
+        train(begun, data, stage="second start", iterations=int(fitting.settings["iterations"]), fitting=fitting)
 
 
 def _train_gain(fitting: Fitting, first: State, tick: Tick | None) -> None:
