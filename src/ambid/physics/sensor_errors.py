@@ -66,6 +66,14 @@ def other_plane(model: RotorModel, k: int) -> int | None:
     return next((i for i in sensors if i != k), None)
 
 
+def electrical_errors(model: RotorModel) -> tuple[SensorError, ...]:
+    """Return the errors that a rotor's currents, voltages and commands may have; a voltage lags where its amplifier
+    does.
+    """
+    roles = (*(x for x in model.outputs if x.endswith("_current")), *model.inputs)
+    return tuple(SensorError(kind=kind, channel=role) for kind in ("gain", "lag") for role in roles)
+
+
 def position_errors(model: RotorModel) -> tuple[SensorError, ...]:
     """Return the errors that a rotor's position sensors may have and that are no parameters of the model."""
     outputs, free = model.outputs, set(model.extras)

@@ -19,7 +19,7 @@ from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
 from ambid.rotor.prediction import PredictorFit
-from ambid.rotor.scores import agreement_checks, scores
+from ambid.rotor.scores import agreement_checks, refined, scores
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
@@ -76,11 +76,12 @@ class Evidence:
 
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
+    found = scores(fit.problem, fit.vector)
     return Evidence(
         method="periods",
         noise=_noise(fit),
         fit=_fits(fit),
-        checks={**_residual_checks(fit), **agreement_checks(scores(fit.problem, fit.vector), fit.model)},
+        checks={**_residual_checks(fit), **agreement_checks(refined(fit.problem, fit.vector, found), fit.model)},
     )
 
 

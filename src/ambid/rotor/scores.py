@@ -5,75 +5,204 @@ r/|c⊥|, size = c⊥ᵀ r/|c⊥|², c⊥ a cause's column outside the Jacobian'
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 
 from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.linear import directions, triangle_of
+from ambid.estimation.search import search
 from ambid.physics.rotor_model import RotorModel
-from ambid.physics.sensor_errors import SensorError, logged_error, position_errors
-from ambid.rotor.likelihood import Experiment, Likelihood, Point, sampled
+from ambid.physics.sensor_errors import SensorError, electrical_errors, logged_error, position_errors
+from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
+from ambid.rotor.spectra import PeriodSpectra
 
 _FAR = 4.5
 _OWN = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
+_ALIKE = 0.7  # part of the strongest cause's gain from which another explains the record about as well
+_CLOSE = 9.0  # and the difference of gains within which it does in any case
+_LARGE = 1.5  # mean square of the residuals from which an error is not of first order
+_WORTH, _MOST, _STEPS = (
+    0.1,
+    8,
+    30,
+)  # part of the best gain from which a cause is searched, how many are, and steps of it
+_TOGETHER = {"position": "positions", "current": "currents", "voltage": "voltages"}
+
+
+_TWINS = (
+    ("_current.lag", "_voltage.lag"), ("_voltage.lag", "_current.lag"),
+    ("currents.lag", "voltages.lag"), ("voltages.lag", "currents.lag"),
+)  # fmt: skip
+"""What the coil's own lag tells apart by little."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cause:
+    """Errors of one size that have one cause."""
+
+    name: str  # as `Check.cause`: "ax_current.gain", "A.z", "A.z+A.z_sensor", "positions.lag", "eddy_pole"
+    kind: str  # "fixed", "gain", "lag", "cross-talk", "eddy"
+    errors: tuple[SensorError, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Score:
     """A cause, how sure it is in standard deviations, and what it would have to be."""
 
-    kind: str  # "fixed", "gain", "lag", "cross-talk", "eddy"
-    name: str  # of the number, or the channel
+    cause: Cause
     z: float
     size: float  # change of the number, relative gain, lag in s, share, time constant in s
     gain: float  # by how much it would lower the sum of squares
 
 
+def causes_of(problem: Likelihood) -> tuple[Cause, ...]:
+    """Return what may be wrong: fixed numbers, both planes of a bearing, channels alone and together, eddy currents."""
+    model, known = problem.unknowns.model, [p.name for p in problem.unknowns.known if p.role == "fixed"]
+    causes = [Cause(name=x, kind="fixed", errors=(SensorError(kind="fixed", channel=x),)) for x in known]
+    for b in model.bearings:
+        planes = (f"{b.name}.z", *(b.sensor_parameter(k) for k in range(len(b.z_sensors))))
+        if set(known).issuperset(planes):
+            both = tuple(SensorError(kind="fixed", channel=x) for x in planes)
+            causes.append(Cause(name="+".join(planes), kind="fixed", errors=both))
+    errors = (*position_errors(model), *electrical_errors(model))
+    causes += [Cause(name=f"{e.channel}.{e.kind}", kind=e.kind, errors=(e,)) for e in errors]
+    lags = [e for e in errors if e.kind == "lag"]
+    for of, group in groupby(lags, lambda e: e.channel.split("_")[1].rstrip("0123456789")):
+        if len(all_of := tuple(group)) > 1 and of in _TOGETHER:
+            causes.append(Cause(name=f"{_TOGETHER[of]}.lag", kind="lag", errors=all_of))
+    return (*causes, *(() if "a" in model.extras else (Cause(name="eddy_pole", kind="eddy"),)))
+
+
 def scores(problem: Likelihood, v: Array) -> list[Score]:
     """Return the causes that the residuals may have, the surest first."""
-    rows = problem.rows(v, corrected=True)
-    at, model = problem.point(v), problem.unknowns.model
-    fixed = [SensorError(kind="fixed", channel=p.name) for p in problem.unknowns.known if p.role == "fixed"]
-    causes = [*fixed, *position_errors(model)]
-    named = [(e.kind, e.channel) for e in causes] + ([] if "a" in model.extras else [("eddy", "a")])
-    columns = [
-        np.concatenate([_real(w.whiten, c) for c in _columns(e, model, at, causes)], axis=1)
-        for e, w in zip(problem.experiments, problem.weights, strict=True)
-    ]
+    rows, causes = problem.rows(v, corrected=True), causes_of(problem)
+    C = np.concatenate(_by_cause(problem, v, causes, corrected=True))
     J, r = np.concatenate([block[:, :-1] for block in rows]), np.concatenate([block[:, -1] for block in rows])
-    C = np.concatenate(columns)
     inverse = directions(triangle_of([J])).inverse(1e-9)
     outside = C - J @ (inverse @ (J.T @ C))
     own, whole = np.sum(outside**2, axis=0), np.sum(C**2, axis=0)
     along = outside.T @ r
     spread = np.sqrt(max(1.0, float(r @ r) / r.size))
     found = [
-        Score(kind=kind, name=name, z=float(a / np.sqrt(o) / spread), size=float(a / o), gain=float(a * a / o))
-        for (kind, name), a, o, w in zip(named, along, own, whole, strict=True)
+        Score(cause=c, z=float(a / np.sqrt(o) / spread), size=float(a / o), gain=float(a * a / o))
+        for c, a, o, w in zip(causes, along, own, whole, strict=True)
         if o > _OWN * w and o > 0.0
     ]
     return sorted(found, key=lambda s: -abs(s.z))
 
 
+def _by_cause(problem: Likelihood, v: Array, causes: Sequence[Cause], *, corrected: bool) -> list[Array]:
+    """Return what each cause adds to the whitened outputs of each experiment, (n_real, n_causes)."""
+    at, model = problem.point(v), problem.unknowns.model
+    errors = tuple(dict.fromkeys(e for c in causes for e in c.errors))
+    blocks = []
+    for e, w in zip(problem.experiments, problem.weights, strict=True):
+        moved = _columns(e, w if corrected else replace(w, back=None), model, at, errors)
+        single = dict(zip([*errors, None], moved, strict=False))  # no eddy pole where it is in the model
+        columns = [np.sum([single[x] for x in c.errors or (None,)], axis=0) for c in causes]
+        block = (w.whiten @ np.stack(columns, axis=2)).reshape(-1, len(causes))
+        blocks.append(np.sqrt(2.0) * np.concatenate([block.real, block.imag]))
+    return blocks
+
+
+def refined(problem: Likelihood, v: Array, found: Sequence[Score]) -> list[Score]:
+    """Return scores of large errors: where residuals are far above the noise, the likeliest causes are searched with
+    the parameters, by what they do exactly, and lags that are none are left out.
+    """
+    before = problem.cost(v)
+    if before < _LARGE * problem.n_real or not found or abs(found[0].z) < _FAR:
+        return list(found)
+    v, best = _risen(problem, v), found[0]
+    twins = [b for a, b in _TWINS if best.cause.name.endswith(a)]
+    top = [s for s in found if s.gain > _WORTH * best.gain or s.cause.name.endswith(tuple(twins))][:_MOST]
+    searched = [_searched(problem, v, s, before) for s in top]
+    possible = [s for s in searched if s.cause.kind not in ("lag", "eddy") or s.size > 0.0]
+    return sorted(possible, key=lambda s: -s.gain) or list(found)
+
+
+def _risen(problem: Likelihood, v: Array) -> Array:
+    """Return the vector with resistances that ran to zero, where nothing moves them, at the lowest line's reactance."""
+    at, v, names = problem.point(v).theta, v.copy(), problem.unknowns.logs
+    low = min(float(e.spectra.omega[0]) for e in problem.experiments)
+    for k, name in enumerate(names):
+        if name.endswith(".R"):
+            v[k] = max(v[k], np.log(low * at[f"{name[:-1]}L"]))
+    return v
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class _Beside:
+    """The criterion with the size of a cause as one more number, over that of its score."""
+
+    problem: Likelihood
+    cause: Cause
+    unit: float
+
+    def freed(self, theta: Array) -> Likelihood:
+        """Return the problem without the cause."""
+        return _without(self.problem, self.cause, self.unit * float(theta[-1]))
+
+    def cost(self, theta: Array) -> float:
+        """Return the criterion."""
+        return self.freed(theta).cost(theta[:-1])
+
+    def triangle(self, theta: Array) -> Array:
+        """Return the triangle of slopes and residuals."""
+        there, v = self.freed(theta), theta[:-1]
+        rows = np.concatenate(there.rows(v, corrected=False))
+        c = self.unit * np.concatenate(_by_cause(there, v, [self.cause], corrected=False))
+        slopes, left = there.unknowns.priors(v)
+        prior = np.column_stack([slopes, np.zeros(len(left)), left])
+        return triangle_of([np.column_stack([rows[:, :-1], c, rows[:, -1]]), prior])
+
+
+def _searched(problem: Likelihood, v: Array, s: Score, before: float) -> Score:
+    """Return a score whose size is searched together with the parameters, from zero, and a lag from what turns the
+    highest line: a fit that lacks it stands far away.
+    """
+    lag = s.cause.kind == "lag"
+    unit = 1.0 / max(float(e.spectra.omega[-1]) for e in problem.experiments) if lag else abs(s.size)
+    beside = _Beside(problem=problem, cause=s.cause, unit=unit)
+    starts = [np.append(v, x) for x in ((0.0, 1.0) if lag else (0.0,))]
+    ends = [search(beside, x, most=_STEPS, tolerance=1e-4, longest=1.0) for x in starts]
+    best = min(ends, key=lambda x: x.cost)
+    size, gain = unit * float(best.theta[-1]), max(before - best.cost, 0.0)
+    return Score(cause=s.cause, z=float(np.sign(size) * np.sqrt(gain * s.z**2 / s.gain)), size=size, gain=gain)
+
+
 def sensor_gain(problem: Likelihood, v: Array) -> float:
-    """Return by how much a sensor's gain, lag or cross-talk, or an eddy pole, would lower the sum of squares."""
-    return max((s.gain for s in scores(problem, v) if s.kind != "fixed"), default=0.0)
+    """Return by how much a channel's gain, lag or cross-talk, or an eddy pole, would lower the sum of squares."""
+    return max((s.gain for s in scores(problem, v) if s.cause.kind != "fixed"), default=0.0)
 
 
-def _columns(e: Experiment, model: RotorModel, at: Point, causes: Sequence[SensorError]) -> Iterator[Complex]:
-    """Yield what each cause adds to the outputs, (n_lines, n_y); an eddy pole last, where it is not in the model."""
-    of, mean, turned = sampled(e, model, at), e.spectra.mean_u, model.at_speed(e.speed)
-    y = of.states(mean) @ of.space.C.T
-    omega, outputs = e.spectra.omega, list(model.outputs)
-    for cause in causes:
-        if cause.kind == "fixed":
-            yield of.slopes(mean, [turned.derivative(at.theta, cause.channel)])[:, :, 0]
+def _columns(
+    e: Experiment, w: Weight, model: RotorModel, at: Point, errors: Sequence[SensorError]
+) -> Iterator[Complex]:
+    """Yield what each error adds to the outputs, (n_lines, n_y); an eddy pole last, where it is not in the model. The
+    inputs are those of the slopes: freed of what feedback put in.
+    """
+    of, turned = sampled(e, model, at), model.at_speed(e.speed)
+    H, mean = of.transfer(), e.spectra.mean_u
+    if w.back is not None:
+        left = e.spectra.mean_y - (H @ mean[:, :, None])[:, :, 0]
+        mean = mean - (w.back @ left[:, :, None])[:, :, 0]
+    y, omega, outputs, inputs = of.states(mean) @ of.space.C.T, e.spectra.omega, model.outputs, model.inputs
+    for error in errors:
+        if error.kind == "fixed":
+            yield of.slopes(mean, [turned.derivative(at.theta, error.channel)])[:, :, 0]
             continue
-        added, k = np.zeros_like(y), outputs.index(cause.channel)
-        other = y[:, outputs.index(cause.other)] if cause.other else None
-        added[:, k] = logged_error(cause.kind, y[:, k], omega, other)
+        added = np.zeros_like(y)
+        if error.channel in inputs:  # a gain is of what is logged, a lag of what acts
+            k = inputs.index(error.channel)
+            sign = -1.0 if error.kind == "gain" else 1.0
+            yield sign * H[:, :, k] * logged_error(error.kind, mean[:, k], omega)[:, None]
+            continue
+        k = outputs.index(error.channel)
+        other = y[:, outputs.index(error.other)] if error.other else None
+        added[:, k] = logged_error(error.kind, y[:, k], omega, other)
         yield added
     if "a" not in model.extras:
         rate = np.zeros((y.shape[0], len(model.axes)), dtype=complex)
@@ -84,46 +213,103 @@ def _columns(e: Experiment, model: RotorModel, at: Point, causes: Sequence[Senso
         yield (of.disturbed()[:, :, : len(model.axes)] @ rate[:, :, None])[:, :, 0]
 
 
-def _real(whiten: Complex, c: Complex) -> Array:
-    block = (whiten @ c[:, :, None])[:, :, 0].reshape(-1, 1)
-    return np.asarray(np.sqrt(2.0) * np.concatenate([block.real, block.imag]))
+def _without(problem: Likelihood, cause: Cause, size: float) -> Likelihood:
+    """Return the problem freed of a cause of a size."""
+    if cause.kind == "eddy":
+        return problem
+    base, experiments = problem.base, problem.experiments
+    for error in cause.errors:
+        if error.kind == "fixed":
+            base = replace(base, theta={**base.theta, error.channel: base.theta[error.channel] + size})
+        else:
+            experiments = [replace(e, spectra=_freed(e.spectra, problem.unknowns.model, error, size))
+                           for e in experiments]  # fmt: skip
+    return replace(problem, base=base, experiments=experiments)
+
+
+def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: float) -> PeriodSpectra:
+    U, Y, late = spectra.U.copy(), spectra.Y.copy(), 1.0 + 1j * spectra.omega * size
+    if error.channel in model.inputs:
+        U[:, :, model.inputs.index(error.channel)] /= late if error.kind == "lag" else 1.0 + size
+    elif error.kind == "cross-talk":
+        k, other = (model.outputs.index(x) for x in (error.channel, error.other))
+        Y[:, :, k] -= size * Y[:, :, other]
+    else:
+        Y[:, :, model.outputs.index(error.channel)] *= late if error.kind == "lag" else 1.0 / (1.0 + size)
+    return replace(spectra, U=U, Y=Y)
 
 
 def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Check]:
-    """Judge what is fixed, and the sensors, by their scores."""
-    fixed = [s for s in found if s.kind == "fixed"]
-    others = [s for s in found if s.kind != "fixed"]
+    """Judge what is fixed, and the channels, by their scores. What explains the residuals best is named, with what
+    explains them about as well; the other check does not fail for what that explains.
+    """
+    if not found:
+        return {}
+    best = found[0]
     units = {p.name: p.unit for p in model.parameters}
+    alike = [s for s in found[1:] if s.gain > min(_ALIKE * best.gain, best.gain - _CLOSE)]
+    others = [s.cause.name for s in alike] + ["planes"] * ("+" in best.cause.name)
+    twin = next((best.cause.name.replace(a, b) for a, b in _TWINS if best.cause.name.endswith(a)), "")
+    others += [twin] * (twin not in ("", *others))
     checks: dict[str, Check] = {}
-    for name, group, fine in (
-        ("fixed_agree", fixed, "the record agrees with the planes and the other fixed numbers"),
-        ("sensors_agree", others, "no gain, lag or cross-talk of a sensor and no eddy pole shows in the residuals"),
+    for name, fixed, fine in (
+        ("fixed_agree", True, "the record agrees with the planes and the other fixed numbers"),
+        ("sensors_agree", False, "no gain, lag or cross-talk of a channel and no eddy pole shows in the residuals"),
     ):
+        group = [s for s in found if (s.cause.kind == "fixed") == fixed]
         if not group:
             continue
         worst = group[0]
-        passed = abs(worst.z) < _FAR
+        passed = abs(worst.z) < _FAR or worst is not best
+        detail = fine if abs(worst.z) < _FAR else f"{best.cause.name} explains more than what this check asks for"
+        if not passed:
+            detail = _words(worst, units.get(worst.cause.name.split("+")[0], "1"))
+            words = {"planes": "two planes, each by its own"}
+            shown = [_shown(s, units) for s in alike] + [words.get(x, x) for x in others[len(alike) :]]
+            if shown:
+                detail += f"; about as well explained by {' or '.join(shown)}"
         checks[name] = Check(
-            passed=passed, values={"z": worst.z, "size": worst.size},
-            detail=fine if passed else _words(worst, units.get(worst.name, "1")),
+            passed=passed, values={"z": worst.z, "size": worst.size}, detail=detail,
+            cause="" if passed else worst.cause.name, size=None if passed else worst.size,
+            alternatives=() if passed else tuple(others),
         )  # fmt: skip
     return checks
 
 
+def _shown(s: Score, units: dict[str, str]) -> str:
+    """Return a cause with its size, in a few words."""
+    kind, unit = s.cause.kind, units.get(s.cause.name.split("+")[0], "1")
+    if kind == "fixed":
+        size = f"{1e3 * s.size:+.3g} mm" if unit == "m" else f"{s.size:+.3g} {unit}"
+    else:
+        size = f"{1e6 * s.size:.3g} us" if kind in ("lag", "eddy") else f"{100 * s.size:+.3g} %"
+    return f"{s.cause.name} ({size})"
+
+
 def _words(s: Score, unit: str) -> str:
-    sure, axis = f"z = {abs(s.z):.3g}", s.name.split("_")[0]
-    if s.kind == "fixed":
+    sure, name, kind = f"z = {abs(s.z):.3g}", s.cause.name, s.cause.kind
+    channel, axis = name.rpartition(".")[0], name.split("_")[0]
+    if kind == "fixed":
         shown = f"{1e3 * s.size:+.3g} mm" if unit == "m" else f"{s.size:+.3g} {unit}"
-        return f"the record contradicts {s.name}: {shown} would fit better ({sure}). Measure it, or let it be free"
-    if s.kind == "gain":
-        return f"{s.name} reads {100 * s.size:+.3g} % beside the others ({sure}). Calibrate it, or free {axis}.gain"
-    if s.kind == "lag":
-        return f"{s.name} lags by {1e6 * s.size:.3g} us ({sure}). Add {axis}.sensor_pole to [parameters]"
-    if s.kind == "eddy":
+        both = " and ".join(name.split("+"))
+        return f"the record contradicts {both}: {shown} would fit better ({sure}). Measure it, or let it be free"
+    if kind == "eddy":
         return (
             f"the positions lag behind the currents by {1e6 * s.size:.3g} us ({sure}). Add to [parameters] an eddy "
             "pole, a, or the poles of the sensors"
         )
-    return (
-        f"{s.name} holds {100 * s.size:+.3g} % of the other plane ({sure}): cross-talk, or turned. Check its mounting"
-    )
+    if kind == "cross-talk":
+        return (
+            f"{channel} holds {100 * s.size:+.3g} % of the other plane ({sure}): cross-talk, or turned. Check its "
+            "mounting"
+        )
+    position = "_position" in name
+    if kind == "gain":
+        remedy = f"Calibrate it, or free {axis}.gain" if position else "Calibrate it"
+        return f"{channel} reads {100 * s.size:+.3g} % beside the others ({sure}). {remedy}"
+    does = ("lag" if s.size > 0.0 else "lead") + ("s" if "_" in channel else "")
+    late = f"{channel} {does} by {1e6 * abs(s.size):.3g} us ({sure})"
+    if channel.rpartition("_")[2].startswith("voltage"):
+        return f"{late}: the coils get less than what is logged. Log behind the amplifier, or excite more slowly"
+    remedy = f"Add {axis}.sensor_pole to [parameters]" if position else "Log without its filter"
+    return f"{late}. {remedy}"

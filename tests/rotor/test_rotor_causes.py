@@ -1,0 +1,81 @@
+"""What is wrong in a record of a rotor is named, with what cannot be told apart from it, and nothing else is blamed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+import ambid
+from ambid.record import Record
+from ambid.rig import Rig
+from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
+
+pytestmark = needs_simulator
+
+
+@pytest.fixture(scope="module")
+def sound() -> tuple[Record, Rig]:
+    bench = replace(truth.BENCHES["rigid"], period=0.25)
+    return record_of(bench, 1), free_rig(bench)
+
+
+def changed(record: Record, **signals: Any) -> Record:
+    of = {c.name: signals.get(c.name, lambda x: x)(c.values) for c in record.channels}
+    return replace(record, channels=tuple(replace(c, values=of[c.name]) for c in record.channels))
+
+
+def moved(rig: Rig, **by: float) -> Rig:
+    """The rig with planes that are taken too large, in m; names with __ for the dot."""
+    known = tuple(
+        replace(p, value=(p.value or 0.0) + by.get(p.name.replace(".", "__"), 0.0)) if p.role == "fixed" else p
+        for p in rig.parameters
+    )
+    return replace(rig, parameters=known)
+
+
+def named(record: Record, rig: Rig, check: str) -> tuple[str, ...]:
+    """The cause that a check names, and its alternatives; nothing else of that kind fails."""
+    found = ambid.identify(record, rig)
+    agree = {k: c for k, c in found.checks.items() if k in ("fixed_agree", "sensors_agree")}
+    assert [k for k, c in agree.items() if not c.passed] == [check]
+    assert found.verdict.word != "usable"
+    return agree[check].cause, *agree[check].alternatives
+
+
+@pytest.mark.parametrize("role", ["ax_current", "ax_voltage"])
+def test_the_gain_of_a_current_or_voltage_is_named_and_no_position_blamed(sound: Any, role: str) -> None:
+    causes = named(changed(sound[0], **{role: lambda x: 1.05 * x}), sound[1], "sensors_agree")
+    assert set(causes) == {"ax_current.gain", "ax_voltage.gain"}
+
+
+def test_the_lag_of_a_current_is_named_and_no_mode_stands_in_for_it(sound: Any) -> None:
+    record, rig = sound
+    late = np.exp(-2.0 * np.pi * 2000.0 / record.rate_hz)
+    lagging = changed(record, ax_current=lambda x: lfilter([1.0 - late], [1.0, -late], x, zi=[late * x[0]])[0])
+    causes = named(lagging, rig, "sensors_agree")
+    assert causes[0] in ("ax_current.lag", "ax_voltage.lag")
+    assert set(causes) <= {"ax_current.lag", "ax_voltage.lag"}
+    assert not ambid.identify(lagging, rig).modes
+
+
+def test_two_planes_wrong_together_are_no_single_plane(sound: Any) -> None:
+    causes = named(sound[0], moved(sound[1], A__z_sensor=6e-3, B__z=6e-3), "fixed_agree")
+    assert "planes" in causes
+    assert not set(causes) & {"A.z", "B.z", "A.z_sensor", "B.z_sensor"}
+
+
+def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
+    """Without voltages a fixed mass sets the scale of all, and no record says anything against it."""
+    record, rig = sound
+    assert rig.rotor is not None
+    model = replace(rig.rotor, drives=("current",) * 4)
+    channels = tuple(replace(c, delay=0) for c in rig.channels if not c.role.endswith("_voltage"))
+    known = {p.name: p for p in rig.parameters} | {"m": replace(rig.parameter("m"), role="fixed", value=6.2)}
+    bare = replace(rig, rotor=model, channels=channels, parameters=tuple(known[p.name] for p in model.parameters))
+    found = ambid.identify(record, bare)
+    assert found.checks["fixed_agree"].passed, found.checks["fixed_agree"].detail
+    assert found.verdict.word == "usable"
