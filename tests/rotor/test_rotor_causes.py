@@ -79,3 +79,11 @@ def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
     found = ambid.identify(record, bare)
     assert found.checks["fixed_agree"].passed, found.checks["fixed_agree"].detail
     assert found.verdict.word == "usable"
+
+
+def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
+    record, rig = sound[0][0.0:0.45], sound[1]
+    assert ambid.identify(record, rig).verdict.word == "usable"
+    assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
+    causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")
+    assert causes[0] == "ax_position.gain"

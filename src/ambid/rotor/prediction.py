@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from ambid.arrays import Array
 from ambid.errors import EstimationError
-from ambid.estimation.likelihood import Fit, score_statistic, search
+from ambid.estimation.likelihood import Fit, extend, score_statistic, search
 from ambid.estimation.linear import directions, triangle_of
 from ambid.estimation.predictor import PredictorProblem, Scales, noise_floor
 from ambid.estimation.progress import Tick, silent
@@ -22,6 +22,7 @@ from ambid.record import Record
 from ambid.rig.rotor import RigModes
 from ambid.rotor.estimator import Ending, Starter, unknowns_at
 from ambid.rotor.likelihood import Experiment, Point
+from ambid.rotor.scores import Cause, Score, causes_of, scored
 from ambid.rotor.spectra import PeriodSpectra, windowed_spectra
 from ambid.rotor.unknowns import Unknowns
 
@@ -103,6 +104,63 @@ class Searched:
     def references(self, theta: Mapping[str, float]) -> Mapping[str, float]:
         """Return one for what may be zero: it is over its size already."""
         return {name: 1.0 for name in self.unknowns.linear if name in theta}
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
+class _Erring(Searched):
+    """The same with the sizes of causes, all zero, as further numbers."""
+
+    causes: Mapping[str, Cause]
+
+    def matrices(self, theta: Mapping[str, float]) -> StateSpace:
+        """Return the rotor's matrices."""
+        return super().matrices({k: x for k, x in theta.items() if k not in self.causes})
+
+    def derivative(self, theta: Mapping[str, float], parameter: str) -> StateSpace:
+        """Return the derivative by a number or by the size of a cause: of what is logged, y = C x, for it."""
+        own = {k: x for k, x in theta.items() if k not in self.causes}
+        if parameter not in self.causes:
+            return super().derivative(own, parameter)
+        at, _ = self.unknowns.unpack(self.vector(own), self.base.theta, self.base.delays)
+        space = self.rotor.matrices(at)
+        moved = StateSpace(A=0.0 * space.A, B=0.0 * space.B, E=0.0 * space.E, C=0.0 * space.C)
+        for error in self.causes[parameter].errors:
+            if error.kind == "fixed":
+                d = self.rotor.derivative(at, error.channel)
+                moved = StateSpace(A=moved.A + d.A, B=moved.B + d.B, E=moved.E + d.E, C=moved.C + d.C)
+            elif error.channel in self.inputs:
+                k = self.inputs.index(error.channel)
+                moved.B[:, k] -= space.B[:, k]
+            else:
+                k = self.outputs.index(error.channel)
+                row = {"gain": space.C[k], "lag": -space.C[k] @ space.A}
+                moved.C[k] += row[error.kind] if error.kind in row else space.C[self.outputs.index(error.other)]
+        return moved
+
+
+def predictor_scores(found: PredictorFit) -> list[Score]:
+    """Return the causes that the innovations may have: fixed numbers, gains, cross-talk, lags of positions."""
+    fit, searched = found.fit, found.fit.problem.model
+    assert isinstance(searched, Searched)
+    unseen = ("_current", "_voltage", "_command")  # lags of these move no matrix of the plant
+    causes = {
+        c.name: c for c in causes_of(searched.unknowns)
+        if c.errors and not any(e.kind == "lag" and e.channel.endswith(unseen) for e in c.errors)
+    }  # fmt: skip
+    old, n, more = fit.problem, fit.problem.n_physical, len(causes)
+    erring = _Erring(unknowns=searched.unknowns, base=searched.base, causes=causes)
+    problem = replace(
+        old, model=erring, estimated=(*old.estimated, *causes), magnitude=np.append(old.magnitude, np.ones(more)),
+        prior_mean=np.append(old.prior_mean, np.zeros(more)), prior_sd=np.append(old.prior_sd, np.full(more, np.inf)),
+        joint_priors=None,
+    )  # fmt: skip
+    rows = extend(fit, problem, np.insert(fit.vector, n, np.zeros(more)))
+    if rows is None:
+        return []
+    of_noise = np.zeros(problem.size, dtype=np.bool_)
+    of_noise[problem.slices["noise"]] = True  # levels take up a part of what is left out
+    of_noise[n : n + more] = True
+    return scored(tuple(causes.values()), rows[0][:, n : n + more], rows[0][:, ~of_noise], -rows[1], old.y.size)
 
 
 def predict_rotor(

@@ -18,6 +18,7 @@ from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import SensorError, electrical_errors, logged_error, position_errors
 from ambid.rotor.likelihood import Experiment, Likelihood, Point, Weight, sampled
 from ambid.rotor.spectra import PeriodSpectra
+from ambid.rotor.unknowns import Unknowns
 
 _FAR = 4.5
 _OWN = 1e-5  # part of a column outside the Jacobian's space, squared, below which the data do not tell it from J
@@ -58,9 +59,9 @@ class Score:
     gain: float  # by how much it would lower the sum of squares
 
 
-def causes_of(problem: Likelihood) -> tuple[Cause, ...]:
+def causes_of(unknowns: Unknowns) -> tuple[Cause, ...]:
     """Return what may be wrong: fixed numbers, both planes of a bearing, channels alone and together, eddy currents."""
-    model, known = problem.unknowns.model, [p.name for p in problem.unknowns.known if p.role == "fixed"]
+    model, known = unknowns.model, [p.name for p in unknowns.known if p.role == "fixed"]
     causes = [Cause(name=x, kind="fixed", errors=(SensorError(kind="fixed", channel=x),)) for x in known]
     for b in model.bearings:
         planes = (f"{b.name}.z", *(b.sensor_parameter(k) for k in range(len(b.z_sensors))))
@@ -78,14 +79,19 @@ def causes_of(problem: Likelihood) -> tuple[Cause, ...]:
 
 def scores(problem: Likelihood, v: Array) -> list[Score]:
     """Return the causes that the residuals may have, the surest first."""
-    rows, causes = problem.rows(v, corrected=True), causes_of(problem)
+    rows, causes = problem.rows(v, corrected=True), causes_of(problem.unknowns)
     C = np.concatenate(_by_cause(problem, v, causes, corrected=True))
     J, r = np.concatenate([block[:, :-1] for block in rows]), np.concatenate([block[:, -1] for block in rows])
+    return scored(causes, C, J, r, r.size)
+
+
+def scored(causes: Sequence[Cause], C: Array, J: Array, r: Array, n: int) -> list[Score]:
+    """Return scores by what each cause adds, C (n_rows, n_causes), slopes J and residuals r; `n`: real residuals."""
     inverse = directions(triangle_of([J])).inverse(1e-9)
     outside = C - J @ (inverse @ (J.T @ C))
     own, whole = np.sum(outside**2, axis=0), np.sum(C**2, axis=0)
     along = outside.T @ r
-    spread = np.sqrt(max(1.0, float(r @ r) / r.size))
+    spread = np.sqrt(max(1.0, float(r @ r) / n))
     found = [
         Score(cause=c, z=float(a / np.sqrt(o) / spread), size=float(a / o), gain=float(a * a / o))
         for c, a, o, w in zip(causes, along, own, whole, strict=True)

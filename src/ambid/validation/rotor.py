@@ -7,6 +7,7 @@ where sensor, current and voltage count in one direction; each axis has a bench'
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,7 +21,8 @@ from ambid.physics.linear_model import Parameter, model
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Record
 from ambid.rotor.conclusion import Evidence
-from ambid.rotor.prediction import PredictorFit
+from ambid.rotor.prediction import PredictorFit, predictor_scores
+from ambid.rotor.scores import agreement_checks
 from ambid.validation.physical import innovation_products, innovation_tests
 from ambid.validation.residuals import fit_of, uncorrelated_check, white_check
 
@@ -42,8 +44,24 @@ def of_predictor(found: PredictorFit) -> Evidence:
             role: OutputFit(one_step=float(a), simulation=None, innovation_sd=float(b))
             for role, a, b in zip(found.model.outputs, share, size, strict=True)
         },
-        checks={"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)},
+        checks={
+            "residuals_white": white_check(white),
+            "residuals_uncorrelated": uncorrelated_check(past),
+            **agreement_checks(predictor_scores(found), found.model),
+        },
     )
+
+
+def _or_late(checks: dict[str, Check], white: bool) -> dict[str, Check]:
+    """Return checks that name the lags of a coil's current and voltage, which innovations are not tested for, beside
+    their gains where the innovations are not white.
+    """
+    named = checks.get("sensors_agree")
+    if white or named is None or not named.cause.endswith(("_current.gain", "_voltage.gain")):
+        return checks
+    lags = tuple(f"{named.cause.split('_')[0]}_{x}.lag" for x in ("current", "voltage"))
+    text = f"{named.detail}; or by {' or '.join(lags)}"
+    return {**checks, "sensors_agree": replace(named, detail=text, alternatives=(*named.alternatives, *lags))}
 
 
 _LONGEST = 30.0  # m between planes: shafts of turbine sets
