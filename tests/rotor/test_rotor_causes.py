@@ -12,6 +12,7 @@ from scipy.signal import lfilter
 import ambid
 from ambid.record import Record
 from ambid.rig import Rig
+from ambid.rotor.spectra import find_slip
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -87,3 +88,22 @@ def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
     assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
     causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")
     assert causes[0] == "ax_position.gain"
+
+
+@pytest.mark.parametrize(("at", "logged"), [(0.35, True), (0.8, True), (0.35, False)])
+def test_lost_samples_are_named_by_the_phase_that_jumps(sound: Any, at: float, logged: bool) -> None:
+    record, rig = sound
+    kept = [c for c in record.channels if logged or not c.name.endswith("_reference")]
+    cut = tuple(replace(c, values=np.delete(c.values, slice(int(at * 1e4), int(at * 1e4) + 3))) for c in kept)
+    slip = find_slip(replace(record, channels=cut), rig.plant)
+    assert slip is not None
+    assert slip.samples == 3
+    assert slip.at_s == pytest.approx(at, abs=0.1)
+    assert find_slip(replace(record, channels=tuple(kept)), rig.plant) is None
+
+
+def test_a_record_that_lost_samples_is_not_usable(sound: Any) -> None:
+    cut = tuple(replace(c, values=np.delete(c.values, slice(8000, 8003))) for c in sound[0].channels)
+    found = ambid.identify(replace(sound[0], channels=cut), sound[1])
+    assert found.verdict.word != "usable"
+    assert (found.checks["samples_complete"].cause, found.checks["samples_complete"].size) == ("lost_samples", 3.0)

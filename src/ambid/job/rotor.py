@@ -322,7 +322,23 @@ def _plausible(estimate: RotorEstimate, rig: Rig, bench: Record) -> Mapping[str,
 
 
 def _record_checks(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:
-    """Judge the records themselves: saturation of the voltages."""
+    """Judge the records themselves: lost samples, saturation of the voltages."""
+    from ambid.rotor.spectra import find_slip
+
+    checks = dict[str, Check]()
+    for bench in benches:
+        slip = find_slip(bench, rig.plant)
+        if slip is not None:
+            what = "lacks {}" if slip.samples > 0 else "holds {} twice"
+            checks["samples_complete"] = Check(
+                passed=False, cause="lost_samples", size=float(slip.samples),
+                detail=f"{name_of(bench)} {what.format(counted(abs(slip.samples), 'sample'))} at about {slip.at_s:.3g} "
+                "s: the phase of the excitation jumps. Log without gaps, or use a part before or after",
+            )  # fmt: skip
+    return {**checks, **_saturation(benches, rig)}
+
+
+def _saturation(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:
     if rig.limits is None:
         return {}
     low, high = rig.limits.voltage

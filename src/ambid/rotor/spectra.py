@@ -24,6 +24,7 @@ _TRANSIENT = 5.0  # standard deviations by which a first period may differ from 
 LEAST_PERIODS = 2
 """Whole periods of a record whose spectra are used."""
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
+_SAME_COURSE = 0.4  # correlation of two periods from which they are one excitation
 _FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
 LEAST_LINES = 20
 """Lines of a rotor's record that are excited, at least."""
@@ -204,6 +205,47 @@ def experiments_of(record: Record, model: LinearModel) -> tuple[Record, ...]:
         return (record,)
     at = [*(record.start_s + edge * period / record.rate_hz for edge in edges[:-1]), None]
     return tuple(cut(record, first, last) for first, last in pairwise(at))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Slip:
+    """Where the phase of a periodic excitation jumps: samples that a log lost, negative where it holds some twice."""
+
+    at_s: float
+    samples: int
+
+
+def find_slip(record: Record, model: LinearModel) -> Slip | None:
+    """Return the jump of phase between the first period of a record and its last, by their correlation, None without.
+
+    The period is that of either half of the record: one of them holds no jump.
+    """
+    x, n, found = np.column_stack(_excitations(record, model) or [np.zeros(2)]), record.n_samples, dict[int, float]()
+    for half in (x[: n // 2], x[n // 2 :]):
+        try:
+            period = find_period(half)
+        except EstimationError:
+            continue
+        found[period] = float(np.mean((half[period:] - half[:-period]) ** 2))
+    if not found:
+        return None
+    period = min(found, key=lambda p: found[p])
+    first, last = (np.fft.rfft(part - part.mean(axis=0), axis=0) for part in (x[:period], _last(x, period)))
+    alike = np.fft.irfft(np.sum(first.conj() * last, axis=1), period)
+    power = float(np.prod([np.fft.irfft(np.sum(np.abs(x) ** 2, axis=1), period)[0] for x in (first, last)]) ** 0.5)
+    k = -((int(np.argmax(alike)) + period // 2) % period - period // 2)
+    if (
+        not k or alike.max() < _SAME_COURSE * power or power - alike.max() > 0.5 * (power - alike[0])
+    ):  # as noise moves it
+        return None
+    moved = np.sum((x[period:] - x[:-period]) ** 2, axis=1)
+    inside = int(np.flatnonzero(np.cumsum(moved) > 0.5 * moved.sum())[0]) + period // 2
+    return Slip(at_s=inside / record.rate_hz, samples=k)
+
+
+def _last(x: Array, period: int) -> Array:
+    """Return the last period in the phase of the first."""
+    return np.roll(x[-period:], (x.shape[0] - period) % period, axis=0)
 
 
 def _excitations(record: Record, model: LinearModel) -> list[Array]:
