@@ -107,3 +107,22 @@ def test_a_record_that_lost_samples_is_not_usable(sound: Any) -> None:
     found = ambid.identify(replace(sound[0], channels=cut), sound[1])
     assert found.verdict.word != "usable"
     assert (found.checks["samples_complete"].cause, found.checks["samples_complete"].size) == ("lost_samples", 3.0)
+
+
+@pytest.mark.parametrize("frequency", [52.0, 50.0, 151.3])
+def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
+    """On an excited line, between two, and between the lines of the whole record: all else stays as it was."""
+    record, rig = sound
+    hum = 2e-6 * np.sin(2.0 * np.pi * frequency * np.arange(record.n_samples) / record.rate_hz + 0.3)
+    found, plain = ambid.identify(changed(record, ax_position=lambda x: x + hum), rig), ambid.identify(record, rig)
+    assert found.verdict.word == "usable", found.verdict.reasons
+    said = [w for w in found.warnings if "lines were taken out" in w]
+    assert len(said) == 1
+    told, where = said[0].split("taken out: ")[1].split(". ")[0].split(" Hz in ")
+    assert float(told) == pytest.approx(frequency, abs=0.3)
+    assert where == "ax_position"
+    assert not [p.name for p in plain.parameters if abs(found[p.name].value - p.value) > p.sd]
+
+
+def test_a_sound_record_has_no_line(sound: Any) -> None:
+    assert not [w for w in ambid.identify(*sound).warnings if "lines" in w]

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from ambid.control.closed import ClosedLoop
     from ambid.rotor.conclusion import Evidence
     from ambid.rotor.estimator import RotorFit
+    from ambid.rotor.lines import Line
     from ambid.rotor.prediction import PredictorFit
     from ambid.rotor.replay import RotorReplay
     from ambid.rotor.spectra import Excitation, PeriodSpectra
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 _LEAST = 200  # samples
 _TURNING = ("angle", "speed", "tacho")
 _SAME_RATE = 1e-6
+_MOST_LINES = 20  # lines of hum that are taken out, about
 
 
 def identify_rotor(
@@ -134,23 +136,42 @@ def _from_periods(
     from ambid.rotor.conclusion import experiments_hint, of_periods
     from ambid.rotor.estimator import estimate_rotor
     from ambid.rotor.likelihood import Experiment
+    from ambid.rotor.lines import apart, find_lines, without_lines
     from ambid.rotor.spectra import period_spectra
 
     model = rig.rotor
     assert model is not None
-    experiments, remembered, warnings = [], [], list[str]()
-    for bench, speed, excitation in zip(benches, speeds, excitations, strict=True):
-        spectra = period_spectra(bench, model, excitation, speed)
-        experiments.append(Experiment(spectra=spectra, speed=speed))
+    remembered, warnings = [], list[str]()
+    lines: list[list[Line]] = [[] for _ in benches]
+    while True:
+        pairs = zip(benches, speeds, excitations, lines, strict=True)
+        experiments = [
+            Experiment(spectra=apart(period_spectra(bench, model, excitation, speed), out), speed=speed)
+            for bench, speed, excitation, out in pairs
+        ]
+        clock.lap("periods")
+        fit = estimate_rotor(experiments, model, rig.parameters, delays=_delays(rig), modes=rig.modes, tick=say)
+        clock.lap("fit")
+        order = [experiments.index(e) for e in fit.problem.experiments]
+        more = dict(zip(order, find_lines(fit), strict=True))
+        if not any(more.values()) or max(map(len, lines)) > _MOST_LINES:
+            break
+        roles = (*model.inputs, *model.outputs)
+        cleaned = [
+            without_lines(b, x, roles, more[k]) for k, (b, x) in enumerate(zip(benches, excitations, strict=True))
+        ]
+        benches, lines = [c[0] for c in cleaned], [[*a, *c[1]] for a, c in zip(lines, cleaned, strict=True)]
+    for bench, speed, e, found in zip(benches, speeds, experiments, lines, strict=True):
+        spectra = e.spectra
         remembered.append(
             {**origin(bench), "speed": speed, "periods": spectra.n_periods, "period_s": spectra.period / bench.rate_hz}
         )
         if spectra.dropped:
             lost = spectra.dropped / bench.rate_hz
             warnings.append(f"{name_of(bench)}: the first {lost:.4g} s were left out: a transient, or part of a period")
-    clock.lap("periods")
-    fit = estimate_rotor(experiments, model, rig.parameters, delays=_delays(rig), modes=rig.modes, tick=say)
-    clock.lap("fit")
+        if found:
+            said = ", ".join(f"{x.frequency_hz:.4g} Hz in {x.channel}" for x in found)
+            warnings.append(f"{name_of(bench)}: lines were taken out: {said}. Hum, motion of the base, or a tone")
     say("check")
     hint = experiments_hint(experiments, model)
     least = min(x.count for x in excitations)

@@ -73,14 +73,14 @@ def fit_noise(between: Between, response_between: Sampled, sampled: Sampled, bef
     each line (`sampled`); `before`: at a model nearby.
     """
     e = between.Y - (response_between.transfer() @ between.U[:, :, None])[:, :, 0]
-    g = _sources(response_between)  # (n_between, n_y, n_sources)
+    g = sources(response_between)  # (n_between, n_y, n_sources)
     power = np.real(np.einsum("kij,kij->kj", g.conj(), g))
     pulled = np.abs(np.einsum("kis,ki->ks", g.conj(), e)) ** 2 / np.maximum(power, 1e-300) ** 2
     alone = np.maximum(np.median(pulled, axis=0) / 2.0, 1e-300)
     least = _LEAST * alone
     levels = alone if before is None else before.levels
     for _ in range(_NOISE_STEPS):
-        back = np.linalg.solve(_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
+        back = np.linalg.solve(source_covariance(g, levels), np.concatenate([g, e[:, :, None]], axis=2))
         back, whitened = back[:, :, :-1], back[:, :, -1]
         power_of_sources = np.sum(np.abs(np.einsum("kis,ki->ks", g.conj(), whitened)) ** 2, axis=0)
         products = np.conj(np.swapaxes(g, 1, 2)) @ back
@@ -91,17 +91,18 @@ def fit_noise(between: Between, response_between: Sampled, sampled: Sampled, bef
         levels = np.maximum(levels * np.exp(step), least)
         if float(np.max(np.abs(step) * (levels > 2.0 * least))) < _NOISE_SETTLED:
             break
-    return Noise(levels=levels, covariance=_covariance(_sources(sampled), levels))
+    return Noise(levels=levels, covariance=source_covariance(sources(sampled), levels))
 
 
-def _sources(sampled: Sampled) -> Complex:
+def sources(sampled: Sampled) -> Complex:
     """Return what each source does to the outputs, (n_lines, n_y, n_sources): sensors, then disturbances."""
     g = sampled.disturbed()
     unit = np.broadcast_to(np.eye(g.shape[1], dtype=complex), (g.shape[0], g.shape[1], g.shape[1]))
     return np.concatenate([unit, g], axis=2)
 
 
-def _covariance(g: Complex, levels: Array) -> Complex:
+def source_covariance(g: Complex, levels: Array) -> Complex:
+    """Return the covariance of outputs by sources, (n_lines, n_y, n_y)."""
     return np.asarray((g * levels) @ np.conj(np.swapaxes(g, 1, 2)))
 
 

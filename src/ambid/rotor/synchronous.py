@@ -368,7 +368,7 @@ def _amplitudes(
     """
     n = y.shape[0]
     columns = np.column_stack([part for w in waves for part in (w.real, -w.imag)])
-    own, target = (_aperiodic(x, samples, periods) for x in (columns, y))
+    own, target = (aperiodic(x, samples, periods) for x in (columns, y))
     size = np.linalg.norm(own, axis=0) + 1e-300
     solved, *_ = np.linalg.lstsq(own / size, target, rcond=1e-9)
     solved = solved / size[:, None]
@@ -377,7 +377,7 @@ def _amplitudes(
     return solved[0::2] + 1j * solved[1::2], share, y - columns @ solved
 
 
-def _aperiodic(x: Array, samples: NDArray[np.intp], periods: int) -> Array:
+def aperiodic(x: Array, samples: NDArray[np.intp], periods: int) -> Array:
     """Return signals (n, n_channels) without the mean over their periods, `samples` lines of which stay."""
     if periods < 2:
         return x

@@ -1,0 +1,143 @@
+"""Lines that are none of the excitation, such as mains hum: found where the residuals of a fit stand out at a single
+frequency, told by the direction in which they point, and taken out of all channels by least squares.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ambid.arrays import Array, Complex
+from ambid.record import Record, Step
+from ambid.rotor.estimator import RotorFit
+from ambid.rotor.likelihood import Experiment, Point, Weight, sampled, source_covariance, sources
+from ambid.rotor.spectra import Excitation, PeriodSpectra
+from ambid.rotor.synchronous import aperiodic
+
+_STANDS_OUT = 8.0  # times the median of the lines around
+_AROUND, _NEAR = 20, 12  # lines on either side for that median, and of which it must hold nearly all power
+_NARROW = 0.8
+_LIKE, _ALONE = 8, 30.0  # excited lines on either side, over the largest of which one of them has to stand
+_APART = 3  # lines that two are apart
+_OF_ONE = 0.7  # part of a line's power from which it is of one channel
+_GRIDS, _POINTS = (1.0, 0.1, 0.01), 21  # lines of the whole record on either side within which a frequency is sought
+_BESIDE = (-9.5, -7.5, -5.5, 5.5, 7.5, 9.5)  # lines of the whole record away, where noise alone is
+_OWN = 1e-9  # part of a wave that is not periodic, below which it is one with an excited line
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Line:
+    """A line, and the channel that it is in: an output, a force, a voltage, or "several channels"."""
+
+    frequency_hz: float
+    channel: str
+
+
+def find_lines(fit: RotorFit) -> list[list[Line]]:
+    """Return the lines in each experiment of a fit, the largest first."""
+    pairs = zip(fit.problem.experiments, fit.problem.weights, strict=True)
+    return [_lines(fit, e, w) for e, w in pairs]
+
+
+def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
+    if weight.noise is None:
+        return []
+    at, spectra = fit.point, e.spectra
+    parts = [
+        _whitened(fit, e, at, weight.noise.levels, spectra.mean_u, np.sqrt(spectra.n_periods) * spectra.mean_y, False),
+        _whitened(fit, e, at, weight.noise.levels, spectra.between.U, spectra.between.Y, True),
+    ]
+    frequency = np.concatenate([spectra.frequency_hz, spectra.between.frequency_hz])
+    order = np.argsort(frequency)
+    frequency = frequency[order]
+    w, ways = (np.concatenate([p[k] for p in parts])[order] for k in (0, 1))
+    power, found, excited = np.sum(np.abs(w) ** 2, axis=1), dict[int, Line](), order < spectra.frequency_hz.size
+    at_lines = np.flatnonzero(excited)
+    for j in np.argsort(-power).tolist():
+        around = power[max(0, j - _AROUND) : j + _AROUND + 1]
+        if power[j] < _STANDS_OUT * float(np.median(around)):
+            break
+        near = power[max(0, j - _NEAR) : j + _NEAR + 1]
+        if excited[j]:  # what the model lacks shows at several lines
+            k = int(np.searchsorted(at_lines, j))
+            others = np.delete(at_lines[max(0, k - _LIKE) : k + _LIKE + 1], min(k, _LIKE))
+            if power[j] < _ALONE * float(power[others].max()):
+                continue
+        if any(abs(j - other) < _APART for other in found):
+            continue
+        if float(power[max(0, j - 1) : j + 2].sum()) > _NARROW * float(near.sum()):
+            shares = np.abs(np.sum(ways[j].conj() * w[j][:, None], axis=0)) ** 2
+            shares /= np.maximum(np.sum(np.abs(ways[j]) ** 2, axis=0), 1e-300)
+            k, names = int(np.argmax(shares)), (*fit.model.outputs, *fit.model.disturbances)
+            one = shares[k] > _OF_ONE * power[j]
+            found[j] = Line(frequency_hz=float(frequency[j]), channel=names[k] if one else "several channels")
+    return list(found.values())
+
+
+def _whitened(
+    fit: RotorFit, e: Experiment, at: Point, levels: Array, U: Complex, Y: Complex, between: bool
+) -> tuple[Complex, Complex]:
+    """Return whitened residuals (n, n_y) of one period's variance, and how each source shows, (n, n_y, n_sources)."""
+    of = sampled(e, fit.model, at, between=between)
+    scale = 1.0 if between else np.sqrt(e.spectra.n_periods)
+    left = Y - scale * (of.transfer() @ U[:, :, None])[:, :, 0]
+    g = sources(of)
+    root = np.linalg.inv(np.linalg.cholesky(source_covariance(g, levels)))
+    return np.asarray((root @ left[:, :, None])[:, :, 0], dtype=np.complex128), np.asarray(root @ g)
+
+
+def without_lines(
+    record: Record, excitation: Excitation, roles: Sequence[str], lines: Sequence[Line]
+) -> tuple[Record, tuple[Line, ...]]:
+    """Return a record without some lines, and these with their frequencies as the samples between the excited lines
+    show them. What is one with an excited line stays: that line is to be left out.
+    """
+    used = slice(excitation.first, excitation.first + excitation.count * excitation.period)
+    y = np.column_stack([record[role].values for role in roles])
+    size, t = np.std(y[used], axis=0), np.arange(-excitation.first, record.n_samples - excitation.first)
+    target = aperiodic(y[used] - y[used].mean(axis=0), np.zeros(0, dtype=np.intp), excitation.count) / size
+    step, taken, sharper = record.rate_hz / target.shape[0], np.zeros_like(y), list[Line]()
+    for line in lines:
+        f = line.frequency_hz
+        for reach in _GRIDS:
+            tried = f + reach * step * np.linspace(-1.0, 1.0, _POINTS)
+            f = float(max(tried, key=lambda x: _fitted(target, x / record.rate_hz, excitation.count)[1]))
+        a, explained = _fitted(target, f / record.rate_hz, excitation.count)
+        beside = [_fitted(target, (f + k * step) / record.rate_hz, excitation.count)[1] for k in _BESIDE]
+        if explained < _STANDS_OUT * float(np.median(beside)):
+            sharper.append(line)
+            continue
+        wave = np.exp(2j * np.pi * f / record.rate_hz * t)
+        target = target - aperiodic(np.real(wave[used, None] * a), np.zeros(0, dtype=np.intp), excitation.count)
+        taken += np.real(wave[:, None] * (a * size))
+        sharper.append(replace(line, frequency_hz=f))
+    channels = tuple(
+        replace(c, values=c.values - taken[:, roles.index(c.name)]) if c.name in roles else c for c in record.channels
+    )
+    done = Step(name="without_lines", settings={"frequency_hz": [x.frequency_hz for x in sharper]})
+    return replace(record, channels=channels, history=(*record.history, done)), tuple(sharper)
+
+
+def _fitted(target: Array, turns: float, periods: int) -> tuple[Complex, float]:
+    """Return the amplitude in each channel of a wave of some turns a sample, and the power that it explains."""
+    turn = 2.0 * np.pi * turns * np.arange(target.shape[0])
+    own = aperiodic(np.column_stack([np.cos(turn), -np.sin(turn)]), np.zeros(0, dtype=np.intp), periods)
+    gram = own.T @ own
+    if np.trace(gram) < _OWN * target.shape[0]:
+        return np.zeros(target.shape[1], dtype=complex), 0.0
+    along = own.T @ target
+    solved = np.linalg.lstsq(gram, along, rcond=1e-9)[0]
+    return solved[0] + 1j * solved[1], float(np.sum(solved * along))
+
+
+def apart(spectra: PeriodSpectra, lines: Sequence[Line]) -> PeriodSpectra:
+    """Return spectra without the excited lines that a line falls on, roughly within one of the whole record."""
+    reach = 1.5 * spectra.rate_hz / spectra.period / spectra.n_periods
+    far: NDArray[np.bool_] = np.ones(spectra.frequency_hz.size, dtype=np.bool_)
+    for line in lines:
+        far &= np.abs(spectra.frequency_hz - line.frequency_hz) >= reach
+    kept = spectra.lines(far)
+    return replace(kept, left_out_hz=np.sort(np.concatenate([kept.left_out_hz, spectra.frequency_hz[~far]])))
