@@ -238,7 +238,7 @@ class _Work:
                 more = model.with_modes(model.n_modes + 1)
                 trial = replace(at, theta=_with_mode(at.theta, more, missing.named(more.n_modes)))
                 trial, lower = self.rough(band, more, trial)
-                if not lower < 0.9 * cost:
+                if not lower < 0.9 * cost or _below(trial, band):
                     break
                 model, at, cost = more, trial, lower
             if edge >= last:
@@ -274,7 +274,7 @@ class _Work:
             trial, lower = self.rough(experiments, more, trial, relative=_REFINED)
         except np.linalg.LinAlgError:  # ran off
             return None
-        return (more, trial, lower) if (cost - lower) * n_real > price else None
+        return (more, trial, lower) if (cost - lower) * n_real > price and not _below(trial, experiments) else None
 
     def turn(self, fast: Sequence[Experiment], model: RotorModel, at: Point) -> Point:
         """Find polar inertia and gyroscopic terms of records at higher speeds by scans of the criterion."""
@@ -351,7 +351,8 @@ class _Work:
             return None
         # Weights follow the model: both are judged by those of the larger one.
         before = replace(fit.problem, weights=trial.problem.weights)
-        return trial if before.cost(fit.vector) - trial.cost > price else None
+        wanted = before.cost(fit.vector) - trial.cost > price and not _below(trial.point, experiments)
+        return trial if wanted else None
 
     def _sensors(self, band: Sequence[Experiment], model: RotorModel, at: Point, weights: Sequence[Weight]) -> float:
         """Return what a sensor at fault would explain, which no bending mode is to stand in for."""
@@ -388,6 +389,12 @@ class _Work:
                 if candidate is not None:
                     return candidate
         return scan(e, model, at, weight, (low, high))
+
+
+def _below(at: Point, experiments: Sequence[Experiment]) -> bool:
+    """Whether a mode ran below the lowest line: nothing of it shows there, and it stands in for something else."""
+    low = min(float(e.spectra.omega.min()) for e in experiments)
+    return any(x < low for name, x in at.theta.items() if name.startswith("mode") and name.endswith(".omega"))
 
 
 def _slowest(ordered: Sequence[Experiment]) -> list[Experiment]:
