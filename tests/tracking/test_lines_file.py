@@ -232,3 +232,35 @@ def test_warnings_of_the_start_come_back_and_a_header_without_them_is_read(tmp_p
     del document["warnings"]
     (tmp_path / "t.jsonl").write_text(json.dumps(document) + "\n", encoding="utf-8")
     assert read_track(tmp_path / "t.jsonl").header.warnings == ()
+
+
+def noticed(*times, kind="disturbed", **values):
+    """A line's events, noticed at times."""
+    return [Event(kind=kind, t=t - 0.01, why="", parameter="k_x", values={"detected": t, **values}) for t in times]
+
+
+def tallied(*events, until):
+    """A track that is sound but for its events, each in the line of the time at which it was noticed."""
+    line = TrackLine(t=until, parameters=header().start, error=1.0, state="tracking")
+    tally = Tally(header())
+    for e in events:
+        tally.add(replace(line, t=e.values.get("named", e.values["detected"]), events=(e,)))
+    tally.add(line)
+    return replace(track_of(seconds=0.2, every_s=0.1), lines=(line,), totals=tally.summary())
+
+
+def test_no_value_is_usable_while_disturbances_recur():
+    assert tallied(*noticed(1.0, 1.3, 1.6), until=2.0).verdict.word == "caution"
+    assert tallied(*noticed(1.0, 1.3, 1.6), until=3.2).verdict.word == "usable"
+    together = tallied(*noticed(1.0, 1.05, 1.1, 1.14), until=1.2)  # one thing, seen again and again
+    assert (together.totals.recurring, together.verdict.word) == (1, "usable")
+    found = tallied(*noticed(1.0, 1.3, 1.6), until=2.0)
+    assert [r.check for r in found.reasons] == ["disturbed"]
+    assert "3 times in the last 2 s" in found.reasons[0].text
+
+
+def test_a_change_that_turns_out_to_be_a_load_is_not_left_open():
+    (change,), (load,) = noticed(1.0, kind="change"), noticed(1.0, named=1.1)
+    assert tallied(change, until=2.0).verdict.word == "unusable"
+    assert tallied(change, load, until=2.0).totals.unanswered == ()
+    assert tallied(change, load, until=2.0).verdict.word == "usable"

@@ -112,7 +112,7 @@ class Follower:
             self._writer.summary(found)
             self._writer.close()
         if self.state.line is not None:
-            found = replace(found, unanswered=self.state.tally.open_changes)
+            found = replace(found, unanswered=self.state.tally.open_changes, recurring=self.state.tally.recurring)
             used = Followed(record=self.record, rate_hz=self.rate_hz, history=self.history, events=self.state.events)
             self.track = Track(header=self.state.header, lines=(self.state.line,), totals=found, used=used)
 

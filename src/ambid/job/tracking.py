@@ -214,7 +214,7 @@ def follow(
         )  # fmt: skip
     reporter.finish()
     summary = reporter.summary(computing_s=report.working_s, latency=report.latency, complete=not report.interrupted)
-    summary = replace(summary, unanswered=tally.open_changes)
+    summary = replace(summary, unanswered=tally.open_changes, recurring=tally.recurring)
     return Track(header=top, lines=tuple(lines), totals=summary)
 
 

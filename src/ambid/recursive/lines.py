@@ -16,6 +16,7 @@ from ambid.estimation.result import NORMAL_95, Reason, Result
 from ambid.physics.linear_model import model_names
 from ambid.settings.caller import setting
 
+RECENT_S, _OFTEN = 2.0, 3  # end of a record in which so many disturbances and changes leave no value to be trusted
 _VAGUE = 0.25  # relative standard deviation above which data do not show a parameter
 
 State = Literal["tracking", "frozen", "changed", "hold"]
@@ -146,6 +147,7 @@ class TrackSummary:
     update_s: float = 0.0
     # changes after which no new value of that parameter was accepted
     unanswered: tuple[Event, ...] = ()
+    recurring: int = 0  # times that a disturbance or a change was noticed in the last 2 s of record
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -198,6 +200,9 @@ class Track(Result):
         if last.state == "changed" and not self.totals.unanswered:
             text = "the record ends while the data contradict the published values. Track on, or identify again"
             found.append(Reason(check="change", text=text, grave=True))
+        if self.totals.recurring >= _OFTEN:
+            text = f"the bench was disturbed or changed {self.totals.recurring} times in the last {RECENT_S:g} s"
+            found.append(Reason(check="disturbed", text=f"{text}: the values may follow that. Track on"))
         if last.error > header.limit:
             text = f"the model error at the end is {last.error:.3g}, above the limit {header.limit:g}. Identify again"
             found.append(Reason(check="error", text=text, grave=True))

@@ -18,9 +18,10 @@ from ambid.errors import AmbidError, RecordError
 from ambid.estimation.estimate import fields_json, plain_json, read_as
 from ambid.estimation.result import NORMAL_95, Verdict
 from ambid.record.record import file_bytes
-from ambid.recursive.lines import Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
+from ambid.recursive.lines import RECENT_S, Event, Track, TrackedValue, TrackHeader, TrackLine, TrackSummary
 
 T = TypeVar("T")
+_APART_S = 0.15  # of record, within which what is noticed belongs together
 
 SCHEMA = "ambid.track/1"
 
@@ -179,6 +180,7 @@ class Tally:
         self._values = tuple(v.value for v in header.start.values()) or None
         self._changes: list[Event] = []
         self._open: dict[str | None, Event] = {}
+        self._alarms: deque[float] = deque()
         self.updates = self.rejected_samples = 0
         self.counts: Counter[str] = Counter()
 
@@ -186,6 +188,11 @@ class Tally:
     def open_changes(self) -> tuple[Event, ...]:
         """Changes after which no new value of that parameter was accepted."""
         return tuple(self._open.values())
+
+    @property
+    def recurring(self) -> int:
+        """Times that something was noticed in the last `RECENT_S`, as far as they lie apart."""
+        return sum(t > self._end_s - RECENT_S for t in self._alarms)
 
     def add(self, line: TrackLine) -> None:
         """Count one line."""
@@ -198,11 +205,19 @@ class Tally:
             self._values = values
         for event in line.events:
             self.counts[event.kind] += 1
+            noticed = event.values.get("detected") if event.kind in ("change", "disturbed") else None
+            if noticed is not None and (not self._alarms or noticed > self._alarms[-1] + _APART_S):
+                self._alarms.append(noticed)
+                while self._alarms[0] <= noticed - RECENT_S:
+                    self._alarms.popleft()
             if event.kind == "rejected":
                 self.rejected_samples += event.samples or 0
             elif event.kind == "change":
                 self._changes.append(event)
                 self._open[event.parameter] = event
+            elif event.kind == "disturbed" and "named" in event.values:  # what looked like a change was none
+                self._changes = [e for e in self._changes if e.t != event.t]
+                self._open = {name: e for name, e in self._open.items() if e.t != event.t}
             elif event.kind == "accepted" and event.parameter is None:  # all of them together
                 self._open.clear()
             elif event.kind == "accepted":
@@ -223,6 +238,7 @@ class Tally:
             counts=dict(self.counts),
             complete=complete,
             unanswered=self.open_changes,
+            recurring=self.recurring,
         )
 
 
