@@ -1,8 +1,8 @@
 """What a track makes of a bench that changes, and whether it calls itself usable while it is wrong.
 
-Each record is tracked as `ambid track` does. A line is judged as if the record ended there: it counts as wrong where the
-verdict is "usable" and a parameter is more than four standard deviations from the truth, from `AFTER_S` behind the end
-of what happens on (a drift, and disturbances that come again: behind its beginning).
+Each record is tracked as `ambid track` does. A line is judged as if the record ended there: it counts as wrong where
+the verdict is "usable" and a parameter is more than four standard deviations from the truth, from `AFTER_S` behind the
+beginning of what happens on; while disturbances come again it is wrong wherever it is usable.
 
 Alone: ``python bench/tracks.py [--bench heavy,light] [--only ramp,strength] [--seeds 10] [--json FILE]``.
 """
@@ -75,7 +75,9 @@ def _step(factor: float) -> tuple[tuple[float, float], ...]:
     return (AT_S, 1.0), (AT_S, factor)
 
 
-def _together(powers: Mapping[str, float], *knots: tuple[float, float]) -> Mapping[str, tuple[tuple[float, float], ...]]:
+def _together(
+    powers: Mapping[str, float], *knots: tuple[float, float]
+) -> Mapping[str, tuple[tuple[float, float], ...]]:
     """Every power of one factor; a course of many knots where a power is no line."""
     return {name: tuple((t, f**power) for t, f in knots) for name, power in powers.items()}
 
@@ -164,13 +166,14 @@ class Found:
     far_of: str
     usable: float  # share of judged lines that are usable
     inside: float  # share of values in judged lines whose interval holds the truth, of those that are not stale
+    width: float  # geometric mean of the standard deviations over those of the start
     events: tuple[str, ...]
 
 
 def judged(name: str, what: Happening, followed: Track) -> Found:
     """Hold each line against the truth, with the verdict that a record would have that ended with it."""
     truth, tally = _bench(name).parameters, Tally(followed.header)
-    usable, far, inside = list[bool](), list[tuple[float, str]](), list[float]()
+    usable, far, inside, width = list[bool](), list[tuple[float, str]](), list[float](), list[float]()
     z: dict[str, float] = {}
     for line in followed.lines:
         tally.add(line)
@@ -181,11 +184,13 @@ def judged(name: str, what: Happening, followed: Track) -> Found:
         worst = max(z, key=lambda n: abs(z[n]) if not line.parameters[n].stale else 0.0)
         usable.append(now.verdict.word == "usable")
         far.append((abs(z[worst]) if usable[-1] else 0.0, worst))
+        width += [np.log(line.parameters[n].sd / followed.header.start[n].sd) for n in z]
         inside += [abs(z[n]) < 1.96 for n in z if not line.parameters[n].stale]
     over = [z > FAR for z, _ in far]
     return Found(
         word=followed.verdict.word, z=z, wrong=float(np.mean(usable if what.recurring else over)), far=max(far)[0],
         far_of=max(far)[1], usable=float(np.mean(usable)), inside=float(np.mean(inside or [np.nan])),
+        width=float(np.exp(np.mean(width))),
         events=tuple(
             f"{e.t:.3f} {e.kind} {e.parameter or ''}: {e.why}"
             for line in followed.lines for e in line.events
@@ -220,7 +225,7 @@ def main() -> None:
     words.add_argument("--events", action="store_true")
     given, all_found = words.parse_args(), dict[str, object]()
     print("bench happening: words at the end; records with lines usable and wrong; largest |z| of a usable line;")
-    print("    median over records of max |z| at the end, its parameter; usable lines; coverage")
+    print("    median over records of max |z| at the end, its parameter; usable lines; coverage and widths")
     for bench in given.bench.split(","):
         for key in given.only.split(","):
             found = [tracked(bench, HAPPENINGS[key], s) for s in range(given.first, given.first + given.seeds)]
@@ -232,7 +237,7 @@ def main() -> None:
                 f" wrong {sum(f.wrong > 0 for f in found)} of {len(found)} ({np.mean([f.wrong for f in found]):.0%});"
                 f" {far.far:.1f} ({far.far_of}); end {np.median([abs(z) for _, z in ends]):.1f}"
                 f" ({','.join(sorted({n for n, _ in ends}))}); usable {np.mean([f.usable for f in found]):.0%};"
-                f" inside {np.nanmean([f.inside for f in found]):.0%}",
+                f" inside {np.nanmean([f.inside for f in found]):.0%}, sd {np.mean([f.width for f in found]):.2f}",
                 flush=True,
             )
             if given.events:

@@ -67,6 +67,47 @@ def test_a_load_that_comes_on_is_no_change_of_the_bench():
     assert run.lines[-1].state == "tracking"
 
 
+@pytest.mark.parametrize(
+    ("cause", "powers"), [("strength", {"k_i": 1, "k_x": 1, "L": 1}), ("bias", {"k_i": 1, "k_x": 2})]
+)
+def test_what_one_cause_moves_together_is_followed_together(cause, powers):
+    """By 3 %, of which each number alone shows little: a single one would be named, and the others stay wrong."""
+    factors = {name: 0.97**power for name, power in powers.items()}
+    moved = {name: Schedule.step(TRUE[name], TRUE[name] * f, AT) for name, f in factors.items()}
+    truth = {name: f * TRUE[name] for name, f in factors.items()}
+    for seed in (1, 2, 3):
+        run = tracked(simulated(moved, seconds=2.4, seed=seed), seed=seed)
+        for line in run.lines:
+            if line.t > AT + 0.5 and line.state == "tracking":
+                assert all(abs(run.z(line, n, truth.get(n, TRUE[n]))) < 4.0 for n in line.parameters)
+        assert run.lines[-1].state == "tracking"
+        assert any(cause in e.why for e in run.of("change", "accepted"))
+
+
+@pytest.mark.parametrize(("name", "seen_s"), [("R", 0.8), ("k_i", 0.5)])
+def test_a_drift_that_begins_keeps_its_band_honest(name, seen_s):
+    """3.3 % a second, as soon as the record can show it: half a second alone tells R to no better than 0.6 %."""
+    errors = []
+    for seed in (1, 2, 3, 4):
+        run = tracked(simulated(course(name, (2.1, 1.0), (3.3, 1.04)), seconds=3.3, seed=seed), seed=seed)
+        for line in run.lines:
+            true = {name: TRUE[name] * (1.0 + (line.t - 2.1) / 30.0)}
+            errors += [run.z(line, n, true.get(n, TRUE[n])) for n in line.parameters if line.t > 2.1 + seen_s]
+    assert np.mean(np.abs(errors) < 4.0) > 0.99
+
+
+def test_a_load_that_ramps_up_moves_no_parameter():
+    for seed in (1, 2):
+        run = tracked(
+            simulated(force=Schedule(times_s=(1.5, 2.5), values=(0.0, 5.0)), seconds=2.8, seed=seed), seed=seed
+        )
+        assert run.of("accepted", "disturbed")
+        for line in run.lines:
+            if line.t > 2.0 and line.state == "tracking":
+                assert all(abs(run.z(line, n, TRUE[n])) < 4.5 for n in line.parameters)
+        assert near(run, 2.8) == {}
+
+
 def test_two_parameters_at_once_and_one_after_the_other():
     both = tracked(simulated({**step("k_i", 0.85, AT), **step("R", 1.2, AT)}, seconds=2.2))
     assert {e.parameter for e in both.of("change")} >= {"k_i"}
@@ -232,8 +273,9 @@ def test_a_long_gap_makes_numbers_stale_and_a_change_in_it_is_found(jump):
     assert all(v.stale for v in run.at(2.7).parameters.values())
     steps = np.diff([line.t for line in run.lines])
     assert steps == pytest.approx(0.01)
-    (change,) = run.of("change")
-    assert change.parameter == "k_i"
+    change = run.of("change")[-1]  # a name may be mended once, when more data are there
+    assert (change.parameter, len(run.of("change")) <= 2) == ("k_i", True)
+    assert {e.t for e in run.of("change")} == {change.t}
     assert 2.79 < change.t < 2.9
     assert near(run, 3.5, k_i=0.85 * TRUE["k_i"]) == {}
 

@@ -100,12 +100,13 @@ class Diagnosis:
     ) -> None:
         numbers, imperfect = rpem.numbers, rpem.numbers.overdispersion
         self._rpem, self._publication, self._log, self._t0 = rpem, publication, log, t0
-        kinds = dict(zip(numbers.names, numbers.kinds, strict=True))
+        kinds = {**dict(zip(numbers.names, numbers.kinds, strict=True)), **dict.fromkeys(numbers.joints, "parameter")}
         self._kinds = kinds
         self._bench = tuple(n for n, kind in kinds.items() if kind in _BENCH)
         self._detector = ChangeDetector(
             numbers.names,
-            hypotheses=[n for n, kind in kinds.items() if kind != "noise"],
+            hypotheses=[n for n in numbers.names if kinds[n] != "noise"],
+            joints={cause: numbers.direction(cause) for cause in numbers.joints},
             block_s=rpem.block_s,
             false_alarms_per_hour=false_alarms_per_hour,
             longest_s=LONGEST_S,
@@ -170,9 +171,11 @@ class Diagnosis:
                 self._search(Event(kind="disturbed", t=t, why=why, values={"detected": t}), sample, self._bench)
             return False
         self._detector.drift = rpem.drift.variance * rpem.block_s
+        self._detector.walking = rpem.drift.risen * rpem.block_s
         alarm = self._detector.update(evidence, rpem.filter.q, rpem.filter.covariance)
         if alarm is not None:
             return False if self._undecided(alarm) else self._alarmed(alarm, evidence, t)
+        rpem.drift.suspected |= self._detector.suspected
         self._waited = 0
         if self.unexplained.blocks and unexplained(evidence) <= WILD * self._detector.noise:
             self.unexplained.over()
@@ -214,21 +217,23 @@ class Diagnosis:
         self.unexplained.over()
         self._publication.restart()
         if name is not None and kind in _DISTURBED:
-            self._rpem.filter.widen(self._rpem.numbers.names.index(name), _STRAY * abs(alarm.size))
+            self._rpem.filter.widen(self._rpem.numbers.direction(name), _STRAY * abs(alarm.size))
+            self._rpem.drift.suspected |= self._rpem.numbers.direction(name) != 0.0  # it may go on as it has begun
             self._detector.restart(self._rpem.stream.sample)
             self.settling = True
             return alarm.blocks > 1  # in its own block the jump has a beginning: that says nothing of what holds now
         if alarm.kind != "moved" and alarm.blocks > _SUDDEN:  # nothing jumped: the recursion has to follow
+            self._rpem.drift.suspected[:] = True
             self._detector.restart(self._rpem.stream.sample)
             return True
         suspects = self._bench  # a fault of one thing is likelier than of several at once
         if name is not None and kind in _BENCH:
             self.changes.append(event)
             if alarm.blocks > _SUDDEN:
-                drift, place = self._rpem.drift, self._rpem.numbers.names.index(name)
+                drift = self._rpem.drift
                 if drift.adapts:  # it may go on as it has begun
-                    faster = alarm.size**2 / (alarm.blocks * self._rpem.block_s)
-                    drift.variance[place] = max(drift.variance[place], faster)
+                    faster = (alarm.size * self._rpem.numbers.direction(name)) ** 2
+                    drift.variance = np.maximum(drift.variance, faster / (alarm.blocks * self._rpem.block_s))
             suspects = (name, *[n for n, _ in alarm.rivals if self._kind(n) in _BENCH][:2])
         self._search(event, alarm.onset, suspects, size=alarm.size, blocks=alarm.blocks)
         return False
@@ -279,8 +284,9 @@ class Diagnosis:
             self.unexplained.count(unexplained(evidence))
             self._no_change(t)
         elif self._recovery.attempts >= _ATTEMPTS:
-            for place in self._rpem.numbers.places("parameter"):  # the recursion has to find what no search has
-                self._rpem.filter.widen(int(place), _UNKNOWN)
+            numbers = self._rpem.numbers
+            for place in numbers.places("parameter"):  # the recursion has to find what no search has
+                self._rpem.filter.widen(numbers.direction(numbers.names[place]), _UNKNOWN)
             why = "nothing explains the data after the change; all parameters are re-estimated"
             self._log.add(Event(kind="disturbed", t=t, why=why))
             self._fresh_start()
@@ -298,26 +304,26 @@ class Diagnosis:
         self.unexplained.over()
         self._name(recovered, t)
         self._fresh_start()
-        names = ", ".join(recovered.moved)
         if all(self._kind(name) in _DISTURBED for name in recovered.moved):
             self.settling = True
             return
-        why = f"{names} re-estimated from the samples after the change"
+        why = f"{recovered.text} re-estimated from the samples after the change"
         self._publication.propose(t, why)
         self._publication.unconfirmed = self.renewed = True
 
     def _name(self, recovered: Recovered, t: float) -> None:
         """Say which number moved where the alarm has not, or has named another: more data are there now."""
         assert self._recovery is not None
-        rpem, before = self._rpem, self._recovery.before
-        places = [rpem.numbers.names.index(name) for name in recovered.moved]
-        moves = [abs(rpem.filter.q[j] - before.q[j]) / rpem.filter.sd[j] for j in places]
-        name = recovered.moved[int(np.argmax(moves))]
-        first = self._recovery.event
+        name, first = recovered.moved[0], self._recovery.event
+        if recovered.together:
+            rpem, before = self._rpem, self._recovery.before
+            places = [rpem.numbers.names.index(name) for name in recovered.moved]
+            moves = [abs(rpem.filter.q[j] - before.q[j]) / rpem.filter.sd[j] for j in places]
+            name = recovered.moved[int(np.argmax(moves))]
         if first.kind == "change" and first.parameter == name:
             return
         disturbed = self._kind(name) in _DISTURBED
-        what = f"a change of {', '.join(recovered.moved)} explains the data that followed"
+        what = f"a change of {recovered.text} explains the data that followed"
         event = Event(
             kind="disturbed" if disturbed else "change",
             t=first.t,
@@ -325,11 +331,9 @@ class Diagnosis:
             why=f"{what}; at first: {first.why}",
             values={**first.values, "named": t},
         )
-        if disturbed:
-            pass
-        elif first.kind == "change":
-            self.changes[-1] = event
-        else:
+        if first.kind == "change":
+            self.changes.pop()
+        if not disturbed:
             self.changes.append(event)
         self._log.add(event)
 

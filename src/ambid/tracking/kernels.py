@@ -282,21 +282,24 @@ def whiten(T: Array, before: Array, drift: Array, blocks: int, M: Array, X: Arra
 
 @compiled(error_model="numpy")
 def _test(
-    X: Array, rest: float, freedom: float, learned: Array, marks: Array, tested: Counts, gain: float, noise: float,
-    row: Array,
+    X: Array, rest: float, freedom: float, learned: Array, marks: Array, toward: Array, gain: float, noise: float,
+    blur: float, row: Array,
 ) -> None:  # fmt: skip
     """Test one whitened window, and learn from it if `gain` is positive; see `watch` for `row`."""
-    p, joint = X.shape[0], tested.size
+    p, joint = X.shape[0], toward.shape[0]
     level = joint + 1
     spread = rest / freedom if freedom >= 1.0 else 0.0
     row[3], row[4] = -1.0, 0.0
     for t in range(level + 1):
         b, v, raw, scale = 0.0, 0.0, 0.0, math.exp(learned[t])
         if t < joint:
-            j = tested[t]
             for i in range(p):
-                b += X[i, j] * X[i, p]
-                v += X[i, j] * X[i, j]
+                a = 0.0
+                for j in range(p):
+                    if toward[t, j] != 0.0:
+                        a += X[i, j] * toward[t, j]
+                b += a * X[i, p]
+                v += a * a
             if v > 1e-30:
                 raw = b * b / v
         elif t == joint:
@@ -305,6 +308,8 @@ def _test(
         elif freedom >= 1.0:  # a standard normal number for rest/freedom of a chi-squared rest (Wilson, Hilferty 1931)
             v = 2.0 / (9.0 * freedom)
             raw = ((spread / noise) ** (1.0 / 3.0) - (1.0 - v)) ** 2 / v
+        if t < level:
+            raw /= blur
         if gain > 0.0:  # so that a share `_QUANTILE` lies above the mark times the scale, which is at least one
             step = gain * ((1.0 if raw > marks[1, t] * scale else 0.0) - _QUANTILE)
             learned[t] = max(learned[t] + step, 0.0)
@@ -313,7 +318,7 @@ def _test(
         now = raw / scale
         row[10 + t] = now
         if t < joint and now > row[4]:
-            row[3], row[4], row[5], row[6] = float(t), now, -b / v, math.sqrt(scale / v)
+            row[3], row[4], row[5], row[6] = float(t), now, -b / v, math.sqrt(scale * blur / v)
     row[7], row[8], row[9] = row[10 + joint], row[10 + level], spread / noise
     passed = row[4] > marks[0, 0] or row[7] > marks[0, joint] or row[8] > marks[0, level]
     row[0] = 1.0 if passed else 0.0
@@ -335,17 +340,19 @@ def _gather(base: Array, m: int, acc: Array, other: Array) -> None:
 
 @compiled(error_model="numpy")
 def watch(
-    bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array, tested: Counts,
-    drift: Array, longest: int, gain: float, noise: float, acc: Array, other: Array, M: Array, X: Array, tests: Array,
+    bases: Array, notes: Array, counts: Counts, history: Array, learned: Array, marks: Array, toward: Array,
+    drift: Array, walking: Array, longest: int, gain: float, noise: float, acc: Array, other: Array, M: Array, X: Array,
+    tests: Array,
 ) -> bool:  # fmt: skip
     """Test the windows that end with the newest block, learn how much larger than chance quiet statistics are; return
     whether any passed. `bases` (4 levels, p, p + 1): each level's last four triangles [J r] of 2^level blocks, `counts`
     (levels,) so far; `notes` (4 levels, 4): rest, freedom, first sample, first block. `history` (ring, p, p + 1): [P q]
     before each block, q relative to the triangles' point. `learned` (windows, tests): log of overdispersion; `marks`
-    (2, tests): thresholds, and points that few quiet statistics pass; `tested`: column of each hypothesis; `drift`:
-    variance per block; `longest` window, blocks; `gain` of learning, below 0 while settling; `noise` level. `tests`
-    (windows, 10 + tests): passed, blocks, first sample, likeliest hypothesis, its statistic, size, sd, joint, rest,
-    noise; all statistics. `acc` (p, p + 1), `other` (p + 1, p), `M` (p, p), `X` (p, p + 1) are scratch.
+    (2, tests): thresholds, and points that few quiet statistics pass; `toward` (hypotheses, p): move of the numbers by
+    each; `drift`: variance per block; `walking` (p,): that part of it which blurs a window; `longest` window, blocks;
+    `gain` of learning, below 0 while settling; `noise` level. `tests` (windows, 10 + tests): passed, blocks, first
+    sample, likeliest hypothesis, its statistic, size, sd, joint, rest, noise; all statistics. `acc` (p, p + 1), `other`
+    (p + 1, p), `M` (p, p), `X` (p, p + 1) are scratch.
     """
     levels, alarm = counts.size, False
     for level in range(levels):
@@ -372,7 +379,12 @@ def watch(
             whiten(acc, history[int(note[3]) % history.shape[0]], drift, length, M, X)
             window = m - 1 if level == 0 else 2 * level + m - 1
             tests[window, 1], tests[window, 2] = length, note[2]
-            _test(X, rest, freedom, learned[window], marks, tested, speed, noise, tests[window])
+            blur = 1.0  # what walks within a window shows in the other numbers, and not as a jump before it
+            for j in range(acc.shape[0]):
+                if walking[j] > 0.0:
+                    for i in range(j + 1):
+                        blur += walking[j] * acc[i, j] * acc[i, j]
+            _test(X, rest, freedom, learned[window], marks, toward, speed, noise, blur, tests[window])
             alarm = alarm or tests[window, 0] > 0.0
         if n_bases % 2 == 1 or level + 1 == levels:
             break

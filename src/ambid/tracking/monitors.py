@@ -193,6 +193,8 @@ _PASSED = 0.03  # share of quiet statistics above the point by which overdispers
 _GAIN, _NOISE_GAIN = 0.002, 2e-4  # per test, per block: of learning overdispersion and noise level
 _TESTS: dict[int, tuple[Literal["number", "all", "noise"], int]] = {1: ("number", 0), 2: ("all", -2), 3: ("noise", -1)}
 _RAISED = 1.5  # level of the unexplained part, over its usual one, from which no number is named
+_WITHIN = 6.0  # variance of a walk of many steps about its mean, over a step's and their number
+_SLOW, _DRIFTS = 16, 9.0  # blocks of a window, and statistic of a number in it, from which it may have begun to drift
 _SETTLE_NOISE = 25.0  # blocks after which the noise level is learned slower and slower while settling
 
 
@@ -255,11 +257,12 @@ class ChangeDetector:
     or a window's unexplained part per degree of freedom where larger (rising noise looks like no parameter). Without
     several times as many rows a block (samples times outputs) as numbers the second guard is not there.
 
-    `names`: all numbers of the evidence; `block_s`, `longest_s`: a block and the longest window, s;
-    `false_alarms_per_hour`: in quiet running with Gaussian evidence; `drift`: (p,), or float; `threshold`: of T_j;
-    `windows`: lengths, blocks; `overdispersion`: where learning starts, then (n_windows, n_hypotheses + 2), the last
-    two all numbers together and the unexplained part; `noise`: its usual level per degree of freedom. May be set again
-    any time.
+    `names`: all numbers of the evidence; `joints`: causes that move several of them, each with the direction (p,);
+    `block_s`, `longest_s`: a block and the longest window, s; `false_alarms_per_hour`: in quiet running with Gaussian
+    evidence; `drift`: (p,), or float; `walking`: (p,), that part of it which blurs a window; `suspected`: (p,), which
+    numbers seem to have begun to drift; `threshold`: of T_j; `windows`: lengths, blocks; `overdispersion`: where
+    learning starts, then (n_windows, n_hypotheses + 2), the last two all numbers together and the unexplained part;
+    `noise`: its usual level per degree of freedom. May be set again any time.
     """
 
     def __init__(
@@ -268,6 +271,7 @@ class ChangeDetector:
         *,
         block_s: float,
         hypotheses: Sequence[str] | None = None,
+        joints: Mapping[str, Array] | None = None,
         false_alarms_per_hour: float = 0.05,
         longest_s: float = 0.5,
         drift: ArrayLike | None = None,
@@ -276,9 +280,10 @@ class ChangeDetector:
         margin: float = 9.2,
     ) -> None:
         self.names = tuple(names)
-        self.hypotheses = self.names if hypotheses is None else tuple(hypotheses)
+        joints = joints or {}
+        self.hypotheses = (*(self.names if hypotheses is None else hypotheses), *joints)
         for name in self.hypotheses:
-            if name not in self.names:
+            if name not in self.names and name not in joints:
                 raise EstimationError(f"hypothesis {name!r} is not a tracked parameter.{nearest(name, self.names)}")
         if not (block_s > 0 and false_alarms_per_hour > 0 and overdispersion >= 1):
             raise EstimationError(
@@ -293,13 +298,18 @@ class ChangeDetector:
         hourly = 3600.0 / block_s * per_block * tests * _INDEPENDENT
         self._marks = _marks(tests, p, min(false_alarms_per_hour / hourly, 0.01))
         self.threshold = float(self._marks[0, 0])
-        self._tested = np.array([self.names.index(h) for h in self.hypotheses], dtype=np.int64)
+        self._toward = np.array(
+            [joints[h] if h in joints else [float(n == h) for n in self.names] for h in self.hypotheses]
+        ).reshape(-1, p)
+        self._long = np.array([n >= _SLOW for n in self.windows] + [False] * (len(lengths) - len(self.windows)))
+        self.suspected = np.zeros(p, dtype=np.bool_)
         self._bases, self._notes = np.zeros((4 * levels, p, p + 1)), np.zeros((4 * levels, 4))
         self._counts, self._blocks, self._point = np.zeros(levels, dtype=np.int64), 0, np.zeros(p)
         self._history = np.zeros((longest + 2, p, p + 1))
         self._learned = np.full((len(lengths), tests), math.log(overdispersion))
         self._drift = np.zeros(p)
         self.drift = self._drift if drift is None else drift
+        self.walking = np.zeros(p)
         self.noise, self._longest = overdispersion, longest
         self._wait = 0  # blocks until statistics are quiet again
         self._scratch = np.zeros((p, p + 1)), np.zeros((p + 1, p)), np.zeros((p, p)), np.zeros((p, p + 1))
@@ -343,12 +353,14 @@ class ChangeDetector:
         self._blocks += 1
         settling, calm = self._seen < self._settle, self._wait <= 0
         self._seen += 1
-        self._found[:, 0] = 0.0
+        self._found[:, 0] = self._found[:, 10:] = 0.0
         passed = watch(
-            self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._tested,
-            self._drift, self._longest, (-1.0 if settling else _GAIN) if calm else 0.0, self.noise, *self._scratch,
-            self._found,
+            self._bases, self._notes, self._counts, self._history, self._learned, self._marks, self._toward,
+            self._drift, self.walking / _WITHIN, self._longest, (-1.0 if settling else _GAIN) if calm else 0.0,
+            self.noise, *self._scratch, self._found,
         )  # fmt: skip
+        drifts = self._found[self._long, 10 : 10 + len(self.hypotheses)].max(axis=0, initial=0.0) > _DRIFTS
+        self.suspected = np.any(self._toward[drifts], axis=0)
         if passed and not settling:
             self._wait = self._longest
             return self._alarm(evidence.last)

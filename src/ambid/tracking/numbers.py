@@ -185,6 +185,8 @@ def amplitude_and_phase(a: float, b: float, covariance: Array) -> tuple[float, f
 Kind = Literal["parameter", "gain", "noise", "offset", "unbalance"]
 
 UNBALANCE = ("unbalance_cos", "unbalance_sin")
+# what one cause moves together, each number by a power of its factor: the flux of the magnets, the bias of a pair
+JOINT = {"strength": {"k_i": 1.0, "k_x": 1.0, "L": 1.0}, "bias": {"k_i": 1.0, "k_x": 2.0}}
 _WIDE = 0.15  # relative standard deviation above which a first-order step is too long
 _GAIN_KNOWN = 1e-6  # of a sensor's gain as long as no fault is found
 _OFFSET_SD = 1e3  # disturbance scales: nothing is known of an offset
@@ -230,6 +232,19 @@ class TrackedNumbers:
     def places(self, *kinds: Kind) -> NDArray[np.int64]:
         """Return where the numbers of some kinds stand in q, (n_places,)."""
         return np.array([j for j, k in enumerate(self.kinds) if k in kinds], dtype=np.int64)
+
+    @property
+    def joints(self) -> tuple[str, ...]:
+        """Causes that move several of the parameters."""
+        own = [self.names[j] for j in self.places("parameter")]
+        return tuple(cause for cause, moved in JOINT.items() if sum(name in own for name in moved) > 1)
+
+    def direction(self, name: str) -> Array:
+        """Return how q moves, (p,), with one of its numbers, or with the factor of a joint cause around the start."""
+        powers = JOINT.get(name, {})
+        if not powers:
+            return np.array([float(n == name) for n in self.names])
+        return np.array([powers.get(n, 0.0) * at for n, at in zip(self.names, self.start, strict=True)])
 
     def values(self, q: Array) -> dict[str, float]:
         """Return the numbers q (p,) in SI units."""

@@ -25,6 +25,8 @@ _SHOWN = 4.0  # standard deviations by which the innovations of a block are larg
 _FEW = 3  # suspects that are searched in full
 _MISFIT = 4.0  # times the number of unknowns: what a right explanation's misfit hardly passes
 _LEFT = 2.0  # times the usual variance of innovations that a right explanation may leave, as it is over few blocks
+_NEAR = 30.0  # of twice the log-likelihood that a suspect may fall behind to first order to be searched as well
+_ALIKE = 9.2  # by which misfits differ by chance in one of a hundred cases
 _TOLD = 25.0  # by which a number has to lessen the misfit to be named where the alarm named none
 _VAGUE = 0.1  # relative standard deviation above which nothing is said to have been found
 _QUIET = 3.0  # standard deviations of chi-squared under which what was known before explains a stretch
@@ -137,8 +139,14 @@ class Recovered:
     """Numbers found again."""
 
     refined: Refined | None  # none where nothing has moved
-    moved: tuple[str, ...]  # numbers that were freed
+    moved: tuple[str, ...]  # numbers and joint causes that were freed, the best explanation first
+    together: bool  # whether all of them are the explanation; else each may be
     computing_s: float
+
+    @property
+    def text(self) -> str:
+        """What may have moved, in words."""
+        return (", " if self.together else " or ").join(self.moved)
 
 
 @dataclass(slots=True, kw_only=True, eq=False)
@@ -172,7 +180,8 @@ class Recovery:
         best = None if evidence is None else self._explanation(rpem, samples, evidence)
         if best is None:
             return None
-        return Recovered(refined=best[0], moved=best[1], computing_s=time.thread_time() - begun)
+        refined, moved, together = best
+        return Recovered(refined=refined, moved=moved, together=together, computing_s=time.thread_time() - begun)
 
     def restart(self, sample: int, rpem: PhysicalRpem) -> None:
         """Wait for samples from `sample` on, behind a gap: those before it cannot be used together with them."""
@@ -182,48 +191,60 @@ class Recovery:
 
     def _explanation(
         self, rpem: PhysicalRpem, samples: Samples, evidence: Evidence
-    ) -> tuple[Refined | None, tuple[str, ...]] | None:
-        """What explains the samples since the onset, if anything does: nothing has moved, one number has, or all."""
+    ) -> tuple[Refined | None, tuple[str, ...], bool] | None:
+        """What explains the samples since the onset, if anything does: nothing has moved, one cause has, of several
+        that explain them alike any may have, or all numbers moved.
+        """
         p = rpem.numbers.start.size
         before = self.before.copy().absorb(evidence, rpem.noise)  # chi-squared if nothing has moved
         if self.short and self.attempts == 1 and before < p + _QUIET * np.sqrt(2.0 * p):
-            return None, ()
+            return None, (), False
         numbers = rpem.numbers
         choices = [(name,) for name in self._likeliest(rpem, evidence)]
         if self.event.kind != "change" or self.attempts > 1:  # it may have been a load after all
             choices.append(tuple(numbers.names[j] for j in numbers.places("offset", "unbalance")))
-        best = self._best(rpem, samples, choices)
-        if best is None or best[0].misfit >= _MISFIT * p:
-            every = tuple(numbers.names[j] for j in numbers.places("parameter"))
-            best = self._best(rpem, samples, [every])
-        if best is None or best[0].misfit >= _MISFIT * p:
+        found = self._searched(rpem, samples, choices)
+        together = not found or len(found[0][1]) > 1
+        if found and found[0][0].misfit < _MISFIT * p:
+            alike = [freed for refined, freed in found if refined.misfit < found[0][0].misfit + _ALIKE]
+            if len(alike) > 1:  # what later data will tell apart stays free until then
+                together = False
+                found = self._searched(rpem, samples, [tuple(dict.fromkeys(name for freed in alike for name in freed))])
+        else:
+            together = True
+            found = self._searched(rpem, samples, [tuple(numbers.names[j] for j in numbers.places("parameter"))])
+        if not found or found[0][0].misfit >= _MISFIT * p:
             return None
-        if self.event.kind != "change" and before - best[0].misfit < _TOLD and before < _MISFIT * p:
-            return None, ()
-        return best
+        if self.event.kind != "change" and before - found[0][0].misfit < _TOLD and before < _MISFIT * p:
+            return None, (), False
+        return *found[0], together
 
     def _likeliest(self, rpem: PhysicalRpem, evidence: Evidence) -> tuple[str, ...]:
-        """Of many suspects those few that explain the stretch best to first order."""
-        if len(self.suspects) <= _FEW:
-            return self.suspects
+        """The suspects, and what else explains the stretch about as well as the best of them to first order; of many
+        those few that do best.
+        """
+        numbers = rpem.numbers
         rho, spread = evidence.residual(self.before.q), evidence.J @ self.before.covariance @ evidence.J.T
-        places = [rpem.numbers.names.index(name) for name in self.suspects]
-        toward = evidence.J[:, places]
+        jumps = numbers.places("parameter", "gain", "offset", "unbalance")
+        bench = (*(numbers.names[j] for j in jumps), *numbers.joints)
+        toward = evidence.J @ np.column_stack([numbers.direction(name) for name in bench])
         weighted = np.linalg.solve(rpem.noise * np.eye(rho.size) + spread, np.column_stack([rho, toward]))
         power = np.einsum("ij,ij->j", toward, weighted[:, 1:])
         gain = (toward.T @ weighted[:, 0]) ** 2 / np.where(power > 0.0, power, np.inf)
-        return tuple(self.suspects[j] for j in np.argsort(-gain)[:_FEW])
+        ranked = [bench[j] for j in np.argsort(-gain) if gain[j] > gain.max() - _NEAR]
+        named = self.suspects if len(self.suspects) <= _FEW else ()
+        return tuple(dict.fromkeys((*named, *ranked)))[: max(_FEW, len(named) + 1)]
 
-    def _best(
+    def _searched(
         self, rpem: PhysicalRpem, samples: Samples, choices: Sequence[tuple[str, ...]]
-    ) -> tuple[Refined, tuple[str, ...]] | None:
-        """Of several sets of numbers that may be freed, the one that explains the stretch best."""
-        numbers, best = rpem.numbers, None
+    ) -> list[tuple[Refined, tuple[str, ...]]]:
+        """Of several sets of numbers that may be freed, those that leave the innovations as usual, the best first."""
+        numbers, found = rpem.numbers, []
         for freed in choices:
-            start, places = self.before.copy(), [numbers.names.index(name) for name in freed]
-            for place in places:
-                start.active[place] = True
-                start.widen(place, max(_LEAST_SD, _STRAY * abs(self.size)))
+            start, toward = self.before.copy(), [numbers.direction(name) for name in freed]
+            for direction in toward:
+                start.active[direction != 0.0] = True
+                start.widen(direction, max(_LEAST_SD, _STRAY * abs(self.size)))
             refined = refine(
                 numbers, start, samples, first=self.onset, block=rpem.block_samples, noise=rpem.noise,
                 gain=rpem.stream.at.gain,
@@ -231,8 +252,7 @@ class Recovery:
             if refined is None or not refined.converged:
                 continue
             left = refined.evidence.rest / refined.evidence.freedom if refined.evidence.freedom else 1.0
-            if max(refined.filter.sd[places]) > _VAGUE or left > _LEFT * max(rpem.noise_level, 1.0):
-                continue
-            if best is None or refined.misfit < best[0].misfit:
-                best = refined, freed
-        return best
+            sd = refined.filter.sd[np.any(toward, axis=0)]
+            if sd.max() <= _VAGUE and left <= _LEFT * max(rpem.noise_level, 1.0):
+                found.append((refined, freed))
+        return sorted(found, key=lambda item: item[0].misfit)

@@ -20,7 +20,7 @@ from ambid.arrays import Array
 from ambid.errors import EstimationError, counted
 from ambid.estimation.estimate import Estimate
 from ambid.recursive.estimator import covariance_of, factors_of
-from ambid.recursive.square_root_kernels import deviations, walk
+from ambid.recursive.square_root_kernels import deviations, walk, widen
 from ambid.tracking.evidence import Evidence, EvidenceStream, EvidenceSum, Samples, checked, linearise
 from ambid.tracking.kernels import absorb, filter_ring, smooth_ring
 from ambid.tracking.numbers import TrackedNumbers, tracked_numbers
@@ -75,11 +75,12 @@ class ParameterFilter:
         length = J @ move
         return bool(length @ length > most or (move * move > curved * self.sd).any())
 
-    def widen(self, place: int, sd: float) -> None:
-        """Forget what is known of one number, but not the others: it may have moved by about `sd`."""
-        variance = np.zeros(self.q.size)
-        variance[place] = sd * sd
-        walk(self._F, variance, self._scratch[0])
+    def widen(self, direction: Array, sd: float) -> None:
+        """Forget what is known along a `direction` (p,), but not across it: the numbers may have moved by about `sd`
+        times it.
+        """
+        self._scratch[0] = direction
+        widen(self._F, self._scratch[0], sd * sd)
 
     def set(self, q: Array, covariance: Array) -> None:
         """Go on from other numbers. `q`: (p,); `covariance`: (p, p)."""
@@ -97,25 +98,28 @@ class ParameterFilter:
 CHUNK_S = 0.05  # evidence is merged to this length: the fastest drift that is told from a jump
 _WINDOW = 400  # chunks
 _FEWEST = 20  # chunks before the first adaptation
+_FIRST = 6  # chunks before one of a number that is suspected to drift
 _EVERY = 5  # chunks between looks at the recent past
 _SELDOM = 20  # chunks between looks at the whole window
 _SURE = 6.0  # ratio in the recent past that chance seldom makes; what follows from a false one is a wider interval
+_LIKELY, _FOUND = 2.5, 1.2  # ratios from which a suspected number walks faster, until it has its most likely rate
 _RECENT = (20, 60)  # chunks that alone may show that something has begun to drift
 _POWER = 0.5
 _SLOWER, _FASTER = 0.5, 10.0  # factors by which one adaptation may change a variance
-_ROUNDS = 5  # of raising a variance at one look
+_ROUNDS = 10  # of raising a variance at one look
+_WITHIN = 6.0  # what may walk within a chunk, as squares of its innovations: more would be taken for other numbers
 _NOTICED = 3.0  # factor of a variance from which the recent past is filtered anew
 
 
 class DriftRates:
     """Variances per second of the walks, from `start` (p,) within `floor` and `ceiling` (p,): equal ones are not
     adapted. `block_s`: length of the evidence to come, s; `adapts`: whether they are found from the data; `walks`:
-    whether any variance is, or may become, positive.
+    whether any variance is, or may become, positive; `suspected` (p,): which seem to have begun to walk, to be set.
     """
 
     def __init__(self, start: Array, floor: Array, ceiling: Array, block_s: float) -> None:
         p = start.size
-        self.variance, self._floor, self._ceiling = start.copy(), floor, ceiling
+        self.variance, self._start, self._floor, self._ceiling = start.copy(), start, floor, ceiling
         self.adapts = bool(np.any(ceiling > floor))
         self.walks = self.adapts or bool(np.any(start > 0.0))
         self._per_chunk = max(1, round(CHUNK_S / block_s))
@@ -126,6 +130,7 @@ class DriftRates:
         self._scratch = np.zeros((room, p, p + 2)), np.zeros((p, p))
         self._chunk = EvidenceSum(p)
         self._count = self._next = self._since = self._looks = 0
+        self.suspected = np.zeros(p, dtype=np.bool_)
 
     def add(self, evidence: Evidence, before: ParameterFilter) -> None:
         """Take in a block. `before`: the numbers as they were known before this block."""
@@ -148,28 +153,45 @@ class DriftRates:
         """Look at the window when due; where something walks faster than thought, filter its end again with the
         residual's variance `noise`.
         """
-        if self._chunk.blocks or self._count < _FEWEST or self._since < _EVERY:
+        if self._chunk.blocks:
             return
-        self._since = 0
+        suspected = self.suspected & present.active & (self._ceiling > self._floor)
+        self.suspected[:] = False
+        due = self._since >= _EVERY
+        if self._count < (_FIRST if self._looks else _FEWEST) or not (due or suspected.any()):
+            return
         active, before = present.active, self.variance
-        if self._looks % (_SELDOM // _EVERY) == 0:
-            self._raise(self._ratio(self._count, active, noise))
-        self._looks += 1
+        if due and self._count >= _FEWEST:
+            if self._looks % (_SELDOM // _EVERY) == 0:
+                self._raise(self._ratio(self._count, active, noise))
+            self._looks += 1
         for length in _RECENT:
+            until = np.where(suspected, _LIKELY, _SURE)
             for _ in range(_ROUNDS):
                 recent = self._ratio(min(length, self._count), active, noise)
-                if not np.any(recent > _SURE):
+                until[suspected & (recent > _LIKELY)] = _FOUND
+                if not np.any(recent > until):
                     break
-                self._raise(np.where(recent > _SURE, recent, 1.0))
-        if np.any(self.variance > _NOTICED * before):
+                self._raise(np.where(recent > until, recent, 1.0))
+        if due:  # what has only seemed to walk soon stands still again
+            self._since = 0
+            self._raise(np.where(self.risen > 0.0, np.minimum(recent, 1.0), 1.0))
+        seen = np.square(self._J[(self._next - 1) % _WINDOW]).sum(axis=0) @ self.risen * self._chunk_s
+        if np.any(self.variance > _NOTICED * before) and seen < _WITHIN:
             # filter the recent past again: with the rates as they were, what moved was taken for chance
             _, _, q, P = self._run(min(max(_RECENT), self._count), active, noise)
             if np.all(np.isfinite(q)) and np.all(np.diag(P) > 0.0):
                 present.set(np.where(active, q, present.q), P)
 
+    @property
+    def risen(self) -> Array:
+        """By how much numbers walk faster than was thought at the start."""
+        return np.maximum(self.variance - self._start, 0.0)
+
     def restart(self) -> None:
         """Forget the window: a jump in it would pass for drift."""
         self._count = self._next = self._since = self._chunk.blocks = 0
+        self.suspected[:] = False
 
     def _raise(self, ratio: Array) -> None:
         factor = np.clip(ratio**_POWER, _SLOWER, _FASTER)
