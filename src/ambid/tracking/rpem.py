@@ -11,6 +11,7 @@ moves w_j.
 from __future__ import annotations
 
 import copy
+import math
 from typing import Literal, Self
 
 import numpy as np
@@ -255,6 +256,7 @@ class PhysicalRpem:
         self.n_linearised = self.n_unreached = 0
         self.noise_level = 1.0
         self._curved = np.array([_CURVED[kind] for kind in numbers.kinds])
+        self._joints = [numbers.direction(cause) for cause in numbers.joints]
         self._part = -float(np.expm1(-self.block_s / _NOISE_S))
 
     @property
@@ -324,9 +326,15 @@ class PhysicalRpem:
         self.refresh()
 
     def predict(self) -> None:
-        """Let the numbers walk over one block."""
-        if self.drift.walks:
-            self.filter.walk(self.drift.variance, self.block_s)
+        """Let the numbers walk over one block; what a joint cause moves together, where two of them have begun to."""
+        if not self.drift.walks:
+            return
+        self.filter.walk(self.drift.variance, self.block_s)
+        risen = np.where(self.filter.active, self.drift.risen, 0.0)
+        for direction in self._joints if risen.any() else ():
+            common = np.sort(risen[direction != 0.0] / direction[direction != 0.0] ** 2)[-2]
+            if common > 0.0:
+                self.filter.widen(np.where(self.filter.active, direction, 0.0), math.sqrt(common * self.block_s))
 
     def refresh(self) -> None:
         """Assemble the predictor again where second-order terms matter, or its innovations are noticeably larger."""
