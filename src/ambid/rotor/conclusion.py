@@ -15,6 +15,7 @@ from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import Lines
+from ambid.rotor.curvature import Bent, curvature, curvature_check
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
@@ -40,6 +41,12 @@ class Numbers:
     def sd(self, name: str) -> float:
         """Return the standard deviation of a number, 0 where it was not estimated."""
         return float(np.sqrt(self.covariance[k, k])) if (k := self._at(name)) is not None else 0.0
+
+    def wider(self, names: Sequence[str], more: Array) -> Numbers:
+        """Return them with covariance beside that of the record."""
+        covariance, at = self.covariance.copy(), [self.names.index(name) for name in names]
+        covariance[np.ix_(at, at)] += more
+        return replace(self, covariance=covariance)
 
     def _at(self, name: str) -> int | None:
         return self.names.index(name) if name in self.names else None
@@ -72,16 +79,26 @@ class Evidence:
     noise: Mapping[str, float]  # rms of each source, SI
     fit: Mapping[str, OutputFit]
     checks: Mapping[str, Check]
+    bent: Bent | None = None  # what curvature has done to the numbers
 
 
 def of_periods(fit: RotorFit) -> Evidence:
     """Return the evidence of period spectra."""
-    found = scores(fit.problem, fit.vector)
+    found, numbers = refined(fit.problem, fit.vector, scores(fit.problem, fit.vector)), numbers_of(fit)
+    sd = {name: numbers.sd(name) for name in numbers.names}
+    agree, bent = agreement_checks(found, fit.model), curvature(fit.problem, fit.vector)
+    if not all(c.passed for c in agree.values()) and bent.gain < found[0].gain:  # no more than what is named does
+        bent = Bent.none()
     return Evidence(
         method="periods",
         noise=_noise(fit),
         fit=_fits(fit),
-        checks={**_residual_checks(fit), **agreement_checks(refined(fit.problem, fit.vector, found), fit.model)},
+        bent=bent,
+        checks={
+            **_residual_checks(fit),
+            "curvature": curvature_check(bent, sd),
+            **agree,
+        },
     )
 
 
@@ -111,6 +128,8 @@ def conclude(
 ) -> RotorEstimate:
     """Return the estimate of a search; `delay_how`: by input, "given" or "estimated"."""
     numbers, model = numbers_of(fit), fit.model
+    if evidence.bent is not None:
+        numbers = numbers.wider(tuple(evidence.bent.shift), evidence.bent.more)
     estimated = _parameters(model, parameters, numbers)
     checks = {**evidence.checks, "identifiable": _identifiable(estimated, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)

@@ -36,8 +36,9 @@ _TOGETHER = {"position": "positions", "current": "currents", "voltage": "voltage
 _TWINS = (
     ("_current.lag", "_voltage.lag"), ("_voltage.lag", "_current.lag"),
     ("currents.lag", "voltages.lag"), ("voltages.lag", "currents.lag"),
+    ("positions.lag", "eddy_pole"), ("eddy_pole", "positions.lag"),
 )  # fmt: skip
-"""What the coil's own lag tells apart by little."""
+"""Lags that records tell apart by little."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -167,8 +168,10 @@ class _Beside:
 
 def _searched(problem: Likelihood, v: Array, s: Score, before: float) -> Score:
     """Return a score whose size is searched together with the parameters, from zero, and a lag from what turns the
-    highest line: a fit that lacks it stands far away.
+    highest line: a fit that lacks it stands far away. An eddy pole keeps the score of its first order.
     """
+    if s.cause.kind == "eddy":
+        return s
     lag = s.cause.kind == "lag"
     unit = 1.0 / max(float(e.spectra.omega[-1]) for e in problem.experiments) if lag else abs(s.size)
     beside = _Beside(problem=problem, cause=s.cause, unit=unit)
