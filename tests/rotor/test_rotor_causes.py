@@ -10,8 +10,10 @@ import pytest
 from scipy.signal import lfilter
 
 import ambid
+from ambid.physics.linear_model import Parameter
+from ambid.physics.presets import preset
 from ambid.record import Record
-from ambid.rig import Rig
+from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.spectra import find_slip
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
@@ -126,3 +128,24 @@ def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
 
 def test_a_sound_record_has_no_line(sound: Any) -> None:
     assert not [w for w in ambid.identify(*sound).warnings if "lines" in w]
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_curvature_of_the_magnets_is_named_and_within_the_intervals(seed: int) -> None:
+    """Beyond a tenth of the gap; to a quarter of that it moves nothing, and is not told."""
+    rig = rig_of_preset(preset("rmit"))
+    assert rig.rotor is not None
+    free = tuple(p if p.name in rig.rotor.places else Parameter(name=p.name, unit=p.unit) for p in rig.parameters)
+    told: dict[str, Any] = {"duration": 1.0, "periods": 4, "excitation": "zippered", "band": (4.0, 500.0)}
+    large, small = (
+        ambid.identify(
+            ambid.simulate(rig, nonlinear=True, amplitude=x, seed=seed, **told), replace(rig, parameters=free)
+        )
+        for x in (10.0, 2.5)
+    )
+    off = {x: large[f"{x}.L"].value - (rig.parameter(f"{x}.L").value or 0.0) for x in rig.rotor.axes}
+    assert sum(off.values()) > 3.0 * sum(large[f"{x}.L"].value for x in off) * 1e-4  # all too large
+    assert all(abs(off[x]) < 1.96 * large[f"{x}.L"].sd for x in off)
+    assert "curvature of the magnets shows" in large.checks["curvature"].detail
+    assert small.verdict.word == "usable"
+    assert "no curvature" in small.checks["curvature"].detail
