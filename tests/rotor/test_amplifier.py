@@ -2,11 +2,12 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 import ambid
 from ambid.errors import RigError
-from ambid.rig import rig_from_text
+from ambid.rig import bench_record, rig_from_text
 from ambid.rotor.spectra import experiments_of
 
 AXES = ("ax", "ay")
@@ -90,3 +91,14 @@ def test_experiments_of_an_orthogonal_excitation_are_taken_as_records_of_one_rot
 def test_an_axis_that_nothing_drives_is_refused() -> None:
     with pytest.raises(RigError, match=r"axis 'bx' has none of \[channels.bx_voltage\]"):
         rig_from_text(RIG.replace("[channels.bx_command]\n", ""), "amplifiers.toml")
+
+
+def test_a_command_in_ampere_is_taken_as_the_volts_of_an_amplifier_of_one_ampere_a_volt() -> None:
+    rig = rig_from_text(RIG, "amplifiers.toml")
+    record = ambid.simulate(rig, duration=0.5, periods=4, seed=1)
+    units = {name: "A" if name.endswith("_command") else "m" for name in record.names if "reference" not in name}
+    in_ampere = ambid.read_record({name: record[name].values for name in units}, rate_hz=1e4, units=units)
+    seen = bench_record(in_ampere, rig)
+    assert seen["ax_command"].unit == "V"
+    np.testing.assert_array_equal(seen["ax_command"].values, record["ax_command"].values)
+    assert any("ax_command" in str(step) for step in seen.history)

@@ -18,6 +18,7 @@ from ambid.physics.linear_model import LinearModel, Parameter, ParameterSpec, mo
 from ambid.physics.loop import UNLIMITED, Interval, Limits, Loop, Noise
 from ambid.physics.rotor_model import RotorModel
 from ambid.record import Channel, GapPolicy, Record, Source, Step, read_record
+from ambid.record.calibration import Calibration
 from ambid.rig.calibration import calibration_of, channel_sd_of, plane_sd_of
 from ambid.rig.rig import (
     DAQ_RATE_HZ,
@@ -690,6 +691,8 @@ def _refuse_swapped(channels: dict[str, Channel], wanted: dict[str, str], rig: R
 
 def _calibrated(channel: Channel, c: RigChannel, unit: str) -> tuple[Channel, Step | None]:
     """Return the channel in the role's unit, and the line for the history if it was calibrated."""
+    if c.calibration is None and channel.unit == "A" and c.role.endswith("_command"):  # an ampere counts as a volt
+        c = replace(c, calibration=Calibration(unit_in="A", unit_out=unit, gain=1.0))
     if c.calibration is None:
         if channel.unit != unit != UNKNOWN:
             raise UnitError(

@@ -38,7 +38,7 @@ _TWINS = (
     ("currents.lag", "voltages.lag"), ("voltages.lag", "currents.lag"),
     ("positions.lag", "eddy_pole"), ("eddy_pole", "positions.lag"),
 )  # fmt: skip
-"""Lags that records tell apart by little."""
+"""Lags that look alike in most records."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
