@@ -50,6 +50,9 @@ _IN_TIME = {*_SAME_COURSE, "r_drift"}
 """Causes that change in time, which no constant of the plant can imitate."""
 _GROWING = {*_SAME_COURSE, "eddy_pole", "sensor_lag", "current_sensor_pole", "cross_talk", "r_drift", "curvature"}
 """Causes whose signals are known but for their sizes."""
+_GOES_ON = (
+    0.01  # probability by chance, of waves that are faster, below which a walk goes on beyond those that were taken
+)
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
@@ -193,10 +196,21 @@ def extended(
         left = _tested(look, [("", tuple(columns))])[0]
         step = left.sizes
         if left.gain < _SETTLED and fit.status == "converged":
+            if any(_goes_on(look, c) for c in parts):
+                return None
             ends = np.cumsum([c.sizes.size for c in parts])[:-1]
             parts = tuple(replace(c, sizes=z) for c, z in zip(parts, np.split(total, ends), strict=True))
             return replace(fit, beside=_beside(look, columns)), parts
     return None
+
+
+def _goes_on(look: _Look, walk: Cause) -> bool:
+    """Return whether a walk that a fit holds goes on beyond its waves, where it would pass for motion of the rotor."""
+    if walk.name not in ("slow_force", "slow_voltage"):
+        return False
+    count = len(walk.columns)
+    beyond = _waves(look.course.t, max(2 * count, _MANY))[count:]
+    return _tested(look, [(walk.name, tuple(((walk.channel, wave),) for wave in beyond))])[0].p < _GOES_ON
 
 
 def told(cause: Cause) -> str:
