@@ -103,14 +103,16 @@ class Uncertainty:
         """Return standard deviations (n,) over `scale`."""
         return np.asarray(self.standard_deviations(robust=robust) / self.scale)
 
-    def weighed(self, gain: Array, slope: Array, sd: float) -> Uncertainty:
-        """Return it after the numbers were moved by gain (z - slopeᵀ θ), (n,) each, for a fact z of deviation `sd`."""
+    def weighed(self, gain: Array, slope: Array, sd: float, scale: Array) -> Uncertainty:
+        """Return it after the numbers were moved by gain (z - slopeᵀ θ), (n,) each, for a fact z of deviation `sd`;
+        `scale`: that of the moved numbers.
+        """
         kept = np.eye(len(self.names)) - np.outer(gain, slope)
         own = sd**2 * np.outer(gain, gain)
         parts = {name: kept @ getattr(self, name) @ kept.T + own for name in ("information", "robust", "fisher")}
         away = {name: kept @ getattr(self, name) for name in ("disagreement", "bias")}
-        values, weakest = weakest_direction(self.names, parts["information"], self.scale)
-        return replace(self, **parts, **away, singular_values=values, weakest=weakest)
+        values, weakest = weakest_direction(self.names, parts["information"], scale)
+        return replace(self, **parts, **away, scale=scale, singular_values=values, weakest=weakest)
 
     def identifiable_at(self, *, robust: bool) -> tuple[bool, ...]:
         """Return which parameters have a relative standard deviation below 25 %."""

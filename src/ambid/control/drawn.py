@@ -378,9 +378,9 @@ def laws_of(plant: Plant, rig: Rig, at: Mapping[str, float]) -> tuple[dict[str, 
         try:
             nominal = nominal_of(rig, theta, at)
             assert isinstance(nominal.magnet, LawMagnet)
-            rest = rest_of_rig(rig, nominal)
-            x, i = at.get("position", rest.position), at.get("current", rest.current)
-            if not (travel[0] < x < travel[1] and most[0] < i < most[1]):  # a record of deviations from rest
+            x, i = at.get("position", math.nan), at.get("current", math.nan)
+            if not (travel[0] < x < travel[1] and most[0] < i < most[1]):  # unknown, or of deviations from rest
+                rest = rest_of_rig(rig, nominal)
                 x, i = rest.position, rest.current
             law = Law(
                 energy=nominal.magnet.coenergy,

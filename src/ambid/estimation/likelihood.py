@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ambid.arrays import Array
-from ambid.estimation.linear import column_sizes, directions, periods_near, triangle_of
+from ambid.estimation.linear import column_sizes, directions, periods_near, triangle_of, waves_at, without
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest, predictor_gain
 from ambid.estimation.search import NOT_CONVERGED, PhysicalFit, predictable
 from ambid.estimation.search import search as descend
@@ -645,17 +645,14 @@ def failure(fit: Fit) -> str:
 
 def _without_lines(e: Array) -> Array:
     """Return innovations without their strongest narrow lines, each of an amplitude and a phase that may drift."""
-    n, t = len(e), np.linspace(-1.0, 1.0, len(e))
+    n = len(e)
     for _ in range(_LINES):
         spectra = np.fft.rfft(e * np.hanning(n)[:, None], axis=0)
         power = np.sum(np.abs(spectra) ** 2 / np.maximum(np.median(np.abs(spectra) ** 2, axis=0), 1e-300), axis=1)
         j = int(np.argmax(power))
         if power[j] < _STANDS or j < 2:
             break
-        k = periods_near((e @ spectra[j].conj()), j)
-        turn = 2.0 * np.pi * k / n * np.arange(n)
-        waves = np.column_stack([s * wave(turn) for s in (1.0, t) for wave in (np.cos, np.sin)])
-        e = e - waves @ np.linalg.lstsq(waves, e, rcond=None)[0]
+        e = without(e, waves_at(periods_near(e @ spectra[j].conj(), j), n))
     return e
 
 

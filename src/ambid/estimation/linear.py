@@ -135,7 +135,7 @@ def _controller(_with_scipy: bool) -> Any:
 
 
 def periods_near(signal: Array | Complex, k: int) -> float:
-    """Return at how many periods over a signal, about `k`, its windowed transform is largest."""
+    """Return at how many periods over a signal, within one of `k`, its windowed transform is largest."""
     n = signal.size
     turn = 2j * np.pi / n * np.arange(n)
     rest = signal * np.hanning(n) * np.exp(-k * turn)
@@ -145,4 +145,17 @@ def periods_near(signal: Array | Complex, k: int) -> float:
     power = np.abs(np.exp(-np.outer(beside, turn[::length])) @ short)
     j = min(max(int(np.argmax(power)), 1), 59)
     a, b, c = power[j - 1 : j + 2].tolist()
-    return k + float(beside[j] + (beside[1] - beside[0]) * 0.5 * (a - c) / min(a - 2.0 * b + c, -1e-300))
+    bend = a - 2.0 * b + c
+    return k + float(beside[j] + (beside[1] - beside[0]) * (np.clip(0.5 * (a - c) / bend, -1.0, 1.0) if bend else 0.0))
+
+
+def waves_at(periods: float, n: int) -> Array:
+    """Return cosine and sine of some periods over n samples, and both times a drift from -1 to 1, (n, 4)."""
+    turn = 2.0 * np.pi * periods / n * np.arange(n)
+    waves = np.column_stack([np.cos(turn), np.sin(turn)])
+    return np.hstack([waves, np.linspace(-1.0, 1.0, n)[:, None] * waves])
+
+
+def without(signals: Array, waves: Array) -> Array:
+    """Return signals (n, n_signals) without what waves (n, n_waves) explain of them."""
+    return np.asarray(signals - waves @ np.linalg.lstsq(waves, signals, rcond=None)[0])

@@ -216,7 +216,9 @@ def _grown(fit: Fit, rig: Rig, bench: Record, *, delay_how: Literal["estimated",
             break
         fit, taken = more
         estimate, found = _judged(fit, rig, bench, delay_how=delay_how)
-        estimate = replace(estimate, extended=tuple(dict.fromkeys(told(c) for c in taken)))
+        agree = {k: first.checks[k] for k, c in estimate.checks.items() if c.values.get("refits") == 0.0}
+        checks = {**estimate.checks, **agree}  # where no refit was possible, that without the causes counts
+        estimate = replace(estimate, checks=checks, extended=tuple(dict.fromkeys(told(c) for c in taken)))
     before, after = ({name for name, c in e.checks.items() if not c.passed} for e in (first, estimate))
     return estimate if after < before and not after & _OF_THE_MODEL else first
 
@@ -252,7 +254,7 @@ def _judged(
     if problem.model.name == "one-axis":
         from ambid.validation.causes import causes, causes_check, named_bias
 
-        in_time, named = check_lag(signals), causes(fit, means, thorough=robust, delay_given=delay_how == "given")
+        checks["in_time"] = check_lag(signals)
         curved, own = None, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import magnet_checks
@@ -260,18 +262,23 @@ def _judged(
             sd = spread.standard_deviations(robust=robust)
             checks |= magnet_checks(fit, e, rig, means, sd)
             curved = checks.get("curvature")
-        if curved is not None and not curved.passed:  # a law says more than powers of the motion
-            named = [c for c in named if c.name != "curvature"]
+        bent = curved is not None and not curved.passed  # a law says more than powers of the motion
+        if curved is not None and bent:
             spread = replace(spread, bias=np.array([curved.values[name] for name in spread.names]) * sd)
-        checks |= {
-            **causes_check(named, {**checks, "in_time": in_time}, own, robust=robust, record=bench), "in_time": in_time
-        }  # fmt: skip
+        before, given = dict(checks), delay_how == "given"
+        for thorough in (True,) if robust else (False, True):  # what takes long only where there is a reason
+            named = [
+                c for c in causes(fit, means, thorough=thorough, delay_given=given) if not bent or c.name != "curvature"
+            ]
+            checks = {**before, **causes_check(named, before, own, robust=robust, record=bench)}
+            if checks["causes"].passed:
+                break
         spread = replace(spread, bias=named_bias(named, spread.bias))
     facts: Mapping[str, Check] = {}
-    used = None
+    used, alone = None, spread.information
     if problem.model.name == "one-axis":
         facts = physical.fact_checks(fit, rig, bench, spread, robust=robust)
-        fit, spread, used = physical.informed(fit, rig, facts, spread, robust=robust)
+        fit, spread, used = physical.informed(fit, rig, bench, facts, spread, robust=robust)
         if used is not None:
             text = f"{facts['gravity_balance'].detail}. The estimate uses it"
             facts = {**facts, "gravity_balance": replace(facts["gravity_balance"], detail=text)}
@@ -287,8 +294,8 @@ def _judged(
         checks=checks, warnings=warnings_of(fit, checks, inflated), record=origin(bench), rig=rig_entry(rig),
     )  # fmt: skip
     estimate, theta = replace(estimate, global_search=fit.global_search), problem.parameters(fit.vector)
-    covariance, lines = spread.information, [lines_of(fit)]
-    return calibrated(estimate, rig, problem.model, theta, spread.names, covariance, lines, weight=used), named
+    lines = [lines_of(fit)]
+    return calibrated(estimate, rig, problem.model, theta, spread.names, alone, lines, weight=used), named
 
 
 def _units(fit: Fit, rig: Rig, signals: Signals, *, doubt: bool) -> Check:

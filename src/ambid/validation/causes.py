@@ -23,7 +23,7 @@ from ambid.arrays import Array, Complex
 from ambid.estimation.estimate import Check
 from ambid.estimation.kernels import state_scan
 from ambid.estimation.likelihood import Fit, innovations, residual_blocks, run, search, weight_of, workspace_near
-from ambid.estimation.linear import column_sizes, directions, periods_near
+from ambid.estimation.linear import column_sizes, directions, periods_near, waves_at, without
 from ambid.estimation.predictor import Predictor, PredictorProblem, assemble, busiest
 from ambid.estimation.uncertainty import chi_squared_tail
 from ambid.record import Record
@@ -56,7 +56,7 @@ _GOES_ON = (
 _HARMLESS = 1.5  # standard deviations by which a cause may move a number
 _BENT = 5.0  # standard deviations that curvature may move a number by, to be taken in by two degrees
 _STEPS = 40  # of a search that begins at a fit
-_TURNS = 6  # in which sizes and parameters are found in turn
+_TURNS = 8  # in which sizes and parameters are found in turn
 _SETTLED = 0.1  # gain below which they are
 
 
@@ -130,17 +130,14 @@ def causes(fit: Fit, means: Mapping[str, float], *, thorough: bool, delay_given:
         return []
     course, rate_hz = look.course, fit.problem.rate_hz
     spectra = _spectra(look.e @ look.weight.T)
-    lines = _lines(spectra, look)
+    lines = _lines(look)
     modes = _modes(spectra, rate_hz, lines) if thorough else ()
     groups = list(_groups(course, modes, thorough=thorough))
     if delay_given:
         later = -(course.u - course.u_before) * rate_hz
         groups.append(("input_delay", ((("voltage", later),),)))
     if lines:
-        turns = [(line.channel, 2.0 * np.pi * line.k / course.t.size * np.arange(course.t.size)) for line in lines]
-        waves = [
-            (channel, s * wave(turn)) for channel, turn in turns for s in (1.0, course.t) for wave in (np.cos, np.sin)
-        ]
+        waves = [(line.channel, wave) for line in lines for wave in waves_at(line.k, course.t.size).T]
         groups.append(("line", tuple((wave,) for wave in waves)))
     found = _tested(look, groups)
     if lines:
@@ -172,7 +169,8 @@ def extended(
     if not sure or fit.problem.n_used > _LONGEST:
         return None
     cause = sure[0]
-    alike = {c.name: c for c in reversed(sure) if c.gain > _ALIKE * cause.gain and c.name != cause.name}
+    strong = [c for c in reversed(sure) if c.gain > _ALIKE * cause.gain]
+    alike = {(c.name, c.channel): c for c in strong if (c.name, c.channel) != (cause.name, cause.channel)}
     allowed = _IN_TIME if doubtful else _GROWING
     if any(not c.columns or c.name not in allowed for c in (cause, *alike.values())):
         return None
@@ -180,27 +178,27 @@ def extended(
     sd = np.sqrt(np.diag(directions(np.vstack([fit.J, fit.J_prior])).inverse())[:n]) * size
     if cause.name == "curvature" and np.any(np.abs(cause.shift) > _BENT * sd):
         return None  # what is of higher degree would move them too
-    parts, step = (*taken, cause, *alike.values()), np.zeros(0)
-    for c in parts:
-        step = np.append(step, c.sizes if c is cause else np.zeros(c.sizes.size))
-    total = np.concatenate([*(c.sizes for c in taken), np.zeros(step.size - sum(c.sizes.size for c in taken))])
+    parts = [*taken, *(replace(c, sizes=np.zeros(c.sizes.size)) for c in (cause, *alike.values()))]
+    step = [cause.sizes if k == len(taken) else np.zeros(c.sizes.size) for k, c in enumerate(parts)]
     for _ in range(_TURNS):
-        total = total + step
-        problem = _corrected(plain, [column for c in parts for column in c.columns], total)
+        parts = [replace(c, sizes=c.sizes + more) for c, more in zip(parts, step, strict=True)]
+        problem = _corrected(plain, [z for c in parts for z in c.columns], np.concatenate([c.sizes for c in parts]))
         fit = search(problem, fit.vector, steps=_STEPS, work=workspace_near(fit, problem))
         look = None if fit.status == "failed" else _look(fit, means)
         if look is None:
             return None
-        parts = tuple(replace(c, columns=_again(c, look.course)) for c in parts)
-        columns = [column for c in parts for column in c.columns]
+        parts = [replace(c, columns=_again(c, look.course)) for c in parts]
+        columns = [z for c in parts for z in c.columns]
         left = _tested(look, [("", tuple(columns))])[0]
-        step = left.sizes
+        step = np.split(left.sizes, np.cumsum([c.sizes.size for c in parts])[:-1])
         if left.gain < _SETTLED and fit.status == "converged":
-            if any(_goes_on(look, c) for c in parts):
+            on = [_goes_on(look, c) for c in parts]
+            if not any(on):
+                return replace(fit, beside=_beside(look, columns)), tuple(parts)
+            if any(goes and len(c.columns) >= _MANY for goes, c in zip(on, parts, strict=True)):
                 return None
-            ends = np.cumsum([c.sizes.size for c in parts])[:-1]
-            parts = tuple(replace(c, sizes=z) for c, z in zip(parts, np.split(total, ends), strict=True))
-            return replace(fit, beside=_beside(look, columns)), parts
+            parts = [_faster(c, look.course) if goes else c for goes, c in zip(on, parts, strict=True)]
+            step = [np.zeros(c.sizes.size) for c in parts]
     return None
 
 
@@ -211,6 +209,12 @@ def _goes_on(look: _Look, walk: Cause) -> bool:
     count = len(walk.columns)
     beyond = _waves(look.course.t, max(2 * count, _MANY))[count:]
     return _tested(look, [(walk.name, tuple(((walk.channel, wave),) for wave in beyond))])[0].p < _GOES_ON
+
+
+def _faster(walk: Cause, course: _Course) -> Cause:
+    """Return a walk with faster waves beside its own."""
+    columns = tuple(((walk.channel, wave),) for wave in _waves(course.t, _MANY))
+    return replace(walk, columns=columns, sizes=np.append(walk.sizes, np.zeros(_MANY - walk.sizes.size)))
 
 
 def told(cause: Cause) -> str:
@@ -469,14 +473,15 @@ class _Line:
     p: float
 
 
-def _lines(spectra: Complex, look: _Look) -> list[_Line]:
-    """Return narrow lines that stand out, the strongest first."""
-    power = np.sum(np.abs(spectra) ** 2, axis=1)
-    n_y, lines = spectra.shape[1], list[_Line]()
-    median = float(np.median(power))
-    usual = median / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
-    power[: _WAVES // 2] = median  # what walks as slowly is no line
+def _lines(look: _Look) -> list[_Line]:
+    """Return narrow lines that stand out, the strongest first, each after those before it are taken off."""
+    e, lines = look.e @ look.weight.T, list[_Line]()
     while len(lines) < _LINES:
+        spectra = _spectra(e)
+        power, n_y = np.sum(np.abs(spectra) ** 2, axis=1), spectra.shape[1]
+        median = float(np.median(power))
+        usual = median / (1.678 if n_y == 2 else np.log(2.0))  # of a sum of n_y unit exponentials
+        power[: _WAVES // 2] = median  # what walks as slowly is no line
         j = int(np.argmax(power))
         ratio = float(power[j] / max(usual, 1e-300))
         p = float(power.size * (1.0 + ratio * (n_y > 1)) * np.exp(-min(ratio, 700.0)))
@@ -486,9 +491,9 @@ def _lines(spectra: Complex, look: _Look) -> list[_Line]:
         ways = {name: way[0] for name, way in _ways(look, slice(j, j + 1)).items()}
         shares = {name: abs(np.vdot(way, spectra[j])) ** 2 / np.vdot(way, way).real for name, way in ways.items()}
         channel = max(shares, key=lambda name: float(shares[name]))
-        k = periods_near(look.e @ look.weight.T @ ways[channel].conj(), j + 2)
+        k = periods_near(e @ ways[channel].conj(), j + 2)
         lines.append(_Line(k=k, channel=channel, p=p))
-        power[max(j - _SKIRT, 0) : j + _SKIRT + 1] = median
+        e = without(e, waves_at(k, len(e)))
     return lines
 
 

@@ -57,12 +57,14 @@ def mean_resistance(record: Record, rig: Rig | None = None) -> tuple[float, floa
     length = max(1, len(v) // _BLOCKS)
     rest = (v - ratio * i)[: len(v) // length * length].reshape(-1, length).mean(axis=1)
     scatter = float(rest.std(ddof=1)) / np.sqrt(rest.size) if rest.size > 1 else float(np.abs(v).max())
-    known = {c.role: c for c in rig.channels} if rig else {}
-    volts, amperes = (
-        _OFFSET * float(np.abs(x).max()) if role not in known or (sd := known[role].offset_sd) is None else sd
-        for role, x in (("voltage", v), ("current", i))
-    )
+    volts, amperes = (offset_sd(record, role, rig) for role in ("voltage", "current"))
     return ratio, float(np.sqrt(scatter**2 + volts**2 + (ratio * amperes) ** 2) / abs(i.mean()))
+
+
+def offset_sd(record: Record, role: str, rig: Rig | None) -> float:
+    """Return how well the zero of a channel is known, SI: as the rig says, else to 0.5 % of its largest value."""
+    said = None if rig is None else rig.channel(role).offset_sd
+    return _OFFSET * float(np.abs(record[role].values).max()) if said is None else said
 
 
 def facts(record: Record, rig: Rig | None = None, *, belongs: bool = False) -> dict[str, Check]:
