@@ -112,7 +112,7 @@ def test_the_interval_holds_what_gravity_asks_for_and_the_cause_is_named(levitat
     assert check.values["expected"] == pytest.approx(run.balance / MASS, rel=1e-3)
     assert least < -100.0 * check.values["relative"] < most
     assert abs(run.estimate["k_i"].value - run.balance) < 2.0 * run.estimate["k_i"].sd
-    assert not check.passed or run.estimate["k_i"].value == pytest.approx(run.balance, rel=0.03)
+    assert not check.passed or run.estimate["k_i"].value == pytest.approx(run.balance, rel=0.04)
     assert abs(run.estimate["R"].value - RESISTANCE) < 2.0 * np.hypot(run.estimate["R"].sd, 0.01 * RESISTANCE)
     assert run.estimate.verdict.word != "usable"
     named = run.estimate.checks["causes"]
