@@ -10,11 +10,13 @@ import pytest
 from scipy.signal import lfilter
 
 import ambid
+from ambid.errors import EstimationError
 from ambid.physics.linear_model import Parameter
 from ambid.physics.presets import preset
 from ambid.record import Record
 from ambid.rig import Rig, rig_of_preset
-from ambid.rotor.spectra import find_slip
+from ambid.rotor.lines import Line, apart
+from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
 pytestmark = needs_simulator
@@ -113,11 +115,16 @@ def test_a_record_that_lost_samples_is_not_usable(sound: Any) -> None:
 
 @pytest.mark.parametrize("frequency", [52.0, 50.0, 151.3])
 def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
-    """On an excited line, between two, and between the lines of the whole record: all else stays as it was."""
+    """On an excited line, where a narrow mode looks alike, between two, and between the lines of the whole record: all
+    else stays as it was.
+    """
     record, rig = sound
     hum = 2e-6 * np.sin(2.0 * np.pi * frequency * np.arange(record.n_samples) / record.rate_hz + 0.3)
     found, plain = ambid.identify(changed(record, ax_position=lambda x: x + hum), rig), ambid.identify(record, rig)
-    assert found.verdict.word == "usable", found.verdict.reasons
+    on = frequency == 52.0
+    assert found.verdict.word == ("caution" if on else "usable"), found.verdict.reasons
+    assert [k for k, c in found.checks.items() if not c.passed] == ["lines"] * on
+    assert found.checks["lines"].alternatives == ("mode",) * on
     said = [w for w in found.warnings if "lines were taken out" in w]
     assert len(said) == 1
     told, where = said[0].split("taken out: ")[1].split(". ")[0].split(" Hz in ")
@@ -128,6 +135,16 @@ def test_hum_is_named_and_taken_out(sound: Any, frequency: float) -> None:
 
 def test_a_sound_record_has_no_line(sound: Any) -> None:
     assert not [w for w in ambid.identify(*sound).warnings if "lines" in w]
+
+
+def test_a_record_with_tones_on_nearly_all_lines_is_refused(sound: Any) -> None:
+    excitation = find_excitation(*(told := (sound[0], sound[1].plant)))
+    assert excitation is not None
+    spectra = period_spectra(*told, excitation)
+    lines = [Line(frequency_hz=float(f), channel="ax_position") for f in spectra.frequency_hz[19:]]
+    assert apart(spectra, lines[1:]).frequency_hz.size == 20
+    with pytest.raises(EstimationError, match="needs 20 others"):
+        apart(spectra, lines)
 
 
 @pytest.mark.parametrize("seed", [1, 2])

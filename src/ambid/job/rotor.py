@@ -5,7 +5,7 @@ bearing excited at a time, give one machine.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from math import isfinite, pi
 from typing import TYPE_CHECKING, Any, Unpack
 
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 _LEAST = 200  # samples
 _TURNING = ("angle", "speed", "tacho")
 _SAME_RATE = 1e-6
-_MOST_LINES = 20  # lines of hum that are taken out, about
+_ROUNDS = 4  # in which lines of hum are taken out
 
 
 def identify_rotor(
@@ -81,7 +81,8 @@ def identify_rotor(
         estimate = conclude(
             outcome.fit, outcome.evidence, rig.parameters, outcome.records,
             delay_how=["given" if d is not None else "estimated" for d in _delays(rig)],
-            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=outcome.why)},
+            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=outcome.why),
+                         **outcome.checks},
             rig=rig_entry(rig), warnings=[*warnings, *outcome.warnings],
         )  # fmt: skip
         estimate = replace(estimate, checks={**estimate.checks, **_plausible(estimate, rig, benches[0])})
@@ -122,6 +123,7 @@ class _Found:
     why: str
     seen: Sequence[PeriodSpectra | None]  # of each record
     warnings: Sequence[str] = ()
+    checks: Mapping[str, Check] = field(default_factory=dict)
 
 
 def _from_periods(
@@ -143,7 +145,7 @@ def _from_periods(
     assert model is not None
     remembered, warnings = [], list[str]()
     lines: list[list[Line]] = [[] for _ in benches]
-    while True:
+    for left in reversed(range(_ROUNDS)):
         pairs = zip(benches, speeds, excitations, lines, strict=True)
         experiments = [
             Experiment(spectra=apart(period_spectra(bench, model, excitation, speed), out), speed=speed)
@@ -154,14 +156,14 @@ def _from_periods(
         clock.lap("fit")
         order = [experiments.index(e) for e in fit.problem.experiments]
         more = dict(zip(order, find_lines(fit), strict=True))
-        if not any(more.values()) or max(map(len, lines)) > _MOST_LINES:
+        if not left or not any(more.values()):
             break
         roles = (*model.inputs, *model.outputs)
         cleaned = [
             without_lines(b, x, roles, more[k]) for k, (b, x) in enumerate(zip(benches, excitations, strict=True))
         ]
         benches, lines = [c[0] for c in cleaned], [[*a, *c[1]] for a, c in zip(lines, cleaned, strict=True)]
-    for bench, speed, e, found in zip(benches, speeds, experiments, lines, strict=True):
+    for k, (bench, speed, e, found) in enumerate(zip(benches, speeds, experiments, lines, strict=True)):
         spectra = e.spectra
         remembered.append(
             {**origin(bench), "speed": speed, "periods": spectra.n_periods, "period_s": spectra.period / bench.rate_hz}
@@ -170,15 +172,36 @@ def _from_periods(
             lost = spectra.dropped / bench.rate_hz
             warnings.append(f"{name_of(bench)}: the first {lost:.4g} s were left out: a transient, or part of a period")
         if found:
-            said = ", ".join(f"{x.frequency_hz:.4g} Hz in {x.channel}" for x in found)
-            warnings.append(f"{name_of(bench)}: lines were taken out: {said}. Hum, motion of the base, or a tone")
+            warnings.append(
+                f"{name_of(bench)}: lines were taken out: {_listed(found)}. Hum, motion of the base, or a tone"
+            )
+        if more[k]:
+            warnings.append(f"{name_of(bench)}: lines remain: {_listed(more[k])}. Look for their source")
     say("check")
     hint = experiments_hint(experiments, model)
     least = min(x.count for x in excitations)
     return _Found(
         fit=fit, evidence=of_periods(fit), records=remembered, warnings=[*warnings, *([hint] if hint else [])],
+        checks={"lines": _excited(benches, [[*a, *more[k]] for k, a in enumerate(lines)])},
         spectra=max(experiments, key=lambda e: abs(e.speed)).spectra, seen=[e.spectra for e in experiments],
         why=f"the excitation is periodic ({least} whole periods): maximum likelihood on period spectra",
+    )  # fmt: skip
+
+
+def _listed(lines: Sequence[Line]) -> str:
+    return ", ".join(f"{x.frequency_hz:.4g} Hz in {x.channel}" for x in lines)
+
+
+def _excited(benches: Sequence[Record], lines: Sequence[Sequence[Line]]) -> Check:
+    """Judge lines on excited ones, where a mode between their neighbours looks alike."""
+    on = [(b, [x for x in found if x.excited]) for b, found in zip(benches, lines, strict=True)]
+    said = "; ".join(f"{_listed(found)} of {name_of(b)}" for b, found in on if found)
+    if not said:
+        return Check(passed=True, detail="nothing but the excitation stands at a single excited line")
+    return Check(
+        passed=False, cause="line", alternatives=("mode",),
+        detail=f"{said} stands at a single excited line: hum, or a bending mode that the model lacks. Look for hum "
+        "with the excitation off; else let modes.count be auto, or one more, and excite with lines closer together",
     )  # fmt: skip
 
 

@@ -11,13 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ambid.arrays import Array, Complex
+from ambid.errors import EstimationError
 from ambid.record import Record, Step
 from ambid.rotor.estimator import RotorFit
 from ambid.rotor.likelihood import Experiment, Point, Weight, sampled, source_covariance, sources
-from ambid.rotor.spectra import Excitation, PeriodSpectra
+from ambid.rotor.spectra import LEAST_LINES, Excitation, PeriodSpectra
 from ambid.rotor.synchronous import aperiodic
 
-_STANDS_OUT = 8.0  # times the median of the lines around
+_STANDS_OUT, _FOUND = 8.0, 12.0  # times the median of the lines around, to be taken out, and to be found
 _AROUND, _NEAR = 20, 12  # lines on either side for that median, and of which it must hold nearly all power
 _NARROW = 0.8
 _LIKE, _ALONE = 8, 30.0  # excited lines on either side, over the largest of which one of them has to stand
@@ -34,6 +35,7 @@ class Line:
 
     frequency_hz: float
     channel: str
+    excited: bool = False  # whether it stands on an excited line, where a mode narrower than their spacing looks alike
 
 
 def find_lines(fit: RotorFit) -> list[list[Line]]:
@@ -58,9 +60,9 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
     at_lines = np.flatnonzero(excited)
     for j in np.argsort(-power).tolist():
         around = power[max(0, j - _AROUND) : j + _AROUND + 1]
-        if power[j] < _STANDS_OUT * float(np.median(around)):
+        if power[j] < _FOUND * float(np.median(around)):
             break
-        near = power[max(0, j - _NEAR) : j + _NEAR + 1]
+        over = power - float(np.median(around))
         if excited[j]:  # what the model lacks shows at several lines
             k = int(np.searchsorted(at_lines, j))
             others = np.delete(at_lines[max(0, k - _LIKE) : k + _LIKE + 1], min(k, _LIKE))
@@ -68,12 +70,13 @@ def _lines(fit: RotorFit, e: Experiment, weight: Weight) -> list[Line]:
                 continue
         if any(abs(j - other) < _APART for other in found):
             continue
-        if float(power[max(0, j - 1) : j + 2].sum()) > _NARROW * float(near.sum()):
+        if float(over[max(0, j - 2) : j + 3].sum()) > _NARROW * float(over[max(0, j - _NEAR) : j + _NEAR + 1].sum()):
             shares = np.abs(np.sum(ways[j].conj() * w[j][:, None], axis=0)) ** 2
             shares /= np.maximum(np.sum(np.abs(ways[j]) ** 2, axis=0), 1e-300)
             k, names = int(np.argmax(shares)), (*fit.model.outputs, *fit.model.disturbances)
             one = shares[k] > _OF_ONE * power[j]
-            found[j] = Line(frequency_hz=float(frequency[j]), channel=names[k] if one else "several channels")
+            channel = names[k] if one else "several channels"
+            found[j] = Line(frequency_hz=float(frequency[j]), channel=channel, excited=bool(excited[j]))
     return list(found.values())
 
 
@@ -139,5 +142,10 @@ def apart(spectra: PeriodSpectra, lines: Sequence[Line]) -> PeriodSpectra:
     far: NDArray[np.bool_] = np.ones(spectra.frequency_hz.size, dtype=np.bool_)
     for line in lines:
         far &= np.abs(spectra.frequency_hz - line.frequency_hz) >= reach
+    if np.count_nonzero(far) < LEAST_LINES:
+        raise EstimationError(
+            f"the excitation of the record has {far.size} lines, on {np.count_nonzero(~far)} of which hum or another "
+            f"tone stands; a rotor needs {LEAST_LINES} others. Excite more lines: a multisine with whole periods"
+        )
     kept = spectra.lines(far)
     return replace(kept, left_out_hz=np.sort(np.concatenate([kept.left_out_hz, spectra.frequency_hz[~far]])))
