@@ -264,3 +264,11 @@ def test_a_change_that_turns_out_to_be_a_load_is_not_left_open():
     assert tallied(change, until=2.0).verdict.word == "unusable"
     assert tallied(change, load, until=2.0).totals.unanswered == ()
     assert tallied(change, load, until=2.0).verdict.word == "usable"
+
+
+def test_a_change_that_turns_out_to_be_another_counts_once():
+    (change,), (other,) = noticed(1.0, kind="change"), noticed(1.0, kind="change", named=1.1)
+    other = replace(other, parameter="k_i")
+    assert change.parameter != other.parameter
+    found = tallied(change, other, until=2.0).totals
+    assert (found.changes, found.unanswered) == ((other,), (other,))

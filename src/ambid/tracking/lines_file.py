@@ -210,14 +210,14 @@ class Tally:
                 self._alarms.append(noticed)
                 while self._alarms[0] <= noticed - RECENT_S:
                     self._alarms.popleft()
+            if "named" in event.values:  # what looked like another change, or like one, was none
+                self._changes = [e for e in self._changes if e.t != event.t]
+                self._open = {name: e for name, e in self._open.items() if e.t != event.t}
             if event.kind == "rejected":
                 self.rejected_samples += event.samples or 0
             elif event.kind == "change":
                 self._changes.append(event)
                 self._open[event.parameter] = event
-            elif event.kind == "disturbed" and "named" in event.values:  # what looked like a change was none
-                self._changes = [e for e in self._changes if e.t != event.t]
-                self._open = {name: e for name, e in self._open.items() if e.t != event.t}
             elif event.kind == "accepted" and event.parameter is None:  # all of them together
                 self._open.clear()
             elif event.kind == "accepted":

@@ -332,6 +332,8 @@ class PhysicalRpem:
         self.filter.walk(self.drift.variance, self.block_s)
         risen = np.where(self.filter.active, self.drift.risen, 0.0)
         for direction in self._joints if risen.any() else ():
+            if np.count_nonzero(direction) < 2:  # such as where the others start at zero
+                continue
             common = np.sort(risen[direction != 0.0] / direction[direction != 0.0] ** 2)[-2]
             if common > 0.0:
                 self.filter.widen(np.where(self.filter.active, direction, 0.0), math.sqrt(common * self.block_s))
