@@ -106,11 +106,22 @@ def test_lost_samples_are_named_by_the_phase_that_jumps(sound: Any, at: float, l
     assert find_slip(replace(record, channels=tuple(kept)), rig.plant) is None
 
 
+@pytest.mark.parametrize("frequency", [151.3, 298.7])
+def test_a_tone_over_the_excitation_is_no_lost_sample(sound: Any, frequency: float) -> None:
+    """Such as a synchronous part: the phase drifts from period to period."""
+    wave = np.sin(2.0 * np.pi * frequency * np.arange(sound[0].n_samples) / sound[0].rate_hz)
+    channels = tuple(c for c in sound[0].channels if not c.name.endswith("_reference"))
+    more = tuple(replace(c, values=c.values + 4.0 * np.std(c.values) * wave) for c in channels)
+    assert find_slip(replace(sound[0], channels=more), sound[1].plant) is None
+
+
 def test_a_record_that_lost_samples_is_not_usable(sound: Any) -> None:
     cut = tuple(replace(c, values=np.delete(c.values, slice(8000, 8003))) for c in sound[0].channels)
     found = ambid.identify(replace(sound[0], channels=cut), sound[1])
     assert found.verdict.word != "usable"
-    assert (found.checks["samples_complete"].cause, found.checks["samples_complete"].size) == ("lost_samples", 3.0)
+    complete = found.checks["samples_complete"]
+    assert (complete.cause, complete.size) == ("lost_samples", 3.0)
+    assert "3 samples, but for whole periods of 2500" in complete.detail
 
 
 @pytest.mark.parametrize("frequency", [52.0, 50.0, 151.3])

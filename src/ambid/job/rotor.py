@@ -81,7 +81,7 @@ def identify_rotor(
         estimate = conclude(
             outcome.fit, outcome.evidence, rig.parameters, outcome.records,
             delay_how=["given" if d is not None else "estimated" for d in _delays(rig)],
-            more_checks={**_record_checks(benches, rig), "method": Check(passed=True, detail=outcome.why),
+            more_checks={**_record_checks(benches, clean, rig), "method": Check(passed=True, detail=outcome.why),
                          **outcome.checks},
             rig=rig_entry(rig), warnings=[*warnings, *outcome.warnings],
         )  # fmt: skip
@@ -365,21 +365,22 @@ def _plausible(estimate: RotorEstimate, rig: Rig, bench: Record) -> Mapping[str,
     return plausible_checks(estimate.plant, estimate.numbers, sd, rig.parameters, bench)
 
 
-def _record_checks(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:
-    """Judge the records themselves: lost samples, saturation of the voltages."""
+def _record_checks(benches: Sequence[Record], clean: Sequence[Record], rig: Rig) -> dict[str, Check]:
+    """Judge the records themselves: lost samples of those without synchronous parts, saturation of the voltages."""
     from ambid.rotor.spectra import find_slip
 
-    checks = dict[str, Check]()
-    for bench in benches:
-        slip = find_slip(bench, rig.plant)
-        if slip is not None:
-            what = "lacks {}" if slip.samples > 0 else "holds {} twice"
-            checks["samples_complete"] = Check(
-                passed=False, cause="lost_samples", size=float(slip.samples),
-                detail=f"{name_of(bench)} {what.format(counted(abs(slip.samples), 'sample'))} at about {slip.at_s:.3g} "
-                "s: the phase of the excitation jumps. Log without gaps, or use a part before or after",
-            )  # fmt: skip
-    return {**checks, **_saturation(benches, rig)}
+    slips = [(name_of(b), slip) for b in clean if (slip := find_slip(b, rig.plant)) is not None]
+    said = "; ".join(
+        f"{name} {'lacks' if slip.samples > 0 else 'holds twice'} {counted(abs(slip.samples), 'sample')}, but for "
+        f"whole periods of {slip.period}, at about {slip.at_s:.3g} s"
+        for name, slip in slips
+    )
+    complete = Check(
+        passed=not slips, cause="lost_samples" if slips else "", size=float(slips[0][1].samples) if slips else None,
+        detail=f"{said}: the phase of the excitation jumps. Log without gaps, or use a part before or after" if slips
+        else "the phase of the excitation jumps nowhere, as far as it is periodic",
+    )  # fmt: skip
+    return {"samples_complete": complete, **_saturation(benches, rig)}
 
 
 def _saturation(benches: Sequence[Record], rig: Rig) -> dict[str, Check]:

@@ -24,6 +24,7 @@ _TRANSIENT = 5.0  # standard deviations by which a first period may differ from 
 LEAST_PERIODS = 2
 """Whole periods of a record whose spectra are used."""
 _OTHER = 0.5  # change of an excitation from period to period, over its rms, from which it is another experiment
+_BROKEN = 3  # periods, half of one apart, that a break may lie in
 _SAME_COURSE = 0.4  # correlation of two periods from which they are one excitation
 _FIRST_LINE = 10  # of a window's spectrum: below, what leaks from the edges is not small
 LEAST_LINES = 20
@@ -212,40 +213,49 @@ class Slip:
     """Where the phase of a periodic excitation jumps: samples that a log lost, negative where it holds some twice."""
 
     at_s: float
-    samples: int
+    samples: int  # but for whole periods, which leave the phase as it is
+    period: int
 
 
 def find_slip(record: Record, model: LinearModel) -> Slip | None:
-    """Return the jump of phase between the first period of a record and its last, by their correlation, None without.
+    """Return the jump of phase between the first period of a record and its last, by their correlation, None without:
+    up to a break it stays where it is, and from there on.
 
     The period is that of either half of the record: one of them holds no jump.
     """
-    x, n, found = np.column_stack(_excitations(record, model) or [np.zeros(2)]), record.n_samples, dict[int, float]()
+    if not (signals := _excitations(record, model)):
+        return None
+    x, n, found = np.column_stack(signals), record.n_samples, dict[int, float]()
     for half in (x[: n // 2], x[n // 2 :]):
         try:
             period = find_period(half)
         except EstimationError:
             continue
-        found[period] = float(np.mean((half[period:] - half[:-period]) ** 2))
+        found[period] = float(np.median(np.sum((x[period:] - x[:-period]) ** 2, axis=1)))  # most samples see no jump
     if not found:
         return None
     period = min(found, key=lambda p: found[p])
-    first, last = (np.fft.rfft(part - part.mean(axis=0), axis=0) for part in (x[:period], _last(x, period)))
-    alike = np.fft.irfft(np.sum(first.conj() * last, axis=1), period)
-    power = float(np.prod([np.fft.irfft(np.sum(np.abs(x) ** 2, axis=1), period)[0] for x in (first, last)]) ** 0.5)
-    k = -((int(np.argmax(alike)) + period // 2) % period - period // 2)
-    if (
-        not k or alike.max() < _SAME_COURSE * power or power - alike.max() > 0.5 * (power - alike[0])
-    ):  # as noise moves it
+    starts = [*range(0, n - period, max(1, period // 2)), n - period]
+    shifts, (alike, power) = np.zeros(len(starts), dtype=int), (np.zeros(period), 0.0)
+    for j, start in enumerate(starts):
+        alike, power = _alike(x[:period], np.roll(x[start : start + period], start % period, axis=0))
+        shifts[j] = -((int(np.argmax(alike)) + period // 2) % period - period // 2)
+    k = int(shifts[-1])
+    if not k or alike.max() < _SAME_COURSE * power or power - alike.max() > 0.5 * (power - alike[0]):  # as noise moves
+        return None
+    before, after = (int(np.argmin([*(q == s for q in part), False])) for s, part in ((0, shifts), (k, shifts[::-1])))
+    if max(before, after) < 2 or before + after < len(starts) - _BROKEN:  # it drifts, or wanders
         return None
     moved = np.sum((x[period:] - x[:-period]) ** 2, axis=1)
     inside = int(np.flatnonzero(np.cumsum(moved) > 0.5 * moved.sum())[0]) + period // 2
-    return Slip(at_s=inside / record.rate_hz, samples=k)
+    return Slip(at_s=inside / record.rate_hz, samples=k, period=period)
 
 
-def _last(x: Array, period: int) -> Array:
-    """Return the last period in the phase of the first."""
-    return np.roll(x[-period:], (x.shape[0] - period) % period, axis=0)
+def _alike(a: Array, b: Array) -> tuple[Array, float]:
+    """Return the correlation of one period with another, and what it is of one with itself."""
+    first, last = (np.fft.rfft(part - part.mean(axis=0), axis=0) for part in (a, b))
+    own = [np.fft.irfft(np.sum(np.abs(s) ** 2, axis=1), a.shape[0])[0] for s in (first, last)]
+    return np.fft.irfft(np.sum(first.conj() * last, axis=1), a.shape[0]), float(np.sqrt(np.prod(own)))
 
 
 def _excitations(record: Record, model: LinearModel) -> list[Array]:
