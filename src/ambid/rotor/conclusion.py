@@ -15,12 +15,11 @@ from ambid.estimation.modes import EstimatedNumber, Mode
 from ambid.physics.linear_model import Parameter
 from ambid.physics.rotor_model import RotorModel
 from ambid.physics.sensor_errors import Lines
-from ambid.rotor.curvature import Bent, curvature, curvature_check
 from ambid.rotor.estimate import RotorEstimate
 from ambid.rotor.estimator import Ending, RotorFit
 from ambid.rotor.likelihood import Experiment, sampled
 from ambid.rotor.prediction import PredictorFit
-from ambid.rotor.scores import agreement_checks, refined, scores
+from ambid.rotor.scores import Bent, agreement_checks, curvature, curvature_check, refined, scores
 
 _BANDS = 24  # parts of the excited band whose residuals are judged
 _FAR = 4.5  # standard deviations from which residuals are above the noise
