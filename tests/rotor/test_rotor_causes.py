@@ -16,6 +16,7 @@ from ambid.physics.presets import preset
 from ambid.record import Record
 from ambid.rig import Rig, rig_of_preset
 from ambid.rotor.lines import Line, apart
+from ambid.rotor.scores import Cause, Score, agreement_checks
 from ambid.rotor.spectra import find_excitation, find_slip, period_spectra
 from tests.rotor_benches import free_rig, needs_simulator, record_of, truth
 
@@ -75,20 +76,46 @@ def test_two_planes_wrong_together_are_no_single_plane(sound: Any) -> None:
 
 def test_a_mass_that_only_scales_is_not_contradicted(sound: Any) -> None:
     """Without voltages a fixed mass sets the scale of all, and no record says anything against it."""
+    found = ambid.identify(sound[0], driven(sound[1], 6.2))
+    assert found.checks["fixed_agree"].passed, found.checks["fixed_agree"].detail
+    assert found.verdict.word == "usable"
+    assert "curvature" not in found.checks  # which is not tested without coils
+
+
+def test_a_late_current_is_late_where_it_is_the_input(sound: Any) -> None:
     record, rig = sound
+    pole = np.exp(-2.0 * np.pi * 2000.0 / record.rate_hz)
+    late = changed(record, ax_current=lambda x: lfilter([1.0 - pole], [1.0, -pole], x, zi=[pole * x[0]])[0])
+    check = ambid.identify(late, driven(rig, 6.0)).checks["sensors_agree"]
+    assert (check.passed, check.cause) == (False, "ax_current.lag")
+    assert check.size == pytest.approx(1.0 / (2.0 * np.pi * 2000.0), rel=0.6)
+    assert not [x for x in check.alternatives if "voltage" in x]
+
+
+@pytest.mark.parametrize(("name", "kind"), [("ax_position.lag", "lag"), ("eddy_pole", "eddy")])
+def test_a_lead_names_the_lags_of_current_and_voltage(sound: Any, name: str, kind: str) -> None:
+    lead = Score(cause=Cause(name=name, kind=kind), z=-9.0, size=-1e-5, gain=81.0)
+    check = agreement_checks([lead], sound[1].rotor)["sensors_agree"]
+    of = ("currents", "voltages") if kind == "eddy" else ("ax_current", "ax_voltage")
+    assert check.alternatives == tuple(f"{x}.lag" for x in of)
+    assert "pole to" not in check.detail
+    assert "a lead of 10 us" in check.detail
+
+
+def driven(rig: Rig, mass: float) -> Rig:
+    """The rig without voltages, of a known mass in kg."""
     assert rig.rotor is not None
     model = replace(rig.rotor, drives=("current",) * 4)
     channels = tuple(replace(c, delay=0) for c in rig.channels if not c.role.endswith("_voltage"))
-    known = {p.name: p for p in rig.parameters} | {"m": replace(rig.parameter("m"), role="fixed", value=6.2)}
-    bare = replace(rig, rotor=model, channels=channels, parameters=tuple(known[p.name] for p in model.parameters))
-    found = ambid.identify(record, bare)
-    assert found.checks["fixed_agree"].passed, found.checks["fixed_agree"].detail
-    assert found.verdict.word == "usable"
+    known = {p.name: p for p in rig.parameters} | {"m": replace(rig.parameter("m"), role="fixed", value=mass)}
+    return replace(rig, rotor=model, channels=channels, parameters=tuple(known[p.name] for p in model.parameters))
 
 
 def test_a_plane_and_a_gain_are_named_without_whole_periods(sound: Any) -> None:
     record, rig = sound[0][0.0:0.45], sound[1]
-    assert ambid.identify(record, rig).verdict.word == "usable"
+    plain = ambid.identify(record, rig)
+    assert plain.verdict.word == "usable"
+    assert "were not asked of" in plain.checks["sensors_agree"].detail
     assert {"A.z", "A.z_sensor"} >= set(named(record, moved(rig, A__z_sensor=5e-3), "fixed_agree"))
     causes = named(changed(record, ax_position=lambda x: 1.05 * x), rig, "sensors_agree")
     assert causes[0] == "ax_position.gain"

@@ -201,9 +201,9 @@ def _columns(
             yield of.slopes(mean, [turned.derivative(at.theta, error.channel)])[:, :, 0]
             continue
         added = np.zeros_like(y)
-        if error.channel in inputs:  # a gain is of what is logged, a lag of what acts
+        if error.channel in inputs:  # a gain is of what is logged, a lag of what acts, but for a measured current
             k = inputs.index(error.channel)
-            sign = -1.0 if error.kind == "gain" else 1.0
+            sign = -1.0 if error.kind == "gain" or error.channel.endswith("_current") else 1.0
             yield sign * H[:, :, k] * logged_error(error.kind, mean[:, k], omega)[:, None]
             continue
         k = outputs.index(error.channel)
@@ -236,7 +236,8 @@ def _without(problem: Likelihood, cause: Cause, size: float) -> Likelihood:
 def _freed(spectra: PeriodSpectra, model: RotorModel, error: SensorError, size: float) -> PeriodSpectra:
     U, Y, late = spectra.U.copy(), spectra.Y.copy(), 1.0 + 1j * spectra.omega * size
     if error.channel in model.inputs:
-        U[:, :, model.inputs.index(error.channel)] /= late if error.kind == "lag" else 1.0 + size
+        acts = 1.0 / late if not error.channel.endswith("_current") else late
+        U[:, :, model.inputs.index(error.channel)] *= acts if error.kind == "lag" else 1.0 / (1.0 + size)
     elif error.kind == "cross-talk":
         k, other = (model.outputs.index(x) for x in (error.channel, error.other))
         Y[:, :, k] -= size * Y[:, :, other]
@@ -256,7 +257,8 @@ def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Che
     alike = [s for s in found[1:] if s.gain > min(_ALIKE * best.gain, best.gain - _CLOSE)]
     others = [s.cause.name for s in alike] + ["planes"] * ("+" in best.cause.name)
     twin = next((best.cause.name.replace(a, b) for a, b in _TWINS if best.cause.name.endswith(a)), "")
-    others += [twin] * (twin not in ("", *others))
+    twins = _late_instead(best.cause.name) if _leads(best) else (twin,)
+    others += [x for x in twins if x not in (best.cause.name, *others) and _logged(x, model)]
     checks: dict[str, Check] = {}
     for name, fixed, fine in (
         ("fixed_agree", True, "the record agrees with the planes and the other fixed numbers"),
@@ -282,6 +284,27 @@ def agreement_checks(found: Sequence[Score], model: RotorModel) -> dict[str, Che
     return checks
 
 
+def _leads(s: Score) -> bool:
+    """Whether a score would have a channel lead, as none does: others lag."""
+    return s.cause.kind in ("lag", "eddy") and s.size < 0.0
+
+
+def _late_instead(name: str) -> tuple[str, ...]:
+    """Return the lags of current and voltage that a lead of another channel stands for."""
+    axis, _, channel = name.partition("_")
+    if not channel or name == "eddy_pole":
+        return ("currents.lag", "voltages.lag")
+    return (f"{axis}_current.lag", f"{axis}_voltage.lag")
+
+
+def _logged(name: str, model: RotorModel) -> bool:
+    """Whether a model has the channels that a lag is of, or lacks the eddy pole."""
+    if name == "eddy_pole":
+        return "a" not in model.extras
+    channel, roles = name.rpartition(".")[0], (*model.inputs, *model.outputs)
+    return channel in roles or any(role.endswith(f"_{channel.removesuffix('s')}") for role in roles)
+
+
 def _shown(s: Score, units: dict[str, str]) -> str:
     """Return a cause with its size, in a few words."""
     kind, unit = s.cause.kind, units.get(s.cause.name.split("+")[0], "1")
@@ -299,6 +322,11 @@ def _words(s: Score, unit: str) -> str:
         shown = f"{1e3 * s.size:+.3g} mm" if unit == "m" else f"{s.size:+.3g} {unit}"
         both = " and ".join(name.split("+"))
         return f"the record contradicts {both}: {shown} would fit better ({sure}). Measure it, or let it be free"
+    if _leads(s):
+        return (
+            f"{name} would have to be a lead of {1e6 * abs(s.size):.3g} us ({sure}), as no sensor has: currents or "
+            "voltages lag behind what is logged, or are logged late. Log them without filters"
+        )
     if kind == "eddy":
         return (
             f"the positions lag behind the currents by {1e6 * s.size:.3g} us ({sure}). Add to [parameters] an eddy "
@@ -313,8 +341,7 @@ def _words(s: Score, unit: str) -> str:
     if kind == "gain":
         remedy = f"Calibrate it, or free {axis}.gain" if position else "Calibrate it"
         return f"{channel} reads {100 * s.size:+.3g} % beside the others ({sure}). {remedy}"
-    does = ("lag" if s.size > 0.0 else "lead") + ("s" if "_" in channel else "")
-    late = f"{channel} {does} by {1e6 * abs(s.size):.3g} us ({sure})"
+    late = f"{channel} {'lags' if '_' in channel else 'lag'} by {1e6 * s.size:.3g} us ({sure})"
     if channel.rpartition("_")[2].startswith("voltage"):
         return f"{late}: the coils get less than what is logged. Log behind the amplifier, or excite more slowly"
     remedy = f"Add {axis}.sensor_pole to [parameters]" if position else "Log without its filter"

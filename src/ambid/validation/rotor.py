@@ -37,6 +37,8 @@ def of_predictor(found: PredictorFit) -> Evidence:
     disturbance, sensor = noise_levels(fit, predictor)
     e = e * problem.scales.output
     share, size = fit_of(e, problem.y[problem.skip :]), np.sqrt(np.mean(e**2, axis=0))
+    agree = _asked(agreement_checks(predictor_scores(found), found.model))
+    checks = {"residuals_white": white_check(white), "residuals_uncorrelated": uncorrelated_check(past)}
     return Evidence(
         method="predictor",
         noise={**sensor, **disturbance},
@@ -44,17 +46,25 @@ def of_predictor(found: PredictorFit) -> Evidence:
             role: OutputFit(one_step=float(a), simulation=None, innovation_sd=float(b))
             for role, a, b in zip(found.model.outputs, share, size, strict=True)
         },
-        checks={
-            "residuals_white": white_check(white),
-            "residuals_uncorrelated": uncorrelated_check(past),
-            **agreement_checks(predictor_scores(found), found.model),
-        },
+        checks={**checks, **_or_late(agree, all(c.passed for c in checks.values()))},
     )
+
+
+def _asked(checks: dict[str, Check]) -> dict[str, Check]:
+    """Return checks of which none that passed says more than was asked of innovations."""
+    fine = checks.get("sensors_agree")
+    if fine is None or not fine.passed:
+        return checks
+    text = (
+        "no gain or cross-talk of a channel and no lag of a position shows in the innovations, which lags of currents "
+        "and voltages and eddy poles were not asked of"
+    )
+    return {**checks, "sensors_agree": replace(fine, detail=text)}
 
 
 def _or_late(checks: dict[str, Check], white: bool) -> dict[str, Check]:
     """Return checks that name the lags of a coil's current and voltage, which innovations are not tested for, beside
-    their gains where the innovations are not white.
+    their gains where the innovations are not white; a position that leads names them by itself.
     """
     named = checks.get("sensors_agree")
     if white or named is None or not named.cause.endswith(("_current.gain", "_voltage.gain")):
