@@ -86,8 +86,9 @@ def of_periods(fit: RotorFit) -> Evidence:
     found, numbers = refined(fit.problem, fit.vector, scores(fit.problem, fit.vector)), numbers_of(fit)
     sd = {name: numbers.sd(name) for name in numbers.names}
     agree, bent = agreement_checks(found, fit.model), curvature(fit.problem, fit.vector)
-    if not all(c.passed for c in agree.values()) and bent.gain < found[0].gain:  # no more than what is named does
-        bent = Bent.none()
+    named = next((c.cause for c in agree.values() if not c.passed), "")
+    if bent and bent.shift and named and bent.gain < found[0].gain:  # no more than what is named does
+        bent = bent.instead(named)
     return Evidence(
         method="periods",
         noise=_noise(fit),
@@ -95,7 +96,7 @@ def of_periods(fit: RotorFit) -> Evidence:
         bent=bent,
         checks={
             **_residual_checks(fit),
-            "curvature": curvature_check(bent, sd),
+            **({"curvature": curvature_check(bent, sd)} if bent else {}),
             **agree,
         },
     )
@@ -126,10 +127,10 @@ def conclude(
     warnings: Sequence[str] = (),
 ) -> RotorEstimate:
     """Return the estimate of a search; `delay_how`: by input, "given" or "estimated"."""
-    numbers, model = numbers_of(fit), fit.model
+    numbers, model = (of_record := numbers_of(fit)), fit.model
     if evidence.bent is not None:
         numbers = numbers.wider(tuple(evidence.bent.shift), evidence.bent.more)
-    estimated = _parameters(model, parameters, numbers)
+    estimated = _parameters(model, parameters, numbers, of_record)
     checks = {**evidence.checks, "identifiable": _identifiable(estimated, numbers), **more_checks}
     speed = max(fit.speeds, key=abs)
     turned = model.at_speed(speed)
@@ -157,7 +158,10 @@ def conclude(
     )  # fmt: skip
 
 
-def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Numbers) -> tuple[EstimatedParameter, ...]:
+def _parameters(
+    model: RotorModel, parameters: Sequence[Parameter], numbers: Numbers, of_record: Numbers
+) -> tuple[EstimatedParameter, ...]:
+    """Return the parameters as estimated; what the record itself shows of a prior is by `of_record`."""
     sizes = model.references(numbers.theta)
     estimated = []
     for p in parameters:
@@ -166,9 +170,10 @@ def _parameters(model: RotorModel, parameters: Sequence[Parameter], numbers: Num
         size = sizes.get(p.name, abs(value))
         shows = {p.name: p.role == "fixed" or bool(sd <= _LENGTH_SEEN * size)}
         # of independent information 1/sd² = 1/alone² + 1/prior²
-        left = max(1.0 - (sd / p.sd) ** 2, 1e-12) if p.role == "prior" and p.sd else 1.0
+        own = of_record.sd(p.name)
+        left = max(1.0 - (own / p.sd) ** 2, 1e-12) if p.role == "prior" and p.sd else 1.0
         estimated.append(
-            EstimatedParameter.of(p, numbers.theta, {p.name: sd}, shows, {p.name: sd / float(np.sqrt(left))})
+            EstimatedParameter.of(p, numbers.theta, {p.name: sd}, shows, {p.name: own / float(np.sqrt(left))})
         )
     return tuple(estimated)
 

@@ -367,17 +367,18 @@ class Bent:
     # and how far it is known
     more: Array
 
-    @classmethod
-    def none(cls) -> Bent:
-        """Return that nothing shows."""
-        return cls(gain=0.0, p=1.0, shift={}, more=np.zeros((0, 0)))
+    other: str = ""  # what explains the residuals better, so that the shift is none of curvature
+
+    def instead(self, other: str) -> Bent:
+        """Return that something else explains the residuals better."""
+        return replace(self, shift={}, more=np.zeros((0, 0)), other=other)
 
 
-def curvature(problem: Likelihood, v: Array) -> Bent:
-    """Return what curvature has done to the numbers; nothing where it does not show, or an axis has no coil."""
+def curvature(problem: Likelihood, v: Array) -> Bent | None:
+    """Return what curvature has done to the numbers; no shift where it does not show, None without coils."""
     model = problem.unknowns.model
     if len(model.coils) < len(model.axes):
-        return Bent.none()
+        return None
     rows, at = np.concatenate(problem.rows(v, corrected=True)), problem.point(v)
     pairs = zip(problem.experiments, problem.weights, strict=True)
     C = np.concatenate([_bent(problem, e, w, at) for e, w in pairs])
@@ -393,7 +394,9 @@ def curvature(problem: Likelihood, v: Array) -> Bent:
     if p > _CHANCE:
         return Bent(gain=gain, p=p, shift={}, more=np.zeros((0, 0)))
     names, chain = problem.unknowns.chain(v)
-    of_sizes = chain[: len(names)] @ moved @ axes
+    late = problem.unknowns.free_delays
+    of_sizes = chain[[*range(len(names)), *(len(names) + k for k in late)]] @ moved @ axes
+    names = (*names, *(f"{model.inputs[k]}.delay" for k in late))
     shift = of_sizes @ (along / values)
     more = np.outer(shift, shift) + (of_sizes / values) @ of_sizes.T
     return Bent(gain=gain, p=p, shift=dict(zip(names, shift.tolist(), strict=True)), more=np.asarray(more))
@@ -439,6 +442,9 @@ def curvature_check(bent: Bent, sd: Mapping[str, float]) -> Check:
     """Judge what curvature has done against the standard deviations of the record."""
     worst = max(bent.shift, key=lambda x: abs(bent.shift[x]) / (sd.get(x) or np.inf), default="")
     z = abs(bent.shift[worst]) / (sd.get(worst) or np.inf) if worst else 0.0
+    if bent.other:
+        text = f"curvature of the magnets would explain less than {bent.other}: it is not held in the intervals"
+        return Check(passed=True, p=bent.p, detail=text)
     if z <= _HARMLESS:
         return Check(passed=True, p=bent.p, detail="no curvature of the magnets shows that moves a number")
     held = z <= _BENT
