@@ -254,7 +254,7 @@ def _judged(
     if problem.model.name == "one-axis":
         from ambid.validation.causes import causes, causes_check, named_bias
 
-        checks["in_time"] = check_lag(signals)
+        in_time = check_lag(signals)
         curved, own = None, np.sqrt(np.diag(spread.information))
         if rig.magnet is not None or rig.limits is not None:  # else no law of the magnet is known
             from ambid.control.curvature import magnet_checks
@@ -270,7 +270,8 @@ def _judged(
             named = [
                 c for c in causes(fit, means, thorough=thorough, delay_given=given) if not bent or c.name != "curvature"
             ]
-            checks = {**before, **causes_check(named, before, own, robust=robust, record=bench)}
+            judged = causes_check(named, {**before, "in_time": in_time}, own, robust=robust, record=bench)
+            checks = {**before, **judged, "in_time": in_time}
             if checks["causes"].passed:
                 break
         spread = replace(spread, bias=named_bias(named, spread.bias))
